@@ -103,13 +103,13 @@ def begun(case: Any, task: Task, stated: Mapping[str, tuple[float, float]] | Non
     ready()
     from calibration.data import robot_file
     from calibration.data import runs as records
-    from calibration.discovery.discover import prepared
+    from calibration.discovery.discover import prepare_loop
 
     with tempfile.TemporaryDirectory() as folder:
         case.write(Path(folder))
         robot = robot_of(task.robot) if case.toml is None else robot_file.read(Path(folder) / "rig.toml")
         runs = records.read(Path(folder) / "table.csv", robot=robot)
-    return prepared(runs, robot, stated=stated, replicates=task.replicates, seed=task.seed)
+    return prepare_loop(runs, robot, stated=stated, replicates=task.replicates, seed=task.seed)
 
 
 def looped(case: Any, task: Task, stated: Mapping[str, tuple[float, float]] | None = None) -> tuple[Any, Any, dict]:

@@ -52,7 +52,7 @@ def run(
     """Climbs of members with angles (members, 2, knots) [deg] over steps of their heights [m]."""
     n = len(heights)
     conditions = Conditions(0, voltage=np.full(n, volts), adhesion=adhesion, payload=payload).resolved(robot)
-    grounds = jax.vmap(lambda h: terrain.step(h))(jnp.asarray(heights))
+    grounds = jax.vmap(lambda h: terrain.single_step(h))(jnp.asarray(heights))
     front, rear = (jnp.asarray(np.radians(angles[:, k])) for k in range(2))
     supply = None if levers is None else jnp.full(n, levers)
     knots = jnp.broadcast_to(jnp.asarray(KNOTS), front.shape)

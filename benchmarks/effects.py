@@ -32,7 +32,7 @@ ADHESION = {
     f"{c}.ground.friction.{k}": v for c in (TRACKED, WHEELED) for k, v in (("static", 0.6), ("dynamic", 0.48))
 }
 #: In the units of the channels' columns; only the ratios of display resolutions matter for look-alikes.
-SHOWN = 1 / np.array(channels.factors(channels.usual()))
+SHOWN = 1 / np.array(channels.channel_factors(channels.usual_channels()))
 NOISE = np.array([0.02, 5.0, 3.0])
 #: Base parameters that every fit frees; they are projected out.
 FREED = (
@@ -60,7 +60,7 @@ def robot(effects: tuple[type[Effect], ...]) -> Robot:
 
 
 def amplitude(effect: type[Effect]) -> params.Spec:
-    return next(p.spec for p in params.walk(effect()) if p.spec.amplitude)
+    return next(p.spec for p in params.walk_parameters(effect()) if p.spec.amplitude)
 
 
 def _shown(reading: dict[str, jax.Array]) -> jax.Array:
@@ -86,7 +86,7 @@ def sensitivities() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
     full = robot(SETTLED)
     names = [f"effects.{e.name}.amplitude" for e in SETTLED] + list(FREED)
-    values = {p.name: p.value for p in params.walk(full)}
+    values = {p.name: p.value for p in params.walk_parameters(full)}
     start = jnp.stack([values[n] for n in names])
     runs = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), examples(), table8())
 
@@ -160,7 +160,9 @@ def _about(effect: type[Effect]) -> tuple[str, ...]:
 def _section(effect: type[Effect]) -> str:
     """Section of one effect: equation, meaning, source and what it declares."""
     spec = amplitude(effect)
-    shapes = [f"{p.name} {float(p.value):g} {p.spec.unit}" for p in params.walk(effect()) if not p.spec.amplitude]
+    shapes = [
+        f"{p.name} {float(p.value):g} {p.spec.unit}" for p in params.walk_parameters(effect()) if not p.spec.amplitude
+    ]
     where = effect.balance + (f": {effect.channel}" if effect.channel else "")
     low, high = spec.bounds
     equation, meaning, source = _about(effect)

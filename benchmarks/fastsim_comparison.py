@@ -128,7 +128,7 @@ def robot_of(vehicle: Vehicle) -> Robot:
     }
     robot = params.replace(paper_robots.nominal(), values)
     battery = dataclasses.replace(robot.battery, cells=vehicle.cells)
-    return params.strong(dataclasses.replace(robot, battery=battery))
+    return params.without_weak_types(dataclasses.replace(robot, battery=battery))
 
 
 @eqx.filter_jit

@@ -36,7 +36,7 @@ from shaking import shaking
 from mmrjax.fidelities.track import _batch
 from mmrjax.model import balances, masses, params
 from mmrjax.model.conditions import Conditions
-from mmrjax.model.contact import force_contact, step
+from mmrjax.model.contact import cubic_step, force_contact
 from mmrjax.model.paper_robots import nominal
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import GRAVITY, State
@@ -96,7 +96,7 @@ def chain(gear: RunningGear, robot: Robot | None = None) -> Chain:
     robot = dataclasses.replace(nominal() if robot is None else robot, running_gear=gear)
     run = Conditions(voltage=33.0)
     rest = State(*(jnp.zeros(()) for _ in range(4)))
-    half = masses.masses(robot, run, balances.begin(robot, run, rest).mass)
+    half = masses.masses_of_parts(robot, run, balances.begin_signals(robot, run, rest).mass)
     link = (2 * gear.wheelbase + 2 * jnp.pi * robot.configurations["6T2A"].radius) / TEETH_BELT
     radius = link / (2 * jnp.sin(jnp.pi / TEETH_PULLEY))
     return Chain(
@@ -191,7 +191,7 @@ def forces(c: Chain, m: Motion, turn, speed):
         pitch = 2 * jnp.pi / TEETH_PULLEY
         late = jnp.arctan2(outward[:, 0], outward[:, 1]) - angle  # clockwise from the top
         late = late - pitch * jnp.round(late / pitch)
-        engaged = step(distance, c.radius + 5e-5, 1.0, c.radius + 3e-4, 0.0)
+        engaged = cubic_step(distance, c.radius + 5e-5, 1.0, c.radius + 3e-4, 0.0)
         drag = TEETH_STIFFNESS * c.radius * late
         drag = drag + TEETH_DAMPING * (jnp.sum(relative * running, -1) - c.radius * rate)
         hold = push[:, None] * outward - (engaged * drag)[:, None] * running

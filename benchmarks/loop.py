@@ -171,7 +171,7 @@ def deviates(case: Case, found, settings) -> dict:
 
     Empty if the found class does not contain the truth, or if there is a wrong finding.
     """
-    from calibration.discovery.findings import size_of
+    from calibration.discovery.findings import amplitude_unit
 
     truths = [e["class"] for e in case.label["effects"]]
     space, best = found.screened.base.space, found.best
@@ -199,7 +199,7 @@ def deviates(case: Case, found, settings) -> dict:
     if truths:
         slot = best.active.index(truths[0])
         sd = settings.width * best.sd[free + slot]
-        truth = case.label["effects"][0]["amplitude"] / size_of(space.library[truths[0]])
+        truth = case.label["effects"][0]["amplitude"] / amplitude_unit(space.library[truths[0]])
         line["amplitude_deviate"] = float((best.amplitude[slot] - truth) / sd)
     return line
 
@@ -207,15 +207,15 @@ def deviates(case: Case, found, settings) -> dict:
 def after(case: Case, runs, found) -> dict:
     """Hold-out errors by slope before and after, over the noise's sd, and the bias of the base parameters."""
     from calibration.inference import blocks
-    from calibration.inference.held_out import held_out
+    from calibration.inference.held_out import hold_out_blocks
 
-    masks, rows = list(blocks.blocks(runs, "slope").values()), len(runs)
+    masks, rows = list(blocks.blocks_of_kind(runs, "slope").values()), len(runs)
     space, both = found.screened.base.space, (found.screened.base.candidate, found.best)
     included, sd = space.included[:rows], np.asarray(space.bare.data.sd)[:rows]
 
     def rms(candidate) -> float:
         indices = space.library.indices(candidate.active)
-        seen = held_out(space.equipped, candidate.z, masks, indices).reading
+        seen = hold_out_blocks(space.equipped, candidate.z, masks, indices).reading
         return float(np.sqrt(np.nanmean((((seen - runs.measured()) / sd)[included]) ** 2)))
 
     c = space.coordinates.base
@@ -233,12 +233,12 @@ def carried_out(case: Case, found, settings) -> list[dict]:
 
     from calibration.discovery import experiments
 
-    left = experiments.alternatives(found.best, found.alike)
-    seen = whole = experiments.predict(found.screened.base.space, left, settings)
+    left = experiments.alternatives_of_class(found.best, found.alike)
+    seen = whole = experiments.predict_menu(found.screened.base.space, left, settings)
     done: dict[str, dict] = {}
     said: list[dict] = []
     while len(seen.names) > 1 and len(said) < EXPERIMENTS:
-        proposal = experiments.choose(seen)
+        proposal = experiments.choose_experiment(seen)
         new = [name for name in proposal.experiments if name not in (experiments.NONE, *done)]
         if not new:
             said.append({"experiments": [experiments.NONE], "left": seen.names})
@@ -256,14 +256,14 @@ def carried_out(case: Case, found, settings) -> list[dict]:
 
 def program(task: Task) -> tuple | dict:
     """Properties that tables with the same programs share; or the line of an invalid case."""
-    from calibration.discovery.discover import padded
+    from calibration.discovery.discover import padded_rows
     from calibration.inference.observers.settled import SettledRuns
 
     case = attempt(task.kind, task.seed, task.narrow, task.stratum)
     if isinstance(case, str):
         return {"skipped": case}
     names = () if case.world is None else case.world.machine.names.values()
-    return len(padded(len(case.conditions.U), SettledRuns.sizes_padded)[0]), *names
+    return len(padded_rows(len(case.conditions.U), SettledRuns.sizes_padded)[0]), *names
 
 
 def summary(lines: list[dict]) -> list[str]:

@@ -55,10 +55,10 @@ class Ladder:
     """
 
     def __init__(self, runs, fitted, settings) -> None:
-        from calibration.discovery.discover import bases_at
+        from calibration.discovery.discover import bases_at_fit
 
         self.space, self.base, self.settings = fitted.space, fitted.candidate, settings
-        self.bases = bases_at(runs, fitted)
+        self.bases = bases_at_fit(runs, fitted)
         self.fitted: dict = {self.base.key: self.base}
         self.looks: dict = {}
 
@@ -67,25 +67,27 @@ class Ladder:
         import jax
         import jax.numpy as jnp
 
-        from calibration.discovery.score_tests import diagnosed
+        from calibration.discovery.score_tests import diagnose_fit
 
         if candidate.key not in self.looks:
             problem, z = self.space.problem(candidate.active), jnp.asarray(candidate.z)
-            seen = diagnosed(problem, z, self.space.library.scored, self.bases)
+            seen = diagnose_fit(problem, z, self.space.library.scored, self.bases)
             self.looks[candidate.key] = jax.device_get(seen)[:2]
         return self.looks[candidate.key]
 
     def beside(self, candidate) -> list:
         """Fits with one effect more: the strongest by the score test, as many as the loop itself refits."""
-        from calibration.discovery.candidates import filled, fit_candidates, start
+        from calibration.discovery.candidates import fill_slots, fit_candidates, start_of_fit
 
         space, settings, scores = self.space, self.settings, self.look(candidate)[1]
         strength = space.library.largest(np.abs(np.asarray(scores.single)))
         strength[list(space.library.indices(candidate.effects))] = -1.0
         names = [space.library.names[k] for k in np.argsort(-strength)[:BATCH]]
-        wanted = [filled([*candidate.effects, name], settings) for name in names]
+        wanted = [fill_slots([*candidate.effects, name], settings) for name in names]
         new = [w for w in wanted if frozenset(w) - {""} not in self.fitted]
-        found = fit_candidates(space, [(w, start(space, candidate, w, settings, scores)) for w in new], settings)
+        found = fit_candidates(
+            space, [(w, start_of_fit(space, candidate, w, settings, scores)) for w in new], settings
+        )
         self.fitted |= {c.key: c for c in found}
         return [self.fitted[frozenset(w) - {""}] for w in wanted]
 
@@ -200,11 +202,11 @@ def sindy_refit(space, linear, scores, sees=None) -> list[str]:
 
 
 def base_of(given):
-    """The base fit of the result of `discover.prepared`, with which the loop begins: `candidates.BaseFit`."""
+    """The base fit of the result of `discover.prepare_loop`, with which the loop begins: `candidates.BaseFit`."""
     from calibration.discovery.candidates import fit_base
-    from calibration.discovery.discover import pose
+    from calibration.discovery.discover import pose_candidates
 
-    space = pose(given.runs, given.robot, given.noise.sd, given.settings, given.stated, given.library)
+    space = pose_candidates(given.runs, given.robot, given.noise.sd, given.settings, given.stated, given.library)
     return fit_base(space, given.settings, given.runs.source)
 
 

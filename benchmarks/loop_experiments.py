@@ -52,7 +52,7 @@ def supported(seen: experiments.PredictedReadings, carried_out: Mapping[str, Map
         carried_out: experiment → `value` and `sd` of its readings [SI], repeats averaged, in the menu's order;
             NaN for missing ones.
     """
-    spans = predicted.spans(seen.experiments)
+    spans = predicted.reading_spans(seen.experiments)
     at = np.concatenate([np.arange(len(seen.sd))[spans[name]] for name in carried_out])
     value, sd = (
         np.concatenate([np.asarray(r[what], float) for r in carried_out.values()]) for what in ("value", "sd")

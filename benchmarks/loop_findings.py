@@ -54,7 +54,7 @@ def findings(given: Any, found: Any) -> dict[str, Any]:
     """Effects of the model, tests of each, the noise, and the written model.
 
     Args:
-        given: result of `discover.prepared`; found: the `LoopStages` of it.
+        given: result of `discover.prepare_loop`; found: the `LoopStages` of it.
     """
     alike, best, base = found.alike, found.best, found.screened.base.candidate
     members = () if alike is None else alike.members
@@ -111,12 +111,12 @@ def _noise(noise: Any) -> dict[str, dict[str, Any]]:
 def _held_out(runs: Any, found: Any) -> dict[str, Any]:
     """Scores of the model and of smaller sets over the refit on held-out data, and errors by channel."""
     from calibration.discovery import prediction
-    from calibration.discovery.search import path
+    from calibration.discovery.search import best_of_each_size
     from calibration.inference import blocks as blocks_room
-    from calibration.inference.held_out import held_out
+    from calibration.inference.held_out import hold_out_blocks
 
     space, base, best = found.screened.base.space, found.screened.base.candidate, found.best
-    kinds = blocks_room.predictable(runs, space.bare)
+    kinds = blocks_room.predictable_blocks(runs, space.bare)
     if not kinds:
         return {}
     data, rows = space.equipped.data, len(runs)
@@ -125,16 +125,16 @@ def _held_out(runs: Any, found: Any) -> dict[str, Any]:
     def reading(candidate: Any) -> dict[str, np.ndarray]:
         active = space.library.indices(candidate.active)
         return {
-            kind: held_out(space.equipped, candidate.z, list(by.values()), active).reading
+            kind: hold_out_blocks(space.equipped, candidate.z, list(by.values()), active).reading
             for kind, by in kinds.items()
         }
 
     def score(seen: dict[str, np.ndarray]) -> Any:
-        return prediction.scored(seen, measured, sd, counts, kinds)
+        return prediction.score_readings(seen, measured, sd, counts, kinds)
 
     before, after = reading(base), reading(best)
     gain, refit = score(after).gain(score(before)), score(before)
-    smaller = [c for c in path(found.searched) if c.key != best.key]
+    smaller = [c for c in best_of_each_size(found.searched) if c.key != best.key]
     gains = [(c.effects, score(reading(c)).gain(refit)) for c in smaller]
     names = [channel.name for channel in runs.channels]
     return {
@@ -159,13 +159,13 @@ def elsewhere(given: Any, found: Any, runs: Any) -> dict[str, Any]:
     """
     from calibration.discovery import findings as results
     from calibration.discovery import prediction
-    from calibration.discovery.discover import pose
+    from calibration.discovery.discover import pose_candidates
 
     space, base, best = found.screened.base.space, found.screened.base.candidate, found.best
     if best is base:
         return {}
     measured, sd, rows = runs.measured(), runs.deviations(), len(runs)
-    there = pose(runs, given.robot, sd, given.settings, given.stated, given.library)
+    there = pose_candidates(runs, given.robot, sd, given.settings, given.stated, given.library)
     if there.library.names != space.library.names or there.coordinates.base.names != space.coordinates.base.names:
         return {}
     off, score = [], []

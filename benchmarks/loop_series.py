@@ -111,7 +111,7 @@ def work(task: Task) -> dict:
 
 def _left(found, effect: dict, settings) -> dict:
     """Remainder of a library effect after the loop's own base, which frees its base parameters at its own fit."""
-    from calibration.discovery.findings import effect_scores, size_of
+    from calibration.discovery.findings import amplitude_unit, effect_scores
 
     if not effect["class"]:
         return {}
@@ -119,16 +119,16 @@ def _left(found, effect: dict, settings) -> dict:
     left = {s.name: s.sigmas_per_prior_sd for s in effect_scores(space, found.left.scores, settings)}
     if effect["class"] not in left:
         return {}
-    sd = size_of(space.library[effect["class"]])
+    sd = amplitude_unit(space.library[effect["class"]])
     return {"sigmas_left": left[effect["class"]] * abs(effect["amplitude"]) / sd}
 
 
 def _amplitudes(found, settings) -> dict:
     """Amplitude of each named effect, and its sd [SI]."""
-    from calibration.discovery.findings import size_of
+    from calibration.discovery.findings import amplitude_unit
 
     space, best = found.screened.base.space, found.best
-    sd = {e.name: size_of(e) for e in space.library.effects}
+    sd = {e.name: amplitude_unit(e) for e in space.library.effects}
     spread = settings.width * best.sd[space.free :]
     return {
         "amplitudes": {

@@ -58,8 +58,8 @@ def fleet(robots: Robot, conditions: Conditions, course: Profile) -> dict[str, j
 def drawn(count: int, seed: int = 0) -> tuple[Robot, Conditions]:
     """Robots with masses, losses and resistances around the nominal ones, in both configurations, on small slopes."""
     rng = np.random.default_rng(seed)
-    robot = params.strong(paper_robots.nominal())
-    base = {p.name: float(p.value) for p in params.walk(robot)}
+    robot = params.without_weak_types(paper_robots.nominal())
+    base = {p.name: float(p.value) for p in params.walk_parameters(robot)}
     names = ("motor.resistance", "6T2A.mass", "4W2T.mass", "6T2A.track.loss_coulomb", "4W2T.track.loss_coulomb")
     values = {n: jnp.asarray(base[n] * rng.uniform(0.9, 1.1, count)) for n in names}
     conditions = Conditions(
@@ -142,7 +142,7 @@ def main() -> None:
             "unaccounted": float(np.abs(report["unaccounted"] / report["energy"]).max()),
         }), flush=True)  # fmt: skip
         return
-    robot = params.strong(paper_robots.nominal())
+    robot = params.without_weak_types(paper_robots.nominal())
 
     @eqx.filter_jit
     def alone(robot: Robot, conditions: Conditions, course: Profile) -> Mission:

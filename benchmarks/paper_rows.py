@@ -98,7 +98,7 @@ def base(changed: dict[str, float]) -> Robot:
 def errors(table: Runs, reading: dict[str, np.ndarray]) -> dict[str, Any]:
     """Errors of each channel [%]: rms, and row by row."""
     found = {}
-    for channel in channels.usual():
+    for channel in channels.usual_channels():
         e = 100 * (np.asarray(reading[channel.name]) / channel.factor / table[channel.column] - 1)
         found[channel.name] = {"rms": round(float(np.sqrt(np.mean(e**2))), 3), "rows": e.round(2).tolist()}
     return found
@@ -150,7 +150,7 @@ def resolved(robot: Robot) -> list[dict[str, Any]]:
     """
     table = rows(False)
     table = table.where(table["configuration"] == "6T2A")
-    known = {p.name: float(p.value) for p in params.walk(robot)}
+    known = {p.name: float(p.value) for p in params.walk_parameters(robot)}
     product = known["6T2A.track.guide_friction"] * known["6T2A.track.guide_share"]
     bare = dataclasses.replace(robot, effects=())
 

@@ -346,7 +346,7 @@ def conditions_of(runs: Any, robot: Any) -> SimpleNamespace:
 def _names(robot: Any) -> list[str]:
     from calibration.inference import priors
 
-    return list(priors.known(robot))
+    return list(priors.parameters_by_name(robot))
 
 
 def drive(runs: Any, robot: Any, coordinates: Any, term: Term | None = None) -> Drive:
@@ -367,7 +367,7 @@ def drive(runs: Any, robot: Any, coordinates: Any, term: Term | None = None) -> 
     strange = [c.name for c in runs.channels if c.name not in CHANNELS]
     if strange:
         raise Unable(f"channel {strange[0]}")
-    known = {name: float(field.value) for name, field in priors.known(robot).items()}
+    known = {name: float(field.value) for name, field in priors.parameters_by_name(robot).items()}
     given = conditions_of(runs, robot)
     if given.motor_speed is not None:
         given.most *= known["motor.torque_constant"]

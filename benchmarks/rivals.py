@@ -1,7 +1,8 @@
 """Methods that predict unseen runs, all with the same folds: our fits, SciPy, MuJoCo, PySINDy, regressions.
 
 Each method gets the same problem (`Posed`): a table, a robot whose constants have the tolerances of its file, and the
-folds, which are the blocks of `blocks.predictable`. It returns readings of every fold by a fit without its rows.
+folds, which are the blocks of `blocks.predictable_blocks`. It returns readings of every fold by a fit without its
+rows.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ class Posed:
     """A record in the form that every method gets.
 
     Attributes:
-        given: `discover.prepared`; fitted: our base fit, `candidates.BaseFit`; folds: the blocks left out.
+        given: `discover.prepare_loop`; fitted: our base fit, `candidates.BaseFit`; folds: the blocks left out.
         measured, sd: [SI], shape (rows, channels); counts: True for a fitted reading; case: see `Record`.
     """
 
@@ -101,7 +102,7 @@ def posed(robot: str, table: Any, seed: int, replicates: int, case: Any = None) 
     ready()
     from calibration.data import robot_file
     from calibration.data import runs as records
-    from calibration.discovery.discover import prepared
+    from calibration.discovery.discover import prepare_loop
     from calibration.inference import blocks
     from calibration.inference.held_out import search_each
 
@@ -109,11 +110,11 @@ def posed(robot: str, table: Any, seed: int, replicates: int, case: Any = None) 
     runs = records.read(table, robot=rig)
     if runs.unknown:
         raise Unable(f"column {runs.unknown[0]} of the record is not used")
-    given = prepared(runs, rig, replicates=replicates, seed=seed)
+    given = prepare_loop(runs, rig, replicates=replicates, seed=seed)
     fitted = loop_baselines.base_of(given)
     space, rows = fitted.space, len(given.runs)
     problem, weight = space.bare, space.weight
-    masks = [(kind, m) for kind, by in blocks.predictable(given.runs, problem).items() for m in by.values()]
+    masks = [(kind, m) for kind, by in blocks.predictable_blocks(given.runs, problem).items() for m in by.values()]
     folds: list[Fold] = []
     if masks:
         out = [np.concatenate([m, np.zeros(len(weight) - rows, bool)]) for _, m in masks]

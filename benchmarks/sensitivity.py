@@ -35,7 +35,7 @@ from calibration.sensitivity.model import Model, chosen_outputs  # noqa: E402
 from calibration.sensitivity.result import Points  # noqa: E402
 from calibration.sensitivity.study import Study  # noqa: E402
 from mmrjax import nominal  # noqa: E402
-from mmrjax.fidelities.variation import Variation, evaluate  # noqa: E402
+from mmrjax.fidelities.variation import Variation, evaluate_points  # noqa: E402
 from mmrjax.model.conditions import Conditions  # noqa: E402
 from mmrjax.model.paper_tables import PAYLOADS_KG, SLOPES_DEG, VOLTAGES_V  # noqa: E402
 
@@ -113,7 +113,7 @@ def ours() -> tuple[room.Inputs, Model, Conditions]:
     from mmrjax.model import params
 
     robot = params.replace(nominal(), {k: jax.numpy.asarray(v) for k, v in ADHESION.items()})
-    inputs = room.of_priors(robot, NAMES, {})
+    inputs = room.inputs_from_priors(robot, NAMES, {})
     model = Model(robot, inputs.columns, "steady", {}, chosen_outputs(OUTPUTS, robot))
     return inputs, model, Conditions(0, VOLTAGE, SLOPE, PAYLOAD)
 
@@ -127,31 +127,31 @@ def coverage(seeds: int, size: int, reference_size: int) -> dict[str, Any]:
     exact = ishigami_indices()
     held = np.zeros((2, 3))
     for seed in range(seeds):
-        design = sobol.design(3, size, seed, second=False)
-        found = sobol.terms(design, ishigami(design.points))
+        design = sobol.sobol_design(3, size, seed, second=False)
+        found = sobol.sobol_terms(design, ishigami(design.points))
         assert found is not None
-        indices = sobol.indices(found)
+        indices = sobol.indices_of_terms(found)
         for k, (true, e) in enumerate(zip(exact, (indices.first, indices.total), strict=True)):
             held[k] += (e.low <= true) & (true <= e.high)
     record["ishigami"] = {"first": (held[0] / seeds).tolist(), "total": (held[1] / seeds).tolist()}
     print("Ishigami, share of seeds whose interval holds the index:", record["ishigami"], flush=True)
 
     inputs, model, conditions = ours()
-    design = sobol.design(len(NAMES), reference_size, 2**31, second=False)
+    design = sobol.sobol_design(len(NAMES), reference_size, 2**31, second=False)
     values = inputs.values(inputs.scores(design.points))
     began = time.perf_counter()
     by = by_scipy(values[:, : len(NAMES)])
     print(f"reference: {len(values)} roots by SciPy in {time.perf_counter() - began:.0f} s", flush=True)
-    known = [sobol.indices(sobol.terms(design, by[:, j])) for j in range(3)]  # type: ignore[arg-type]
+    known = [sobol.indices_of_terms(sobol.sobol_terms(design, by[:, j])) for j in range(3)]  # type: ignore[arg-type]
     held = np.zeros((3, 2, len(NAMES)))
     for seed in range(seeds):
-        design = sobol.design(len(NAMES), size, seed, second=False)
+        design = sobol.sobol_design(len(NAMES), size, seed, second=False)
         values = inputs.values(inputs.scores(design.points))
         answer = model(values, conditions)
         for j, name in enumerate(OUTPUTS):
-            found = sobol.terms(design, answer.values[name])
+            found = sobol.sobol_terms(design, answer.values[name])
             assert found is not None
-            indices = sobol.indices(found)
+            indices = sobol.indices_of_terms(found)
             pairs = ((indices.first, known[j].first), (indices.total, known[j].total))
             for k, (e, true) in enumerate(pairs):
                 held[j, k] += (e.low <= true.value) & (true.value <= e.high)
@@ -177,7 +177,7 @@ def speed(points: int, repeats: int) -> dict[str, Any]:
     """Rate of model evaluations over the points of a Sobol design [1/s]: a loop of SciPy, NumPy, ours."""
     inputs, model, conditions = ours()
     blocks = 2 * len(NAMES) + 2
-    design = sobol.design(len(NAMES), 2 ** int(np.log2(points / 32 / blocks)), 0)
+    design = sobol.sobol_design(len(NAMES), 2 ** int(np.log2(points / 32 / blocks)), 0)
     values = inputs.values(inputs.scores(design.points))
     own = values[:, : len(NAMES)]
     some = own[:: max(len(own) // 2000, 1)]
@@ -188,13 +188,13 @@ def speed(points: int, repeats: int) -> dict[str, Any]:
     best = {"numpy": math.inf, "ours": math.inf, "ours_in_study": math.inf}
     variation, there = Variation(model.robot, model.columns), jax.numpy.asarray(values)
     model(values, conditions)
-    evaluate(variation, "steady", there, conditions, {}, OUTPUTS)
+    evaluate_points(variation, "steady", there, conditions, {}, OUTPUTS)
     for _ in range(repeats):  # in turn
         began = time.perf_counter()
         fast = by_numpy(own)
         best["numpy"] = min(best["numpy"], time.perf_counter() - began)
         began = time.perf_counter()
-        jax.block_until_ready(evaluate(variation, "steady", there, conditions, {}, OUTPUTS))
+        jax.block_until_ready(evaluate_points(variation, "steady", there, conditions, {}, OUTPUTS))
         best["ours"] = min(best["ours"], time.perf_counter() - began)
         began = time.perf_counter()
         answer = model(values, conditions)  # including transfers between NumPy and the device
@@ -213,7 +213,7 @@ def speed(points: int, repeats: int) -> dict[str, Any]:
 def table8(repeats: int) -> dict[str, Any]:
     """Time for the derivative-based indices of the whole of Table 8 [s], every configuration, all parameters."""
     robot = nominal()
-    inputs = room.of_priors(robot, room.default_names(robot, robot.configurations.names, False), {})
+    inputs = room.inputs_from_priors(robot, room.default_input_names(robot, robot.configurations.names, False), {})
     axes = np.meshgrid(range(2), VOLTAGES_V, PAYLOADS_KG, SLOPES_DEG, indexing="ij")
     which, voltage, payload, slope = (x.ravel() for x in axes)
     points = Points(np.array(robot.configurations.names)[which], voltage, payload, slope)

@@ -32,10 +32,10 @@ from mmrjax.undercarriage.half_robot import (  # noqa: E402
     Motion,
     advance,
     generalized,
+    half_robot_system,
     instant,
     resistance,
     roll,
-    system,
 )
 from mmrjax.undercarriage.ripple import period_pitch, touchdowns  # noqa: E402
 from mmrjax.undercarriage.running_gear import GROUSERS, TEETH_BELT  # noqa: E402
@@ -177,13 +177,13 @@ def native(voltage: float, slope: float, payload: float) -> dict[str, Any]:
 
     robot, run = shaking(), Conditions(voltage=voltage, slope_deg=slope, payload=payload)
     rest = State(*(jnp.asarray(0.0) for _ in range(4)))
-    mass = float(balances.begin(robot, run, rest).mass)
-    model = mujoco.MjModel.from_xml_string(mjcf.text(robot, run, mass, STEP))
+    mass = float(balances.begin_signals(robot, run, rest).mass)
+    model = mujoco.MjModel.from_xml_string(mjcf.mjcf_text(robot, run, mass, STEP))
     data = mujoco.MjData(model)
 
     @jax.jit
     def forces(motion: Motion) -> tuple[Any, ...]:
-        constants = system(robot, run, STEP)
+        constants = half_robot_system(robot, run, STEP)
         signals, at, pulled = instant(constants, motion)
         after, _, _ = advance(constants, motion)
         damping = resistance(constants, motion, signals, at, pulled)
@@ -191,14 +191,14 @@ def native(voltage: float, slope: float, payload: float) -> dict[str, Any]:
 
     @jax.jit
     def ours(motion: Motion) -> jax.Array:
-        constants = system(robot, run, STEP)
+        constants = half_robot_system(robot, run, STEP)
 
         def small(m: Motion, _: None) -> tuple[Motion, tuple[jax.Array, jax.Array]]:
             return advance(constants, m)[0], (instant(constants, m)[1].normal, m.v[0])
 
         return jax.lax.scan(small, motion, None, length=STEPS)[1]
 
-    motion = roll(system(robot, run, STEP))
+    motion = roll(half_robot_system(robot, run, STEP))
     normal, speed = map(np.asarray, ours(motion))
     data.qpos[:], data.qvel[:] = motion.q, motion.v
     full, theirs, fast = np.zeros((model.nv, model.nv)), np.empty(STEPS), np.empty(STEPS)

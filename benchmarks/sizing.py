@@ -18,17 +18,17 @@ import numpy as np  # noqa: E402
 
 from calibration.data import requirements_file  # noqa: E402
 from calibration.sizing import design_search  # noqa: E402
-from calibration.sizing.design import OBJECTIVES, task  # noqa: E402
-from calibration.sizing.part_options import options  # noqa: E402
+from calibration.sizing.design import OBJECTIVES, sizing_task  # noqa: E402
+from calibration.sizing.part_options import options_for_robot  # noqa: E402
 from mmrjax.model import paper_robots  # noqa: E402
 
 
 def grid(objective: str, points: int, kept: np.ndarray) -> tuple[float, int, float]:
     """The best feasible objective of a grid, its number of designs, and seconds."""
     robot, asked = paper_robots.nominal(), requirements_file.load(None)
-    chosen = options(robot)
-    of = task(robot, asked, chosen)
-    choice = design_search.space(robot, of, chosen)
+    chosen = options_for_robot(robot)
+    of = sizing_task(robot, asked, chosen)
+    choice = design_search.choice_space(robot, of, chosen)
     n = len(choice.drive)
     along = max(2, round((points / n) ** (1 / 3)))
     counts = (max(2, round(points / n / along**2)), along, along)
@@ -38,7 +38,7 @@ def grid(objective: str, points: int, kept: np.ndarray) -> tuple[float, int, flo
     for rows in np.array_split(np.arange(n), max(1, n // 200)):
         every = np.repeat(rows, len(box))
         x = choice.low[every] + (choice.high[every] - choice.low[every]) * np.tile(box, (len(rows), 1))
-        f, g = design_search.measured(of, choice, every, x)
+        f, g = design_search.evaluate_designs(of, choice, every, x)
         good = np.all(g[:, kept] >= 0, axis=1) & np.isfinite(f[:, column])
         best, seen = min(best, float(f[good, column].min(initial=np.inf))), seen + len(every)
     return best, seen, time.perf_counter() - begin
@@ -53,7 +53,7 @@ def main() -> None:
     robot, asked = paper_robots.nominal(), requirements_file.load(None)
     for words in ("with compilation", "once compiled"):
         begin, busy = time.perf_counter(), time.process_time()
-        found = design_search.size(robot, asked, (given.objective,), starts=given.starts)
+        found = design_search.size_robot(robot, asked, (given.objective,), starts=given.starts)
         seconds, busy = time.perf_counter() - begin, time.process_time() - busy
         print(
             f"{given.starts} starts, {found.evaluated} designs, {words}: {seconds:.1f} s, {busy:.1f} s of processors"

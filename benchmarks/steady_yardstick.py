@@ -53,7 +53,7 @@ from mmrjax.model.robot import Robot
 from mmrjax.model.signals import CONVERGED
 
 THREE = vectorised.NAMES
-ALL = tuple(output.name for output in outputs.table(channels.usual()))
+ALL = tuple(output.name for output in outputs.output_table(channels.usual_channels()))
 EFFECTS = {"series_resistance": 0.3, "churning": 5e-4, "winding_heating": 1.0, "nonlinear_slip": 0.05}
 PARAMETERS = (
     "motor.resistance", "motor.torque_constant", "motor.friction_coulomb", "motor.friction_viscous",
@@ -105,7 +105,7 @@ def compared(size: int, rounds: int) -> dict[str, Any]:
     }
     assert max(differences.values()) < 1e-9, differences
 
-    values = {p.name: np.full(size, float(p.value)) for p in params.walk(robot) if p.name in PARAMETERS}
+    values = {p.name: np.full(size, float(p.value)) for p in params.walk_parameters(robot) if p.name in PARAMETERS}
     times = in_turn(
         {
             "numpy_three": lambda: vectorised.closed_form(*given),

@@ -62,7 +62,10 @@ def prepared(arguments: argparse.Namespace, points: int, devices: int) -> tuple[
     from sweeps.points import axes
     from sweeps.points.job import prepare
 
-    chunk = arguments.chunk or fidelities.facts(arguments.model).at_once(jax.default_backend() != "cpu") * devices
+    chunk = (
+        arguments.chunk
+        or fidelities.fidelity_facts(arguments.model).at_once(jax.default_backend() != "cpu") * devices
+    )
     config = Campaign(
         model=arguments.model, chunk=min(chunk, points), storage=arguments.storage, outputs=channels.USUAL,
         duration_s=arguments.duration if arguments.model != "steady" else None,

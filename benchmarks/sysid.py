@@ -89,7 +89,7 @@ def exact(known: dict[str, float], theta: np.ndarray, times: np.ndarray) -> np.n
 
 def ours(robot: Any, start: np.ndarray, times: np.ndarray, ratio: float) -> Any:
     """A compiled fit, speeds (voltages, times) → Optimum, and the coordinates of its result."""
-    coordinates = priors.coordinates(
+    coordinates = priors.parameter_coordinates(
         robot, NAMES, {n: (float(s), float(s)) for n, s in zip(NAMES, start, strict=True)}
     )
     count, samples = len(VOLTAGES), len(times)
@@ -101,7 +101,7 @@ def ours(robot: Any, start: np.ndarray, times: np.ndarray, ratio: float) -> Any:
         *map(jnp.asarray, (clock, run, sample, rows_of, rows_of[:, [0, -1]])),
     )
     motor = channels.USUAL.index("motor_speed")
-    only_speed = jnp.zeros(len(channels.usual())).at[motor].set(1.0)
+    only_speed = jnp.zeros(len(channels.usual_channels())).at[motor].set(1.0)
     rows = count * samples
 
     def fitted(speeds: Any) -> fit.Optimum:
@@ -160,7 +160,7 @@ def main() -> None:
     options.add_argument("--draws", type=int, default=20, help="noise draws")
     chosen = options.parse_args()
     robot, times = lifted(), STEP * np.arange(1, SAMPLES + 1)
-    fields, known = priors.known(robot), constants(robot)
+    fields, known = priors.parameters_by_name(robot), constants(robot)
     truth = np.array([float(fields[n].value) for n in NAMES])
     start, clean = truth * OFF, exact(known, truth, times)
     rng = np.random.default_rng(0)

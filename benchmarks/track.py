@@ -97,7 +97,7 @@ def derivatives(size: int = 30) -> dict:
     30 runs of 0.6 s from Table 8, rolling; least processor time of five rounds, with each call in turn.
     """
     robot = paper_robots.nominal()
-    values = {p.name: p.value for p in params.walk(robot)}
+    values = {p.name: p.value for p in params.walk_parameters(robot)}
     every = table8()
     commands = jax.tree.map(lambda x: x[jnp.linspace(0, len(x) - 1, size).astype(int)], every)
 

@@ -48,7 +48,7 @@ from calibration.inference import priors  # noqa: E402
 from calibration.inference.held_out import search_each  # noqa: E402
 from calibration.inference.observers.settled import SettledRuns  # noqa: E402
 from calibration.inference.population import Members, Rows  # noqa: E402
-from calibration.inference.problem import MARGIN, STIFFNESS, Observation, Problem, data_of  # noqa: E402
+from calibration.inference.problem import MARGIN, STIFFNESS, Observation, Problem, data_from_readings  # noqa: E402
 from mmrjax.effects.electrical_effects import BrushDrop, SeriesResistance  # noqa: E402
 from mmrjax.effects.mass_effects import MassOffset  # noqa: E402
 from mmrjax.effects.slip_effects import VibrationSlip  # noqa: E402
@@ -248,12 +248,12 @@ def pose(what: str) -> tuple[Posed, Robot, Runs]:
         robot = params.replace(robot, {"6T2A.track.guide_friction": 0.06})
         names, stated = FRICTION + GEAR, {}
     else:
-        robot, stated = priors.guided(robot, "6T2A")
+        robot, stated = priors.with_guide_share(robot, "6T2A")
         zero = jnp.asarray(0.0)
         made = (BrushDrop(amplitude=zero), SeriesResistance(amplitude=zero), MassOffset(amplitude=zero))
         robot = dataclasses.replace(robot, effects=made)
         names = FRICTION + GEAR + DRIVE
-    coordinates = priors.coordinates(robot, names, stated, any_surface=True)
+    coordinates = priors.parameter_coordinates(robot, names, stated, any_surface=True)
     tracked = table["configuration"] == "6T2A"
     voltage, slope = (np.asarray(table[name], float) for name in ("supply_voltage_V", "slope_deg"))
     runs, factor = [], []
@@ -275,8 +275,8 @@ def pose(what: str) -> tuple[Posed, Robot, Runs]:
     motor, speed = (paper.measured()[:, channels.USUAL.index(name)] for name in ("motor_speed", "speed"))
     simulated = np.full(len(measured), np.nan)
     simulated[tracked] = 100 * (1 - speed * float(robot.gearbox.ratio) / (motor * float(robot.radius_pulley)))
-    data = data_of(measured[row], SettledRuns.sizes(table)[row], len(names))
-    problem = Problem(params.strong(robot), coordinates, Resolved(chosen, "track", wheeled=rest), data)
+    data = data_from_readings(measured[row], SettledRuns.sizes(table)[row], len(names))
+    problem = Problem(params.without_weak_types(robot), coordinates, Resolved(chosen, "track", wheeled=rest), data)
     return Posed(problem, row, measured, slope, voltage, tracked, what, simulated), robot, table
 
 
@@ -285,12 +285,12 @@ def lumped(posed: Posed, robot: Robot, table: Runs, seen: list[np.ndarray]) -> t
     names = DRIVE + LUMPED
     zero = VibrationSlip(amplitude=jnp.asarray(0.0))
     robot = dataclasses.replace(robot, effects=(*robot.effects, zero))
-    stated = priors.guided(paper_robots.nominal(), "6T2A")[1]
+    stated = priors.with_guide_share(paper_robots.nominal(), "6T2A")[1]
     share = {"total_current": SD_CURRENT, "motor_speed": SD_MOTOR, "speed": SD_SPEED}
     size = np.abs(posed.measured) * np.array([0.01 * share[name] for name in channels.USUAL])
-    data = data_of(posed.measured, size, len(names))
-    coordinates = priors.coordinates(robot, names, stated, any_surface=True)
-    problem = Problem(params.strong(robot), coordinates, SettledRuns.of(table, robot, "steady"), data)
+    data = data_from_readings(posed.measured, size, len(names))
+    coordinates = priors.parameter_coordinates(robot, names, stated, any_surface=True)
+    problem = Problem(params.without_weak_types(robot), coordinates, SettledRuns.of(table, robot, "steady"), data)
     weights = [np.asarray(data.weight) * s[:, None] for s in seen]
     found, _ = search_each(problem, [np.zeros(len(names))] * len(seen), weights)
     slope = jax.jit(jax.jacfwd(lambda z, data: problem.misfit(z, data)))
@@ -401,9 +401,9 @@ def lumped_slip(arguments: argparse.Namespace) -> None:
     for law, names in (("Fig. 7 alone", LUMPED[:2]), ("vibration_slip", LUMPED)):
         effects = (VibrationSlip(amplitude=jnp.asarray(0.0)),) if len(names) > 2 else ()
         base = dataclasses.replace(robot, effects=effects)
-        coordinates = priors.coordinates(base, names, any_surface=True)
-        data = data_of(posed.measured, np.ones_like(posed.measured), len(names))
-        problem = Problem(params.strong(base), coordinates, SettledRuns.of(table, base, "steady"), data)
+        coordinates = priors.parameter_coordinates(base, names, any_surface=True)
+        data = data_from_readings(posed.measured, np.ones_like(posed.measured), len(names))
+        problem = Problem(params.without_weak_types(base), coordinates, SettledRuns.of(table, base, "steady"), data)
         observed = eqx.filter_jit(lambda problem, z: problem.observation(z))
         for name, here in seen.items():
             compared = here & (np.arange(len(here)) > 0)
@@ -437,11 +437,13 @@ def timed(arguments: argparse.Namespace) -> dict[str, Any]:
     robot = own_mass.with_table_mass(
         params.replace(paper_robots.nominal(), {"6T2A.track.guide_friction": 0.06}), table
     )
-    coordinates = priors.coordinates(robot, FRICTION + GEAR, any_surface=True)
+    coordinates = priors.parameter_coordinates(robot, FRICTION + GEAR, any_surface=True)
     conditions = table.conditions(robot)
-    data = data_of(table.measured(), SettledRuns.sizes(table), len(coordinates))
+    data = data_from_readings(table.measured(), SettledRuns.sizes(table), len(coordinates))
     none = jax.tree.map(lambda x: x[:0], conditions)
-    problem = Problem(params.strong(robot), coordinates, Resolved(conditions, "track", wheeled=none), data)
+    problem = Problem(
+        params.without_weak_types(robot), coordinates, Resolved(conditions, "track", wheeled=none), data
+    )
     values = np.where(np.array(coordinates.scale), np.log(np.maximum(np.abs(SET_S), 1e-12)), np.array(SET_S))
     centre = (values - np.asarray(coordinates.location)) / np.asarray(coordinates.spread)
     size = (arguments.population, len(coordinates))

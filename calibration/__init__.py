@@ -6,12 +6,16 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from calibration.data.frames import to_pandas, to_polars, to_xarray
     from calibration.data.robot_file import load as read_robot
     from calibration.data.runs import read as read_runs
+    from calibration.data.runs import read as runs
     from calibration.discovery.discover import discover
     from calibration.inference.calibration import calibrate
 
-__all__ = ["calibrate", "discover", "read_robot", "read_runs"]
+__all__ = [
+    "calibrate", "discover", "read_robot", "read_runs", "runs", "to_pandas", "to_polars", "to_xarray",
+]  # fmt: skip
 
 #: Module and attribute of each name; imported when it is asked for, since most of them load JAX.
 _HOMES = {
@@ -19,6 +23,10 @@ _HOMES = {
     "discover": ("calibration.discovery.discover", "discover"),
     "read_robot": ("calibration.data.robot_file", "load"),
     "read_runs": ("calibration.data.runs", "read"),
+    "runs": ("calibration.data.runs", "read"),
+    "to_pandas": ("calibration.data.frames", "to_pandas"),
+    "to_polars": ("calibration.data.frames", "to_polars"),
+    "to_xarray": ("calibration.data.frames", "to_xarray"),
 }
 
 

@@ -244,7 +244,7 @@ def parameters() -> str:
     from mmrjax.model import paper_robots, params
 
     entries = []
-    for p in params.walk(paper_robots.nominal()):
+    for p in params.walk_parameters(paper_robots.nominal()):
         spec, (low, high) = p.spec, p.spec.bounds
         value = f"{float(p.value):.4g} ± {spec.prior_sd(float(p.value)):.2g} {spec.unit}"
         entries.append(

@@ -21,6 +21,10 @@ if TYPE_CHECKING:
     from calibration import discover as discover
     from calibration import read_robot as read_robot
     from calibration import read_runs as read_runs
+    from calibration import runs as runs
+    from calibration import to_pandas as to_pandas
+    from calibration import to_polars as to_polars
+    from calibration import to_xarray as to_xarray
     from mmrjax.effects import Effect as Effect
     from mmrjax.errors import UsageError as UsageError
     from mmrjax.fidelities.results import Results as Results
@@ -37,6 +41,7 @@ if TYPE_CHECKING:
     from mmrjax.model.signals import State as State
     from sweeps import sweep as sweep
     from sweeps.compilation_cache import keep_programs as keep_programs
+    from sweeps.export.drive_export import export as export
     from sweeps.report.words.note_words import describe as describe
 
 #: Module of each public name.
@@ -62,10 +67,15 @@ _ABOVE = {
     "calibrate": "calibration",
     "describe": "sweeps.report.words.note_words",
     "discover": "calibration",
+    "export": "sweeps.export.drive_export",
     "keep_programs": "sweeps.compilation_cache",
     "read_robot": "calibration",
     "read_runs": "calibration",
+    "runs": "calibration",
     "sweep": "sweeps",
+    "to_pandas": "calibration",
+    "to_polars": "calibration",
+    "to_xarray": "calibration",
 }
 
 __all__ = [
@@ -80,6 +90,7 @@ __all__ = [
     "calibrate",
     "describe",
     "discover",
+    "export",
     "initial_state",
     "keep_programs",
     "nominal",
@@ -88,9 +99,13 @@ __all__ = [
     "read_robot",
     "read_runs",
     "replace",
+    "runs",
     "simulate",
     "step",
     "sweep",
+    "to_pandas",
+    "to_polars",
+    "to_xarray",
 ]
 
 #: Value for XLA_FLAGS, to be set before JAX is imported. It turns off LLVM's fast instruction selection, which acts

@@ -11,7 +11,7 @@ from collections.abc import Iterable
 WORD, SHOWN, PATH, LONGEST = 80, 40, 300, 900
 
 
-def shortened(message: str, longest: int = LONGEST) -> str:
+def shorten(message: str, longest: int = LONGEST) -> str:
     """Returns a message with very long words cut and the middle of a very long text left out."""
 
     def cut(word: re.Match[str]) -> str:
@@ -28,16 +28,16 @@ class UsageError(ValueError):
     """Wrong use of the public API; one sentence: where, what came, what is allowed."""
 
     def __init__(self, message: str) -> None:
-        """Stores the message, `shortened`."""
-        super().__init__(shortened(message))
+        """Stores the message, `shorten`."""
+        super().__init__(shorten(message))
 
 
-def counted(count: int, noun: str) -> str:
+def count_noun(count: int, noun: str) -> str:
     """Returns a count with its noun, `1 run` or `2,000 runs`; the noun is singular and its plural ends in s."""
     return f"{count:,} {noun}{'' if count == 1 else 's'}"  # a comparison of NumPy integers gives no Python bool
 
 
-def choices(word: str, allowed: Iterable[str], most: int = 1, shown: Iterable[str] | None = None) -> str:
+def allowed_words(word: str, allowed: Iterable[str], most: int = 1, shown: Iterable[str] | None = None) -> str:
     """Returns «did you mean X? allowed: ...» for an unknown word.
 
     Args:
@@ -46,12 +46,12 @@ def choices(word: str, allowed: Iterable[str], most: int = 1, shown: Iterable[st
         shown: the words to list as allowed, if not all.
     """
     allowed = list(allowed)
-    found = near(word, allowed, most)
+    found = similar_words(word, allowed, most)
     hint = f"did you mean {', '.join(found)}? " if found else ""
-    return f"{hint}allowed: {some(allowed if shown is None else shown)}"
+    return f"{hint}allowed: {list_some(allowed if shown is None else shown)}"
 
 
-def some(names: Iterable[str], width: int = 240) -> str:
+def list_some(names: Iterable[str], width: int = 240) -> str:
     """A list of names, cut after `width` characters with the number of the others: "a, b and 3 more"."""
     names = list(names)
     ends = list(itertools.accumulate(len(name) + 2 for name in names))
@@ -60,7 +60,7 @@ def some(names: Iterable[str], width: int = 240) -> str:
     return ", ".join(names) if rest <= 1 else f"{', '.join(names[:shown])} and {rest} more"
 
 
-def near(word: str, allowed: Iterable[str], most: int = 1) -> list[str]:
+def similar_words(word: str, allowed: Iterable[str], most: int = 1) -> list[str]:
     """Up to `most` of the allowed words that resemble one, ignoring case.
 
     Words that contain it come first, in their order (`current` is a part of `total_current`).

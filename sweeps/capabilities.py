@@ -13,7 +13,7 @@ from mmrjax import derived
 from mmrjax.fidelities import outputs
 from mmrjax.model import params
 from mmrjax.model.channels import EVERY, HEAT, SIDES, VOLTAGE, WARMING
-from mmrjax.model.paper_robots import blank
+from mmrjax.model.paper_robots import blank_robot
 from mmrjax.model.power import Battery
 from mmrjax.model.robot import Robot
 from sweeps.pages import words
@@ -30,7 +30,7 @@ OF_TRAVEL = (
 _WARMING = ("winding_temperature_C", "housing_temperature_C", "winding_peak_C", "winding_end_C", "housing_end_C")
 #: Column → parameters on which it rests and which a rig's file may leave open.
 RESTS_ON: dict[str, tuple[str, ...]] = {
-    **{output.column: output.rests_on for output in outputs.table(EVERY)},
+    **{output.column: output.rests_on for output in outputs.output_table(EVERY)},
     **{output.column: output.rests_on for output in derived.TABLE},
     **dict.fromkeys(("power_left_W", "power_right_W"), VOLTAGE),
     **dict.fromkeys(("winding_left_C", "winding_right_C"), HEAT),
@@ -40,12 +40,12 @@ RESTS_ON: dict[str, tuple[str, ...]] = {
 
 def _nothing(robot: Robot) -> dict[str, float]:
     """Parameters of a rig whose file states its loads only."""
-    return {p.name: float(p.value) for p in params.walk(blank(robot.configurations, rig=robot.rig))}
+    return {p.name: float(p.value) for p in params.walk_parameters(blank_robot(robot.configurations, rig=robot.rig))}
 
 
 def states(robot: Robot, prefix: str) -> bool:
     """True if the robot's file or its base states any parameter whose name begins so."""
-    return any(p.name.startswith(prefix) and robot.knows([p.name]) for p in params.walk(robot))
+    return any(p.name.startswith(prefix) and robot.knows([p.name]) for p in params.walk_parameters(robot))
 
 
 def battery(robot: Robot) -> bool:
@@ -57,7 +57,7 @@ def battery(robot: Robot) -> bool:
         getattr(robot.battery, name) != value for name, value in vars(nothing).items() if not eqx.is_array(value)
     )
     return own or any(
-        robot.knows([f"battery.{p.name}"]) for p in params.walk(nothing) if f"battery.{p.name}" != other
+        robot.knows([f"battery.{p.name}"]) for p in params.walk_parameters(nothing) if f"battery.{p.name}" != other
     )
 
 
@@ -95,7 +95,7 @@ def parameters(file: RobotFile) -> list[tuple[str, float, str, str, str]]:
     """Parameters that a rig's file states, and others with an effect: name, value, unit, meaning, source."""
     robot = file.robot
     nothing, found = _nothing(robot), []
-    for p in params.walk(robot):
+    for p in params.walk_parameters(robot):
         head = p.name.partition(".")[0]
         load = head in robot.configurations
         own = p.name in file.stated and head not in file.linear
@@ -112,10 +112,10 @@ def parameters(file: RobotFile) -> list[tuple[str, float, str, str, str]]:
 
 def changed_parameters(robot: Robot, nominal: Robot) -> list[tuple[Any, ...]]:
     """Parameters of `robot` that differ from the nominal robot's: name, both values, unit, meaning."""
-    base = {p.name: float(p.value) for p in params.walk(nominal)}
+    base = {p.name: float(p.value) for p in params.walk_parameters(nominal)}
     return [
         (p.name, float(p.value), base.get(p.name, "not in the paper's model"), p.spec.unit, p.spec.meaning)
-        for p in params.walk(robot)
+        for p in params.walk_parameters(robot)
         if p.name not in base or not np.isclose(float(p.value), base[p.name], rtol=1e-9, atol=0.0)
     ]
 

@@ -17,7 +17,7 @@ import typer
 
 from calibration.data.input_errors import BadConfiguration, InputError
 from mmrjax import SOUND_AT_LEVEL_0, __version__, fidelities
-from mmrjax.errors import shortened
+from mmrjax.errors import shorten
 from sweeps import config, config_campaign
 from sweeps import options as made
 from sweeps.flags import flags as flags_of
@@ -46,6 +46,9 @@ _Trust = Annotated[
 ]
 _Effects = Annotated[
     list[str] | None, typer.Option("--effects", help="A Python file with effects of your own, repeatable.")
+]
+_Columns = Annotated[
+    str | None, typer.Option("--columns", help="A preset of the data's columns, or its file (docs/howto/formats.md).")
 ]
 
 
@@ -231,7 +234,7 @@ def sweep(
 def compare(
     told: Told,
     data: Annotated[
-        str, typer.Argument(help="A CSV of measured runs, or measured, or simulated_by_paper.")
+        str, typer.Argument(help="Measured runs in any format, or measured, or simulated_by_paper.")
     ] = "measured",
     own_mass: Annotated[
         bool, typer.Option("--own-mass", help="Take the robot's mass and the payload, not the stated total mass.")
@@ -303,7 +306,7 @@ def render(
 )
 def calibrate(
     told: Told,
-    data: Annotated[str, typer.Argument(help="A CSV of measured runs or histories, or measured.")] = "measured",
+    data: Annotated[str, typer.Argument(help="Measured runs or histories in any format, or measured.")] = "measured",
     out: _Out = None,
     force: _Force = False,
 ) -> int:
@@ -328,7 +331,7 @@ def calibrate(
 def settle(
     told: Told,
     log: Annotated[
-        str, typer.Argument(metavar="LOG.csv", help="A log over time: time_s, what is imposed, channels.")
+        str, typer.Argument(metavar="LOG", help="A log over time in any format: time_s, what is imposed, channels.")
     ],
     out: _Out = None,
     force: _Force = False,
@@ -343,6 +346,23 @@ def settle(
 
 
 @_command(
+    config.Export,
+    arguments=("robot",),
+    example="mmrjax export found/robot.toml --to mujoco --data runs.csv --out exported",
+    failure="does not occur: runs that do not settle are left out of the comparison",
+)
+def export(told: Told, out: _Out = None, force: _Force = False) -> int:
+    """Write a drive in the format of another simulator, and a page on what the format loses.
+
+    Parameters of the format are refitted to this model over the runs of --data. LAW.md describes the law to people
+    who have never seen this program: equations, constants with intervals, conditions seen, what was not tested.
+    """
+    from sweeps.commands import export_drive as room
+
+    return room.export(told.config, out, force)
+
+
+@_command(
     config.Loop,
     beside=config.LoopBeside,
     example="mmrjax loop measured --out found, then mmrjax sweep --robot found/robot.toml",
@@ -353,7 +373,7 @@ def loop(
     told: Told,
     data: Annotated[
         str,
-        typer.Argument(help="A CSV of measured runs, or with time_s of histories from rest; or measured."),
+        typer.Argument(help="Measured runs in any format, or with time_s histories from rest; or measured."),
     ] = "measured",
     out: _Out = None,
     force: _Force = False,
@@ -461,23 +481,30 @@ def new(
     kind: Annotated[
         str, typer.Option(help="tracked, wheeled, bench, dyno, pendulum, servo, linear or carriage.")
     ] = "bench",
+    source: Annotated[
+        Path | None, typer.Option("--from", help="A model of MuJoCo (.xml) whose driven joint is the rig.")
+    ] = None,
+    joint: Annotated[str | None, typer.Option(help="Name of that joint.")] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace the file where there is one.")] = False,
 ) -> int:
     """Write a rig's file to fill in, with units and where each number comes from; it asks nothing.
 
     As written it can be read, with numbers of an example. Units are SI but where a comment says another.
+    With --from the numbers are those of a model's joint, as export --to mujoco writes them.
     """
     from sweeps.commands import rig_new
 
-    return rig_new.new(file, kind, force)
+    return rig_new.new(file, kind, force, source, joint)
 
 
 @rig.command("check", epilog="Example: mmrjax rig check my-rig.toml my-runs.csv")
 def rig_check(
     file: Annotated[Path, typer.Argument(metavar="FILE.toml", help="The rig's file.")],
     data: Annotated[
-        str | None, typer.Argument(metavar="[DATA.csv]", help="A table of runs, settled or over time (time_s, s).")
+        str | None,
+        typer.Argument(metavar="[DATA]", help="A table of runs or a log, in any format (docs/howto/formats.md)."),
     ] = None,
+    columns: _Columns = None,
     effects: _Effects = None,
     json: Annotated[bool, typer.Option("--json", help="Print JSON (mmrjax.rig_check/1) instead of words.")] = False,
     no_cache: _NoCache = False,
@@ -491,7 +518,21 @@ def rig_check(
     _start_jax(no_cache)
     from sweeps.commands import rig_check as room
 
-    return room.check(file, data, tuple(effects or ()), json)
+    return room.check(file, data, tuple(effects or ()), json, columns)
+
+
+@app.command("inspect", epilog="Example: mmrjax inspect log.bag; mmrjax inspect log.h5::/run1 --json")
+def inspect_file(
+    file: Annotated[str, typer.Argument(metavar="FILE", help="A file of data; ::PATH for a part of it.")],
+    json: Annotated[bool, typer.Option("--json", help="Print JSON (mmrjax.inspect/1) instead of words.")] = False,
+) -> int:
+    """List what a file of data contains: signals, units, rates, ranges, gaps; and propose the lines of [columns].
+
+    Exit codes: 0 it can be read; 4 it cannot.
+    """
+    from sweeps.commands import inspect as room
+
+    return room.inspect(file, json)
 
 
 @app.command(epilog="Example: mmrjax explain series_resistance")
@@ -526,7 +567,7 @@ def _prepared(resolved: Any, no_cache: bool = False) -> Any:
     XLA_FLAGS, be it to nothing, is heeded.
     """
     model = getattr(resolved, "model", None)  # None: of a calibration, whose data decide
-    one_thread = model is not None and fidelities.facts(model).one_thread
+    one_thread = model is not None and fidelities.fidelity_facts(model).one_thread
     options = (f"xla_cpu_small_while_loop_byte_threshold={WHOLE}",) * isinstance(resolved, config.Loop)
     _start_jax(no_cache, ("--xla_cpu_multi_thread_eigen=false",) * one_thread, options)
     return resolved
@@ -661,5 +702,5 @@ def _no_number(error: Any) -> str:
 
 
 def _fail(message: str, code: int) -> int:
-    print(f"mmrjax: {shortened(' '.join(message.splitlines()))}", file=sys.stderr)
+    print(f"mmrjax: {shorten(' '.join(message.splitlines()))}", file=sys.stderr)
     return code

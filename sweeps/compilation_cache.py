@@ -18,7 +18,7 @@ import stat
 import warnings
 from pathlib import Path
 
-from mmrjax.compile.private import exposure
+from mmrjax.compile.private import exposure_reason
 
 VARIABLE = "MMRJAX_CACHE"
 #: The same of `mmrjax.compile.programs`, which finds programs that were kept whole there; empty to keep none so.
@@ -108,7 +108,7 @@ def keep_programs() -> Path | None:
 
 def _refused(folder: str) -> bool:
     """True if others could change a folder of programs, which is reported: their code would be run."""
-    reason = exposure(Path(folder)) if folder else ""
+    reason = exposure_reason(Path(folder)) if folder else ""
     if reason:
         from sweeps.console import tell
 
@@ -169,5 +169,5 @@ def describe(path: Path | None = None) -> Contents:
     """Returns the folder of the cache and its contents."""
     folder = location(path)
     entries = [] if folder is None else _entries(folder)
-    exposed = "" if folder is None else exposure(folder)
+    exposed = "" if folder is None else exposure_reason(folder)
     return Contents(folder, len(entries), sum(entry[1] for entry in entries), exposed)

@@ -12,8 +12,9 @@ from typing import Annotated, Any, Literal, Self, TypeVar
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
+from calibration.data import presets_file
 from calibration.data.columns import ROWS
-from calibration.data.input_errors import BadConfiguration, choices, parsed
+from calibration.data.input_errors import BadConfiguration, allowed_words, parsed
 from calibration.data.input_files import toml_content, toml_text
 from calibration.inference import solvers
 from mmrjax import fidelities
@@ -25,8 +26,8 @@ from sweeps.flags import flags
 _VOLTAGE, _PAYLOAD, _SLOPE = (CONDITIONS[c].range for c in ("voltage", "payload", "slope_deg"))
 Slope = Annotated[float, Field(ge=_SLOPE[0], le=_SLOPE[1], allow_inf_nan=False)]
 Payload = Annotated[float, Field(ge=_PAYLOAD[0], le=_PAYLOAD[1], allow_inf_nan=False)]
-_SPEED = channels.find("motor_speed").range
-_CURRENT = channels.find("motor_current").range
+_SPEED = channels.find_channel("motor_speed").range
+_CURRENT = channels.find_channel("motor_current").range
 MotorCurrent = Annotated[float, Field(ge=_CURRENT[0], le=_CURRENT[1], allow_inf_nan=False)]
 _TORQUE = CONDITIONS["load_torque"].range
 LoadTorque = Annotated[float, Field(ge=_TORQUE[0], le=_TORQUE[1], allow_inf_nan=False)]
@@ -71,6 +72,17 @@ class RobotPart(Part):
     )
 
 
+class DataPart(Part):
+    """Columns of a table or log that have other names than this program's."""
+
+    columns: str | None = about(
+        None,
+        "Names, units and signs of the data's columns: a preset "
+        f"({', '.join(presets_file.PACKAGED)}; with the numbers it asks for, vesc,pole_pairs=7) or a preset's file",
+        usual="[columns] of the robot's file",
+    )
+
+
 class ModelPart(Part):
     """Fidelity, one of `mmrjax.fidelities`."""
 
@@ -92,7 +104,7 @@ def _fidelity(model: str) -> str:
 def _solver(name: str) -> str:
     """The name of a solver of fits, refused where there is no such one."""
     if name not in solvers.NAMES:
-        raise PydanticCustomError("unknown", choices(name, solvers.NAMES))
+        raise PydanticCustomError("unknown", allowed_words(name, solvers.NAMES))
     return name
 
 
@@ -146,7 +158,7 @@ class FidelityPart(ModelPart):
     @property
     def options(self) -> dict[str, float]:
         """Every option of the fidelity, as stated or by default."""
-        facts = fidelities.facts(self.model)
+        facts = fidelities.fidelity_facts(self.model)
         return facts.resolved(**{option.name: getattr(self, f"{option.name}_s") for option in facts.options})
 
 
@@ -365,6 +377,7 @@ class OutputPart(Part):
     """Files written in addition to the numbers."""
 
     report: bool = about(True, "Write report.html")
+    table: Literal["csv", "parquet"] = about("csv", "Tables of the folder: CSV, or Parquet too")
 
 
 class ProfilePart(FidelityPart):
@@ -404,7 +417,7 @@ class ProfilePart(FidelityPart):
         return super().options if self.profile is None else {}
 
 
-class Simulate(RobotPart, ProfilePart, SupplyPart, TurnPart, PosteriorPart, OutputPart):
+class Simulate(RobotPart, DataPart, ProfilePart, SupplyPart, TurnPart, PosteriorPart, OutputPart):
     """A few given runs; those over time from standstill, or over a profile."""
 
     @model_validator(mode="after")
@@ -432,7 +445,7 @@ class Sweep(RobotPart, BatchPart, SupplyPart, GridPart, PosteriorPart, OutputPar
     """A grid of runs: every combination of the axes."""
 
 
-class Compare(RobotPart, FidelityPart, PosteriorPart, OutputPart):
+class Compare(RobotPart, DataPart, FidelityPart, PosteriorPart, OutputPart):
     """The runs of a measured table."""
 
 
@@ -545,7 +558,7 @@ class Reproduce(RobotPart, ModelPart):
     model: str = about(fidelities.NAMES[0], "steady, or track for Figs. 23-27 too")
 
 
-class Calibrate(RobotPart, InferencePart, OutputPart):
+class Calibrate(RobotPart, DataPart, InferencePart, OutputPart):
     """Options of a calibration; for None the fidelity or the data decide."""
 
     model: Annotated[str, AfterValidator(_fidelity)] | None = about(
@@ -578,7 +591,7 @@ class Calibrate(RobotPart, InferencePart, OutputPart):
     hold_out: bool | None = about(None, "Fit again without each block", usual="steady only")
 
 
-class Settle(RobotPart, OutputPart):
+class Settle(RobotPart, DataPart, OutputPart):
     """Options for extracting settled runs from a log over time."""
 
     shortest_s: Annotated[float, Field(gt=0, le=3600, allow_inf_nan=False)] | None = about(
@@ -589,7 +602,23 @@ class Settle(RobotPart, OutputPart):
     )
 
 
-class Loop(RobotPart, InferencePart, OutputPart):
+class Export(RobotPart, OutputPart):
+    """A drive in the format of another simulator."""
+
+    robot: str = about("nominal", "nominal, sm1, sm2, or a robot's TOML file", metavar="[ROBOT.toml]", format="path")
+    to: Literal["mujoco", "jax", "onnx", "mjlab", "table", "randomization"] = about(
+        "mujoco", "Format (docs/howto/export.md)"
+    )
+    data: str | None = about(
+        None, "A table of runs or a log, with which the exported drive is compared", usual="a grid without readings"
+    )
+    configuration: str | None = about(None, "Which of the robot's configurations", usual="its first")
+    joint: str = about("drive", "Name of the joint in the simulator's model, for mujoco")
+    draws: Annotated[int, Field(ge=1, le=100_000)] = about(1000, "Draws of the posterior, for randomization")
+    seed: Seed = about(0, "Of the draws")
+
+
+class Loop(RobotPart, DataPart, InferencePart, OutputPart):
     """Options of the closed loop."""
 
     replicates: Annotated[int, Field(ge=250, le=100_000)] = about(
@@ -644,7 +673,7 @@ class Size(RequirementsPart, RobotPart, OutputPart):
     seed: Seed = about(0, "Of the starts")
 
 
-class Sensitivity(RobotPart, FidelityPart, SupplyPart, OutputPart):
+class Sensitivity(RobotPart, DataPart, FidelityPart, SupplyPart, OutputPart):
     """A sensitivity study.
 
     Operating points are those of a grid; None leaves them to the method: Table 8 where gradients do, its corners and
@@ -734,7 +763,7 @@ def _keys(kind: type[Part], file: Path, beside: type[Part] | None) -> dict[str, 
     own, others = solver_keys(kind), [] if beside is None else solver_keys(beside)
     for key in table:
         if key not in own + others:
-            known = choices(key, own + others) if own + others else "this command has none"
+            known = allowed_words(key, own + others) if own + others else "this command has none"
             raise BadConfiguration(f"{file.name}, solver.{key}: no such key; {known}")
         if key in values:
             raise BadConfiguration(f"{file.name}, solver.{key}: the file states {key} too; expected it once")
@@ -807,7 +836,7 @@ def _sentence(kind: type[Part], error: ValidationError, file: Path | None, given
     place = ".".join(str(part) for part in first["loc"])
     where = f"{file.name}, {place}" if file is not None and key not in given else called(key)
     if first["type"] == "extra_forbidden":
-        return f"{where}: no such key; {choices(key, kind.model_fields)}"
+        return f"{where}: no such key; {allowed_words(key, kind.model_fields)}"
     limits = {
         name: first["ctx"][name] for name in ("gt", "ge", "lt", "le", "expected") if name in first.get("ctx", {})
     }

@@ -11,7 +11,7 @@ from typing import Any, Literal, Self
 from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
 
-from calibration.data.input_errors import BadConfiguration, choices
+from calibration.data.input_errors import BadConfiguration, allowed_words
 from mmrjax.model.paper_tables import COULOMB_PER_MAH
 from mmrjax.model.quantities import RPM
 from sweeps.config import BatchPart, OutputPart, Part, ProfilePart, RobotPart, Sweep, about, read_toml, resolve
@@ -61,7 +61,7 @@ class Campaign(RobotPart, ProfilePart, BatchPart, OutputPart):
         conditions: constant conditions, by name.
         axes: of the grid, by name: a list, `first:last:step`, or a table with start, stop, number and scale.
         samples: a sampled design: design, number, seed, over (distributions by name), posterior.
-        outputs: names of `mmrjax.fidelities.outputs.table()`, of columns of the fidelity, or flags; empty: the
+        outputs: names of `mmrjax.fidelities.outputs.output_table()`, of columns of the fidelity, or flags; empty: the
             channels. Over a profile columns of `missions.mission_batch.OUTPUTS`, or flags; empty: its `USUAL`.
         storage: type in which outputs are stored.
         compression: of the store's chunks.
@@ -127,7 +127,7 @@ def how(
             raise BadConfiguration(f"--shard: got {shard}; expected i/n with i from 1 to n, such as 3/8")
     for kind in export or ():
         if kind not in EXPORTS:
-            raise BadConfiguration(f"--export: got {kind}; {choices(kind, EXPORTS)}")
+            raise BadConfiguration(f"--export: got {kind}; {allowed_words(kind, EXPORTS)}")
     if share is not None and scheduler is not None:
         raise BadConfiguration("--shard: not allowed with --scheduler, which shares out the chunks; give one of them")
     wanted = () if outputs is None else tuple(name.strip() for name in outputs.split(","))

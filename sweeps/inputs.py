@@ -11,14 +11,14 @@ from calibration.data import effect_file, posterior_file, robot_file, surface_la
 from calibration.data import runs as records
 from calibration.data.columns import IMPOSED, Layout
 from calibration.data.contradictions import misplaced
-from calibration.data.input_errors import BadConfiguration, choices
+from calibration.data.input_errors import BadConfiguration, allowed_words
 from calibration.data.posterior_file import Posterior
 from calibration.data.robot_file import RobotFile
 from mmrjax import fidelities
-from mmrjax.derived.turning_figures import by_itself
+from mmrjax.derived.turning_figures import turns_under_equal_commands
 from mmrjax.model.paper_tables import BENCH, SURFACES
 from mmrjax.model.quantities import RPM
-from mmrjax.model.robot import Robot, cannot_turn
+from mmrjax.model.robot import Robot, turn_error
 from sweeps import capabilities, store
 from sweeps.config import FidelityPart, OneRun, RobotPart
 from sweeps.console import tell
@@ -44,7 +44,7 @@ def load_robot(config: RobotPart) -> RobotFile:
     unlike = () if getattr(config, "turns", False) else _unlike(file.name, robot)
     for note in (*notes, *unlike):
         tell(note)
-    resolves = isinstance(config, FidelityPart) and fidelities.facts(config.model).resolves
+    resolves = isinstance(config, FidelityPart) and fidelities.fidelity_facts(config.model).resolves
     runs = (
         robot.has_ground
         and robot.rig.imposed == "voltage"
@@ -59,10 +59,10 @@ def _unlike(name: str, robot: Robot) -> tuple[str, ...]:
     """Sentence for straight travel: how a robot with different sides turns if both are driven the same."""
     if not robot.unlike or not robot.has_ground:
         return ()
-    if why := cannot_turn(robot, robot.configurations):
+    if why := turn_error(robot, robot.configurations):
         return (turn_words.unlike(name, robot.unlike, f"how it would turn is not known: {why}"),)
     value = imposed.usual(robot)
-    found = by_itself(robot, value * RPM if robot.rig.imposed == "motor_speed" else value)
+    found = turns_under_equal_commands(robot, value * RPM if robot.rig.imposed == "motor_speed" else value)
     turns = turn_words.by_itself(robot, found, value)
     return (turn_words.unlike(name, robot.unlike, turns),) if turns else ()
 
@@ -99,7 +99,8 @@ def check_configurations(robot: Robot, names: tuple[str, ...], where: str) -> No
     for name in names:
         if name not in robot.configurations:
             raise BadConfiguration(
-                f"{where}: got {name}; the robot has no such configuration; {choices(name, robot.configurations)}"
+                f"{where}: got {name}; the robot has no such configuration; "
+                f"{allowed_words(name, robot.configurations)}"
             )
 
 
@@ -115,7 +116,7 @@ def check_surface(robot: Robot, names: Collection[str], surface: str | None, whe
     known = surface is None or surface in SURFACES or not robot.rig.scales_adhesion
     if not known and not all(surface_labels.named(name, str(surface)) in robot.configurations for name in names):
         raise BadConfiguration(
-            f"{where}: got {surface}, whose friction is not known; {choices(str(surface), SURFACES)}"
+            f"{where}: got {surface}, whose friction is not known; {allowed_words(str(surface), SURFACES)}"
         )
 
 
@@ -124,6 +125,7 @@ def read_runs(
     robot: Robot,
     *,
     measured: bool,
+    columns: str | None = None,
     series: bool = False,
     battery: bool = False,
     of_turns: bool = False,
@@ -131,9 +133,10 @@ def read_runs(
     """Read a table and list its unused columns on stderr.
 
     Args:
-        source: a file, or a packaged table.
+        source: a file of any format, or a packaged table.
         robot: has the configurations of the table.
         measured: whether readings are needed; series: whether time histories are taken.
+        columns: a preset or its file, see `records.read`.
         battery: whether the runs are on the battery, see `records.read`.
         of_turns: whether a table of turns has each channel of both sides, and of the yaw, for which it has a column.
 
@@ -141,11 +144,11 @@ def read_runs(
         BadData: what `records.read` refuses, time histories where none are taken, or a configuration that the
             robot does not have.
     """
-    runs = records.read(source, measured=measured, battery=battery, robot=robot, of_turns=of_turns)
+    runs = records.read(source, robot, columns=columns, measured=measured, battery=battery, of_turns=of_turns)
     if not series:
         from calibration.inference import observers
 
-        observers.kind(runs).check_settled(runs)
+        observers.observer_kind(runs).check_settled(runs)
     runs.configurations(robot)
     for note in runs.notes:
         tell(note)

@@ -21,7 +21,7 @@ from typing import Any, Literal
 import numpy as np
 
 from calibration.data.effect_file import OWN_MODULE
-from mmrjax.effects.scaled import scaled
+from mmrjax.effects.scaled import scaled_effect
 from mmrjax.model import channels
 from mmrjax.model.channels import Channel
 
@@ -162,7 +162,7 @@ class _Reader:
 
     def _compound(self, kind: str, *rest: Any) -> Any:
         if kind == "channel":
-            return channels.find(rest[0])
+            return channels.find_channel(rest[0])
         if kind in ("list", "tuple", "set", "frozenset"):
             items = [self.decoded(item) for item in rest[0]]
             return {"list": list, "tuple": tuple, "set": set, "frozenset": frozenset}[kind](items)
@@ -248,7 +248,7 @@ def _class(module: str, name: str, factors: list[float] | None) -> type:
         found = getattr(found, part)
     if not isinstance(found, type) or found.__module__ != module:
         raise Unreadable(f"{module}.{name} is no class there")
-    return found if factors is None else scaled(found, tuple(factors))
+    return found if factors is None else scaled_effect(found, tuple(factors))
 
 
 def _function(module: str, name: str) -> types.FunctionType:

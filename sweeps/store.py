@@ -59,6 +59,7 @@ class Folder:
         if not path.name:
             raise BadConfiguration(f"--out: got {str(path)!r}; expected the name of a folder")
         self.path, self.partial = path, path.with_name(path.name + ".partial")
+        self.tables = "csv"
         self.started = datetime.datetime.now(datetime.UTC)
 
     def refuse_taken(self, force: bool) -> None:
@@ -109,13 +110,18 @@ class Folder:
         """Write a text file."""
         writing.write_text(self.partial / name, text)
 
+    def write_bytes(self, name: str, content: bytes) -> None:
+        """Write a file of bytes."""
+        with writing.naming(self.partial / name):
+            (self.partial / name).write_bytes(content)
+
     def write_json(self, name: str, content: dict[str, Any]) -> None:
         """Write a JSON file; what is not finite becomes null."""
         writing.write_json(self.partial / name, content)
 
     def write_table(self, name: str, columns: dict[str, np.ndarray]) -> None:
-        """Write a table as CSV; what is not finite becomes an empty cell."""
-        writing.write_table(self.partial / name, columns)
+        """Write a table as CSV, and as Parquet too where asked; what is not finite is an empty cell."""
+        writing.write_table(self.partial / name, columns, self.tables)
 
     def finish(self, manifest: dict[str, Any], runs: Runs | None = None) -> Path:
         """Write the manifest and move the folder into place; returns its path.
@@ -391,17 +397,19 @@ def open_folder(
     """
     import jax
 
-    from mmrjax.compile.programs import sources
+    from mmrjax.compile.programs import source_hash
 
     identity = {
         "command": command,
-        "program": f"{sources()}, {jax.default_backend()}",
-        "config": config.model_dump(exclude={"report"}),
-        "robot": {p.name: float(p.value) for p in params.walk(robot)},
+        "program": f"{source_hash()}, {jax.default_backend()}",
+        "config": config.model_dump(exclude={"report", "table"}),
+        "robot": {p.name: float(p.value) for p in params.walk_parameters(robot)},
         "runs": None if runs is None else {key: value.tolist() for key, value in runs.columns.items()},
         "effects": [digest(Path(file).read_bytes()) for file in config.effects],
     }
-    return RunFolder(out or default_path(command), identity, force=force)
+    folder = RunFolder(out or default_path(command), identity, force=force)
+    folder.tables = getattr(config, "table", folder.tables)
+    return folder
 
 
 def provenance() -> dict[str, Any]:

@@ -237,7 +237,7 @@ def free(robot_with_representatives):
 
     Shape parameters are not: at amplitude zero nothing depends on them.
     """
-    every = params.walk(robot_with_representatives)
+    every = params.walk_parameters(robot_with_representatives)
     return [p for p in every if p.spec.amplitude or not p.name.startswith("effects.")]
 
 

@@ -16,7 +16,7 @@ from calibration.discovery import discover
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.candidates import BaseFit, fit_base
 from calibration.discovery.discover import LoopStages
-from calibration.discovery.outliers import Screening, screen
+from calibration.discovery.outliers import Screening, screen_outliers
 from calibration.discovery.result import DiscoveryResult
 from calibration.discovery.settings import Settings, settings_for
 from calibration.inference import noise, observers
@@ -38,7 +38,7 @@ def table(made: Any) -> Runs:
 
 def known(runs: Runs) -> Noise:
     """The sds that a table states."""
-    return noise.from_table(runs, observers.kind(runs).sizes(runs))
+    return noise.noise_from_table(runs, observers.observer_kind(runs).sizes(runs))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,7 +55,9 @@ class Analyst:
 
     def space(self, runs: Runs) -> CandidateSpace:
         """What can be fitted to a table."""
-        return discover.pose(runs, paper_robots.nominal(), known(runs).sd, self.settings, self.stated, self.library)
+        return discover.pose_candidates(
+            runs, paper_robots.nominal(), known(runs).sd, self.settings, self.stated, self.library
+        )
 
     def base(self, runs: Runs) -> BaseFit:
         """The base fitted to a table."""
@@ -63,7 +65,7 @@ class Analyst:
 
     def screened(self, runs: Runs) -> Screening:
         """The base fitted to a table, rows that stand alone set aside."""
-        return screen(self.base(runs), lambda base: discover.bases_at(runs, base), runs, self.settings)
+        return screen_outliers(self.base(runs), lambda base: discover.bases_at_fit(runs, base), runs, self.settings)
 
     def trace(self, runs: Runs) -> LoopStages:
         """The stages of the loop up to its verdict."""

@@ -13,7 +13,7 @@ from calibration.data.input_errors import BadConfiguration
 from calibration.inference.calibration import calibrate
 from mmrjax.effects import ALL
 from mmrjax.fidelities.drive import drive_batch
-from mmrjax.fidelities.histories import grid, histories
+from mmrjax.fidelities.histories import history_signals, time_grid
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import balances, channels, paper_robots, params
 from mmrjax.model.conditions import Conditions
@@ -27,20 +27,20 @@ DRIVE = {
     "motor.friction_coulomb": 2e-3, "motor.friction_viscous": 1e-6, "motor.inertia": 2e-6, "motor.inductance": 1e-3,
 }  # fmt: skip
 SAMPLES = np.linspace(0, 2, 201)
-TIMES = grid(SAMPLES, np.arange(0, 2, 0.5), change=(1e-5, 0.04))
+TIMES = time_grid(SAMPLES, np.arange(0, 2, 0.5), change=(1e-5, 0.04))
 VOLTAGE = np.where(TIMES % 1.0 < 0.5, 6.0, -6.0)
 
 
 def bench(backlash):
     shaft = Shaft(inertia=0.01, loss_coulomb=0.1, loss_viscous=0.01, backlash=backlash)
     rig = Rig(loose=backlash > 0)
-    return params.replace(paper_robots.blank(Configurations({"bench": shaft}), rig=rig), DRIVE)
+    return params.replace(paper_robots.blank_robot(Configurations({"bench": shaft}), rig=rig), DRIVE)
 
 
 @jax.jit
 def driven(robot):
     conditions = dataclasses.replace(Conditions(voltage=0.0), voltage=jnp.asarray(VOLTAGE))
-    return histories(robot, conditions, jnp.asarray(TIMES))
+    return history_signals(robot, conditions, jnp.asarray(TIMES))
 
 
 @pytest.mark.slow
@@ -60,7 +60,7 @@ def test_effects_of_the_gearbox_go_by_the_load_within_the_backlash_too():
     def net(amplitudes, constant):
         robot = params.replace(bench(0.02), {"bench.torque_constant": constant})
         there = tuple(e(amplitude=a) for e, a in zip(those, amplitudes, strict=True))
-        return balances.moving(
+        return balances.moving_signals(
             dataclasses.replace(robot, effects=there), Conditions(0, voltage=6.0), state
         ).torque_net
 

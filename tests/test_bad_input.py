@@ -12,7 +12,7 @@ from worlds import settled, tables
 from calibration.data.runs import Runs
 from calibration.inference import checks
 from calibration.inference.calibration import calibrate
-from calibration.inference.conduct import conduct
+from calibration.inference.conduct import conduct_notes
 from calibration.inference.fit_notes import EndsEarly, Fact, NeverGrips, NoiseOff, Shown
 from mmrjax.model import paper_robots, params
 
@@ -55,34 +55,34 @@ def written(path, runs):
 
 @pytest.mark.slow
 def test_histories_that_grip_have_nothing_said(histories):
-    assert conduct(histories, CLIMBING) == []
-    assert conduct(table(tables.narrow(seed=3)), CLIMBING) == []
+    assert conduct_notes(histories, CLIMBING) == []
+    assert conduct_notes(table(tables.narrow(seed=3)), CLIMBING) == []
 
 
 @pytest.mark.slow
 def test_histories_that_never_grip_are_said(sliding, histories):
-    which, none = conduct(sliding, CLIMBING)
+    which, none = conduct_notes(sliding, CLIMBING)
     assert which == NeverGrips(RUNS, which.share) and 0 <= which.share < 0.7 and none == Fact("no grip")
     half = {c: np.concatenate([sliding[c][sliding["run_id"] == "start0"], histories[c][histories["run_id"] != "start0"]])
             for c in histories.columns}  # fmt: skip
-    (said,) = conduct(Runs("runs.csv", half), CLIMBING)
+    (said,) = conduct_notes(Runs("runs.csv", half), CLIMBING)
     assert said == NeverGrips(("start0",), said.share)
 
 
 def test_runs_of_ten_milliseconds_are_said(short):
-    (said,) = conduct(short, CLIMBING)
+    (said,) = conduct_notes(short, CLIMBING)
     assert isinstance(said, EndsEarly) and said.runs == RUNS
     assert said.lasts == pytest.approx(0.01, rel=0.1) and 0 < said.share < 0.7
     bare = Runs("runs.csv", {c: x for c, x in short.columns.items() if not c.startswith("speed")})
-    (said,) = conduct(bare, CLIMBING)
+    (said,) = conduct_notes(bare, CLIMBING)
     assert isinstance(said, EndsEarly) and said.runs == RUNS and np.isnan(said.share)
 
 
 @pytest.mark.slow
 def test_loop_and_calibrate_say_both(sliding, short):
-    """Both ask `checks.check` before they fit, and keep what it says."""
+    """Both ask `checks.check_data` before they fit, and keep what it says."""
     for runs, kind in ((sliding, NeverGrips), (short, EndsEarly)):
-        assert any(isinstance(note, kind) for note in checks.check(runs, CLIMBING, (), known(runs)))
+        assert any(isinstance(note, kind) for note in checks.check_data(runs, CLIMBING, (), known(runs)))
 
 
 #: A table or histories, and what is said of it by every command that fits.

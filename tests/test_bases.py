@@ -5,7 +5,15 @@ import numpy as np
 import pytest
 
 from calibration.inference import bases
-from calibration.inference.bases import COLLINEAR, Window, collinearity, families, names, window, windows
+from calibration.inference.bases import (
+    COLLINEAR,
+    Window,
+    curve_families,
+    family_names,
+    order_collinearity,
+    window_families,
+    window_from_name,
+)
 from mmrjax.compile.compiling import for_equations
 from mmrjax.model import channels
 
@@ -42,46 +50,46 @@ COUNTS = np.ones(ROWS)
 
 
 def test_order_of_a_grid_that_is_run_through_is_collinear_with_its_conditions():
-    assert collinearity(table(), COUNTS) > 0.99 > COLLINEAR
+    assert order_collinearity(table(), COUNTS) > 0.99 > COLLINEAR
     for seed in range(5):
-        assert collinearity(shuffled(table(), seed), COUNTS) < 0.5
+        assert order_collinearity(shuffled(table(), seed), COUNTS) < 0.5
     # of rows that do not count nothing is known; one value of the order says nothing
     few = np.zeros(ROWS)
     few[:3] = 1
-    assert collinearity(table(), few) == collinearity(table(order=np.ones(ROWS)), COUNTS) == 1.0
+    assert order_collinearity(table(), few) == order_collinearity(table(order=np.ones(ROWS)), COUNTS) == 1.0
 
 
 def test_order_of_levels_that_rise_one_way_and_then_the_other_is_that_of_the_levels():
     volts = np.array([5, 6.5, 8, 9.5, 11, 12.5, 14, 15.5, 17, 18.5, 20, 22, 24, -7, -11, -15, -19, -23])
     columns = {"configuration": np.full(18, "bench"), "supply_voltage_V": volts, "order": np.arange(18.0)}
     axes = ("supply_voltage_V",)
-    assert collinearity(columns, np.ones(18), axes) > COLLINEAR
-    assert max(collinearity(shuffled(columns, seed), np.ones(18), axes) for seed in range(20)) < 0.7
+    assert order_collinearity(columns, np.ones(18), axes) > COLLINEAR
+    assert max(order_collinearity(shuffled(columns, seed), np.ones(18), axes) for seed in range(20)) < 0.7
 
 
 def test_collinearity_is_not_made_by_the_number_of_terms():
     """R² of noise is the share of the parameters; adjusted for them it is about 0."""
-    found = [collinearity(shuffled(table(), seed), COUNTS) for seed in range(40)]
+    found = [order_collinearity(shuffled(table(), seed), COUNTS) for seed in range(40)]
     assert abs(np.mean(found)) < 0.1
 
 
 def variables(found):
-    return [v for _, v in names(found)]
+    return [v for _, v in family_names(found)]
 
 
 def test_curves_of_channels_are_over_their_reading_and_what_order_brings():
     for columns, over in ((table(), set()), (shuffled(table()), {"order"})):
-        of = {c: {v for p, v in names(families(columns, COUNTS)) if p == c} for c in channels.USUAL}
+        of = {c: {v for p, v in family_names(curve_families(columns, COUNTS)) if p == c} for c in channels.USUAL}
         assert of == {
             "total_current": {"current"} | over, "motor_speed": {"speed_motor"} | over, "speed": {"speed"} | over,
         }  # fmt: skip
 
 
 def test_curves_over_the_order_where_it_says_something_new():
-    assert "order" in variables(families(shuffled(table()), COUNTS))
-    assert "order" not in variables(families(table(), COUNTS))
+    assert "order" in variables(curve_families(shuffled(table()), COUNTS))
+    assert "order" not in variables(curve_families(table(), COUNTS))
     bare = {k: v for k, v in table().items() if k != "order"}
-    assert "order" not in variables(families(bare, COUNTS))
+    assert "order" not in variables(curve_families(bare, COUNTS))
 
 
 # --- windows --------------------------------------------------------------------------------------------
@@ -89,20 +97,20 @@ def test_curves_over_the_order_where_it_says_something_new():
 
 def test_a_window_is_read_from_its_name():
     for of in (Window("time", 0.6, 0.75), Window("order", 12.0, 19.0), Window("time", 1e-05, 12345.0)):
-        assert window(str(of)) == of
+        assert window_from_name(str(of)) == of
     for word in ("time", "order", bases.CONDITIONS, "speed_motor", *bases.ORDERS):
-        assert window(word) is None
+        assert window_from_name(word) is None
 
 
 def test_windows_cover_the_order_and_overlap_by_half():
-    basis, shown = windows(shuffled(table()), COUNTS)
+    basis, shown = window_families(shuffled(table()), COUNTS)
     assert [v for _, v in shown.names[:4]] == [v for _, v in basis.names[:4]]
     assert {n[0] for n in basis.names} == set(bases.BALANCES) and {n[0] for n in shown.names} == set(channels.USUAL)
     assert basis.columns.shape[2] == 1 and set(np.unique(basis.columns)) == {0.0, 1.0}
     order = shuffled(table())["order"]
-    mine = [k for k, n in enumerate(basis.names) if n[0] == "track" and window(n[1]).axis == "order"]
+    mine = [k for k, n in enumerate(basis.names) if n[0] == "track" and window_from_name(n[1]).axis == "order"]
     for k in mine:
-        of, inside = window(basis.names[k][1]), np.asarray(basis.columns)[k, :, 0] > 0
+        of, inside = window_from_name(basis.names[k][1]), np.asarray(basis.columns)[k, :, 0] > 0
         np.testing.assert_array_equal(inside, of.holds(order))
         assert bases.FEWEST <= inside.sum() <= ROWS / 2
     shapes = np.asarray(basis.columns)[mine, :, 0]
@@ -113,7 +121,7 @@ def test_windows_cover_the_order_and_overlap_by_half():
 
 
 def over_order(columns):
-    return [n for b in windows(columns, COUNTS) for n in b.names if n[1].startswith("order")]
+    return [n for b in window_families(columns, COUNTS) for n in b.names if n[1].startswith("order")]
 
 
 def test_windows_of_the_order_only_where_conditions_do_not_tell_it():
@@ -129,14 +137,14 @@ def test_order_is_told_by_combinations_of_conditions():
     sequence = np.lexsort((columns["slope_deg"], key, wheeled))
     order = np.empty(len(key))
     order[sequence] = np.arange(len(key))
-    assert collinearity({**columns, "order": order}, COUNTS) > COLLINEAR
+    assert order_collinearity({**columns, "order": order}, COUNTS) > COLLINEAR
     assert not over_order({**columns, "order": order})
 
 
 def test_windows_of_histories_are_in_time_at_the_same_instants_of_all_runs():
     time = np.tile(np.linspace(0, 1.5, 30), 2)
-    for basis in windows(table(time_s=time), COUNTS):
-        over_time = [k for k, (_, v) in enumerate(basis.names) if window(v).axis == "time"]
+    for basis in window_families(table(time_s=time), COUNTS):
+        over_time = [k for k, (_, v) in enumerate(basis.names) if window_from_name(v).axis == "time"]
         assert over_time
         for shape in np.asarray(basis.columns)[over_time, :, 0]:
             np.testing.assert_array_equal(shape[:30], shape[30:])
@@ -144,8 +152,8 @@ def test_windows_of_histories_are_in_time_at_the_same_instants_of_all_runs():
 
 def test_levels_of_conditions_are_windows():
     columns = table()
-    basis = windows({k: v for k, v in columns.items() if k != "order"}, COUNTS)[0]
-    found = {window(v) for place, v in basis.names if place == "slip"}
+    basis = window_families({k: v for k, v in columns.items() if k != "order"}, COUNTS)[0]
+    found = {window_from_name(v) for place, v in basis.names if place == "slip"}
     slopes = np.unique(columns["slope_deg"])
     mine = sorted((w for w in found if w.axis == "slope"), key=lambda w: w.low)
     np.testing.assert_allclose([w.low for w in mine], np.radians(slopes), rtol=1e-4, atol=1e-6)
@@ -159,28 +167,28 @@ def test_levels_of_conditions_are_windows():
 def test_rows_that_do_not_count_are_in_no_window():
     counts = COUNTS.copy()
     counts[[5, 20, 40]] = 0
-    for basis in windows(shuffled(table()), counts):
+    for basis in window_families(shuffled(table()), counts):
         assert not np.asarray(basis.columns)[:, [5, 20, 40]].any()
 
 
 def test_a_table_without_order_or_levels_has_no_windows():
     rng = np.random.default_rng(3)
     measured = {c: rng.uniform(1, 9, ROWS) for c in ("supply_voltage_V", "slope_deg", "payload_kg")}
-    assert windows({k: v for k, v in (table() | measured).items() if k != "order"}, COUNTS) == ()
+    assert window_families({k: v for k, v in (table() | measured).items() if k != "order"}, COUNTS) == ()
 
 
 def test_an_order_that_the_only_condition_tells_has_no_curves():
     order = np.arange(1.0, ROWS + 1)
     columns = {"configuration": np.full(ROWS, "bench"), "motor_current_A": order, "order": order}
     alone = bases.Scope(("electrical", "track"), ("motor_current_A",))
-    assert {v for _, v in names(families(columns, COUNTS, scope=alone))} == {bases.CONDITIONS}
+    assert {v for _, v in family_names(curve_families(columns, COUNTS, scope=alone))} == {bases.CONDITIONS}
 
 
 # --- sizes ----------------------------------------------------------------------------------------------
 
 
 def shapes(columns, counts):
-    whole = (*families(columns, counts), *windows(columns, counts))
+    whole = (*curve_families(columns, counts), *window_families(columns, counts))
     return jax.tree.structure(for_equations(whole)), [b.columns.shape for b in whole]
 
 
@@ -202,14 +210,14 @@ def test_tables_of_one_size_have_families_of_one_size(seed):
 def test_families_that_fill_up_repeat_others():
     """What stands in the place of a family that says nothing is one that is there already, so that it finds nothing
     that this does not."""
-    found = (*families(table(), COUNTS), *windows(table(order=np.repeat([1.0, 2, 3, 60], 15)), COUNTS))
+    found = (*curve_families(table(), COUNTS), *window_families(table(order=np.repeat([1.0, 2, 3, 60], 15)), COUNTS))
     for basis in found:
         columns = np.asarray(basis.columns)
         for k, name in enumerate(basis.names):
             same = [j for j, n in enumerate(basis.names) if n == name]
             for j in same:
                 np.testing.assert_array_equal(columns[j], columns[k])
-    assert len(set(names(found))) < len(names(found))
+    assert len(set(family_names(found))) < len(family_names(found))
 
 
 # --- waves of a shaft -----------------------------------------------------------------------------------
@@ -225,7 +233,7 @@ def back_and_forth(turn, runs=3, samples=100):
 def waves_of(turn):
     """Order of the shaft → columns of its wave in one balance, of runs that turn so far [rad] and come back."""
     angle, rows = back_and_forth(turn)
-    (basis,) = bases.waves(np.zeros(angle.size, bool), angle, rows, rows)
+    (basis,) = bases.wave_families(np.zeros(angle.size, bool), angle, rows, rows)
     every = {n: np.asarray(c) for n, c in zip(basis.names, basis.columns, strict=True)}
     return angle, rows, {v: c for (place, v), c in every.items() if place == "track"}
 
@@ -253,4 +261,4 @@ def test_pieces_of_a_wave_have_one_phase_in_all_runs():
 
 def test_a_shaft_that_stands_has_no_waves():
     angle, rows = back_and_forth(0.0)
-    assert bases.waves(np.zeros(angle.size, bool), angle, rows, rows) == ()
+    assert bases.wave_families(np.zeros(angle.size, bool), angle, rows, rows) == ()

@@ -47,6 +47,8 @@ def test_every_script_is_imported_or_prints_its_help(unchanged, monkeypatch):
 #: Options that make a cited command small, after its own; None: why it is not run here.
 _ONE = "--clean 1 --library 0 --outside 0 --replicates 20 --jobs 1 --out cases.jsonl"
 SMALL = {
+    "read_tables.py": "--parquet-rows 1000 --csv-rows 1000",
+    "actuator.py": "--environments 8 --steps 10 --joints 2",
     "climb_search.py": "--members 4 --generations 1 --tries 1",
     "door.py": "--points 64 --rounds 1",
     "draw_mutants.py": "--number 1",

@@ -27,7 +27,7 @@ from calibration.inference import optimizers as fit
 from calibration.inference.calibration import calibrate
 from calibration.inference.fit_notes import Constant, Repeats, SamePredictions, Unmeasured
 from calibration.inference.observers import SettledRuns
-from calibration.inference.remarks import remarks
+from calibration.inference.remarks import calibration_remarks
 from calibration.inference.result import CalibrationResult, ChannelErrors, HeldOut
 from calibration.inference.simulation_errors import relative_error, root_mean_square
 from mmrjax.fidelities.results import Results
@@ -158,7 +158,7 @@ def test_blocks_that_tell_nothing_of_their_own_are_said_and_not_shown(found, cap
     kinds = ("voltage_configuration", "slope", "voltage", "payload")
     found = dataclasses.replace(found, held_out=dict(zip(kinds, held, strict=True)))
     assert found.held_out_alike == {"voltage_configuration": ("voltage", "payload"), "slope": ()}
-    assert SamePredictions("voltage_configuration", ("voltage", "payload")) in remarks(found)
+    assert SamePredictions("voltage_configuration", ("voltage", "payload")) in calibration_remarks(found)
     print_calibration(found)
     shown = capsys.readouterr().out
     table = [line for line in shown.splitlines() if line.startswith("│ after, held out")]
@@ -182,12 +182,12 @@ def test_rows_have_every_row(found):
 
 def test_stated_noise_comes_before_columns_and_columns_before_estimates(measured):
     with_sd = changed(measured, total_current_sd_A=np.full(20, 0.05), speed_sd_mm_s=np.full(20, 4.0))
-    sizes = observers.kind(with_sd).sizes(with_sd)
-    made = noise.from_table(with_sd, sizes, "current=2%")
+    sizes = observers.observer_kind(with_sd).sizes(with_sd)
+    made = noise.noise_from_table(with_sd, sizes, "current=2%")
     assert made.source == ("stated", "estimated", "columns") and made.estimated.tolist() == [False, True, False]
     np.testing.assert_allclose(made.sd[:, 0], 0.02 * measured["total_current_A"])
     np.testing.assert_allclose(made.sd[:, 2], 4e-3)
-    assert noise.from_table(measured, sizes, "motor_speed=30rpm").sd[0, 1] == pytest.approx(math.pi)
+    assert noise.noise_from_table(measured, sizes, "motor_speed=30rpm").sd[0, 1] == pytest.approx(math.pi)
 
 
 @pytest.mark.parametrize(
@@ -195,7 +195,7 @@ def test_stated_noise_comes_before_columns_and_columns_before_estimates(measured
     [
         (
             "current=2%,total_current=3%",
-            "--noise total_current=3%: total_current stands twice; expected each channel once",
+            "--noise total_current=3%: total_current is given twice; expected each channel once",
         ),
         ("amps=2%", "--noise amps=2%: no such channel; .*allowed: current, motor_speed, speed"),
         ("current=2", "--noise current=2: expected a positive number with % or A or mA, e.g. current=2%"),
@@ -205,12 +205,12 @@ def test_stated_noise_comes_before_columns_and_columns_before_estimates(measured
 )
 def test_noise_refuses(text, says):
     with pytest.raises(BadConfiguration, match=says):
-        noise.parse(text, channels.usual())
+        noise.parse_noise(text, channels.usual_channels())
 
 
 def test_noise_is_in_any_unit_of_its_channel():
-    shown = tuple(channels.find(name) for name in ("total_current", "yaw_rate"))
-    found = noise.parse("current=40mA,yaw_rate=0.6deg/s", shown)
+    shown = tuple(channels.find_channel(name) for name in ("total_current", "yaw_rate"))
+    found = noise.parse_noise("current=40mA,yaw_rate=0.6deg/s", shown)
     assert found == {0: (pytest.approx(0.04), False), 1: (pytest.approx(np.radians(0.6)), False)}
 
 
@@ -254,7 +254,7 @@ def test_repeats_that_differ_are_said_and_no_error(measured):
     current[20] = 5.2
     other = changed(twice, total_current_A=current)
     for stated, apart in ((None, "40%"), ("current=2%,motor_speed=1%,speed=1%", "14 sd")):
-        known = noise.from_table(other, SettledRuns.sizes(other), stated)
+        known = noise.noise_from_table(other, SettledRuns.sizes(other), stated)
         assert SettledRuns.check(other, known) == [
             Repeats(other.source, (4, 21), "total_current_A", (3.45, 5.2), apart)
         ]
@@ -267,7 +267,7 @@ def test_repeats_are_not_measured_by_noise_that_is_their_own_scatter(measured):
         current = twice["total_current_A"].copy()
         current[20] = factor * current[3]
         other = changed(twice, total_current_A=current)
-        known = noise.from_table(other, SettledRuns.sizes(other), "current=6%,motor_speed=1%,speed=1%")
+        known = noise.noise_from_table(other, SettledRuns.sizes(other), "current=6%,motor_speed=1%,speed=1%")
         assert SettledRuns.check(other, known) == []
         known = dataclasses.replace(known, source=("series", *known.source[1:]))
         assert [note.apart for note in SettledRuns.check(other, known)] == said
@@ -278,7 +278,7 @@ def test_a_column_that_varies_where_no_condition_does_is_named(measured):
     speeds = {"motor_speed_rpm": np.linspace(4000.0, 5000.0, 6)}
     extras = {"torque_mNm": np.arange(6.0), "who": np.array(list("abcdef"))}
     dyno = dataclasses.replace(alike, columns=alike.columns | speeds, extras=extras)
-    known = noise.from_table(dyno, SettledRuns.sizes(dyno), "current=2%,motor_speed=1%,speed=1%")
+    known = noise.noise_from_table(dyno, SettledRuns.sizes(dyno), "current=2%,motor_speed=1%,speed=1%")
     with pytest.raises(BadData, match=r"; torque_mNm varies there and is not used as a condition: .*; no condition"):
         SettledRuns.check(dyno, known)
 
@@ -287,7 +287,7 @@ def test_thousands_of_rows_are_compared_at_once(measured):
     long = measured.where(np.tile(np.arange(20), 250))
     long = changed(long, payload_kg=long["payload_kg"] + 1e-3 * np.arange(5000))  # no two alike but by the last
     long.columns["payload_kg"][-1] = long["payload_kg"][19]
-    known = noise.from_table(long, SettledRuns.sizes(long), "current=2%,motor_speed=1%,speed=1%")
+    known = noise.noise_from_table(long, SettledRuns.sizes(long), "current=2%,motor_speed=1%,speed=1%")
     began = time.monotonic()
     assert SettledRuns.check(long, known) == []
     long.columns["speed_mm_s"][-1] *= 2
@@ -381,7 +381,7 @@ def test_the_command_leaves_a_folder_that_other_commands_take(tmp_path, monkeypa
     # Percentages differ: `compare` keeps equation (35), so the readings themselves are compared.
     fitted, compared = (rows_of(tmp_path / folder) for folder in ("c/rows.csv", "d/comparison.csv"))
     for mine, theirs in zip(fitted, compared, strict=True):
-        for c in channels.rows(channels.USUAL):
+        for c in channels.channels_named(channels.USUAL):
             assert float(theirs[f"simulated_{c.column}"]) == pytest.approx(float(mine[f"after_{c.column}"]), rel=1e-6)
     code, _, err = mmrjax("calibrate", "measured", "--free", "6T2A.mu")
     assert code == 2 and "--free 6T2A.mu: no such parameter" in err
@@ -433,14 +433,16 @@ def test_a_prediction_is_made_where_a_reading_is_missing(found_with_gaps):
 
 def test_a_missing_reading_weighs_nothing_whatever_number_stands_in_its_place(gaps):
     robot = paper_robots.nominal()
-    coordinates = priors.coordinates(robot, priors.default_names(["6T2A", "4W2T"], robot))
-    sd = noise.from_table(gaps, observers.kind(gaps).sizes(gaps), "current=9%,speed=4%").sd
-    posed = observers.pose(gaps, robot, coordinates, sd)
+    coordinates = priors.parameter_coordinates(robot, priors.default_names(["6T2A", "4W2T"], robot))
+    sd = noise.noise_from_table(gaps, observers.observer_kind(gaps).sizes(gaps), "current=9%,speed=4%").sd
+    posed = observers.pose_problem(gaps, robot, coordinates, sd)
     starts = 0.3 * jnp.ones((5, len(coordinates)))  # as many as `found_with_gaps` compiled
     lost = jnp.isnan(gaps.measured())
     assert lost.sum() == 22
     ends = [
-        fit.searches(posed, starts, dataclasses.replace(posed.data, measured=posed.data.measured + number * lost))[0]
+        fit.search_starts(
+            posed, starts, dataclasses.replace(posed.data, measured=posed.data.measured + number * lost)
+        )[0]
         for number in (0.0, 1e6)
     ]
     np.testing.assert_array_equal(ends[0].z, ends[1].z)
@@ -484,7 +486,9 @@ def test_a_robot_with_a_configuration_of_its_own_calibrates_from_its_file_alone(
     creep = "rover.ground.friction.speed_static"
     truth = robot_file.change(rover, {creep: 0.05}, where="test")
     shown = steady_batch(truth, conditions.conditions(truth))
-    runs = changed(conditions, **{c.column: np.asarray(shown.reading[c.name]) / c.factor for c in channels.usual()})
+    runs = changed(
+        conditions, **{c.column: np.asarray(shown.reading[c.name]) / c.factor for c in channels.usual_channels()}
+    )
     made = quick(runs, rover, noise="current=1%,motor_speed=0.5%,speed=1%")
     assert set(made.parameters) == {f"rover.{name}" for name in priors.FRICTION}
     low, high = made.parameters[creep].interval

@@ -47,7 +47,7 @@ def seen(base):
 def made(seen):
     """The table of those runs."""
     conditions, runs = seen
-    columns = {c.column: np.asarray(runs.result.reading[c.name]) / c.factor for c in channels.usual()}
+    columns = {c.column: np.asarray(runs.result.reading[c.name]) / c.factor for c in channels.usual_channels()}
     return dataclasses.replace(conditions, source="made", columns={**conditions.columns, **columns})
 
 
@@ -57,13 +57,13 @@ def test_the_share_of_the_guides_is_what_the_track_model_puts_out(seen):
 
 
 def test_in_track_the_guide_friction_stands_for_the_product(base):
-    names = priors.default_names(["6T2A", "4W2T"], base, computed=fidelities.facts("track").computes)
+    names = priors.default_names(["6T2A", "4W2T"], base, computed=fidelities.fidelity_facts("track").computes)
     assert GUIDE_FRICTION in names and GUIDE_SHARE not in names and len(names) == 11
-    turned, known = priors.guided(base, "6T2A")
-    fields, mean = priors.known(turned), known[GUIDE_FRICTION][0]
+    turned, known = priors.with_guide_share(base, "6T2A")
+    fields, mean = priors.parameters_by_name(turned), known[GUIDE_FRICTION][0]
     assert float(fields[GUIDE_SHARE].value) == GUIDED
     assert mean * GUIDED == pytest.approx(0.2 * 0.3)  # of the nominal robot in the other fidelities
-    assert priors.known(base)[GUIDE_SHARE].value == 0.3
+    assert priors.parameters_by_name(base)[GUIDE_SHARE].value == 0.3
     assert "free guide_friction there" in table_words.would_measure(GUIDE_SHARE)
 
 
@@ -81,19 +81,19 @@ def found(base, made, told):
 @pytest.fixture(scope="module")
 def posed(base, made):
     """The problem that `found` solves."""
-    guided, known = priors.guided(base, "6T2A")
-    coordinates = priors.coordinates(guided, [GUIDE_FRICTION, STATIC], known)
-    sd = noise_room.from_table(made, observers.kind(made).sizes(made), STATED).sd
-    return observers.pose(made, guided, coordinates, sd, "track")
+    guided, known = priors.with_guide_share(base, "6T2A")
+    coordinates = priors.parameter_coordinates(guided, [GUIDE_FRICTION, STATIC], known)
+    sd = noise_room.noise_from_table(made, observers.observer_kind(made).sizes(made), STATED).sd
+    return observers.pose_problem(made, guided, coordinates, sd, "track")
 
 
 @pytest.mark.nightly
 @pytest.mark.slow
 def test_jacobian_through_the_rollout_is_the_central_difference(posed):
     at, step = jnp.asarray([0.5, -0.5]), 1e-4
-    _, jacobian, seen = fit.linearised(posed, at, posed.data)
+    _, jacobian, seen = fit.linearise(posed, at, posed.data)
     assert (np.asarray(seen.status) == CONVERGED).all()
-    moved = [[fit.linearised(posed, at + s * e, posed.data)[0] for s in (step, -step)] for e in np.eye(2)]
+    moved = [[fit.linearise(posed, at + s * e, posed.data)[0] for s in (step, -step)] for e in np.eye(2)]
     central = np.stack([(up - down) / (2 * step) for up, down in moved], 1)
     np.testing.assert_allclose(jacobian, central, rtol=0.01, atol=1e-4 * np.abs(central).max())
     assert (np.abs(jacobian[:6]).max(0) > 0.1).all()  # both move the readings
@@ -125,7 +125,7 @@ def test_the_robot_says_the_same_in_the_other_fidelities(found, made):
 def test_a_belt_too_stiff_for_the_step_is_said(base, made):
     """Friction and contacts are implicit in a step, the springs of the belt are not."""
     stiff = params.replace(base, {"running_gear.span_stiffness": jnp.asarray(1e8)})
-    (said,) = fidelities.get("track").cautions(stiff, made.conditions(stiff))
+    (said,) = fidelities.get_fidelity("track").cautions(stiff, made.conditions(stiff))
     assert said.startswith("rows 1, 2")
     assert "the track model's step of 0.0001 s is above the largest stable one" in said
 

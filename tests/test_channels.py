@@ -81,10 +81,10 @@ def bench(tmp_path):
 
 def calibrated(runs, robot):
     """A calibration's result of these runs, without the fit: what is written of readings is read from it."""
-    observe, measured, sd = observers.kind(runs).of(runs, robot), runs.measured(), runs.deviations()
+    observe, measured, sd = observers.observer_kind(runs).of(runs, robot), runs.measured(), runs.deviations()
     known = {
-        "robot": robot, "channels": runs.channels, "held_out": {}, "conditions": estimates.conditions(type(observe), runs),
-        "readings": estimates.readings(runs.channels, measured, sd, measured, measured),
+        "robot": robot, "channels": runs.channels, "held_out": {}, "conditions": estimates.condition_columns(type(observe), runs),
+        "readings": estimates.readings_by_channel(runs.channels, measured, sd, measured, measured),
         "status": np.full(len(runs), "converged"),
     }  # fmt: skip
     return CalibrationResult(**{**dict.fromkeys(f.name for f in dataclasses.fields(CalibrationResult)), **known})
@@ -105,21 +105,21 @@ def discovered(runs):
 
 
 def test_a_robot_has_the_channels_of_its_rig(bench):
-    assert channels.names(bench.channels) == TORQUE
-    assert channels.names(mm.nominal().channels) == channels.USUAL  # whatever was read before
-    assert channels.index("output_torque", bench.channels) == 2
+    assert channels.channel_names(bench.channels) == TORQUE
+    assert channels.channel_names(mm.nominal().channels) == channels.USUAL  # whatever was read before
+    assert channels.channel_index("output_torque", bench.channels) == 2
     with pytest.raises(KeyError, match="no channel speed; there are total_current, motor_speed, output_torque"):
-        channels.index("speed", bench.channels)
+        channels.channel_index("speed", bench.channels)
     with pytest.raises(KeyError, match="no channel torque; there are total_current, "):
-        channels.rows(("speed", "torque"))
-    assert channels.names(channels.rows(reversed(TORQUE))) == TORQUE  # in the order of the table
+        channels.channels_named(("speed", "torque"))
+    assert channels.channel_names(channels.channels_named(reversed(TORQUE))) == TORQUE  # in the order of the table
     assert pickle.loads(pickle.dumps(bench.channels)) == bench.channels and len({bench.channels, bench.channels}) == 1
 
 
 @pytest.mark.parametrize("unit", [None, "mNm"])
 def test_a_reading_keeps_its_column_and_size_from_file_to_result(tmp_path, bench, unit):
     runs = calibration.read_runs(written(tmp_path / "t.csv", made_up(bench, unit)), robot=bench)
-    assert channels.names(runs.channels) == TORQUE and runs.unknown == ()
+    assert channels.channel_names(runs.channels) == TORQUE and runs.unknown == ()
     np.testing.assert_allclose(runs.measured()[:, 2], FIRST + 2 + np.arange(12.0), rtol=1e-12)
     np.testing.assert_allclose(runs.deviations()[:, 2], 0.03, rtol=1e-12)
     np.testing.assert_allclose(runs.measured()[:, 1], (FIRST + 1 + np.arange(12.0)) * channels.RPM, rtol=1e-12)
@@ -134,13 +134,13 @@ def test_a_reading_keeps_its_column_and_size_from_file_to_result(tmp_path, bench
 def test_noise_is_of_the_channels_of_a_table(tmp_path, bench):
     columns = {c: x for c, x in made_up(bench).items() if "_sd_" not in c}
     runs = calibration.read_runs(written(tmp_path / "t.csv", columns), robot=bench)
-    sizes = observers.kind(runs).sizes(runs)
-    known = noise.inferred(runs, sizes, "output_torque=0.05Nm")
+    sizes = observers.observer_kind(runs).sizes(runs)
+    known = noise.infer_noise(runs, sizes, "output_torque=0.05Nm")
     assert known.source == ("series", "series", "stated") and (known.sd[:, 2] == 0.05).all()
-    assert noise.default(runs.channels) == "current=2%,motor_speed=0.5%,output_torque=1%"
+    assert noise.default_noise(runs.channels) == "current=2%,motor_speed=0.5%,output_torque=1%"
     assert known.scaled({"output_torque": 2.0}).sd[0].tolist() == [*known.sd[0, :2], 0.1]
     with pytest.raises(calibration.data.input_errors.BadConfiguration, match="--noise speed=1%: no such channel"):
-        noise.from_table(runs, sizes, "speed=1%")
+        noise.noise_from_table(runs, sizes, "speed=1%")
 
 
 def test_a_table_without_a_robot_has_every_channel_of_which_it_has_a_column(tmp_path):
@@ -154,12 +154,12 @@ def test_a_table_without_a_robot_has_every_channel_of_which_it_has_a_column(tmp_
     columns |= {"output_torque_mNm": 1e3 * (FIRST + np.arange(12.0)), "output_torque_sd_mNm": np.full(12, 10.0)}
     path = written(tmp_path / "t.csv", columns)
     runs = calibration.read_runs(path)
-    assert channels.names(runs.channels) == (*channels.USUAL, "output_torque") and runs.unknown == ()
+    assert channels.channel_names(runs.channels) == (*channels.USUAL, "output_torque") and runs.unknown == ()
     np.testing.assert_allclose(runs.measured()[:, 3], FIRST + np.arange(12.0), rtol=1e-12)
     assert np.isnan(runs.measured()[:, 1:3]).all() and len(runs.missing()) == 2
     # Of a robot without that channel, read so or used so, its columns are said to be left out.
     for left in (calibration.read_runs(path, robot=mm.nominal()), runs.of(mm.nominal())):
-        assert left.channels == channels.usual() and not left.has("output_torque_Nm")
+        assert left.channels == channels.usual_channels() and not left.has("output_torque_Nm")
         assert len(left.unknown) == 2 and all(name.startswith("output_torque") for name in left.unknown)
         assert set(left.unknown) == set(left.extras)
 
@@ -200,9 +200,16 @@ def test_simulated_runs_have_the_columns_of_their_robot(bench):
 def read_by(robot, path):
     """All that a table says of its readings, as one robot's."""
     runs = calibration.read_runs(path, robot=robot)
-    known = noise.from_table(runs, observers.kind(runs).sizes(runs), None)
+    known = noise.noise_from_table(runs, observers.observer_kind(runs).sizes(runs), None)
     rows = calibrated(runs, robot).rows()
-    return channels.names(runs.channels), runs.measured(), known.sd, known.source, list(rows), list(rows.values())
+    return (
+        channels.channel_names(runs.channels),
+        runs.measured(),
+        known.sd,
+        known.source,
+        list(rows),
+        list(rows.values()),
+    )
 
 
 def same(one, other):

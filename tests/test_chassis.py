@@ -35,7 +35,7 @@ def test_mass_factor_is_that_of_acceleration_without_sliding(robot, wheeled):
     for _ in range(80):
         middle = 0.5 * (low + high)
         state = State(1.5, 300.0, 300.0 / robot.gearbox.ratio * body.radius - middle, 0.0)
-        s = balances.moving(robot, run, state)
+        s = balances.moving_signals(robot, run, state)
         if float(s.acceleration) < float(body.radius * s.acceleration_wheel):
             low = middle
         else:
@@ -51,8 +51,8 @@ def test_mass_factor_is_that_of_acceleration_without_sliding(robot, wheeled):
 
 def test_total_mass_stated_overrides_robot_and_payload(robot):
     state = State(0.0, 0.0, 0.0, 0.0)
-    assert float(balances.begin(robot, Conditions(payload=3.0), state).mass) == pytest.approx(16.1, rel=1e-15)
-    assert float(balances.begin(robot, Conditions(payload=3.0, total_mass=20.0), state).mass) == 20.0
+    assert float(balances.begin_signals(robot, Conditions(payload=3.0), state).mass) == pytest.approx(16.1, rel=1e-15)
+    assert float(balances.begin_signals(robot, Conditions(payload=3.0, total_mass=20.0), state).mass) == 20.0
 
 
 def test_table7_motor_side_is_the_reflected_rotor(robot):
@@ -62,5 +62,5 @@ def test_table7_motor_side_is_the_reflected_rotor(robot):
 
 
 def test_masses_are_table7(robot):
-    values = {p.name: float(p.value) for p in params.walk(robot)}
+    values = {p.name: float(p.value) for p in params.walk_parameters(robot)}
     assert (values["6T2A.mass"], values["4W2T.mass"]) == (13.1, 11.5)

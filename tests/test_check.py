@@ -19,7 +19,7 @@ from calibration.data import requirements_file, robot_file
 from calibration.data.input_errors import BadConfiguration
 from calibration.sizing import sheet
 from mmrjax.climbing import resting_posture
-from mmrjax.derived.requirements import CUT_OFF, QUANTITIES, Point, evaluate, packed, ratings
+from mmrjax.derived.requirements import CUT_OFF, QUANTITIES, EnvelopePoint, evaluate_requirement, ratings, with_cells
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
@@ -128,7 +128,9 @@ def test_every_change_meets_its_requirement_and_breaks_what_it_says(folder, resu
     for k, r in enumerate(result["requirements"]):
         assert bool(r["change"]) <= (not r["met"])
         for c in r["change"]:
-            outcomes = sheet.check(robot_file.change(robot, {c["parameter"]: c["to"]}, "test"), asked, changes=False)
+            outcomes = sheet.check_requirements(
+                robot_file.change(robot, {c["parameter"]: c["to"]}, "test"), asked, changes=False
+            )
             assert outcomes[k].met, (r["name"], c)
             before = [x["met"] for x in result["requirements"]]
             broken = {n for n, b, o in zip(names, before, outcomes, strict=True) if b and not o.met}
@@ -137,7 +139,9 @@ def test_every_change_meets_its_requirement_and_breaks_what_it_says(folder, resu
                 1 if c["parameter"] == "battery.cells" else 0.002 * c["to"]
             )
             alone = dataclasses.replace(asked, each=(asked.each[k],))
-            (short,) = sheet.check(robot_file.change(robot, {c["parameter"]: near}, "test"), alone, changes=False)
+            (short,) = sheet.check_requirements(
+                robot_file.change(robot, {c["parameter"]: near}, "test"), alone, changes=False
+            )
             assert not short.met, (r["name"], c, near)
             tried += 1
     assert tried > (8 if len(names) > 5 else 1)
@@ -158,7 +162,9 @@ def point(**given):
         "configuration": 0, "adhesion": 1.0, "adhesion_lateral": 1.0, "battery": 1.0, "charge": 1.0, "charge_end": 0.0, "share": 0.0,
         "slope_deg": 0.0, "payload": 0.0, "ambient": 25.0, "tread": 0.29,
     }  # fmt: skip
-    return Point(**{k: jnp.asarray(v, int if k == "configuration" else float) for k, v in {**usual, **given}.items()})
+    return EnvelopePoint(
+        **{k: jnp.asarray(v, int if k == "configuration" else float) for k, v in {**usual, **given}.items()}
+    )
 
 
 @pytest.mark.nightly
@@ -190,12 +196,14 @@ def test_derivatives_are_differences(robot, name):
         "battery.current_other",
         "6T2A.ground.friction.static",
     )
-    known = {p.name: float(p.value) for p in params.walk(robot)}
+    known = {p.name: float(p.value) for p in params.walk_parameters(robot)}
     theta = jnp.asarray([known[n] for n in given])
 
     @jax.jit
     def value(theta):
-        return evaluate(params.replace(robot, dict(zip(given, theta, strict=True))), at, ratings(robot), name).value
+        return evaluate_requirement(
+            params.replace(robot, dict(zip(given, theta, strict=True))), at, ratings(robot), name
+        ).value
 
     exact = np.asarray(jax.grad(value)(theta))
     for k in range(len(given)):
@@ -208,7 +216,7 @@ def test_derivatives_are_differences(robot, name):
 
 def test_a_robot_slides_or_tips_across_a_slope(robot):
     def side(robot, **given):
-        return float(evaluate(robot, point(**given), ratings(robot), "side_slope_deg").value)
+        return float(evaluate_requirement(robot, point(**given), ratings(robot), "side_slope_deg").value)
 
     chassis = robot.configurations["6T2A"]
     friction, rolling = float(chassis.ground.friction.static), float(chassis.ground.rolling_resistance)
@@ -224,7 +232,7 @@ def test_a_robot_slides_or_tips_across_a_slope(robot):
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "left"), [("turn_in_place_rad_s", -1.0), ("turning_radius_mm", 0.0)])
 def test_turns_that_are_asked_for_are_those_that_settle(robot, name, left):
-    found = evaluate(robot, point(battery=0.0, charge=24.0, payload=3.0), ratings(robot), name)
+    found = evaluate_requirement(robot, point(battery=0.0, charge=24.0, payload=3.0), ratings(robot), name)
     runs = Conditions([0], voltage=24.0, payload=3.0, duty_left=left, duty_right=1.0).resolved(robot)
     reading = steady_batch(robot, runs).reading
     rate, *rolls = (float(reading[name][0]) for name in ("yaw_rate", "speed", "lateral_speed"))
@@ -235,7 +243,7 @@ def test_turns_that_are_asked_for_are_those_that_settle(robot, name, left):
 def test_cells_as_a_number_are_the_batterys_cells(robot):
     other = dataclasses.replace(robot, battery=dataclasses.replace(robot.battery, cells=11))
     for current, discharge in ((0.0, 0.0), (5.0, 4000.0)):
-        assert packed(robot, 11.0).battery.voltage(current, discharge) == pytest.approx(
+        assert with_cells(robot, 11.0).battery.voltage(current, discharge) == pytest.approx(
             float(other.battery.voltage(current, discharge)), rel=1e-12
         )
 
@@ -244,7 +252,7 @@ def test_cells_as_a_number_are_the_batterys_cells(robot):
 def test_endurance_is_the_integral_over_the_charge(robot):
     """Against the trapezoidal rule over 2000 operating points."""
     at = point(share=0.5)
-    found = eqx.filter_jit(evaluate)(robot, at, ratings(robot), "endurance_min")
+    found = eqx.filter_jit(evaluate_requirement)(robot, at, ratings(robot), "endurance_min")
     charge = np.linspace(0, float(robot.battery.capacity) * (1 - 1e-9), 2001)
     runs = steady_batch(robot, Conditions(0, battery=1.0, discharge=charge))
     flowing = 0.5 * np.asarray(runs.total_current) + 1.5
@@ -257,12 +265,12 @@ def test_endurance_is_the_integral_over_the_charge(robot):
 @pytest.mark.slow
 def test_points_without_value_are_missed_in_words(robot, tmp_path, capsys):
     """What slides or stalls has no value: missed, with the status in words and no NaN anywhere."""
-    slides = evaluate(robot, point(slope_deg=16.0), ratings(robot), "speed_m_s")
+    slides = evaluate_requirement(robot, point(slope_deg=16.0), ratings(robot), "speed_m_s")
     assert int(slides.outcome) == SLIDES
     weak = params.replace(robot, {"gearbox.ratio": 2.0})
-    assert int(evaluate(weak, point(slope_deg=10.0), ratings(weak), "speed_m_s").outcome) == STALLED
+    assert int(evaluate_requirement(weak, point(slope_deg=10.0), ratings(weak), "speed_m_s").outcome) == STALLED
     low = dataclasses.replace(robot, battery=dataclasses.replace(robot.battery, voltage_cutoff=3.4))
-    assert int(evaluate(low, point(charge=0.0), ratings(low), "speed_m_s").outcome) == CUT_OFF
+    assert int(evaluate_requirement(low, point(charge=0.0), ratings(low), "speed_m_s").outcome) == CUT_OFF
     file = tmp_path / "steep.toml"
     file.write_text("speed_m_s = 0.5\nwinding_C = 100\n[envelope]\nslope_deg = [0, 16]\n")
     assert command(["check", file, "--out", tmp_path / "run", "--no-changes"]) == 0
@@ -375,7 +383,7 @@ def test_what_no_robot_can_do_is_refused(robot, tmp_path, capsys):
         "mmrjax: r.toml, speed_m_s: the envelope's slope_deg goes up to 20; lacquered_wood holds 6T2A up to "
         f"{steepest:.1f} deg at most (adhesion 0.32), whatever drives it\n"
     )
-    sheet.refuse(robot, read('speed_m_s = 1\n[envelope]\nslope_deg = 20\nsurface = "concrete"'))
+    sheet.refuse_impossible(robot, read('speed_m_s = 1\n[envelope]\nslope_deg = 20\nsurface = "concrete"'))
     file.write_text('speed_m_s = 1\n[envelope]\nconfiguration = "4W2"\n')
     assert command(["check", file, "--out", tmp_path / "run"]) == 2
     assert "the robot has no configuration 4W2; did you mean 4W2T?" in capsys.readouterr().err
@@ -385,11 +393,11 @@ def test_what_no_robot_can_do_is_refused(robot, tmp_path, capsys):
 
 
 def test_rated_is_what_the_parts_permit(robot):
-    asked = sheet.rated(robot, read("winding_C = 'rated'\nmotor_speed_rpm = { most = 'rated' }"))
+    asked = sheet.with_ratings(robot, read("winding_C = 'rated'\nmotor_speed_rpm = { most = 'rated' }"))
     assert [r.limit for r in asked.each] == pytest.approx([125.0, 12000.0])
     robot = dataclasses.replace(robot, gearbox=dataclasses.replace(robot.gearbox, torque_limit=None))
     with pytest.raises(BadConfiguration, match=r"^r.toml, gearbox_Nm: the robot states no rating; state a number$"):
-        sheet.rated(robot, read("gearbox_Nm = 'rated'"))
+        sheet.with_ratings(robot, read("gearbox_Nm = 'rated'"))
 
 
 def test_contradictions_are_those_of_one_use():
@@ -413,7 +421,7 @@ payload_kg = [0, 8]
 @pytest.fixture(scope="module")
 def of_posture(robot):
     asked = requirements_file.read(OF_POSTURE, "posture.toml")
-    return {o.requirement.name: o for o in sheet.check(robot, asked, changes=False)}
+    return {o.requirement.name: o for o in sheet.check_requirements(robot, asked, changes=False)}
 
 
 @pytest.mark.slow
@@ -429,12 +437,12 @@ def test_steps_and_sizes_of_section_2_2(of_posture):
 @pytest.mark.slow
 def test_longer_levers_would_get_over_the_step(robot):
     alone = requirements_file.read("step_mm = 300\n[envelope]\npayload_kg = [0, 8]\n", "posture.toml")
-    (found,) = sheet.check(robot, alone)
+    (found,) = sheet.check_requirements(robot, alone)
     (longer,) = (c for c in found.change if c.parameter == "running_gear.lever_length")
     assert longer.before == pytest.approx(0.205) and longer.after == pytest.approx(0.259, abs=0.002)
     assert longer.gradient > 0 and longer.breaks == ()
     changed = params.replace(robot, {"running_gear.lever_length": longer.after})
-    assert sheet.check(changed, alone, changes=False)[0].met
+    assert sheet.check_requirements(changed, alone, changes=False)[0].met
 
 
 @pytest.mark.slow
@@ -443,13 +451,15 @@ def test_stairs_need_friction_reach_and_a_tread(robot):
     text = 'stairs_rise_mm = {{ least = 170, tread_mm = 290, surface = "{}" }}'
 
     def rise(surface):
-        (found,) = sheet.check(robot, requirements_file.read(text.format(surface), "stairs.toml"), changes=False)
+        (found,) = sheet.check_requirements(
+            robot, requirements_file.read(text.format(surface), "stairs.toml"), changes=False
+        )
         assert found.at["tread_mm"] == 290 and not found.met
         return found.value
 
     friction = float(robot.configurations["6T2A"].ground.friction.static)
     assert rise("lacquered_wood") == pytest.approx(290 * friction, rel=1e-6)
-    rests = resting_posture.level(robot, Conditions(0, levers_front_deg=-8.4707, levers_rear_deg=-8.4707))
+    rests = resting_posture.level_posture(robot, Conditions(0, levers_front_deg=-8.4707, levers_rear_deg=-8.4707))
     reach, high = float(rests.length) / 2, float(rests.centre_height)
     angle = math.atan(rise("asphalt") / 290)
     assert reach - high * math.tan(angle) == pytest.approx(0.29 / math.cos(angle), abs=1e-4)
@@ -468,13 +478,13 @@ def test_derivatives_of_the_highest_step_are_differences(robot):
         "running_gear.centre_height",
         "6T2A.radius",
     )
-    known = {p.name: float(p.value) for p in params.walk(robot)}
+    known = {p.name: float(p.value) for p in params.walk_parameters(robot)}
     theta = jnp.asarray([known[n] for n in given])
 
     @jax.jit
     def value(theta):
         made = params.replace(robot, dict(zip(given, theta, strict=True)))
-        return evaluate(made, point(payload=3.0), ratings(robot), "step_mm").value
+        return evaluate_requirement(made, point(payload=3.0), ratings(robot), "step_mm").value
 
     exact = np.asarray(jax.jit(jax.grad(value))(theta))
     for k in range(len(given)):
@@ -483,10 +493,10 @@ def test_derivatives_of_the_highest_step_are_differences(robot):
 
 
 def test_posture_of_a_robot_that_states_no_running_gear_is_not_known(robot):
-    gear = tuple(p.name for p in params.walk(robot) if p.name.startswith("running_gear."))
+    gear = tuple(p.name for p in params.walk_parameters(robot) if p.name.startswith("running_gear."))
     bare = dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, unknown=gear))
     with pytest.raises(BadConfiguration, match="step_mm: the robot's file states no running_gear"):
-        sheet.refuse(bare, requirements_file.read("step_mm = 100", "posture.toml"))
+        sheet.refuse_impossible(bare, requirements_file.read("step_mm = 100", "posture.toml"))
 
 
 def test_heat_that_the_file_does_not_state_is_asked_for(tmp_path, capsys):

@@ -12,7 +12,7 @@ import pytest
 
 from mmrjax.climbing import climb_simulation as climb
 from mmrjax.climbing import footing, resting_posture, static_limits, terrain
-from mmrjax.climbing.climb_simulation import LOSSES, SOURCES, Sequence, climb_batch, still, system
+from mmrjax.climbing.climb_simulation import LOSSES, SOURCES, Sequence, climb_batch, climb_system, constant_angles
 from mmrjax.fidelities.steady import steady
 from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
@@ -44,10 +44,10 @@ def batch(runs, robot=ROBOT, **options):
 def first_second():
     """Onto a step, and against a wall; a member without numbers and one with levers in the ground beside them."""
     runs = [
-        (terrain.step(0.05, size=SIZE), (45, 20), (-8.4, -60), 24),
-        (terrain.step(0.25, size=SIZE), (45, 80), (-8.4, -60), 24),
-        (terrain.step(np.nan, size=SIZE), 45, 180, 24),
-        (terrain.step(0.05, size=SIZE), -30, 180, 24),
+        (terrain.single_step(0.05, size=SIZE), (45, 20), (-8.4, -60), 24),
+        (terrain.single_step(0.25, size=SIZE), (45, 80), (-8.4, -60), 24),
+        (terrain.single_step(np.nan, size=SIZE), 45, 180, 24),
+        (terrain.single_step(0.05, size=SIZE), -30, 180, 24),
     ]
     return batch(runs, duration=0.64, part=0.64)
 
@@ -80,7 +80,7 @@ def test_energy_in_is_stored_and_lost_at_every_instant_and_a_failed_member_harms
 def test_a_margin_is_of_contacts_that_carry_the_robot():
     """Of what grazes the ground in a fall, or touches nothing, there is none."""
     base = jnp.array([[0.2, 0.1], [0.2, -0.1], [0.2, -0.1], [-jnp.inf, -jnp.inf]])
-    shown = climb.Passed.margin.fget(SimpleNamespace(base=base, carried=jnp.array([1.0, 0.9, 0.4, 1.0])))
+    shown = climb.ClimbRecord.margin.fget(SimpleNamespace(base=base, carried=jnp.array([1.0, 0.9, 0.4, 1.0])))
     np.testing.assert_allclose(shown, [0.1, -0.1, jnp.nan, jnp.nan])
 
 
@@ -105,17 +105,19 @@ def test_parts_of_a_run_follow_on_each_other_and_end_with_it(monkeypatch, durati
 
 
 def test_samples_have_all_their_steps_each_at_its_time(monkeypatch):
-    run = system(ROBOT, Conditions(0, voltage=6.0).resolved(ROBOT), terrain.flat(), still(0.5, 0.3))
-    motion, energy, progress = climb.begin(run)
-    passed = jax.eval_shape(lambda: climb.advance(run, motion, 0.0, energy)[2])
+    run = climb_system(
+        ROBOT, Conditions(0, voltage=6.0).resolved(ROBOT), terrain.flat_ground(), constant_angles(0.5, 0.3)
+    )
+    motion, energy, progress = climb.begin_climb(run)
+    passed = jax.eval_shape(lambda: climb.advance_climb(run, motion, 0.0, energy)[2])
     passed = jax.tree.map(lambda x: jnp.zeros(x.shape), passed)
 
     def turned(run, motion, time, energy):
         motion = dataclasses.replace(motion, q=motion.q.at[climb.SHAFT].add(1.0))
         return motion, energy, dataclasses.replace(passed, time=time, motion=motion)
 
-    monkeypatch.setattr(climb, "advance", turned)
-    (motion, *_), record = climb.sampled(run, (motion, energy, progress), 0.5, jnp.asarray(3), 2)
+    monkeypatch.setattr(climb, "advance_climb", turned)
+    (motion, *_), record = climb.advance_samples(run, (motion, energy, progress), 0.5, jnp.asarray(3), 2)
     assert motion.q[climb.SHAFT] == 6 and record.motion.q[:, climb.SHAFT].tolist() == [3, 6]
     assert np.asarray(record.time) == pytest.approx(0.5 + climb.STEP * np.array([2, 5]))
 
@@ -123,7 +125,10 @@ def test_samples_have_all_their_steps_each_at_its_time(monkeypatch):
 def test_tracks_of_levers_lose_what_table_3_says_at_their_own_speed():
     """(350 - 70) / 2 mN·m and (16 - 3) / 2 mN·m·s each; all three as one where the levers stand."""
     wheeled, tracked = (
-        system(ROBOT, Conditions(k, voltage=6.0).resolved(ROBOT), terrain.flat(), still(0.5, 0.3)) for k in (1, 0)
+        climb_system(
+            ROBOT, Conditions(k, voltage=6.0).resolved(ROBOT), terrain.flat_ground(), constant_angles(0.5, 0.3)
+        )
+        for k in (1, 0)
     )
     loss = np.asarray(climb._lever_loss(tracked, jnp.array([10.0, -4.0])))
     assert loss == pytest.approx([0.140 + 0.0065 * 10, -0.140 - 0.0065 * 4])
@@ -134,11 +139,13 @@ def test_tracks_of_levers_lose_what_table_3_says_at_their_own_speed():
 
 def test_motors_of_levers_load_the_battery():
     """I_b = I_s + I_p (10), with I_s of all four motors: the voltage falls by 8 x 49 mΩ an ampere."""
-    run = system(ROBOT, Conditions(0, battery=True).resolved(ROBOT), terrain.flat(), still(0.5, 0.3))
-    motion = climb.stand(run)
+    run = climb_system(
+        ROBOT, Conditions(0, battery=True).resolved(ROBOT), terrain.flat_ground(), constant_angles(0.5, 0.3)
+    )
+    motion = climb.stand_before_obstacle(run)
     pulls = dataclasses.replace(motion, drawn=jnp.asarray(10.0))
     none = dict.fromkeys((*SOURCES, *LOSSES), jnp.zeros(()))
-    after = jax.jit(lambda m: climb.advance(run, m, 1.0, none)[::2])
+    after = jax.jit(lambda m: climb.advance_climb(run, m, 1.0, none)[::2])
     volts = [8 * 4.17 - 8 * 0.049 * (1.5 + drawn) for drawn in (0.0, 10.0)]
     (end, passed), (end_pulls, passed_pulls) = after(motion), after(pulls)
     assert [float(p.voltage) for p in (passed, passed_pulls)] == pytest.approx(volts)
@@ -154,8 +161,8 @@ def test_a_positive_voltage_raises_either_lever():
     """Angles are positive up; of the rear pair ψ falls then."""
     volts = jnp.full(2, 6.0)
     asked = Sequence(jnp.arange(2.0), volts, volts, over_time=True, begins=jnp.full(2, 0.5))
-    run = system(ROBOT, Conditions(0, voltage=6.0).resolved(ROBOT), terrain.flat(), asked)
-    swung = climb._swung(run, climb.stand(run), 0.5, 24.0, jnp.zeros(2), run.step * jnp.eye(2))
+    run = climb_system(ROBOT, Conditions(0, voltage=6.0).resolved(ROBOT), terrain.flat_ground(), asked)
+    swung = climb._swung(run, climb.stand_before_obstacle(run), 0.5, 24.0, jnp.zeros(2), run.step * jnp.eye(2))
     assert swung.rate[0] > 0 > swung.rate[1]
     assert np.asarray(swung.voltage) == pytest.approx([6.0, -6.0])
 
@@ -169,14 +176,14 @@ def whole_climbs(runs, **options):
 HEIGHTS = 0.105 + 1e-3 * np.arange(5)
 HOLDS = {"adhesion": 4.0}
 WHOLE = [
-    (terrain.step(0.05, size=POINTS), 45, -8.4, 12),
-    (terrain.step(0.08, size=POINTS), 60, 180, 8, HOLDS),
-    (terrain.step(0.12, size=POINTS), 60, 180, 8, HOLDS),
-    (terrain.step(0.25, size=POINTS), 45, 180, 12),
-    (terrain.step(0.25, size=POINTS), 60, 180, 0.5, {"payload": 8.0}),
+    (terrain.single_step(0.05, size=POINTS), 45, -8.4, 12),
+    (terrain.single_step(0.08, size=POINTS), 60, 180, 8, HOLDS),
+    (terrain.single_step(0.12, size=POINTS), 60, 180, 8, HOLDS),
+    (terrain.single_step(0.25, size=POINTS), 45, 180, 12),
+    (terrain.single_step(0.25, size=POINTS), 60, 180, 0.5, {"payload": 8.0}),
     (terrain.gap(0.6), 0, 0, 12),
     (terrain.gap(0.2), 0, 0, 12),
-    *((terrain.step(height, size=POINTS), 60, 180, 8, HOLDS) for height in HEIGHTS),
+    *((terrain.single_step(height, size=POINTS), 60, 180, 8, HOLDS) for height in HEIGHTS),
 ]
 VERDICTS = ["over", "over", "tips", "slides", "stalls", "tips", "over"]  # into the wide gap head first
 STEPS = 1e-4, 5e-5
@@ -213,9 +220,11 @@ def test_largest_step_is_the_same_to_a_millimetre_with_half_the_step_of_time():
 
 @pytest.mark.slow
 def test_how_a_run_ends_is_read_off_its_motion():
-    run = system(ROBOT, Conditions(0, voltage=6.0).resolved(ROBOT), terrain.step(0.08), still(0.5, 0.3))
-    motion, _, progress = climb.begin(run)
-    _, _, passed = jax.eval_shape(lambda: climb.advance(run, motion, 0.0, climb.begin(run)[1]))
+    run = climb_system(
+        ROBOT, Conditions(0, voltage=6.0).resolved(ROBOT), terrain.single_step(0.08), constant_angles(0.5, 0.3)
+    )
+    motion, _, progress = climb.begin_climb(run)
+    _, _, passed = jax.eval_shape(lambda: climb.advance_climb(run, motion, 0.0, climb.begin_climb(run)[1]))
     passed = jax.tree.map(lambda x: jnp.zeros(x.shape), passed)
 
     def verdict(time=1.0, body=0.0, turned=0.0, **places):
@@ -241,7 +250,7 @@ def test_how_a_run_ends_is_read_off_its_motion():
 def test_dynamics_are_those_of_mujoco():
     """Mass matrix and bias of chassis, pulleys and levers as hinged bodies, at random states."""
     conditions = Conditions(0, voltage=6.0, slope_deg=12.0, payload=5.0).resolved(ROBOT)
-    run = system(ROBOT, conditions, terrain.flat(), still(0.5, 0.3))
+    run = climb_system(ROBOT, conditions, terrain.flat_ground(), constant_angles(0.5, 0.3))
     model = mujoco.MjModel.from_xml_string(_bodies(run, 12.0))
     data = mujoco.MjData(model)
     random = np.random.default_rng(5)
@@ -251,7 +260,7 @@ def test_dynamics_are_those_of_mujoco():
         mujoco.mj_forward(model, data)
         whole = np.zeros((7, 7))
         mujoco.mj_fullM(model, data, whole)
-        matrix, bias, _ = climb.inertia(run, jnp.asarray(q), jnp.asarray(v))
+        matrix, bias, _ = climb.mass_matrix_and_bias(run, jnp.asarray(q), jnp.asarray(v))
         assert np.asarray(matrix) == pytest.approx(TIES.T @ whole @ TIES, abs=1e-11)
         assert np.asarray(bias) == pytest.approx(TIES.T @ data.qfrc_bias, abs=1e-10)
 
@@ -265,19 +274,19 @@ def beside_mujoco(slope, ground, angles, volts, clear):
     """
     conditions = Conditions(0, voltage=volts, slope_deg=slope, payload=5.0).resolved(ROBOT)
     pairs = (jnp.radians(jnp.array(pair)) for pair in angles)
-    run = system(ROBOT, conditions, ground(), Sequence(jnp.array([0.1, 0.8]), *pairs, over_time=True))
+    run = climb_system(ROBOT, conditions, ground(), Sequence(jnp.array([0.1, 0.8]), *pairs, over_time=True))
     steps = 10_000
 
     @jax.jit
     def driven(run, motion, none):
         def one(motion, k):
-            after = climb.advance(run, motion, k * run.step, none)[0]
-            matrix, bias, _ = climb.inertia(run, motion.q, motion.v)
+            after = climb.advance_climb(run, motion, k * run.step, none)[0]
+            matrix, bias, _ = climb.mass_matrix_and_bias(run, motion.q, motion.v)
             return after, (matrix @ (after.v - motion.v) / run.step + bias, after.q)
 
         return jax.lax.scan(one, motion, jnp.arange(steps))
 
-    start = climb.stand(run, clear)
+    start = climb.stand_before_obstacle(run, clear)
     _, (force, ours) = jax.device_get(driven(run, start, dict.fromkeys((*SOURCES, *LOSSES), jnp.zeros(()))))
     model = mujoco.MjModel.from_xml_string(_bodies(run, slope))
     model.opt.timestep = float(run.step)
@@ -296,7 +305,7 @@ def beside_mujoco(slope, ground, angles, volts, clear):
 @pytest.mark.parametrize("slope", [0.0, 10.0])
 def test_ten_thousand_steps_are_those_of_mujoco_under_the_same_forces(slope):
     """Of a second of driving off and swinging the levers."""
-    _, ours, theirs = beside_mujoco(slope, terrain.flat, ((45.0, 20.0), (-8.4, 30.0)), 12.0, 0.1)
+    _, ours, theirs = beside_mujoco(slope, terrain.flat_ground, ((45.0, 20.0), (-8.4, 30.0)), 12.0, 0.1)
     assert np.abs(ours - theirs).max() < 1e-6
     assert ours[-1, 0] - ours[0, 0] > 0.05 and np.ptp(ours[:, 4]) > 0.3 and np.ptp(ours[:, 5]) > 0.3
 
@@ -304,7 +313,7 @@ def test_ten_thousand_steps_are_those_of_mujoco_under_the_same_forces(slope):
 @pytest.mark.slow
 def test_steps_across_a_corner_are_those_of_mujoco_until_contacts_first_differ():
     """Onto a step, front levers first: which pairs touch is read off the coordinates of each."""
-    ground = functools.partial(terrain.step, 0.06)
+    ground = functools.partial(terrain.single_step, 0.06)
     run, ours, theirs = beside_mujoco(0.0, ground, ((45.0, 45.0), (-8.4, -8.4)), 24.0, 0.01)
 
     def touching(q):
@@ -348,7 +357,12 @@ def _bodies(run, slope):
 
 def test_rates_of_all_gaps_are_the_derivatives_of_the_gaps():
     """Each contact moves as its distance changes, so that elastic contacts keep what they store."""
-    run = system(ROBOT, Conditions(0, voltage=6.0).resolved(ROBOT), terrain.step(0.08, nose=0.01), still(0.5, 0.3))
+    run = climb_system(
+        ROBOT,
+        Conditions(0, voltage=6.0).resolved(ROBOT),
+        terrain.single_step(0.08, nose=0.01),
+        constant_angles(0.5, 0.3),
+    )
     q = jnp.array([-0.12, 0.075, -0.2, 1.3, 0.6, 3.4])
     v = jnp.array([0.3, -0.2, 0.7, 2.0, 0.4, -0.5])
 
@@ -367,16 +381,20 @@ def test_rates_of_all_gaps_are_the_derivatives_of_the_gaps():
 def test_polyline_of_constant_slope_is_tilted_gravity():
     angle = np.radians(10.0)
     conditions = [Conditions(0, voltage=10.0, slope_deg=slope).resolved(ROBOT) for slope in (0.0, 10.0)]
-    grounds = terrain.slope(angle), terrain.flat()
-    raised, level = (system(ROBOT, *of, still(np.pi, np.pi)) for of in zip(conditions, grounds, strict=True))
-    start = climb.stand(level)
+    grounds = terrain.inclined_ground(angle), terrain.flat_ground()
+    raised, level = (
+        climb_system(ROBOT, *of, constant_angles(np.pi, np.pi)) for of in zip(conditions, grounds, strict=True)
+    )
+    start = climb.stand_before_obstacle(level)
     cos, sin = np.cos(angle), np.sin(angle)
     x, z = (float(a) for a in start.q[:2])
 
     @jax.jit
     def end(sys_, motion):
         none = dict.fromkeys((*SOURCES, *LOSSES), jnp.zeros(()))
-        return jax.lax.fori_loop(0, 500, lambda k, m: climb.advance(sys_, m, 1.0 + k * sys_.step, none)[0], motion)
+        return jax.lax.fori_loop(
+            0, 500, lambda k, m: climb.advance_climb(sys_, m, 1.0 + k * sys_.step, none)[0], motion
+        )
 
     tilted = end(level, start)
     q = start.q.at[0].set(x * cos - z * sin).at[1].set(x * sin + z * cos).at[2].set(-angle)
@@ -396,20 +414,20 @@ def test_level_ground_is_travelled_as_settled_balances_have_it():
     `track`, whose belt yields, has another share and another ripple, and so other means (docs/explanation/climbing.md).
     """
     conditions = Conditions(0, voltage=15.0, slope_deg=5.0).resolved(ROBOT)
-    run = system(ROBOT, conditions, terrain.flat(), still(np.pi, np.pi))
+    run = climb_system(ROBOT, conditions, terrain.flat_ground(), constant_angles(np.pi, np.pi))
     none = dict.fromkeys((*SOURCES, *LOSSES), jnp.zeros(()))
 
     @jax.jit
     def driven(motion, first):
         def one(motion, k):
-            after, _, passed = climb.advance(run, motion, first + k * run.step, none)
+            after, _, passed = climb.advance_climb(run, motion, first + k * run.step, none)
             at = footing.footing(run.shape, run.terrain, motion.q, motion.v)
             load = jnp.stack([jnp.sum(at.guided * at.force), jnp.sum(at.force)])
             return after, (motion.q[3], passed.current, motion.v[0], load)
 
         return jax.lax.scan(one, motion, jnp.arange(9000))
 
-    motion, _ = driven(climb.stand(run), 0.0)
+    motion, _ = driven(climb.stand_before_obstacle(run), 0.0)
     _, (turned, *found) = jax.device_get(driven(motion, 0.9))
     pitch = float(run.shape.main.pitch / run.shape.main.first)
     whole = np.searchsorted(turned, turned[0] + pitch * np.floor((turned[-1] - turned[0]) / pitch))
@@ -424,14 +442,16 @@ def test_level_ground_is_travelled_as_settled_balances_have_it():
 def test_pairs_of_the_paper_s_full_model_are_counted_on_the_belts_of_its_geometry():
     """1680 (Section 3.4.5): grousers on the ground and teeth on two guides, of two main and four levers' belts. The climb
     resolves the grousers alone, each beside corners of the ground; its teeth run rigidly."""
-    run = system(ROBOT, Conditions(0, voltage=6.0).resolved(ROBOT), terrain.flat(), still(0.5, 0.3))
+    run = climb_system(
+        ROBOT, Conditions(0, voltage=6.0).resolved(ROBOT), terrain.flat_ground(), constant_angles(0.5, 0.3)
+    )
     pairs = {}
     for name, belt, count in (("main", run.shape.main, 2), ("lever", run.shape.lever, 4)):
         teeth = round(float(belt.length) / PITCH_TOOTH)
         assert float(belt.length) == pytest.approx(teeth * PITCH_TOOTH, abs=1e-3)
         pairs[name] = count * belt.grousers, count * 2 * teeth
     assert sum(pairs["main"]) == 720 and sum(pairs["main"]) + sum(pairs["lever"]) == 1680
-    at = footing.footing(run.shape, run.terrain, climb.stand(run).q, jnp.zeros(6))
+    at = footing.footing(run.shape, run.terrain, climb.stand_before_obstacle(run).q, jnp.zeros(6))
     # grousers of one side, then what corners of a terrain and wheels meet
     tips = (pairs["main"][0] + pairs["lever"][0]) // 2
     near = np.abs(np.asarray(at.gap)) < 1.0
@@ -446,7 +466,7 @@ def lowest(run, q):
 
 def leant(run, pitch):
     """Coordinates at a pitch, nose up, with the tail on the lower ground and the robot against the edge of a step."""
-    q = climb.stand(run).q.at[2].set(-pitch)
+    q = climb.stand_before_obstacle(run).q.at[2].set(-pitch)
 
     def gap(x, z):
         return float(lowest(run, q.at[0].set(x).at[1].set(z)))
@@ -467,9 +487,9 @@ def nose_up():
     outer, inner = float(ROBOT.radius_pulley + gear.grouser_height), float(ROBOT.radius_pulley)
     front = np.radians(60.0)
     conditions = Conditions(0, voltage=4.0).resolved(ROBOT)
-    run = system(ROBOT, conditions, terrain.flat(), still(front, np.pi))
+    run = climb_system(ROBOT, conditions, terrain.flat_ground(), constant_angles(front, np.pi))
     q = jnp.zeros(6).at[4].set(front).at[5].set(0.0)
-    matrix, *_ = climb.inertia(run, q, jnp.zeros(6))
+    matrix, *_ = climb.mass_matrix_and_bias(run, q, jnp.zeros(6))
     ahead = float(-matrix[1, 2] / matrix[0, 0]) + float(gear.wheelbase) / 2
     up = float(matrix[0, 2] / matrix[0, 0])
     theta = np.radians(np.linspace(5, 70, 400))
@@ -482,34 +502,40 @@ def nose_up():
 def test_static_limits_of_steps_and_gaps_are_those_of_the_dynamics():
     """Slow, on a ground that holds. A robot that leans on a step with its rear levers flush gets over where the centre
     of mass comes over the edge: under the tips of grousers at the least, between two of them at the most."""
-    flush = float(np.degrees(static_limits.flush(ROBOT)))
+    flush = float(np.degrees(static_limits.flush_lever_angle(ROBOT)))
     runs, starts = [], []
     for payload in (0.0, 8.0):
         of = HOLDS | {"payload": payload}
-        side = resting_posture.outline(
+        side = resting_posture.side_outline(
             ROBOT, Conditions(0, payload=payload, levers_front_deg=180.0, levers_rear_deg=flush).resolved(ROBOT)
         )
-        low = static_limits.step(side)
-        high = static_limits.step(dataclasses.replace(side, belt=ROBOT.radius_pulley))
+        low = static_limits.find_highest_step(side)
+        high = static_limits.find_highest_step(dataclasses.replace(side, belt=ROBOT.radius_pulley))
         assert 1e3 * float(low.height) == pytest.approx({0.0: 232, 8.0: 203}[payload], abs=1)
         for height in (float(low.height) - 0.004, float(high.height) + 0.006):
-            ground = terrain.step(height, size=POINTS)
-            run = system(
-                ROBOT, Conditions(0, voltage=4.0, **of).resolved(ROBOT), ground, still(np.pi, np.radians(flush))
+            ground = terrain.single_step(height, size=POINTS)
+            run = climb_system(
+                ROBOT,
+                Conditions(0, voltage=4.0, **of).resolved(ROBOT),
+                ground,
+                constant_angles(np.pi, np.radians(flush)),
             )
             runs.append((ground, 180, flush, 4, of))
             starts.append(leant(run, float(low.pitch) - np.radians(4.0)))
     # a grouser more or less under the edge of a step that it drives up to nose up, and the way that the robot is at
-    grounds = [(terrain.step(nose_up() + d, size=POINTS), 60.0, 180.0) for d in (-0.006, 0.008)]
+    grounds = [(terrain.single_step(nose_up() + d, size=POINTS), 60.0, 180.0) for d in (-0.006, 0.008)]
     # what bridges on both sides of the centre of mass does not fall in; a nose that does may still catch the far edge
     for front, widths in ((180.0, (0.144, 0.21)), (flush, (0.346, 0.38))):
         grounds += [(terrain.gap(width), front, front) for width in widths]
     for ground, front, rear in grounds:
-        run = system(
-            ROBOT, Conditions(0, voltage=4.0).resolved(ROBOT), ground, still(np.radians(front), np.radians(rear))
+        run = climb_system(
+            ROBOT,
+            Conditions(0, voltage=4.0).resolved(ROBOT),
+            ground,
+            constant_angles(np.radians(front), np.radians(rear)),
         )
         runs.append((ground, front, rear, 4, HOLDS))
-        starts.append(climb.stand(run).q)
+        starts.append(climb.stand_before_obstacle(run).q)
     starts += starts[-1:] * (MEMBERS - len(starts))
     zero = np.zeros(len(starts))
     start = climb.Motion(jnp.stack(starts), jnp.zeros((len(starts), 6)), *map(jnp.asarray, (zero, zero, zero)))

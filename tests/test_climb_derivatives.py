@@ -8,37 +8,37 @@ import pytest
 from mmrjax.climbing import climb_derivatives as room
 from mmrjax.climbing import climb_simulation as climb
 from mmrjax.climbing import terrain
-from mmrjax.climbing.climb_simulation import Motion, Passed
+from mmrjax.climbing.climb_simulation import ClimbRecord, Motion
 from mmrjax.fidelities.variation import Variation
 from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.paper_robots import nominal
 
-ROBOT = params.strong(nominal())
+ROBOT = params.without_weak_types(nominal())
 
 
 def test_smoothed_least_is_between_least_and_mean_and_smooth():
     values = jnp.array([0.3, 0.32, 0.9])
-    assert 0.3 < float(room.least(values)) < 0.36 < float(values.mean())
-    assert float(room.least(jnp.full(7, -0.2))) == pytest.approx(-0.2)
-    slopes = jax.grad(room.least)(values)
+    assert 0.3 < float(room.smooth_minimum(values)) < 0.36 < float(values.mean())
+    assert float(room.smooth_minimum(jnp.full(7, -0.2))) == pytest.approx(-0.2)
+    slopes = jax.grad(room.smooth_minimum)(values)
     assert float(slopes.sum()) == pytest.approx(1.0) and slopes[0] > slopes[1] > 1e-2 > slopes[2]
 
 
 def passed(count, place, **other):
     """A record in closed form, samples of 0.5 s with the centre of mass at `place` [m]."""
     zero = jnp.zeros(count)
-    of = {name: zero for name in Passed.__dataclass_fields__}
+    of = {name: zero for name in ClimbRecord.__dataclass_fields__}
     of |= dict(time=0.5 * jnp.arange(count), voltage=zero + 12.0, current=zero + 2.0, centre=jnp.asarray(place))
     of |= dict(energy={"supply": 10.0 * jnp.arange(count), "levers": zero}, lever_current=jnp.zeros((count, 2)))
     of |= dict(motion=Motion(jnp.zeros((count, 6)), jnp.zeros((count, 6)), zero, zero, zero), grip=zero + 0.25)
-    return Passed(**(of | other))
+    return ClimbRecord(**(of | other))
 
 
 def test_margins_are_shares_and_the_crest_is_between_samples():
-    ground, record = terrain.step(0.08), passed(4, [-0.2, -0.1, 0.3, 0.4])
-    crest = room.crest(ground, record, True)
-    found = {name: float(x) for name, x in room.outputs(ROBOT, ground, record, crest).items()}
+    ground, record = terrain.single_step(0.08), passed(4, [-0.2, -0.1, 0.3, 0.4])
+    crest = room.crest_sample(ground, record, True)
+    found = {name: float(x) for name, x in room.climb_outputs(ROBOT, ground, record, crest).items()}
     assert crest == 2 and list(found) == list(room.OUTPUTS)
     assert found["crest_time_s"] == pytest.approx(0.5 + 0.25 * 0.5)
     assert found["crest_energy_J"] == pytest.approx(10 + 0.25 * 10)
@@ -46,7 +46,7 @@ def test_margins_are_shares_and_the_crest_is_between_samples():
     torque = 1 - 2.0 * float(ROBOT.motor.resistance) / 12.0  # of two samples of three: the first is before the start
     assert torque < found["margin_torque"] < torque + 0.05
     assert 0.7 < found["margin_success"] < 0.85
-    short = room.outputs(ROBOT, ground, passed(4, [-0.2, -0.1, -0.06, -0.06]), None)
+    short = room.climb_outputs(ROBOT, ground, passed(4, [-0.2, -0.1, -0.06, -0.06]), None)
     assert float(short["margin_reach"]) == pytest.approx(-0.06 / 0.15) and float(short["margin_success"]) < -0.25
     assert float(short["crest_time_s"]) == 1.5
 
@@ -56,7 +56,9 @@ def given(values):
     base = jax.tree.map(jnp.asarray, Conditions(0, voltage=6.0, adhesion=2.0).resolved(ROBOT))
     robot, conditions = Variation(ROBOT, ("payload",)).at(values[:1], base)
     angles = (jnp.radians(jnp.asarray(x)) for x in (45.0, 180.0))
-    return room.Given(robot, conditions, terrain.step(values[1] / 1000, size=4), climb.still(*angles))
+    return room.ClimbInputs(
+        robot, conditions, terrain.single_step(values[1] / 1000, size=4), climb.constant_angles(*angles)
+    )
 
 
 @pytest.mark.nightly

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from calibration.discovery import clusters
-from calibration.discovery.clusters import cluster
+from calibration.discovery.clusters import find_cluster
 from sweeps.report.words import loop_words as words
 
 ERROR = 0.01
@@ -25,7 +25,7 @@ def found(rows, axes=AXES, levels=LEVELS, error=ERROR, included=None):
     outliers = np.zeros(ROWS, bool)
     outliers[rows] = True
     included = ~outliers if included is None else included
-    return cluster(outliers, included, axes, levels, error, seed=0)
+    return find_cluster(outliers, included, axes, levels, error, seed=0)
 
 
 def drawn(mask, count, seed=1):

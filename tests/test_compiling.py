@@ -19,7 +19,7 @@ from calibration.discovery.settings import settings_for
 from calibration.inference import noise, observers
 from mmrjax import effects
 from mmrjax.compile.compiling import compiled, for_equations
-from mmrjax.effects.scaled import scaled
+from mmrjax.effects.scaled import scaled_effect
 from mmrjax.fidelities.steady import steady
 from mmrjax.model import paper_robots, params
 from mmrjax.model.conditions import Conditions
@@ -31,10 +31,10 @@ def space_of(world, folder):
     rigs.case(world).write(folder)
     robot = robot_file.read(folder / "rig.toml")
     runs = records.read(folder / "table.csv", robot=robot)
-    observer = observers.kind(runs)
-    library = scales.library_for(robot, runs.conditions(robot), effects.BY_NAME)
-    sd = noise.from_table(runs, observer.sizes(runs)).sd
-    return discover.pose(runs, robot, sd, settings_for(observer), library=library)
+    observer = observers.observer_kind(runs)
+    library = scales.library_of_size(robot, runs.conditions(robot), effects.BY_NAME)
+    sd = noise.noise_from_table(runs, observer.sizes(runs)).sd
+    return discover.pose_candidates(runs, robot, sd, settings_for(observer), library=library)
 
 
 @pytest.mark.nightly
@@ -54,7 +54,7 @@ def test_two_rigs_of_one_structure_share_their_programs(tmp_path, kind):
 
 
 def effects_sd(effect):
-    return next(p.spec.prior_sd(0.0) for p in params.walk(effect) if p.spec.amplitude)
+    return next(p.spec.prior_sd(0.0) for p in params.walk_parameters(effect) if p.spec.amplitude)
 
 
 @pytest.mark.slow
@@ -83,7 +83,7 @@ def test_what_equations_read_keeps_programs_apart():
 
 def test_an_effect_of_another_size_is_the_same_to_equations():
     kind = effects.BY_NAME["churning"]
-    wide = scaled(kind, (3.0, 1.0, 3.0))
+    wide = scaled_effect(kind, (3.0, 1.0, 3.0))
     one = wide(amplitude=jnp.asarray(2e-4))
     assert effects_sd(one) == pytest.approx(3 * effects_sd(kind()))
     plain = for_equations(one)
@@ -114,14 +114,14 @@ def test_a_fit_that_ends_above_the_one_it_builds_on_starts_again_there(monkeypat
         return np.array([1.0, 9.0 if scores else 0.0])
 
     monkeypatch.setattr(candidates, "fit_candidates", fit)
-    monkeypatch.setattr(candidates, "start", start)
+    monkeypatch.setattr(candidates, "start_of_fit", start)
     base, space = candidate((), 20.0), SimpleNamespace(free=1)
     for lowest, kept in ((3.0, 3.0), (11.0, 10.0)):
         costs["a", 0, 7] = lowest
-        found = candidates.fit_beside(space, [(("a",), base, "scores"), (("b",), base, "scores")], None)
+        found = candidates.fit_in_addition(space, [(("a",), base, "scores"), (("b",), base, "scores")], None)
         assert [c.cost for c in found] == [kept, 30.0]
         assert asked.pop() == [("b", 1, 0), ("a", 0, 7)] and asked.pop() == [("a", 1, 9), ("b", 1, 9)]
-    assert candidates.fit_beside(space, [], None) == []
+    assert candidates.fit_in_addition(space, [], None) == []
 
 
 def test_two_threads_never_trace_at_once():

@@ -13,7 +13,7 @@ from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
 from mmrjax.undercarriage import contact_sums, half_robot, mjcf, side_contacts
 from mmrjax.undercarriage.belt import Path
-from mmrjax.undercarriage.half_robot import Motion, advance, generalized, instant, system
+from mmrjax.undercarriage.half_robot import Motion, advance, generalized, half_robot_system, instant
 from mmrjax.undercarriage.mjcf import mjx
 
 RUNS = {
@@ -40,14 +40,14 @@ def eventful(recessed):
     ]
     effects = {e.name: e for e in [*chosen, *remembering]}
     robot = dataclasses.replace(recessed, effects=tuple(e() for e in effects.values()))
-    sizes = {p.name: 0.3 * p.spec.prior_sd(0.0) for p in params.walk(robot) if p.spec.amplitude}
+    sizes = {p.name: 0.3 * p.spec.prior_sd(0.0) for p in params.walk_parameters(robot) if p.spec.amplitude}
     return params.replace(robot, {name: jnp.asarray(size) for name, size in sizes.items()})
 
 
 def motion_of(robot, run, k):
     """In mid-run, no two parts alike; which of the contacts slip beyond V_s differs with `k`."""
     draw = np.random.default_rng(k)
-    setup = system(robot, run, STEP)
+    setup = half_robot_system(robot, run, STEP)
     low = float(half_robot.axle_height(setup))
     q = jnp.asarray([0.1, low - 2e-4, 1e-3 * draw.normal(), 0.3 + draw.random(), 0.0])
     q = q.at[4].set(q[3] - 1e-4)
@@ -62,9 +62,9 @@ def motion_of(robot, run, k):
 def test_slopes_of_the_sums_are_their_derivatives_along_a_direction(recessed):
     """Of motion, slip and every constant at once, to 1e-9; three motions, one program each for ours and theirs."""
     run = Conditions(**RUNS["tracked"])
-    setup = system(recessed, run, STEP)
+    setup = half_robot_system(recessed, run, STEP)
     gained = 1e-3 * jnp.asarray([0.3, -1.0, 0.5, 20.0, 30.0])
-    constants = contact_sums.inputs(setup.path, setup.chassis, run.adhesion)
+    constants = contact_sums.contact_inputs(setup.path, setup.chassis, run.adhesion)
 
     @jax.jit
     def both(given, moved):
@@ -91,8 +91,8 @@ def _summed(setup, given, gained):
     chassis = dataclasses.replace(chassis, ground=ground, **own)
     q = jnp.stack([jnp.zeros(()), *(given[n] for n in contact_sums.MOTION[:4])])
     v = jnp.stack([given[n] for n in contact_sums.MOTION[4:]])
-    at = side_contacts.touch(path, chassis, q, v)
-    return contact_sums.shares(path, chassis, at, given["slip"], given["adhesion"], gained).sum(axis=-1)
+    at = side_contacts.contact_state(path, chassis, q, v)
+    return contact_sums.contact_shares(path, chassis, at, given["slip"], given["adhesion"], gained).sum(axis=-1)
 
 
 @pytest.mark.slow
@@ -100,9 +100,9 @@ def _summed(setup, given, gained):
 def test_slopes_of_the_sums_are_their_derivatives(recessed, name):
     """By the motion, the slip and every constant of the contacts, to 1e-9 of the largest of each sum's slopes."""
     run = Conditions(**RUNS[name])
-    setup = system(recessed, run, STEP)
+    setup = half_robot_system(recessed, run, STEP)
     gained = 1e-3 * jnp.asarray([0.3, -1.0, 0.5, 20.0, 30.0])
-    constants = contact_sums.inputs(setup.path, setup.chassis, run.adhesion)
+    constants = contact_sums.contact_inputs(setup.path, setup.chassis, run.adhesion)
     found = jax.jit(lambda x: contact_sums.linearize(setup.path, setup.chassis, x, gained, tuple(constants)))
     derived = jax.jit(jax.jacfwd(lambda x: _summed(setup, x, gained)))
     for k in range(3):
@@ -123,13 +123,15 @@ def pushed():
 
     @eqx.filter_jit
     def both(robot, run, motion):
-        setup = system(robot, run, STEP)
+        setup = half_robot_system(robot, run, STEP)
         signals, _, pulled = instant(setup, motion)
         force, armature = generalized(setup, signals, pulled)
         model = setup.model.replace(dof_armature=armature)
         data = mjx.step(model, setup.data.replace(qpos=motion.q, qvel=motion.v, qfrc_applied=force))
         gained, wheelbase = data.qvel - motion.v, setup.path.gear.wheelbase
-        return force, mjcf.impulse(setup.half, wheelbase, run, motion.q[2], motion.v[2], armature[3], gained, STEP)
+        return force, mjcf.step_impulse(
+            setup.half, wheelbase, run, motion.q[2], motion.v[2], armature[3], gained, STEP
+        )
 
     return both
 
@@ -144,7 +146,7 @@ def test_impulse_is_that_of_mjx(recessed, pushed, name):
 
 
 def _stepped(robot, run, motion, step, forward):
-    return forward(system(robot, run, step), motion)
+    return forward(half_robot_system(robot, run, step), motion)
 
 
 def _as_computed(run, motion):
@@ -218,7 +220,7 @@ def test_derivative_of_a_step_along_a_direction_is_that_of_what_it_computes(rece
         "running_gear.contact_stiffness", "6T2A.track.guide_friction", "6T2A.ground.friction.static", "6T2A.mass",
         "motor.resistance", "gearbox.efficiency_load",
     )  # fmt: skip
-    values = {p.name: jnp.asarray(p.value) for p in params.walk(recessed) if p.name in names}
+    values = {p.name: jnp.asarray(p.value) for p in params.walk_parameters(recessed) if p.name in names}
     at = values, motion_of(recessed, run, 1)
 
     @eqx.filter_jit
@@ -239,7 +241,7 @@ def test_derivative_by_one_parameter_is_that_of_what_is_computed(recessed, name)
     """What else is constant has no derivative to begin with."""
     run = Conditions(**RUNS["tracked"])
     motion = motion_of(recessed, run, 1)
-    value = next(p.value for p in params.walk(recessed) if p.name == name)
+    value = next(p.value for p in params.walk_parameters(recessed) if p.name == name)
 
     @jax.jit
     def both(x):
@@ -261,7 +263,7 @@ def test_second_derivatives_are_those_of_what_is_computed(recessed):
 
     def slope(v, step):
         def after(v):
-            return step(system(recessed, run, STEP), dataclasses.replace(motion, v=v))[0].v
+            return step(half_robot_system(recessed, run, STEP), dataclasses.replace(motion, v=v))[0].v
 
         return jax.jacfwd(jax.jacfwd(after))(v)
 

@@ -47,25 +47,25 @@ def robot(amplitudes=None, kinds=CURVES):
 
 def test_curve_passes_through_its_ordinates():
     x = jnp.linspace(2.0, 7.0, 6)
-    np.testing.assert_allclose(curve.weights(x, 2.0, 7.0), np.eye(6), atol=1e-12)
+    np.testing.assert_allclose(curve.ordinate_weights(x, 2.0, 7.0), np.eye(6), atol=1e-12)
 
 
 def test_curve_is_exact_for_parabolas():
     x, at = np.linspace(2.0, 7.0, 101), np.linspace(2.0, 7.0, 6)
     for power in range(3):
-        np.testing.assert_allclose(curve.weights(x, 2.0, 7.0) @ at**power, x**power, rtol=1e-12)
+        np.testing.assert_allclose(curve.ordinate_weights(x, 2.0, 7.0) @ at**power, x**power, rtol=1e-12)
 
 
 def test_curve_is_level_beyond_its_ends_and_has_no_corner():
     y = jnp.asarray(list(SHAPE.values()))
-    height = jax.jit(jax.vmap(lambda x: curve.weights(x, 2.0, 7.0) @ y))
-    slope = jax.jit(jax.vmap(jax.grad(lambda x: curve.weights(x, 2.0, 7.0) @ y)))
+    height = jax.jit(jax.vmap(lambda x: curve.ordinate_weights(x, 2.0, 7.0) @ y))
+    slope = jax.jit(jax.vmap(jax.grad(lambda x: curve.ordinate_weights(x, 2.0, 7.0) @ y)))
     far = jnp.asarray([-1e6, 0.0, 2.0 - 5 * curve.LEVEL, 7.0 + 5 * curve.LEVEL, 9.0, 1e6])
     assert np.ptp(height(far)[:3]) == np.ptp(height(far)[3:]) == 0 and not np.any(slope(far))
     x = jnp.linspace(1.0, 8.0, 7001)
     assert np.abs(np.diff(slope(x))).max() < 0.03  # 30 a unit at most: no step of the slope
     np.testing.assert_allclose(np.gradient(height(x), x)[1:-1], slope(x)[1:-1], atol=0.01)
-    np.testing.assert_allclose(curve.weights(x, 2.0, 7.0).sum(1), 1.0, rtol=1e-12)
+    np.testing.assert_allclose(curve.ordinate_weights(x, 2.0, 7.0).sum(1), 1.0, rtol=1e-12)
 
 
 # --- the laws -------------------------------------------------------------------------------------------
@@ -145,7 +145,7 @@ def test_a_curve_of_what_shows_magnitudes_is_the_same_in_mirror_image():
     columns = {"order": np.tile(np.arange(9.0), 2), "supply_voltage_V": np.repeat([12.0, -12.0], 9)}
     columns |= {"configuration": np.repeat("6T2A", 18), "slope_deg": np.zeros(18), "payload_kg": np.zeros(18)}
     ways = dict.fromkeys(curve.WAYS, np.repeat([1.0, -1.0], 9))
-    for looked in (curves.families, curves.windows):
+    for looked in (curves.curve_families, curves.window_families):
         (basis,) = (b for b in looked(columns, np.ones(18), robot, None, ways) if b.places[0] in curve.READINGS)
         for (place, _), shapes in zip(basis.names, np.asarray(basis.columns), strict=True):
             np.testing.assert_allclose(shapes[:9], (1 if place == "motor_current" else -1) * shapes[9:])
@@ -174,12 +174,12 @@ def test_curves_are_those_that_the_trace_looks_for():
     assert set(curve.READINGS) == {c.name for c in channels.EVERY} - {*curve.ROUND}  # a heading is no `yaw` moment
     assert set(curve.READ_BY) <= set(curve.READINGS)
     robot = dataclasses.replace(
-        paper_robots.blank(Configurations({"bench": Shaft(inertia=1e-3, loss_coulomb=0.1)})),
+        paper_robots.blank_robot(Configurations({"bench": Shaft(inertia=1e-3, loss_coulomb=0.1)})),
         rig=Rig(channels=("output_torque", "position")),
     )
     columns = {name: np.arange(9.0) for name in ("order", "total_current_A", "motor_speed_rpm")}
     columns |= {"configuration": np.repeat("bench", 9), "supply_voltage_V": np.tile([6.0, 12.0, 24.0], 3)}
-    (basis,) = (b for b in curves.families(columns, np.ones(9), robot) if b.places[0] in curve.READINGS)
+    (basis,) = (b for b in curves.curve_families(columns, np.ones(9), robot) if b.places[0] in curve.READINGS)
     assert set(basis.names) == {("output_torque", "order"), ("output_torque", "current"), ("position", "order")}
     assert all(f"curve_{place}_{over}" in UNNAMED for place, over in basis.names)
 
@@ -197,8 +197,8 @@ def test_robot_with_curves_written_and_read_is_the_same(tmp_path):
     robot_file.write(mine, tmp_path / "robot.toml")
     for library in ({}, effects.BY_NAME):
         again = robot_file.read(tmp_path / "robot.toml", library)
-        assert [(p.name, float(p.value)) for p in params.walk(again)] == [
-            (p.name, float(p.value)) for p in params.walk(mine)
+        assert [(p.name, float(p.value)) for p in params.walk_parameters(again)] == [
+            (p.name, float(p.value)) for p in params.walk_parameters(mine)
         ]
 
 

@@ -16,7 +16,7 @@ import pytest
 
 from mmrjax import SOUND_AT_LEVEL_0, derived
 from mmrjax.compile.compiling import SELDOM
-from mmrjax.compile.programs import compile_by
+from mmrjax.compile.programs import compile_with_options
 from mmrjax.derived import pitch_and_step, start_figures, steepest_slope
 from mmrjax.fidelities.drive import drive
 from mmrjax.fidelities.steady import steady
@@ -37,7 +37,7 @@ def changed(robot, **values):
 
 
 def value(robot, name):
-    return float(next(p.value for p in params.walk(robot) if p.name == name))
+    return float(next(p.value for p in params.walk_parameters(robot) if p.name == name))
 
 
 def function(robot, conditions, compute):
@@ -56,7 +56,7 @@ def differences(f, theta, step):
 @pytest.mark.slow
 def test_table_names_modules_that_compute_them(robot):
     for module in dict.fromkeys(d.module for d in derived.TABLE):
-        made = jax.eval_shape(derived.compute(module), robot, Conditions(0, 24.0))
+        made = jax.eval_shape(derived.compute_function(module), robot, Conditions(0, 24.0))
         assert {d.name for d in derived.TABLE if d.module == module} | {"status"} == set(made)
     assert next(d for d in derived.TABLE if d.name == "steepest_slope").ignores == ("slope_deg",)
 
@@ -104,7 +104,7 @@ def test_steepest_slope_derivatives_are_finite_differences(robot, static, voltag
     theta, f = function(tuned, Conditions(0, voltage, payload=5.0), steepest_slope.compute)
     forward = jax.jacfwd(lambda t: f(t)["steepest_slope"])
     exact = forward(theta)
-    np.testing.assert_allclose(compile_by(jax.jit(forward).lower(theta), SELDOM)(theta), exact, rtol=1e-9)
+    np.testing.assert_allclose(compile_with_options(jax.jit(forward).lower(theta), SELDOM)(theta), exact, rtol=1e-9)
     twice = differences(f, theta, 1e-6)["steepest_slope"]
     np.testing.assert_allclose(exact, twice, rtol=1e-5, atol=1e-4 * np.abs(twice).max())
     np.testing.assert_allclose(jax.jacrev(lambda t: f(t)["steepest_slope"])(theta), exact, rtol=1e-9, atol=1e-9)
@@ -172,17 +172,17 @@ def test_start_of_a_run_that_does_not_settle_has_no_numbers(robot):
 def test_peak_is_the_top_of_a_parabola():
     x = jnp.asarray([0.0, 0.1, 0.3, 0.5, 0.9, 1.0])  # at unequal distances
     top = np.testing.assert_allclose
-    top(start_figures.peak(x, 3 - (x - 0.47) ** 2), 3.0, atol=1e-12)
+    top(start_figures.curve_peak(x, 3 - (x - 0.47) ** 2), 3.0, atol=1e-12)
     top(
-        start_figures.peak(x, jnp.where(x < 0.8, 3 - (x - 0.37) ** 2, jnp.nan)), 3.0, atol=1e-12
+        start_figures.curve_peak(x, jnp.where(x < 0.8, 3 - (x - 0.37) ** 2, jnp.nan)), 3.0, atol=1e-12
     )  # of a run that has ended
     for rises in (x, -x, jnp.where(x < 0.8, x, jnp.nan)):  # no top between: the largest sample
-        assert float(start_figures.peak(x, rises)) == float(jnp.nanmax(rises))
+        assert float(start_figures.curve_peak(x, rises)) == float(jnp.nanmax(rises))
 
 
 def test_crossing_is_exact_for_a_cubic():
     t = jnp.linspace(0.0, 1.0, 6)
-    k, share = start_figures.crossing(t, t**3, 3 * t**2, jnp.asarray(0.3))
+    k, share = start_figures.first_crossing(t, t**3, 3 * t**2, jnp.asarray(0.3))
     assert float(t[k] + share * (t[k + 1] - t[k])) == pytest.approx(0.3 ** (1 / 3), abs=1e-9)
 
 

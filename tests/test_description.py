@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from calibration.data.runs import Runs
-from calibration.discovery.description import undescribed, unused
+from calibration.discovery.description import undescribed_channels, unused_inputs
 from calibration.discovery.loop_notes import Missed, Summary
 from mmrjax.model import channels
 from sweeps.report.words import loop_words
 
 ROWS, SD = 40, 0.02
-CURRENT, SPEED = channels.find("total_current"), channels.find("motor_speed")
+CURRENT, SPEED = channels.find_channel("total_current"), channels.find_channel("motor_speed")
 
 
 class Sized(SimpleNamespace):
@@ -35,7 +35,9 @@ def judged(refit, found=None, sd=SD, source="columns", outlier=False):
         return SimpleNamespace(by_row=lambda: off)
 
     noise = SimpleNamespace(sd=sds, source=(source, "columns"))
-    return undescribed(SimpleNamespace(weight=weight), runs, noise, fit(refit), None if found is None else fit(found))
+    return undescribed_channels(
+        SimpleNamespace(weight=weight), runs, noise, fit(refit), None if found is None else fit(found)
+    )
 
 
 @pytest.mark.parametrize(
@@ -57,7 +59,7 @@ def test_a_model_that_misses_a_quarter_of_a_channel_does_not_describe_the_runs(s
 
 def test_what_to_check_first_is_said_with_the_columns_that_are_not_used():
     extras = {"brake_Nm": np.linspace(0, 1, 4), "constant": np.ones(4), "who": np.array(list("abab"))}
-    assert unused(Runs("runs.csv", {"order": np.arange(4.0)}, extras=extras)) == ("brake_Nm",)
+    assert unused_inputs(Runs("runs.csv", {"order": np.arange(4.0)}, extras=extras)) == ("brake_Nm",)
     missed = (Missed("total_current", 0.484, 0.02),)
     said = loop_words.statement(
         Summary("undescribed", 0.004, None, missed=missed, unused=("brake_Nm",), far=("motor.r",))

@@ -6,7 +6,7 @@ import pytest
 from calibration.data.posterior_file import LOG, NORMAL, Posterior
 from calibration.described import described
 from calibration.inference.fit_notes import Determination
-from calibration.inference.fit_posterior import determined_together, undetermined
+from calibration.inference.fit_posterior import determined_together, undetermined_names
 
 
 def posterior(correlation, kinds, spread=(1.0, 1.0), value=(3.0, 5.0)):
@@ -47,4 +47,6 @@ def test_a_pair_that_priors_hold_or_that_hardly_trades_is_none():
     assert determined_together(posterior(0.99, (LOG, LOG)), held=("a", "b")) == ()
     (pair,) = determined_together(posterior(0.99, (LOG, LOG)), held=("a",))  # b is known by the prior of a
     assert described(Determination.of("a", True, (pair,))) == "only with b"
-    assert described(Determination.of("c", True, (pair,))) == "no" and undetermined(("a", "c"), (pair,)) == ("c",)
+    assert described(Determination.of("c", True, (pair,))) == "no" and undetermined_names(("a", "c"), (pair,)) == (
+        "c",
+    )

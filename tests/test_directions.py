@@ -45,7 +45,7 @@ def table(name: str, amplitude: float, voltages: tuple[float, ...]) -> Runs:
         "supply_voltage_V": voltage,
     }
     rng = np.random.default_rng(1)
-    for channel in channels.usual():
+    for channel in channels.usual_channels():
         reading = np.asarray(shown[channel.name]) / channel.factor
         sd = channel.sd_share * np.maximum(np.abs(reading), 0.2 * np.abs(reading).max())
         columns |= {channel.column: reading + sd * rng.normal(size=sd.size), channel.sd_column: sd}
@@ -54,24 +54,27 @@ def table(name: str, amplitude: float, voltages: tuple[float, ...]) -> Runs:
 
 def test_runs_that_go_both_ways_are_known_by_what_drives_them_or_by_a_speed():
     measured = read("measured")
-    assert not discover.both_ways(measured)
+    assert not discover.goes_both_ways(measured)
     columns, rows = dict(measured.columns), len(measured)
-    speeds = [c.column for c in channels.usual() if c.zero_at_rest]
+    speeds = [c.column for c in channels.usual_channels() if c.zero_at_rest]
 
     def changed(**values):
         return dataclasses.replace(measured, columns={**columns, **values})
 
     turned = np.where(np.arange(rows) == 3, -1.0, 1.0)
     for name in ("supply_voltage_V", *speeds):
-        assert discover.both_ways(changed(**{name: columns[name] * turned}))
-        assert not discover.both_ways(changed(**{name: np.full(rows, np.nan)}))
+        assert discover.goes_both_ways(changed(**{name: columns[name] * turned}))
+        assert not discover.goes_both_ways(changed(**{name: np.full(rows, np.nan)}))
     noise = np.where(turned < 0, -0.01, 1.0) * np.nanmax(columns[speeds[0]])  # about rest
-    assert not discover.both_ways(changed(**{speeds[0]: noise}))
+    assert not discover.goes_both_ways(changed(**{speeds[0]: noise}))
 
 
 @pytest.mark.parametrize("kind", [SettledRuns, Histories])
 def test_what_needs_runs_both_ways_is_looked_for_in_such_alone(kind):
-    names = [{e.name for e in discover.visible(BY_NAME, paper_robots.nominal(), kind, way)} for way in (True, False)]
+    names = [
+        {e.name for e in discover.visible_effects(BY_NAME, paper_robots.nominal(), kind, way)}
+        for way in (True, False)
+    ]
     # A constant torque is directional friction in settled travel.
     only = {
         "directional_friction",
@@ -95,9 +98,12 @@ def test_what_a_duty_drives_is_known_and_its_effect_looked_for_in_such_alone(sup
     columns = {"configuration": np.full(3, "6T2A"), "supply_voltage_V": np.array(supply)}
     columns |= {} if duty is None else {"duty": np.array(duty)}
     runs = Runs("synthetic", columns)
-    assert discover.pulsed(runs) is below_one and varied_by_duty(runs) is alone
+    assert discover.has_pulses(runs) is below_one and varied_by_duty(runs) is alone
     names = {
-        e.name for e in discover.visible(BY_NAME, paper_robots.nominal(), SettledRuns, True, discover.pulsed(runs))
+        e.name
+        for e in discover.visible_effects(
+            BY_NAME, paper_robots.nominal(), SettledRuns, True, discover.has_pulses(runs)
+        )
     }
     assert ("coast_decay" in names) is below_one
     where = DiscrepancyLocation("electrical", "voltage", ("electrical",), (), 9.0, 9.0, by_duty=alone)
@@ -128,4 +134,4 @@ def test_loop_takes_friction_of_one_direction_for_dry_friction():
 
 
 def _sd(name: str) -> float:
-    return next(p for p in params.walk(BY_NAME[name]()) if p.spec.amplitude).spec.prior_sd(0.0)
+    return next(p for p in params.walk_parameters(BY_NAME[name]()) if p.spec.amplitude).spec.prior_sd(0.0)

@@ -18,15 +18,15 @@ from calibration.data.runs import Runs
 from calibration.data.runs import read as read_runs
 from calibration.discovery import discover
 from calibration.discovery.candidates import fit_base
-from calibration.discovery.outliers import screen
-from calibration.discovery.score_tests import bootstrap, diagnosed, normal_deviate, score_tests
+from calibration.discovery.outliers import screen_outliers
+from calibration.discovery.score_tests import bootstrap, diagnose_fit, normal_deviate, score_tests
 from calibration.discovery.settings import WITHOUT_NAME
 from calibration.inference import bases, noise
-from calibration.inference.held_out import held_out
-from calibration.inference.linearization import PROBED, amplitude_of, scored, shape_of
+from calibration.inference.held_out import hold_out_blocks
+from calibration.inference.linearization import PROBED, amplitude_of, shape_of, with_shape_grid
 from calibration.inference.observers import SettledRuns
 from calibration.inference.observers.settled import SettledLinearization
-from calibration.inference.optimizers import observation
+from calibration.inference.optimizers import observe_at
 from mmrjax.effects import BY_NAME
 from mmrjax.model import channels, paper_robots, params
 
@@ -246,8 +246,8 @@ def test_held_out_readings_are_those_of_a_refit_without_the_block(clean, looks):
     for row in np.flatnonzero(block):  # so far off that whoever has seen the block shows it
         runs = changed(runs, "speed_mm_s", row, 15 * runs["speed_sd_mm_s"][row])
     fitted, brute = looks.analyst.base(runs), looks.analyst.base(runs.where(~block))
-    out = held_out(fitted.space.equipped, fitted.candidate.z, [block], (-1,) * looks.analyst.settings.slots)
-    seen = observation(fitted.space.bare, jnp.asarray(brute.candidate.z[: brute.space.free]))
+    out = hold_out_blocks(fitted.space.equipped, fitted.candidate.z, [block], (-1,) * looks.analyst.settings.slots)
+    seen = observe_at(fitted.space.bare, jnp.asarray(brute.candidate.z[: brute.space.free]))
     expected = np.asarray(seen.reading)[: len(runs)]
     assert out.converged.all() and block.sum() in (4, 6) and np.isnan(out.reading[~block]).all()
     assert (np.abs(out.reading - expected)[block] < 0.05 * sd[block]).all()
@@ -259,10 +259,10 @@ def test_signatures_are_derivatives_of_the_readings(clean, looks):
     """Of the whole library, against differentiation of the steady model in every amplitude, at two points a shape."""
     problem = clean.space.bare
     z = jnp.asarray(clean.base.z[: clean.space.free])
-    library = discover.visible(looks.library, problem.base, SettledRuns)
+    library = discover.visible_effects(looks.library, problem.base, SettledRuns)
     names, shapes = [e.name for e in library], [shape_of(e) for e in library]
     unit = jnp.asarray([amplitude_of(e).spec.prior_sd(0.0) for e in library])
-    instances = tuple(scored(e, (-1.5, 0.75)) for e in library)
+    instances = tuple(with_shape_grid(e, (-1.5, 0.75)) for e in library)
     robot = dataclasses.replace(problem.robot(z), effects=library)
     linear = jax.jit(lambda z: problem.observe.linearise(problem, z, problem.data, instances))(z)
 
@@ -386,7 +386,7 @@ def test_diagnosis_is_that_of_the_fit_and_of_the_rows_that_count(clean):
 
     def residual(space, z) -> np.ndarray:
         problem = space.problem(clean.base.active)
-        return np.asarray(diagnosed(problem, z, space.library.scored, clean.bases)[0].residual)
+        return np.asarray(diagnose_fit(problem, z, space.library.scored, clean.bases)[0].residual)
 
     first = residual(space, z)
     np.testing.assert_array_equal(first, clean.left.linear.residual)
@@ -400,7 +400,7 @@ def test_diagnosis_is_that_of_the_fit_and_of_the_rows_that_count(clean):
 def test_null_of_one_column_is_normal(clean):
     """|score| of one effect in tables drawn from the fit and fitted again is that of a standard normal."""
     space = clean.space
-    one = (scored(space.library["ammeter_offset"]),)
+    one = (with_shape_grid(space.library["ammeter_offset"]),)
     problem, z = space.bare, clean.base.z[: space.free]
     null = bootstrap(problem, z, clean.left.linear, one, clean.bases[:1], 384, 0)
     assert len(null.single) > 370
@@ -416,7 +416,9 @@ def test_null_of_one_column_is_normal(clean):
 def test_bootstrap_of_the_measured_runs_settles():
     """Of tables drawn from the fit to the packaged data nearly all can be fitted again."""
     runs, settings = read_runs("measured"), dataclasses.replace(SETTLED.settings, replicates=128)
-    sd = noise.inferred(runs, SettledRuns.sizes(runs), None).sd
-    space = discover.pose(runs, paper_robots.nominal(), sd, settings, {}, SETTLED.library)
-    screened = screen(fit_base(space, settings, "measured"), lambda b: discover.bases_at(runs, b), runs, settings)
+    sd = noise.infer_noise(runs, SettledRuns.sizes(runs), None).sd
+    space = discover.pose_candidates(runs, paper_robots.nominal(), sd, settings, {}, SETTLED.library)
+    screened = screen_outliers(
+        fit_base(space, settings, "measured"), lambda b: discover.bases_at_fit(runs, b), runs, settings
+    )
     assert len(discover.diagnosis_of_base(screened, settings).test.null.single) >= 0.98 * settings.replicates

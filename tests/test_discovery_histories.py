@@ -15,16 +15,16 @@ from worlds import histories
 from calibration.data.input_errors import BadData
 from calibration.data.runs import Runs
 from calibration.discovery.adequacy import AdequacyTest
-from calibration.discovery.discrepancy import fit_discrepancy, locate
-from calibration.discovery.score_tests import bootstrap, diagnosed
+from calibration.discovery.discrepancy import fit_discrepancy, locate_discrepancy
+from calibration.discovery.score_tests import bootstrap, diagnose_fit
 from calibration.discovery.settings import WITHOUT_NAME, settings_for
-from calibration.discovery.standing import standing
+from calibration.discovery.standing import judge_names
 from calibration.inference import bases, noise
-from calibration.inference.linearization import PROBED, scored, shape_of
+from calibration.inference.linearization import PROBED, shape_of, with_shape_grid
 from calibration.inference.observers import Histories
 from calibration.inference.optimizers import levenberg_marquardt
 from mmrjax.effects import BY_NAME, UNNAMED
-from mmrjax.effects.curve import weights
+from mmrjax.effects.curve import ordinate_weights
 from mmrjax.model import paper_robots, params
 
 #: What these histories are searched for; the whole library is what the command and the campaign search.
@@ -116,9 +116,9 @@ def test_eccentric_pulley_is_named_with_its_amplitude_and_phase():
 def test_wave_outside_the_library_gets_its_balance_and_order_but_no_name(oval):
     space, left, searched = oval.space, oval.left, oval.searched
     assert left.test.rejected
-    stood = standing(space, oval.base, searched, left, oval.bases, ANALYST.settings)
+    stood = judge_names(space, oval.base, searched, left, oval.bases, ANALYST.settings)
     assert not stood.stands and stood.why
-    where = locate(left, oval.bases, space.included)
+    where = locate_discrepancy(left, oval.bases, space.included)
     assert {"track", "gearbox", "motor"} <= {where.balance, *where.alike}
     assert where.variable == "order 2 of the driving shaft"
     told = space.bare.observe.detail(oval.bases, space.included, left, left).before
@@ -130,7 +130,7 @@ def test_wave_outside_the_library_gets_its_balance_and_order_but_no_name(oval):
 @pytest.mark.slow
 def test_wave_without_a_name_is_in_the_result(oval):
     found = ANALYST.result(oval.traced, oval.runs)
-    where = locate(oval.left, oval.bases, oval.space.included)
+    where = locate_discrepancy(oval.left, oval.bases, oval.space.included)
     assert found.verdict in WITHOUT_NAME and found.effects == () and found.after.adequate
     assert (found.unnamed.balance, found.unnamed.variable) == (where.balance, where.variable)
     assert found.unnamed.defect is None and found.unnamed.score > 0.5 * oval.label["sigmas"] ** 2
@@ -151,7 +151,7 @@ def test_wave_without_a_name_can_be_added_to_the_robot(oval):
     assert abs(got - expected) < 0.3 * abs(expected) and float(wave.order_shaft) == 2.0
     assert "sin(2 θ_k" in curve.proposal.formula
     told = curve.problem, jnp.asarray(curve.z), oval.space.library.scored, oval.bases
-    exact, (linear, _, strongest) = diagnosed(*told), diagnosed(*told, near=oval.left.linear)
+    exact, (linear, _, strongest) = diagnose_fit(*told), diagnose_fit(*told, near=oval.left.linear)
     np.testing.assert_allclose(linear.residual, exact[0].residual, atol=1e-6)
     for kind in ("single", "curve", "chi2"):  # by signatures of the fit without the curve
         assert abs(getattr(strongest, kind) - getattr(exact[2], kind)) < 0.3
@@ -211,7 +211,7 @@ def test_columns_are_differences_of_runs_with_a_curve(seen, balance):
     expected = np.asarray(read(sides[0]) - read(sides[1])) / (2 * float(size))
     y = jnp.asarray([shape[f"y{k}"] for k in range(6)])
     along = np.asarray(linear.signals.direction if balance != "ground" else linear.signals.direction_travel)
-    over_time = np.asarray(weights(linear.time, 0.0, 0.8) @ y) * along
+    over_time = np.asarray(ordinate_weights(linear.time, 0.0, 0.8) @ y) * along
     got = np.asarray(linear.columns(PROBED.index(balance), jnp.asarray(over_time[:, None])))[:, 0]
     # linear between samples 20 ms apart; at the start the direction rises within the first of them
     assert np.linalg.norm(got - expected) < 0.05 * np.linalg.norm(expected)
@@ -303,7 +303,7 @@ def test_histories_that_do_not_start_from_rest_are_refused(runs):
 def test_assumed_noise_of_histories_does_not_vanish_at_the_start(runs):
     bare = {k: v for k, v in runs.columns.items() if "_sd_" not in k}
     made = Runs("bare", bare)
-    sd = noise.inferred(made, Histories.sizes(made)).sd
+    sd = noise.infer_noise(made, Histories.sizes(made)).sd
     assert (np.ptp(sd, axis=0) == 0).all()
     current = bare["total_current_A"]
     np.testing.assert_allclose(sd[0, 0], 0.02 * np.sqrt(np.mean(current**2)))
@@ -313,7 +313,7 @@ def test_phase_is_a_shape_and_covers_half_a_turn():
     effect = BY_NAME["pulley_eccentricity"]()
     shape = shape_of(effect)
     assert shape.name == "phase"
-    instances = scored(effect)
+    instances = with_shape_grid(effect)
     # sin(ψ + φ) of any φ lies within 18 degrees of the grid, with either sign
     wanted = np.linspace(-np.pi, np.pi, 400)
     best = np.max(np.abs(np.cos(wanted[:, None] - np.asarray(instances.values))), 1)

@@ -16,12 +16,12 @@ from worlds import settled, tables
 
 from calibration.data import robot_file
 from calibration.discovery import discover, discrepancy, formula
-from calibration.discovery.discrepancy import CurveBeside, alike_variables, fit_discrepancy, refined
-from calibration.discovery.projection import defect
-from calibration.discovery.score_tests import diagnosed
-from calibration.discovery.smooth import smooth
+from calibration.discovery.discrepancy import CurveBeside, fit_discrepancy, refine_window, similar_variables
+from calibration.discovery.projection import defect_by_row
+from calibration.discovery.score_tests import diagnose_fit
+from calibration.discovery.smooth import smooth_curve
 from calibration.inference import bases
-from calibration.inference.held_out import held_out
+from calibration.inference.held_out import hold_out_blocks
 from calibration.inference.linearization import PROBED
 from calibration.inference.observers.settled import SettledLinearization
 from mmrjax.effects.curve import PLACES
@@ -41,7 +41,7 @@ def found(request):
     fitted = SETTLED.base(runs)
     space, base = fitted.space, fitted.candidate
     bare = space.problem(base.active)
-    seen = diagnosed(bare, jnp.asarray(base.z), space.library.scored, discover.bases_at(runs, fitted))
+    seen = diagnose_fit(bare, jnp.asarray(base.z), space.library.scored, discover.bases_at_fit(runs, fitted))
     linear = jax.device_get(seen[0])
     what = fit_discrepancy(space, base, linear, *CASES[request.param])
     truth, sound = settled.readings(case.conditions, case.constants, case.terms)
@@ -92,8 +92,8 @@ def test_curve_takes_the_discrepancy_out_of_the_fit(found):
 def test_curve_lowers_the_error_at_slopes_that_were_not_seen(found):
     slopes = found.runs["slope_deg"]
     blocks = [slopes == s for s in np.unique(slopes)]
-    without = held_out(found.space.equipped, found.base.z, blocks, (-1, -1))
-    with_it = held_out(found.what.problem, found.what.z, blocks)
+    without = hold_out_blocks(found.space.equipped, found.base.z, blocks, (-1, -1))
+    with_it = hold_out_blocks(found.what.problem, found.what.z, blocks)
     assert with_it.converged.all() and np.isfinite(with_it.reading).all()
     before, after = (sigmas(found, out.reading) for out in (without, with_it))
     assert after.max() < 0.5 < before.max() and np.sum(after**2) < 0.25 * np.sum(before**2)
@@ -108,7 +108,7 @@ def test_blocks_that_are_left_out_are_not_seen(found):
             found.what.problem, data=dataclasses.replace(found.what.problem.data, measured=spoilt)
         ),
     )
-    a, b = (held_out(w.problem, w.z, [first]).reading for w in (found.what, other))
+    a, b = (hold_out_blocks(w.problem, w.z, [first]).reading for w in (found.what, other))
     np.testing.assert_array_equal(a, b)
     assert np.isnan(a[20:]).all()
 
@@ -122,8 +122,8 @@ def test_robot_written_and_read_gives_the_same_readings(found, tmp_path):
         == [found.what.effect]
         == [f"curve_{found.what.balance}_{found.what.variable}"]
     )
-    assert {p.name: float(p.value) for p in params.walk(robot)} == {
-        p.name: float(p.value) for p in params.walk(found.what.robot)
+    assert {p.name: float(p.value) for p in params.walk_parameters(robot)} == {
+        p.name: float(p.value) for p in params.walk_parameters(found.what.robot)
     }
     reading = steady_batch(robot, found.runs.conditions(robot)).reading
     seen = jnp.stack([reading[name] for name in channels.USUAL], -1)
@@ -139,7 +139,7 @@ def test_defect_of_each_row_shows_the_discrepancy(found):
     residual = np.zeros_like(np.asarray(found.linear.residual))
     residual[: change.size] = -change.ravel()
     clean = eqx.tree_at(lambda linear: linear.residual, found.linear, residual)
-    expected = defect(clean, found.what.balance).value[:rows]
+    expected = defect_by_row(clean, found.what.balance).value[:rows]
     pull = (shown.value[:rows] - expected) / shown.sd[:rows]
     assert 0.7 < np.sqrt(np.mean(pull**2)) < 1.3
     assert np.corrcoef(expected, shown.value[:rows])[0, 1] > 0.5
@@ -153,7 +153,7 @@ def test_formula_finds_the_variable(found):
         return
     assert found.what.variable in proposal.variables
     assert len(proposal.terms) == 1 and proposal.mark == "a proposal, not a finding"
-    curve = smooth(found.linear, found.what.balance, found.what.variable, found.space.included)
+    curve = smooth_curve(found.linear, found.what.balance, found.what.variable, found.space.included)
     assert proposal.explained >= formula.MOST * curve.explained > 100
     assert all(abs(c) > 3 * s for c, s in zip(proposal.coefficients, proposal.sds, strict=True))
     unit = found.what.unit
@@ -183,7 +183,7 @@ def test_curve_of_a_result_is_in_its_robot_and_takes_the_discrepancy_out(tmp_pat
 def test_dictionary_holds_only_what_is_safe():
     rng = np.random.default_rng(3)
     ratios = np.stack([rng.uniform(*b, 40) for b in ((0.5, 1.5), (-1, 1), (0, 2), (1, 1), (0.5, 2))], 1)
-    known = formula.dictionary(ratios)
+    known = formula.monomial_dictionary(ratios)
     powers = {k: {p for m in known for j, p in m.factors if j == k} for k in range(5)}
     assert -1.0 in powers[0] and 0.5 in powers[0]
     assert not {-1.0, 0.5} & powers[1]  # of either sign
@@ -197,7 +197,7 @@ def test_dictionary_holds_no_monomial_twice():
     rng = np.random.default_rng(3)
     one = rng.uniform(0.5, 1.5, 40)
     ratios = np.stack([one, 2 * one, *rng.uniform(0.5, 1.5, (3, 40))], 1)
-    assert not any(m.variables == ("current",) for m in formula.dictionary(ratios))  # as ω_m, which is first
+    assert not any(m.variables == ("current",) for m in formula.monomial_dictionary(ratios))  # as ω_m, which is first
 
 
 def test_formula_reads_as_text():
@@ -212,10 +212,10 @@ def test_every_place_of_a_curve_has_a_symbol():
 
 def test_no_formula_is_proposed_where_nothing_shows(found):
     blind = eqx.tree_at(lambda linear: linear.defects, found.linear, 0 * np.asarray(found.linear.defects))
-    curve = smooth(found.linear, found.what.balance, found.what.variable, found.space.included)
-    proposal = formula.propose(blind, found.what.balance, found.space.included, curve)
+    curve = smooth_curve(found.linear, found.what.balance, found.what.variable, found.space.included)
+    proposal = formula.propose_formula(blind, found.what.balance, found.space.included, curve)
     assert proposal.formula == "" and proposal.terms == ()
-    assert np.isnan(defect(blind, found.what.balance).value).all()
+    assert np.isnan(defect_by_row(blind, found.what.balance).value).all()
 
 
 def test_variables_over_which_a_curve_is_as_improbable_are_told():
@@ -225,8 +225,8 @@ def test_variables_over_which_a_curve_is_as_improbable_are_told():
     ]
     names.append(("track", "payload"))
     deviate = np.array([9.2, 9.0, 9.9, 9.5, 8.8, 9.8, 9.9])
-    assert alike_variables(names, deviate, "slip", "speed_motor") == ("voltage 24 to 24", "voltage")
-    assert alike_variables(names, deviate, "slip", "voltage 24 to 24") == ("voltage", "speed_motor")
+    assert similar_variables(names, deviate, "slip", "speed_motor") == ("voltage 24 to 24", "voltage")
+    assert similar_variables(names, deviate, "slip", "voltage 24 to 24") == ("voltage", "speed_motor")
 
 
 def test_a_window_is_refined_to_its_rows():
@@ -244,9 +244,9 @@ def test_a_window_is_refined_to_its_rows():
         SimpleNamespace(order=np.arange(1.0, rows + 1), direction=np.ones(rows)),
         channels=channels.USUAL,
     )
-    found, explained = refined(linear, "track", "order", np.ones(rows, bool))
+    found, explained = refine_window(linear, "track", "order", np.ones(rows, bool))
     assert (found.low, found.high) == (14, 25) and explained > 60
-    half, _ = refined(linear, "track", "order", np.arange(rows) % 2 == 0)
+    half, _ = refine_window(linear, "track", "order", np.arange(rows) % 2 == 0)
     assert (half.low, half.high) == (15, 25)
 
 
@@ -259,9 +259,9 @@ def test_a_curve_that_several_ask_for_is_fitted_once(monkeypatch):
 
     where = SimpleNamespace(place="track", variable="speed")
     space, left = SimpleNamespace(included=None), SimpleNamespace(linear="linear")
-    monkeypatch.setattr(discrepancy, "locate", lambda *given: where)
+    monkeypatch.setattr(discrepancy, "locate_discrepancy", lambda *given: where)
     monkeypatch.setattr(discrepancy, "fit_discrepancy", lambda *given: counted("curve", *given))
-    monkeypatch.setattr(discrepancy, "diagnosis_beside", lambda *given: counted("diagnosis", *given))
+    monkeypatch.setattr(discrepancy, "diagnose_with_curve", lambda *given: counted("diagnosis", *given))
     beside = CurveBeside(space, "base", left, "bases")
     assert not calls  # before it is asked for
     assert [beside.curve, beside.diagnosis, beside.curve, beside.diagnosis] == 2 * ["curve", "diagnosis"]

@@ -6,8 +6,8 @@ import pytest
 from calibration.data import robot_file
 from calibration.data.runs import Runs
 from calibration.discovery import discover
-from calibration.discovery.candidates import candidate
-from calibration.discovery.dissipation import supplying
+from calibration.discovery.candidates import candidate_of_fit
+from calibration.discovery.dissipation import supplying_effects
 from calibration.discovery.settings import settings_for
 from calibration.inference import observers
 from calibration.inference.optimizers import Optimum
@@ -46,8 +46,8 @@ def space(tmp_path_factory):
     }  # fmt: skip
     runs = Runs("runs.csv", columns).of(robot)
     library = {n: BY_NAME[n] for n in ("backdriving_loss", "brush_drop", "stribeck_motor")}
-    settings = settings_for(observers.kind(runs))
-    return discover.pose(runs, robot, np.full((12, 1), 0.01), settings, {}, library), settings
+    settings = settings_for(observers.observer_kind(runs))
+    return discover.pose_candidates(runs, robot, np.full((12, 1), 0.01), settings, {}, library), settings
 
 
 @pytest.mark.parametrize(
@@ -66,6 +66,6 @@ def test_a_negative_effect_is_excluded_where_its_balance_supplies_power(space, n
     z = np.zeros(space.free + 2 * settings.slots)
     z[space.free] = amplitude / float(space.coordinates.sd[space.library.names.index(name)])
     sizes = np.where([bool(n) for n in active], amplitude, 0.0)
-    assert supplying(space, active, sizes, z) == ((name,) if supplies else ())
-    found = candidate(space, active, Optimum(z, 0.1 + 0 * z, np.eye(len(z)), 1.0, 0.0, True, 1), settings)
+    assert supplying_effects(space, active, sizes, z) == ((name,) if supplies else ())
+    found = candidate_of_fit(space, active, Optimum(z, 0.1 + 0 * z, np.eye(len(z)), 1.0, 0.0, True, 1), settings)
     assert found.supplying == ((name,) if supplies else ()) and not (supplies and found.plausible)

@@ -75,6 +75,7 @@ def test_the_page_of_public_names_says_what_every_function_returns():
     assert [kind.__name__ for kind in SITE.returned_types()] == [
         "CalibrationResult",
         "DiscoveryResult",
+        "Export",
         "Profile",
         "Runs",
     ]

@@ -23,8 +23,8 @@ from calibration.data import runs as records
 from calibration.data.parts import cells
 from calibration.data.robot_file import RobotFile
 from calibration.sizing import sheet
-from calibration.sizing.design_search import Found, Sizing
-from calibration.sizing.part_options import drives
+from calibration.sizing.design_search import SizedDesign, Sizing
+from calibration.sizing.part_options import drive_options
 from mmrjax.model.paper_robots import nominal
 from sweeps import store
 from sweeps.inputs import fit_of
@@ -84,9 +84,9 @@ def check() -> Document:
 
 
 def size() -> Document:
-    robot, drive = nominal(), drives(("RE 40 24 V",))[0]
+    robot, drive = nominal(), drive_options(("RE 40 24 V",))[0]
     asked = requirements_file.read("mass_kg = 15\n", "aims.toml")
-    best = Found(
+    best = SizedDesign(
         drive, cells()[0], 12.5, 0.0414, 3, 4.0, {"mass": 14.14, "energy": 0.031},
         {"winding": 0.002, "cell current": 0.4}, ("largest ratio",), robot,
     )  # fmt: skip

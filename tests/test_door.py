@@ -48,7 +48,7 @@ def test_what_instruments_show_is_that_of_the_whole(robot, whole):
     assert shown_first.statuses.tolist() == ["converged", "slides", "stalled", "converged", "converged", "reverses"]
     for name in ("total_current", "motor_speed", "speed"):
         np.testing.assert_allclose(getattr(shown_first, name), whole.reading[name], rtol=1e-13, err_msg=name)
-    for output in outputs.table(robot.channels):
+    for output in outputs.output_table(robot.channels):
         np.testing.assert_array_equal(output.get(whole_first.result), output.get(whole), err_msg=output.name)
         np.testing.assert_allclose(output.get(shown_first.result), output.get(whole), rtol=1e-13, err_msg=output.name)
     np.testing.assert_array_equal(whole_first.flags, whole.flags)
@@ -81,7 +81,7 @@ def test_nothing_is_computed_outside_of_compiled_code(robot, primitives):
 
 @pytest.mark.slow
 def test_chunks_and_shapes_are_made_by_compiled_code_too(robot, primitives, monkeypatch):
-    facts = dataclasses.replace(fidelities.facts("steady"), chunk=(4, 4))
+    facts = dataclasses.replace(fidelities.fidelity_facts("steady"), chunk=(4, 4))
     monkeypatch.setitem(fidelities.TABLE, "steady", facts)
     runs = mm.Conditions(voltage=np.linspace(10.0, 30.0, 10).reshape(2, 5))
     for _ in range(2):

@@ -11,7 +11,7 @@ from worlds import paper
 
 from mmrjax.effects.electrical_effects import ThermalDrift
 from mmrjax.fidelities.drive import _status, drive, drive_batch
-from mmrjax.fidelities.result import slips
+from mmrjax.fidelities.result import movers_slip
 from mmrjax.fidelities.steady import steady, steady_batch
 from mmrjax.model import balances, params
 from mmrjax.model.conditions import Conditions
@@ -42,7 +42,7 @@ def test_rates_match_reference_at_random_states(robot, grid):
         configuration=rows[:, 0],
         battery=on_battery,
     )
-    moving = jax.jit(jax.vmap(balances.moving, in_axes=(None, 0, 0)))
+    moving = jax.jit(jax.vmap(balances.moving_signals, in_axes=(None, 0, 0)))
     s = moving(robot, runs, State(*jnp.asarray(states.T), distance=jnp.zeros(n)))
     inductance, ratio = 0.000119, 48.0
     for k in range(n):
@@ -263,10 +263,10 @@ def small(robot):
 def test_status_follows_from_what_the_robot_does(robot, gain, sliding, status):
     """One that slips beyond V_s on average and holds its speed has settled, with a flag that it slips."""
     run = Conditions()
-    end = balances.moving(robot, run, State(1.0, 900.0, 0.7, 0.0))
+    end = balances.moving_signals(robot, run, State(1.0, 900.0, 0.7, 0.0))
     end = dataclasses.replace(end, speed_sliding=jnp.asarray(sliding), acceleration=jnp.asarray(gain))
     assert STATUSES[int(_status(robot, run, end, jnp.asarray(False), jnp.asarray(True)))] == status
-    assert bool(slips(robot, end)) is (sliding > 0.02)
+    assert bool(movers_slip(robot, end)) is (sliding > 0.02)
 
 
 @pytest.mark.slow

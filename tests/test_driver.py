@@ -40,7 +40,9 @@ def test_limit_and_diode_act_alike_on_a_supply_of_either_sign(robot, volts):
     limited = dataclasses.replace(robot, driver=bridge)
     state = State(np.sign(volts) * 1.001, 0.0, 0.0, 0.0)
     signals = [
-        balances.moving(limited, Conditions(voltage=volts), dataclasses.replace(state, current=way * state.current))
+        balances.moving_signals(
+            limited, Conditions(voltage=volts), dataclasses.replace(state, current=way * state.current)
+        )
         for way in (1, -1)
     ]
     assert float(signals[0].voltage) == pytest.approx(0.5 * volts)
@@ -65,7 +67,7 @@ def test_supply_gives_the_duty_of_its_voltage_and_of_the_current(robot):
     sagging = params.replace(BY_NAME["supply_sag"](), {"amplitude": 0.5})
     robot = dataclasses.replace(robot, effects=(sagging,))
     run = Conditions(voltage=24.0, duty=0.25)
-    signals = balances.begin(robot, run, State(3.0, 500.0, 0.4, 0.0))
+    signals = balances.begin_signals(robot, run, State(3.0, 500.0, 0.4, 0.0))
     assert float(signals.total_current) == pytest.approx(2 * 3.0 * 0.25)
     assert float(balances.supply(robot, run, signals).voltage) == pytest.approx(0.25 * (24.0 - 0.5 * 1.5))
 
@@ -73,7 +75,7 @@ def test_supply_gives_the_duty_of_its_voltage_and_of_the_current(robot):
 def bench(decay, **load):
     """k = 0.1 N·m/A, R = 5 ohm, without losses but the shaft's 0.02 N·m."""
     shaft = Shaft(**{"inertia": 1e-3, "loss_coulomb": 0.02, **load})
-    robot = paper_robots.blank(Configurations({"bench": shaft}), sides=1.0)
+    robot = paper_robots.blank_robot(Configurations({"bench": shaft}), sides=1.0)
     motor = {
         "motor.resistance": 5.0,
         "motor.torque_constant": 0.1,
@@ -120,17 +122,17 @@ def test_power_of_the_supply_is_what_goes_into_heat_and_motion(decay, duty):
         current = 0.0 if decay == FAST and duty == 0 else state.current
         state = dataclasses.replace(state, current=current)
         run = Conditions(voltage=8.0, duty=duty)
-        signals = balances.moving(robot, run, state)
-        goes = sum(float(x) for x in energy.sinks(robot, run, signals).values())
+        signals = balances.moving_signals(robot, run, state)
+        goes = sum(float(x) for x in energy.sink_powers(robot, run, signals).values())
         stored = float(signals.voltage_left * signals.current)  # in the inductance
         inertia = robot.motor.inertia + 1e-3
         stored += float(inertia * signals.acceleration_wheel * signals.speed_wheel)
-        assert float(energy.source(robot, run, signals)) == pytest.approx(goes + stored, abs=1e-9)
+        assert float(energy.source_power(robot, run, signals)) == pytest.approx(goes + stored, abs=1e-9)
 
 
 @pytest.mark.parametrize(("opened", "current"), [(1.0, 0.0), (-1.0, -0.1 * 40.0 / 5.0), (0.0, 0.0)])
 def test_fast_decay_coasts_without_pulses_and_brakes_where_it_is_told_to(opened, current):
     run = Conditions(voltage=8.0, duty=0.0, open=opened)
     robot = bench(FAST)
-    signals = balances.driven(robot, run, State(current, 40.0, 40.0, 0.0), None)
+    signals = balances.driven_signals(robot, run, State(current, 40.0, 40.0, 0.0), None)
     assert float(signals.voltage_left) == pytest.approx(0.0, abs=1e-12)

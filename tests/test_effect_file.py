@@ -169,7 +169,7 @@ REFUSED = {
     "fails": (GOOD.replace("signals.direction", "signals.dirction"), r"its term cannot be computed \(AttributeError"),
     "reads ahead": (
         GOOD.replace("signals.direction", "signals.torque_net"),
-        r"its term reads a signal that is computed after its balance; see balances\.moving$",
+        r"its term reads a signal that is computed after its balance; see balances\.moving_signals$",
     ),
     "reads ahead unseen": (
         GOOD.replace("signals.direction", "(1.0 if signals.torque_net > 0 else 2.0)"),

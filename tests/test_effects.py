@@ -24,10 +24,10 @@ import mmrjax
 from calibration.discovery import setups
 from mmrjax import effects
 from mmrjax.effects import ALL, BY_NAME, Effect, base
-from mmrjax.effects.contract import readable
+from mmrjax.effects.contract import readable_signals
 from mmrjax.effects.periodic import Periodic
-from mmrjax.effects.scaled import scaled
-from mmrjax.fidelities.drive import drive, rates, start, state_of
+from mmrjax.effects.scaled import scaled_effect
+from mmrjax.fidelities.drive import drive, drive_rates, drive_start, state_of_unknowns
 from mmrjax.fidelities.steady import steady, steady_batch
 from mmrjax.fidelities.track import track
 from mmrjax.model import balances, channels, paper_robots, params
@@ -135,7 +135,7 @@ def random_states(n=400):
     motor[:40] *= 1e-4  # through rest
     configuration, battery = rng.integers(0, 2, (2, n))
     run = Conditions(configuration, voltage, np.degrees(slope), payload, battery, charge, adhesion)
-    moving = jax.jit(jax.vmap(balances.moving, in_axes=(None, 0, 0)))
+    moving = jax.jit(jax.vmap(balances.moving_signals, in_axes=(None, 0, 0)))
     straight = moving(
         NOMINAL,
         run,
@@ -157,7 +157,7 @@ STATES = random_states()
 
 
 def size(effect: type[Effect]) -> float:
-    spec = next(p for p in params.walk(effect()) if p.name == "amplitude").spec
+    spec = next(p for p in params.walk_parameters(effect()) if p.name == "amplitude").spec
     return spec.prior_sd(0.0)
 
 
@@ -172,7 +172,7 @@ def with_effects(*present: Effect, robot=None):
 def terms(effect: Effect, robot=None, signals: Signals = STATES) -> np.ndarray:
     """What it adds to its balance in each of the states."""
     robot = with_effects(effect, robot=robot)
-    added = jax.vmap(lambda s: balances.added(robot, s, effect.balance, effect.channel) + 0.0 * s.current)
+    added = jax.vmap(lambda s: balances.effects_sum(robot, s, effect.balance, effect.channel) + 0.0 * s.current)
     return np.asarray(added(signals))
 
 
@@ -195,7 +195,7 @@ def outputs_start(robot):
     """Readings through a start: for what settled travel does not show."""
     times = jnp.asarray([0.0, 0.002, 0.01, 0.1, 0.4])
     signals = jax.vmap(lambda c: drive(robot, c, times).signals)(CONDITIONS)
-    return readings(robot, signals)[:, 1:].reshape(-1, len(channels.usual()))
+    return readings(robot, signals)[:, 1:].reshape(-1, len(channels.usual_channels()))
 
 
 @functools.cache
@@ -238,8 +238,8 @@ def law_declared(effect: type[Effect]) -> None:
     assert not effect.settles_to or (effect.settles_to in BY_NAME and effect.settles_to != effect.name)
     assert effect.balance in balances.BALANCES
     assert bool(effect.channel) == (effect.balance == "sensor")
-    assert not effect.channel or effect.channel in channels.names(channels.EVERY)
-    declared = {p.name: p for p in params.walk(effect())}
+    assert not effect.channel or effect.channel in channels.channel_names(channels.EVERY)
+    declared = {p.name: p for p in params.walk_parameters(effect())}
     assert [n for n, p in declared.items() if p.spec.amplitude] == ["amplitude"]
     amplitude = declared["amplitude"]
     assert float(amplitude.value) == 0.0
@@ -280,7 +280,7 @@ def law_family(effect: type[Effect]) -> None:
     """Its family is its equation and its driver; its term changes with that driver, or is a share without one."""
     assert effect.family().startswith(base.EQUATION[effect.balance]) and effect.driver in ("", *DRIVERS)
     assert (effect.driver or "same share everywhere") in effect.family()
-    assert all(name in {p.name for p in params.walk(NOMINAL)} for name in effect.rests_on)
+    assert all(name in {p.name for p in params.walk_parameters(NOMINAL)} for name in effect.rests_on)
     made = fitted(effect, size(effect))
     before = terms(made)
     if not effect.driver:
@@ -341,7 +341,7 @@ def law_unit(effect: type[Effect]) -> None:
         change = dict(zip(BASE, np.exp(rng.uniform(-1.5, 1.5, len(BASE))), strict=True))
 
         def rescaled(component, change=change):
-            values = {p.name: p.value * factor(p.spec.unit, change) for p in params.walk(component)}
+            values = {p.name: p.value * factor(p.spec.unit, change) for p in params.walk_parameters(component)}
             return params.replace(component, values)
 
         signals = dataclasses.replace(
@@ -378,7 +378,7 @@ def known(balance: str, channel: str, instant: str) -> Signals:
     """What a term in this balance may read."""
     state, settled = INSTANTS[instant]
     run = jax.tree.map(lambda x: x[2], CONDITIONS)
-    return readable(NOMINAL, run, state, balance, channel, settled=settled)
+    return readable_signals(NOMINAL, run, state, balance, channel, settled=settled)
 
 
 def law_readable(effect: type[Effect]) -> None:
@@ -389,7 +389,7 @@ def law_readable(effect: type[Effect]) -> None:
         if effect.memory_size is not None and instant != "settled":
             signals = dataclasses.replace(signals, memory={effect.name: jnp.asarray(0.3 * effect.memory_size)})
         term, slopes = eqx.filter_value_and_grad(
-            lambda both, effect=effect: jnp.sum(balances.added(*both, effect.balance, effect.channel))
+            lambda both, effect=effect: jnp.sum(balances.effects_sum(*both, effect.balance, effect.channel))
         )((robot, signals))
         assert np.isfinite(term), f"no number: {instant}"
         assert all(np.isfinite(x).all() for x in jax.tree.leaves(slopes)), f"no derivative: {instant}"
@@ -467,7 +467,7 @@ def test_every_channel_has_an_error_of_its_scale_and_of_a_zero_that_it_may_miss(
     signals = Signals(**values)
     for effect in effects.OF_CHANNELS.values():
         law_declared(effect)
-        shown = float(channels.find(effect.channel).read(NOMINAL, signals))
+        shown = float(channels.find_channel(effect.channel).read(NOMINAL, signals))
         size = 1.0 if effect.of_zero else shown
         assert shown and float(effect(amplitude=0.02).term(NOMINAL, signals)) == pytest.approx(0.02 * size)
 
@@ -490,7 +490,7 @@ def test_an_instruments_errors_are_added_to_what_it_shows(signed, expected):
         signals = jax.tree.map(lambda x: x[0], dataclasses.replace(STATES, current=jnp.full(400, current)))
         read, ideal = (float(balances.sensor(r, signals)["motor_current"]) for r in (robot, without))
         assert read == pytest.approx(shown, rel=1e-12)
-        assert read - ideal == pytest.approx(float(balances.added(robot, signals, "sensor", "motor_current")))
+        assert read - ideal == pytest.approx(float(balances.effects_sum(robot, signals, "sensor", "motor_current")))
 
 
 @pytest.mark.quick(1)
@@ -765,7 +765,7 @@ def test_library_keeps_its_order():
 def test_every_effect_stands_in_the_file_of_its_balance():
     for effect in ALL:
         assert effect.__module__ == f"mmrjax.effects.{effect.balance}_effects"
-    found = {e for name in MODULES for e in effects.defined_in(importlib.import_module(name))}
+    found = {e for name in MODULES for e in effects.effects_of_module(importlib.import_module(name))}
     assert found == {*ALL, *effects.OF_TURNS.values()}
 
 
@@ -773,7 +773,7 @@ def test_every_effect_is_pickled_as_stages_of_the_loop_are():
     """Those too whose classes are made by functions: of channels' instruments, curves and waves."""
     for effect in (BY_NAME | effects.BESIDE).values():
         assert pickle.loads(pickle.dumps(effect)) is effect
-        for kind in (effect, scaled(effect, (2.0, 1.0, 2.0))):
+        for kind in (effect, scaled_effect(effect, (2.0, 1.0, 2.0))):
             assert type(pickle.loads(pickle.dumps(kind()))) is kind
 
 
@@ -1104,7 +1104,7 @@ def test_backdriving_loss_changes_nothing_where_no_load_drives():
 def _on_shaft(torque_constant, *present):
     """A winch or a bench of one drive with losses, the motor's speed imposed forward and backward."""
     load = Shaft(inertia=1e-3, loss_coulomb=0.05, loss_viscous=1e-3, torque_constant=torque_constant)
-    robot = paper_robots.blank(Configurations({"bench": load}))
+    robot = paper_robots.blank_robot(Configurations({"bench": load}))
     stated = {"gearbox.ratio": 20.0, "gearbox.efficiency_load": 0.8, "motor.torque_constant": 0.0259}
     robot = params.replace(robot, stated)
     runs = Conditions(0, voltage=0.0, motor_speed=[100.0, -100.0, 300.0, -300.0])
@@ -1203,13 +1203,13 @@ def test_friction_along_the_travel_and_over_a_turn_turns_round_with_the_speed():
 def test_friction_by_the_position_begins_where_a_history_does():
     names = ("position_friction", "angle_friction", "presliding")
     load = Shaft(inertia=1e-3, loss_coulomb=0.05, loss_viscous=1e-3)
-    robot = paper_robots.blank(Configurations({"bench": load}))
+    robot = paper_robots.blank_robot(Configurations({"bench": load}))
     begins = Begins({"begin_a": Begin(angle=1.5), "begin_b": Begin(angle=-2.0)})
     rig = dataclasses.replace(robot.rig, begins=begins, start="measured")
     robot = dataclasses.replace(with_effects(*(BY_NAME[n]() for n in names), robot=robot), rig=rig)
     for begin, angle in enumerate((1.5, -2.0)):
         run = jax.tree.map(lambda x: x[0], Conditions([0], voltage=[0.0], begin=[begin]))
-        memory = state_of(robot, start(robot, run)).memory
+        memory = state_of_unknowns(robot, drive_start(robot, run)).memory
         assert [float(memory[n]) for n in names] == [angle, angle, 0.0]
 
 
@@ -1292,7 +1292,7 @@ RUNS = Conditions(
     payload=[2.0, 0.0, 0.0],
     battery=[1.0, 0.0, 0.0],
 ).resolved(NOMINAL)
-EVERY = {p.name: p.value for p in params.walk(with_effects(*(fitted(e, 0.02 * size(e)) for e in ALL)))}
+EVERY = {p.name: p.value for p in params.walk_parameters(with_effects(*(fitted(e, 0.02 * size(e)) for e in ALL)))}
 THETA = jnp.stack([jnp.asarray(x) for x in EVERY.values()])
 
 
@@ -1323,7 +1323,7 @@ def test_rates_with_all_effects_have_finite_derivatives_by_every_parameter(share
     """What `drive` integrates, at standstill and on the way."""
     # Current, motor speed, speed, distance and discharge in the units of `drive`, then memories in theirs.
     unknowns = share * jnp.asarray([0.2, 0.7, 0.5, 1.0, 10.0, *[0.3 for e in ALL if e.memory_size is not None]])
-    slopes = _slopes(lambda robot, run: rates(robot, run, unknowns))
+    slopes = _slopes(lambda robot, run: drive_rates(robot, run, unknowns))
     assert np.isfinite(slopes).all() and np.abs(slopes[0]).max() > 0
 
 
@@ -1332,7 +1332,7 @@ def test_instant_of_half_robot_with_all_effects_has_finite_derivatives_by_every_
     """What `track` integrates, at standstill."""
 
     def outputs(robot, run):
-        system = half_robot.system(robot, run, 1e-4)
+        system = half_robot.half_robot_system(robot, run, 1e-4)
         signals, _, pulled = half_robot.instant(system, half_robot.stand(system))
         leaves = [jnp.asarray(x) for x in jax.tree.leaves((signals, pulled))]
         return jnp.concatenate([x.ravel() for x in leaves if x.dtype == THETA.dtype])

@@ -149,7 +149,7 @@ def test_defects_of_turns_are_drawn_by_side_over_what_that_side_does():
 def test_change_of_a_reading_that_crosses_zero_is_of_its_size(monkeypatch):
     """A turn's yaw rate may be next to nothing; what an effect changes of it is no share of that."""
     robot = dataclasses.replace(mm.nominal(), effects=(effects.BY_NAME["iron_loss"](amplitude=1.0),))
-    (yaw,) = channels.rows(["yaw_rate"])
+    (yaw,) = channels.channels_named(["yaw_rate"])
     rates = [np.array([1.0, -1.0, 1e-9]), np.array([1.1, -1.1, 0.1])]
     monkeypatch.setattr(page.mm, "simulate", lambda *_: SimpleNamespace(yaw_rate=rates.pop(0)))
     found = SimpleNamespace(

@@ -9,7 +9,7 @@ import pytest
 from worlds.events import Bench, through
 
 from mmrjax.fidelities.drive import drive_batch
-from mmrjax.fidelities.histories import CHANGE, grid, histories
+from mmrjax.fidelities.histories import CHANGE, history_signals, time_grid
 from mmrjax.model import paper_robots, params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.rig import Rig
@@ -35,7 +35,7 @@ SHARE = 1e-3
 def robot_of(bench):
     loose = bench.backlash > 0
     shaft = Shaft(inertia=1.0, loss_coulomb=1.0, backlash=float(loose))
-    robot = paper_robots.blank(Configurations({"bench": shaft}), rig=Rig(loose=loose))
+    robot = paper_robots.blank_robot(Configurations({"bench": shaft}), rig=Rig(loose=loose))
     return params.replace(robot, {p: getattr(bench, f) for f, p in NAMES.items() if loose or f != "backlash"})
 
 
@@ -43,20 +43,20 @@ def robot_of(bench):
 def simulated():
     """Signals of a bench without a backlash at the samples, and derivatives of current [A] and motor speed [rad/s] by
     shares of its parameters `MOVED`; one program serves all."""
-    times = grid(SAMPLES, CHANGES[1:], start=CHANGE)
+    times = time_grid(SAMPLES, CHANGES[1:], start=CHANGE)
     run = Conditions(voltage=VOLTS[np.searchsorted(CHANGES, times, side="right") - 1])
     at = np.searchsorted(times, SAMPLES)
 
     def of(shares, robot, values):
         moved = {NAMES[f]: value * share for f, value, share in zip(MOVED, values, shares, strict=True)}
-        signals = histories(params.replace(robot, moved), run, jnp.asarray(times), at=at)
+        signals = history_signals(params.replace(robot, moved), run, jnp.asarray(times), at=at)
         return jnp.stack([signals.current, signals.speed_motor], -1), signals
 
     program = jax.jit(jax.jacfwd(of, has_aux=True))
 
     def found(bench):
         values = jnp.asarray([getattr(bench, f) for f in MOVED])
-        return program(jnp.ones(len(MOVED)), params.strong(robot_of(bench)), values)
+        return program(jnp.ones(len(MOVED)), params.without_weak_types(robot_of(bench)), values)
 
     return found
 

@@ -14,12 +14,12 @@ from worlds import laws, settled, tables
 from calibration.data import robot_file
 from calibration.data.input_errors import BadConfiguration
 from calibration.discovery import experiments, menu, predicted
-from calibration.discovery.candidates import Candidate, filled, fit_candidates
+from calibration.discovery.candidates import Candidate, fill_slots, fit_candidates
 from calibration.discovery.classes import Classes
 from calibration.discovery.instructions import NothingPossible
 from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.loop_notes import Heat, Overspeed, Overvoltage
-from calibration.discovery.reach import reach
+from calibration.discovery.reach import reach_of_table
 from calibration.discovery.stated_values import Shift
 from mmrjax.effects import BY_NAME, OF_CHANNELS
 from mmrjax.fidelities.steady import IMPLICIT
@@ -42,14 +42,14 @@ def conditions(made):
 
 
 CLIMBING = params.replace(paper_robots.nominal(), settled.CLIMBING)
-REACH = reach(CLIMBING, conditions(settled.table8()), channels.USUAL)
-MENU = menu.menu(REACH)
-SPANS, BY = predicted.spans(MENU), {e.name: e for e in MENU}
+REACH = reach_of_table(CLIMBING, conditions(settled.table8()), channels.USUAL)
+MENU = menu.experiment_menu(REACH)
+SPANS, BY = predicted.reading_spans(MENU), {e.name: e for e in MENU}
 SETTINGS = SETTLED.settings
 
 
 def foreseen(robot, batch):
-    return predicted.readings(robot, batch, *predicted.of_runs(IMPLICIT.solve, robot, batch))[1]
+    return predicted.predict_readings(robot, batch, *predicted.map_over_runs(IMPLICIT.solve, robot, batch))[1]
 
 
 # --- what the menu foresees -------------------------------------------------------------------------
@@ -59,7 +59,7 @@ def foreseen(robot, batch):
 def shown():
     """Readings of the whole menu, and which exist, for constants and a term of the generator."""
     full = dataclasses.replace(CLIMBING, effects=tuple(BY_NAME[name]() for name in laws.LIBRARY))
-    read, batch = eqx.filter_jit(foreseen), predicted.batch(MENU, channels.USUAL)
+    read, batch = eqx.filter_jit(foreseen), predicted.batch_experiments(MENU, channels.USUAL)
 
     def of(p, term=None):
         values = dict(p)
@@ -96,7 +96,7 @@ def test_agreement_can_fail(shown):
 
 def test_menu_and_generator_have_the_same_instruments():
     case = tables.Case({}, {}, None, settled.conditions(0, 1, 0, 0), settled.CLIMBING, (), settled.Instruments())
-    sd = predicted.sds(
+    sd = predicted.reading_sds(
         MENU, dict(zip(channels.USUAL, case.instruments.stated * [1.0, np.pi / 30, 1e-3], strict=True))
     )
     for name, at in SPANS.items():
@@ -121,16 +121,16 @@ def seen():
         case = tables.narrow([pair[0]], 12.0, seed=3)
         space = SETTLED.space(table(case))
         start = np.zeros(len(space.coordinates))
-        fitted = fit_candidates(space, [(filled([name], SETTINGS), start) for name in pair], SETTINGS)
+        fitted = fit_candidates(space, [(fill_slots([name], SETTINGS), start) for name in pair], SETTINGS)
         answers[pair] = case, space, dict(zip(pair, fitted, strict=True))
-    return {p: (c, space, f, experiments.predict(space, f, SETTINGS)) for p, (c, space, f) in answers.items()}
+    return {p: (c, space, f, experiments.predict_menu(space, f, SETTINGS)) for p, (c, space, f) in answers.items()}
 
 
 @pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("pair", PAIRS)
 def test_proposal_is_what_an_engineer_would_do(pair, seen):
-    proposal = experiments.choose(seen[pair][3])
+    proposal = experiments.choose_experiment(seen[pair][3])
     assert proposal.name in PAIRS[pair]
     assert proposal.settles and proposal.separates == (pair[1],) and proposal.expected_sigma > 3
     assert (
@@ -143,7 +143,7 @@ def test_proposal_is_what_an_engineer_would_do(pair, seen):
 @pytest.mark.parametrize("pair", PAIRS)
 def test_proposal_carried_out_resolves_the_class(pair, seen):
     case, _, _, foreseen = seen[pair]
-    name = experiments.choose(foreseen).name
+    name = experiments.choose_experiment(foreseen).name
     done = next(e for e in foreseen.experiments if e.name == name)
     verdicts = [supported(foreseen, {name: case.carry_out(done, seed)}) for seed in range(10)]
     assert sum(v.resolved and v.best == pair[0] for v in verdicts) >= 8
@@ -165,8 +165,12 @@ def foreseeing(sigma):
 
 
 def test_less_effort_is_preferred_where_more_sigmas_are_no_gain():
-    assert experiments.choose(foreseeing({"weigh": [0, 6.0], "stall": [0, 40.0]})).experiments == ("weigh",)
-    assert experiments.choose(foreseeing({"weigh": [0, 3.0], "stall": [0, 40.0]})).experiments == ("stall",)
+    assert experiments.choose_experiment(foreseeing({"weigh": [0, 6.0], "stall": [0, 40.0]})).experiments == (
+        "weigh",
+    )
+    assert experiments.choose_experiment(foreseeing({"weigh": [0, 3.0], "stall": [0, 40.0]})).experiments == (
+        "stall",
+    )
 
 
 def test_chance_is_the_share_of_draws_in_which_the_false_one_is_refuted():
@@ -177,25 +181,25 @@ def test_chance_is_the_share_of_draws_in_which_the_false_one_is_refuted():
         in supported(seen, {"stall": {"value": rng.standard_normal(at.stop - at.start), "sd": np.ones(2)}}).refuted
         for _ in range(4000)
     ]
-    one = next(r for r in experiments.ranked(seen) if r.experiments == ("stall",))
+    one = next(r for r in experiments.rank_experiments(seen) if r.experiments == ("stall",))
     assert np.mean(refuted) == pytest.approx(one.chances[0], abs=0.025)  # three sds of the draws
 
 
 def test_every_two_alternatives_count_not_only_those_with_the_best_fit():
     # `shunt`, the lesser effort, tells both others from the best fit but not from one another; `stall` all three
-    proposal = experiments.choose(foreseeing({"shunt": [0, 9.0, 9.0], "stall": [0, 6.0, 12.0]}))
+    proposal = experiments.choose_experiment(foreseeing({"shunt": [0, 9.0, 9.0], "stall": [0, 6.0, 12.0]}))
     assert proposal.experiments == ("stall",) and proposal.settles
 
 
 def test_less_effort_is_preferred_also_beside_a_pair_that_nothing_tells():
-    assert experiments.choose(foreseeing({"weigh": [0, 6.0, 6.0], "stall": [0, 40.0, 40.0]})).experiments == (
-        "weigh",
-    )
+    assert experiments.choose_experiment(
+        foreseeing({"weigh": [0, 6.0, 6.0], "stall": [0, 40.0, 40.0]})
+    ).experiments == ("weigh",)
 
 
 def test_one_pair_of_many_alternatives_counts():
     far = [9.0 * k for k in range(1, 6)]
-    proposal = experiments.choose(
+    proposal = experiments.choose_experiment(
         foreseeing({"weigh": [0, 0.0, *far], "stall": [0, *(9.0 * k for k in range(1, 7))]})
     )
     assert proposal.experiments == ("stall",) and proposal.settles
@@ -203,17 +207,17 @@ def test_one_pair_of_many_alternatives_counts():
 
 def test_pair_that_one_experiment_tells_is_worth_more_than_three_that_none_does():
     # three pairs 1.9 sigma apart at most by `stall`; `weigh` tells one of them by 3
-    proposal = experiments.choose(foreseeing({"stall": [0, 1.9, 0.95], "weigh": [0, 1.5, 3.0]}))
+    proposal = experiments.choose_experiment(foreseeing({"stall": [0, 1.9, 0.95], "weigh": [0, 1.5, 3.0]}))
     assert "weigh" in proposal.experiments and proposal.expected_sigma >= 2.0
 
 
 def test_two_weak_experiments_are_proposed_together():
-    proposal = experiments.choose(foreseeing({"stall": [0, 1.9], "weigh": [0, 1.9]}))
+    proposal = experiments.choose_experiment(foreseeing({"stall": [0, 1.9], "weigh": [0, 1.9]}))
     assert set(proposal.experiments) == {"stall", "weigh"} and proposal.expected_sigma == pytest.approx(1.9 * 2**0.5)
 
 
 def test_a_second_experiment_is_proposed_where_one_leaves_two_together():
-    proposal = experiments.choose(
+    proposal = experiments.choose_experiment(
         foreseeing({"stall": [0, 9.0, 9.0], "weigh": [0, 0.0, 7.0], "timing": [0, 0.0, 1.0]})
     )
     assert set(proposal.experiments) == {"stall", "weigh"} and proposal.settles
@@ -223,7 +227,7 @@ def test_a_second_experiment_is_proposed_where_one_leaves_two_together():
 
 
 def test_a_second_experiment_that_adds_nothing_is_not():
-    proposal = experiments.choose(foreseeing({"stall": [0, 9.0, 9.0], "weigh": [0, 0.0, 0.5]}))
+    proposal = experiments.choose_experiment(foreseeing({"stall": [0, 9.0, 9.0], "weigh": [0, 0.0, 0.5]}))
     assert (
         proposal.experiments == ("stall",) and not proposal.settles and proposal.expected_sigma == pytest.approx(9.0)
     )
@@ -233,7 +237,9 @@ def test_a_second_experiment_that_adds_nothing_is_not():
 def test_alternatives_that_agree_give_none(seen):
     _, space, fitted, _ = seen["series_resistance", "supply_sag"]
     same = next(iter(fitted.values()))
-    proposal = experiments.choose(experiments.predict(space, {"one": same, "the other": same}, SETTINGS))
+    proposal = experiments.choose_experiment(
+        experiments.predict_menu(space, {"one": same, "the other": same}, SETTINGS)
+    )
     assert proposal.name == experiments.NONE
     assert proposal.expected_sigma == 0 and proposal.separates == ()
 
@@ -258,16 +264,16 @@ def of_members(*members, ladder, stated=None):
 
 def test_alternatives_are_the_class_best_first():
     made = candidates("a", "b", "c", "d")
-    left = experiments.alternatives(made[2], of_members(("c", "a"), ladder=made))
+    left = experiments.alternatives_of_class(made[2], of_members(("c", "a"), ladder=made))
     assert list(left) == ["c", "a"] and list(left.values()) == [made[2], made[0]]
 
 
 def test_stated_value_that_may_be_wrong_is_an_alternative():
     made = candidates("a", "b", "")
     alike = of_members(("a", "b"), ladder=made, stated=((Shift("motor.resistance", 0, made[2]),),))
-    left = experiments.alternatives(made[0], alike)
+    left = experiments.alternatives_of_class(made[0], alike)
     assert list(left) == ["a", "b", "motor.resistance"] and left["motor.resistance"] is made[2]
-    assert list(experiments.alternatives(made[0], alike, stated=False)) == ["a", "b"]
+    assert list(experiments.alternatives_of_class(made[0], alike, stated=False)) == ["a", "b"]
 
 
 def test_alternatives_of_two_classes_differ_in_one_effect():
@@ -275,7 +281,7 @@ def test_alternatives_of_two_classes_differ_in_one_effect():
         dataclasses.replace(c, active=pair)
         for c, pair in zip(candidates("", "", "", ""), [("a", "b"), ("c", "b"), ("d", "a"), ("c", "d")], strict=True)
     )
-    left = experiments.alternatives(made[0], of_members(("a", "c"), ("b", "d"), ladder=made))
+    left = experiments.alternatives_of_class(made[0], of_members(("a", "c"), ("b", "d"), ladder=made))
     assert list(left) == ["a + b", "c + b", "d + a"]
 
 
@@ -283,7 +289,7 @@ def test_alternatives_of_two_classes_differ_in_one_effect():
 def test_nothing_is_proposed_where_one_name_is_left(seen):
     space = seen["mass_error", "tension_friction"][1]
     (best,) = candidates("mass_error")
-    assert experiments.separating(space, best, of_members(("mass_error",), ladder=(best,)), SETTINGS) is None
+    assert experiments.propose_separating(space, best, of_members(("mass_error",), ladder=(best,)), SETTINGS) is None
 
 
 @pytest.mark.slow
@@ -291,13 +297,15 @@ def test_unnamed_asks_for_finer_steps_in_its_variable(seen):
     space = seen["mass_error", "tension_friction"][1]
     runs = int(space.included.sum())
     where = DiscrepancyLocation("track", "speed", ("track",), (), 60.0, 60.0)
-    proposal = experiments.denser(space, where, SETTINGS)
+    proposal = experiments.propose_denser_runs(space, where, SETTINGS)
     assert "speed" in proposal.name and proposal.instruction.place == "track"
     assert proposal.expected_sigma == pytest.approx(np.sqrt(60 * 45 / runs)) and runs == 90
-    weak = experiments.denser(space, dataclasses.replace(where, strongest=4.0), SETTINGS)
+    weak = experiments.propose_denser_runs(space, dataclasses.replace(where, strongest=4.0), SETTINGS)
     assert weak.instruction.variable == "speed"
     assert weak.name == experiments.NONE and weak.expected_sigma == 0
-    wave = experiments.denser(space, dataclasses.replace(where, variable="order 2 of the driving shaft"), SETTINGS)
+    wave = experiments.propose_denser_runs(
+        space, dataclasses.replace(where, variable="order 2 of the driving shaft"), SETTINGS
+    )
     assert wave.name == "steady speeds for order 2 of the driving shaft"
 
 
@@ -339,7 +347,7 @@ def runs_of(table):
 
 @pytest.mark.slow
 def test_menu_stays_within_the_reach_of_a_small_robot(rover):
-    made = menu.menu(reach(rover, ROVERS_TABLE, channels.USUAL))
+    made = menu.experiment_menu(reach_of_table(rover, ROVERS_TABLE, channels.USUAL))
     runs = runs_of(made)
     assert {r.configuration for r in runs} == {0} and {r.where for r in runs} == {"", "rover"}
     assert max(max(r.voltage) for r in runs) <= 12.0 and min(min(r.voltage) for r in runs) > 0
@@ -354,7 +362,7 @@ def test_menu_stays_within_the_reach_of_a_small_robot(rover):
 @pytest.mark.slow
 def test_configurations_without_rows_are_not_on_the_menu():
     wheels_alone = settled.table8(configurations=(1,))
-    made = menu.menu(reach(CLIMBING, conditions(wheels_alone), channels.USUAL))
+    made = menu.experiment_menu(reach_of_table(CLIMBING, conditions(wheels_alone), channels.USUAL))
     assert not any("6T2A" in e.name for e in made) and {r.where for r in runs_of(made)} == {"", "4W2T"}
     assert {r.configuration for r in runs_of(made) if "4W2T" in r.kinds} == {1}
     assert next(e for e in made if e.name == "weigh").at == ((1.0, 0.0), (1.0, 8.0))
@@ -362,7 +370,7 @@ def test_configurations_without_rows_are_not_on_the_menu():
 
 @pytest.mark.slow
 def test_level_table_without_payload_asks_for_neither_slope_nor_payload(rover):
-    made = menu.menu(reach(rover, grid([12.0], [0.0], [0.0]), channels.USUAL))
+    made = menu.experiment_menu(reach_of_table(rover, grid([12.0], [0.0], [0.0]), channels.USUAL))
     runs = runs_of(made)
     assert all(set(r.slope) <= {0.0, -0.0} and set(r.payload) == {0.0} for r in runs)
     assert not {"downhill", "steepest slope", "payload"} & {k for r in runs for k in r.kinds}
@@ -373,10 +381,10 @@ def test_level_table_without_payload_asks_for_neither_slope_nor_payload(rover):
 @pytest.mark.slow
 def test_higher_voltage_needs_a_rating_and_is_watched(rover):
     rated = robot_file.change(rover, {"motor.voltage_limit": 18.0}, where="test")
-    within = reach(rated, ROVERS_TABLE, channels.USUAL)
-    run = next(r for r in runs_of(menu.menu(within)) if r.name == "other voltages, rover")
+    within = reach_of_table(rated, ROVERS_TABLE, channels.USUAL)
+    run = next(r for r in runs_of(menu.experiment_menu(within)) if r.name == "other voltages, rover")
     assert max(run.voltage) == 18.0
-    shown = menu.carried_out(run, *plain(run), within)
+    shown = menu.restrict_run(run, *plain(run), within)
     assert Overvoltage(18.0, 12.0) in shown.watch
 
 
@@ -387,7 +395,7 @@ def plain(run, temperature=40.0, speed=100.0):
 
 
 def test_channels_that_the_bench_lacks_are_not_read(rover):
-    made = menu.menu(reach(rover, ROVERS_TABLE, ("speed",)))
+    made = menu.experiment_menu(reach_of_table(rover, ROVERS_TABLE, ("speed",)))
     assert {c for r in runs_of(made) for c in r.channels} == {"speed"}
     names = {e.name for e in made}
     assert "timing" in names and not names & {"shunt", "strobe", "zero current", "stall", "lifted, rover"}
@@ -396,14 +404,18 @@ def test_channels_that_the_bench_lacks_are_not_read(rover):
 def test_the_zero_of_a_meter_is_read_at_rest_as_well_as_its_table_is(rover):
     off = OF_CHANNELS["motor_current_offset"](amplitude=0.18), OF_CHANNELS["motor_current_gain"](amplitude=0.05)
     robot = dataclasses.replace(rover, effects=off)
-    (zero,) = (e for e in menu.menu(reach(rover, ROVERS_TABLE, ("motor_current",))) if "zero reading" in e.kinds)
+    (zero,) = (
+        e
+        for e in menu.experiment_menu(reach_of_table(rover, ROVERS_TABLE, ("motor_current",)))
+        if "zero reading" in e.kinds
+    )
     assert np.asarray(zero.reading(robot, jnp.asarray(zero.at))) == pytest.approx([0.18])
-    assert predicted.sds([zero], {"motor_current": 0.1}) == pytest.approx([0.1 / np.sqrt(zero.repeats)])
+    assert predicted.reading_sds([zero], {"motor_current": 0.1}) == pytest.approx([0.1 / np.sqrt(zero.repeats)])
 
 
 def test_robot_with_one_motor_is_not_told_to_disconnect_the_other(rover):
     one = dataclasses.replace(rover, sides=jnp.asarray(1.0))
-    made = menu.menu(reach(one, ROVERS_TABLE, channels.USUAL))
+    made = menu.experiment_menu(reach_of_table(one, ROVERS_TABLE, channels.USUAL))
     assert not any("one motor" in e.kinds for e in made)
     assert {r.motors for r in runs_of(made)} == {1}
 
@@ -411,8 +423,8 @@ def test_robot_with_one_motor_is_not_told_to_disconnect_the_other(rover):
 @pytest.mark.slow
 def test_voltages_without_load_stay_below_the_permissible_speed():
     slow = robot_file.change(CLIMBING, {"motor.speed_limit": 900.0, "gearbox.speed_limit": 500.0}, where="test")
-    within = reach(slow, conditions(settled.table8(voltages=(12.0,))), channels.USUAL)
-    runs = {r.name: r for r in runs_of(menu.menu(within))}
+    within = reach_of_table(slow, conditions(settled.table8(voltages=(12.0,))), channels.USUAL)
+    runs = {r.name: r for r in runs_of(menu.experiment_menu(within))}
     seen = within.motor_speed  # the table went there itself
     assert max(runs["bare motor"].voltage) <= 0.0259 * 900.0
     assert max(runs["lifted, 6T2A"].voltage) <= max(0.0259 * 500.0, 0.0259 * seen)
@@ -429,25 +441,25 @@ def test_only_levels_that_the_robot_manages_are_left():
     does = np.array(
         [True, True, False, True, False, False]
     )  # at 5 V the slopes are too steep, and 20 deg at 10 V too
-    kept = menu.possible(run, does)
+    kept = menu.possible_runs(run, does)
     assert [(run.slope[k], run.voltage[k]) for k in np.flatnonzero(kept)] == [(0.0, 5.0), (0.0, 10.0)]
-    assert not menu.possible(run, np.zeros(6, bool)).any() and menu.possible(run, np.ones(6, bool)).all()
+    assert not menu.possible_runs(run, np.zeros(6, bool)).any() and menu.possible_runs(run, np.ones(6, bool)).all()
     steepest = menu._runs(REACH, "x", "travel", voltages=(5.0,), slopes=(23.0, 21.5, 20.0), steepest=True)
-    kept = menu.possible(steepest, np.array([False, True, True]))
+    kept = menu.possible_runs(steepest, np.array([False, True, True]))
     assert [steepest.slope[k] for k in np.flatnonzero(kept)] == [21.5]
 
 
 @pytest.mark.slow
 def test_steepest_slope_is_one_that_the_robot_climbs():
     slippery = params.replace(CLIMBING, {f"{c}.ground.friction.static": 0.40 for c in ("6T2A", "4W2T")})
-    found = eqx.filter_jit(foreseen)(slippery, predicted.batch(MENU, channels.USUAL))
+    found = eqx.filter_jit(foreseen)(slippery, predicted.batch_experiments(MENU, channels.USUAL))
     first = 0
     for run in runs_of(MENU):
         rows = slice(first, first := first + len(run.voltage))
         if run.name == "steepest slope, 6T2A":  # tan 21.5 deg = 0.394 and rolling resistance: beyond the adhesion
-            assert not menu.possible(run, np.asarray(found.does)[rows]).any()
+            assert not menu.possible_runs(run, np.asarray(found.does)[rows]).any()
         if run.name == "lifted, 6T2A":
-            assert menu.possible(run, np.asarray(found.does)[rows]).all()
+            assert menu.possible_runs(run, np.asarray(found.does)[rows]).all()
 
 
 @pytest.mark.parametrize(
@@ -466,34 +478,36 @@ def test_steepest_slope_is_one_that_the_robot_climbs():
 )
 def test_what_can_do_damage_is_to_be_watched(name, temperature, speed, watch):
     run = BY[name]
-    assert watch in menu.carried_out(run, *plain(run, temperature, speed), REACH).watch
+    assert watch in menu.restrict_run(run, *plain(run, temperature, speed), REACH).watch
 
 
 def test_harmless_run_has_nothing_to_watch():
     run = BY["crawl, 6T2A"]
-    assert menu.carried_out(run, *plain(run), REACH).watch == ()
+    assert menu.restrict_run(run, *plain(run), REACH).watch == ()
 
 
 def test_every_kind_is_on_the_packaged_menu_and_no_other():
-    metered = menu.menu(dataclasses.replace(REACH, measured=("motor_current",)))
-    braked = menu.menu(dataclasses.replace(REACH, has_ground=False, torques=(0.0, 0.5)))
+    metered = menu.experiment_menu(dataclasses.replace(REACH, measured=("motor_current",)))
+    braked = menu.experiment_menu(dataclasses.replace(REACH, has_ground=False, torques=(0.0, 0.5)))
     kinds = {k for e in (*MENU, *metered, *braked) for k in e.kinds}
     assert kinds == {*menu.KINDS, "6T2A", "4W2T"}
 
 
 def test_runs_against_a_brake_have_its_torque():
     within = dataclasses.replace(REACH, has_ground=False, measured=("motor_speed",), torques=(0.0, 0.1, 0.5))
-    made = menu.menu(within)
-    batch = predicted.batch(made, within.measured)
+    made = menu.experiment_menu(within)
+    batch = predicted.batch_experiments(made, within.measured)
     torque = np.asarray(batch.conditions.load_torque)
     assert torque.tolist() == [m for r in made if isinstance(r, menu.Run) for m in r.torque]
     assert torque.max() == 0.5 and (torque * np.asarray(batch.conditions.voltage) >= 0).all()  # it brakes either way
     run = next(r for r in made if "other torques" in r.kinds)
     done = np.asarray(run.torque) < 0.5  # it stalls the motor
-    kept = menu.carried_out(run, menu.possible(run, done), *plain(run)[1:], within)
+    kept = menu.restrict_run(run, menu.possible_runs(run, done), *plain(run)[1:], within)
     assert set(kept.torque) == set(run.torque) - {0.5} and len(kept.voltage) == len(kept.torque)
     assert (
-        predicted.batch(menu.menu(dataclasses.replace(within, torques=())), ("motor_speed",)).conditions.load_torque
+        predicted.batch_experiments(
+            menu.experiment_menu(dataclasses.replace(within, torques=())), ("motor_speed",)
+        ).conditions.load_torque
         is None
     )
 
@@ -510,21 +524,23 @@ def test_unknown_experiments_are_refused_with_the_choices():
 def test_forbidden_and_impossible_experiments_are_not_proposed(seen):
     _, space, fitted, free = seen["series_resistance", "supply_sag"]
     barred = dataclasses.replace(SETTINGS, forbidden=("stall", "one motor", "4W2T"))
-    left = experiments.predict(space, fitted, barred)
+    left = experiments.predict_menu(space, fitted, barred)
     assert not {"stall", "one motor", "4W2T"} & {k for e in left.experiments for k in e.kinds}
     assert {e.name for e in left.experiments} < {e.name for e in free.experiments}
-    assert left.value.shape[1] == sum(predicted.size(e) for e in left.experiments) == len(left.sd)
+    assert left.value.shape[1] == sum(predicted.reading_count(e) for e in left.experiments) == len(left.sd)
     everything = dataclasses.replace(SETTINGS, forbidden=menu.KINDS)
-    nothing = experiments.choose(experiments.predict(space, fitted, everything))
+    nothing = experiments.choose_experiment(experiments.predict_menu(space, fitted, everything))
     assert nothing.name == experiments.NONE and nothing.instruction == NothingPossible()
 
 
 def test_finer_steps_are_within_the_tables_ranges(rover):
-    within = reach(rover, ROVERS_TABLE, channels.USUAL)
-    series = experiments.more_runs("slip", "voltage", within)
+    within = reach_of_table(rover, ROVERS_TABLE, channels.USUAL)
+    series = experiments.denser_runs_instruction("slip", "voltage", within)
     assert (series.low, series.high, series.slope, series.payload) == (6.0, 12.0, 8.0, 1.0)
     assert series.steps == (0.5, 0.5, 0.1)
-    level = experiments.more_runs("slip", "current", reach(rover, grid([12.0], [0.0], [0.0]), channels.USUAL))
+    level = experiments.denser_runs_instruction(
+        "slip", "current", reach_of_table(rover, grid([12.0], [0.0], [0.0]), channels.USUAL)
+    )
     assert (level.low, level.high, level.slope, level.payload) == (6.0, 12.0, 0.0, 0.0)
 
 

@@ -3,7 +3,7 @@
 import pytest
 
 from mmrjax import effects
-from mmrjax.errors import choices, near
+from mmrjax.errors import allowed_words, similar_words
 from mmrjax.model import channels, paper_robots, params
 from sweeps.commands import explain
 from sweeps.pages import words
@@ -34,7 +34,7 @@ def test_every_name_has_an_explanation_of_its_kind(unsimulated):
 def test_an_effect_is_explained_by_what_its_class_states(unsimulated):
     for name, effect in EVERY.items():
         lines = dict(said("effect", name))
-        spec = next(p.spec for p in params.walk(effect()) if p.spec.amplitude)
+        spec = next(p.spec for p in params.walk_parameters(effect()) if p.spec.amplitude)
         equation, meaning, source = words_of.about(effect)
         assert (lines["equation"], lines["stands for"], lines["source"]) == (equation, meaning, source)
         assert lines["typical size"].startswith(f"{spec.sd:g} {spec.unit}") and spec.source in lines["typical size"]
@@ -57,7 +57,7 @@ def test_a_typical_size_is_simulated(robot):
 
 
 def test_parameters_and_channels_are_explained_by_their_rows():
-    known = {p.name: p for p in params.walk(paper_robots.nominal())}
+    known = {p.name: p for p in params.walk_parameters(paper_robots.nominal())}
     lines = dict(said("parameter", "motor.resistance"))
     spec = known["motor.resistance"].spec
     assert lines["means"] == f"{spec.meaning} [{spec.unit}]" and lines["nominal"] == f"0.611 ohm; {spec.source}"
@@ -65,7 +65,7 @@ def test_parameters_and_channels_are_explained_by_their_rows():
     assert dict(said("parameter", "6T2A.ground.friction.static"))["equation"]
     lines = dict(said("channel", "speed_mm_s"))
     assert "speed_sd_mm_s" in lines["column"] and lines["other units"].startswith("m/s, km/h")
-    assert lines["typical noise"].startswith(f"{100 * channels.find('speed').sd_share:g} %")
+    assert lines["typical noise"].startswith(f"{100 * channels.find_channel('speed').sd_share:g} %")
     assert "shows it: drawn from the supply by all motors" in dict(said("channel", "total_current"))["is"]
     assert dict(said("output", "slip"))["equation"].startswith("1 - V / V_theoretical, eq. (33)")
 
@@ -94,7 +94,11 @@ def test_an_unknown_name_is_answered_by_what_is_near(name, says, mmrjax):
 
 def test_near_words_have_the_word_as_a_part_whatever_its_capitals():
     outputs = ["total_current", "motor_speed", "peak_current", "slip"]
-    assert near("current", outputs) == ["total_current"]
-    assert near("current", outputs, 3) == ["total_current", "peak_current"]
-    assert near("SLIP", outputs) == ["slip"] and near("slop", outputs) == ["slip"] and near("xyzzy", outputs) == []
-    assert choices("Motor_Speed", outputs).startswith("did you mean motor_speed? allowed: total_current")
+    assert similar_words("current", outputs) == ["total_current"]
+    assert similar_words("current", outputs, 3) == ["total_current", "peak_current"]
+    assert (
+        similar_words("SLIP", outputs) == ["slip"]
+        and similar_words("slop", outputs) == ["slip"]
+        and similar_words("xyzzy", outputs) == []
+    )
+    assert allowed_words("Motor_Speed", outputs).startswith("did you mean motor_speed? allowed: total_current")

@@ -45,7 +45,7 @@ def knows_itself(fidelity: Fidelity, robot) -> None:
     assert all(0 < option.default <= option.most and option.meaning and option.unit for option in facts.options)
     assert fidelity.facts.resolved() == {option.name: option.default for option in facts.options}
     assert (fidelity.histories is not None) == facts.histories
-    parameters = {p.name for p in params.walk(robot.configurations.members[0])}
+    parameters = {p.name for p in params.walk_parameters(robot.configurations.members[0])}
     assert set(facts.computes) <= parameters
 
 
@@ -56,7 +56,7 @@ def settles_traceably(fidelity: Fidelity, robot) -> None:
         return jnp.stack([result.reading[name] for name in channels.USUAL]), result
 
     (slopes, result) = jax.eval_shape(jax.jacfwd(readings, has_aux=True), jnp.asarray(0.611))
-    assert slopes.shape == (len(channels.usual()), 2)
+    assert slopes.shape == (len(channels.usual_channels()), 2)
     assert all(x.shape == (2,) for x in jax.tree.leaves(result))
 
 
@@ -98,7 +98,7 @@ CONTRACT = (knows_itself, settles_traceably, runs_batches, keeps_histories, chec
     [
         pytest.param(n, law, marks=pytest.mark.slow)
         # a program of its own; what drive keeps is looked at by test_drive, test_start and test_cli
-        if fidelities.facts(n).slow or (n == "drive" and law is keeps_histories)
+        if fidelities.fidelity_facts(n).slow or (n == "drive" and law is keeps_histories)
         else (n, law)
         for n in fidelities.NAMES
         for law in CONTRACT
@@ -106,7 +106,7 @@ CONTRACT = (knows_itself, settles_traceably, runs_batches, keeps_histories, chec
     ids=[f"{n}-{law.__name__}" for n in fidelities.NAMES for law in CONTRACT],
 )
 def test_fidelity_keeps_the_contract(name, law, robot):
-    fidelity = fidelities.get(name)
+    fidelity = fidelities.get_fidelity(name)
     assert fidelity.name == name
     law(fidelity, robot)
 
@@ -120,7 +120,7 @@ def _no_readings(robot, conditions, options, progress=None):
 
 
 def _from_the_middle(robot, conditions, options, progress=None):
-    kept = fidelities.get("drive").histories(robot, conditions, {"duration": 2 * SHORT})
+    kept = fidelities.get_fidelity("drive").histories(robot, conditions, {"duration": 2 * SHORT})
     return kept
 
 
@@ -136,12 +136,12 @@ def _from_the_middle(robot, conditions, options, progress=None):
 )
 def test_contract_can_be_broken(law, of, change, robot):
     with pytest.raises(AssertionError):
-        law(dataclasses.replace(fidelities.get(of), **change), robot)
+        law(dataclasses.replace(fidelities.get_fidelity(of), **change), robot)
 
 
 @pytest.mark.slow
 def test_settled_fidelities_agree_where_the_robot_drives(robot):
-    steady, drive = (fidelities.get(name).settled(robot, RUNS) for name in ("steady", "drive"))
+    steady, drive = (fidelities.get_fidelity(name).settled(robot, RUNS) for name in ("steady", "drive"))
     for name in channels.USUAL:
         np.testing.assert_allclose(drive.reading[name], steady.reading[name], rtol=1e-3)
 
@@ -150,7 +150,7 @@ def test_settled_fidelities_agree_where_the_robot_drives(robot):
 def test_settled_gives_numbers_where_the_robot_slides(robot):
     runs = Conditions(voltage=24.0, slope_deg=[20.0])
     for name in ("steady", "drive"):
-        settled = fidelities.get(name).settled(robot, runs)
+        settled = fidelities.get_fidelity(name).settled(robot, runs)
         assert STATUSES[int(settled.status[0])] == "slides"
         assert all(np.isfinite(reading).all() for reading in settled.reading.values())
 
@@ -180,7 +180,7 @@ def toy(monkeypatch):
 
 
 def test_new_fidelity_is_a_file_and_a_line(toy, robot):
-    fidelity = fidelities.get(toy)
+    fidelity = fidelities.get_fidelity(toy)
     for law in CONTRACT:
         law(fidelity, robot)
     assert fidelity.run(robot, RUNS, fidelity.facts.resolved(patience=4)).columns["patience"].tolist() == [4.0, 4.0]
@@ -192,8 +192,14 @@ def test_new_fidelity_is_a_file_and_a_line(toy, robot):
 @pytest.mark.parametrize(
     ("code", "absent"),
     [
-        ("from mmrjax import fidelities; fidelities.NAMES, fidelities.facts('track').resolved()", "jax mujoco"),
-        ("from mmrjax import fidelities; fidelities.get('steady'); fidelities.get('drive')", "mujoco"),
+        (
+            "from mmrjax import fidelities; fidelities.NAMES, fidelities.fidelity_facts('track').resolved()",
+            "jax mujoco",
+        ),
+        (
+            "from mmrjax import fidelities; fidelities.get_fidelity('steady'); fidelities.get_fidelity('drive')",
+            "mujoco",
+        ),
     ],
 )
 def test_facts_need_no_jax_and_steady_no_mujoco(code, absent):
@@ -203,15 +209,15 @@ def test_facts_need_no_jax_and_steady_no_mujoco(code, absent):
 
 def test_facts_state_what_the_command_line_needs():
     assert fidelities.NAMES == ("steady", "drive", "track")
-    assert [fidelities.facts(name).chunk for name in fidelities.NAMES] == [
+    assert [fidelities.fidelity_facts(name).chunk for name in fidelities.NAMES] == [
         (262144, 4194304),
         (4096, 65536),
         (512, 16384),
     ]
-    assert [fidelities.facts(name).resolved() for name in fidelities.NAMES] == [
+    assert [fidelities.fidelity_facts(name).resolved() for name in fidelities.NAMES] == [
         {}, {"duration": 30.0}, {"duration": 1.5, "step": 1e-4},
     ]  # fmt: skip
-    assert fidelities.facts("drive").resolved(duration=None) == {"duration": 30.0}
+    assert fidelities.fidelity_facts("drive").resolved(duration=None) == {"duration": 30.0}
 
 
 @pytest.mark.parametrize(
@@ -226,19 +232,19 @@ def test_facts_state_what_the_command_line_needs():
 )
 def test_options_are_refused_in_words(name, given, message):
     with pytest.raises(ValueError) as refused:
-        fidelities.facts(name).resolved(**given)
+        fidelities.fidelity_facts(name).resolved(**given)
     assert str(refused.value) == message
 
 
 def test_unknown_fidelity_lists_those_there_are():
-    for ask in (fidelities.get, fidelities.facts):
+    for ask in (fidelities.get_fidelity, fidelities.fidelity_facts):
         with pytest.raises(KeyError, match="no fidelity fast; there are steady, drive, track"):
             ask("fast")
 
 
 @pytest.mark.slow
 def test_check_refuses_a_step_that_a_run_cannot_bear(robot):
-    track = fidelities.get("track")
+    track = fidelities.get_fidelity("track")
     stiff = params.replace(robot, {"running_gear.contact_stiffness": jnp.asarray(3e9)})
     with pytest.raises(ValueError, match=r"the largest stable step is .* \(run \d of 2\)"):
         track.check(stiff, RUNS, track.facts.resolved(step=1e-3))

@@ -33,12 +33,14 @@ def test_ground_forces_match_reference():
 def test_slip_matches_reference():
     for V, w, r in RNG.uniform((0.1, 1, 0.01), (1, 20, 0.1), (50, 3)):
         theoretical = paper.theoretical_speed(w, r)
-        np.testing.assert_allclose(ground.slip(V, theoretical), paper.slip(V, theoretical), rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(
+            ground.slip_ratio(V, theoretical), paper.slip(V, theoretical), rtol=1e-9, atol=1e-12
+        )
 
 
 @pytest.mark.parametrize(("speed", "theoretical", "slip"), [(0.0, 0.0, 0.0), (0.0, 1.0, 1.0), (1.0, 1.0, 0.0)])
 def test_slip_limits_are_finite(speed, theoretical, slip):
-    value, gradient = jax.value_and_grad(ground.slip, argnums=(0, 1))(speed, theoretical)
+    value, gradient = jax.value_and_grad(ground.slip_ratio, argnums=(0, 1))(speed, theoretical)
     assert float(value) == slip and np.isfinite(gradient).all()
 
 

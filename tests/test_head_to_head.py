@@ -112,7 +112,7 @@ def test_plain_drives_read_a_file_as_its_generator_means_it(kind, imposed, seed,
     robot = robot_file.read(tmp_path / "rig.toml")
     runs = records.read(tmp_path / "table.csv", robot=robot)
     names = [case.world.rig.public(n) for n in case.world.rig.tolerances]
-    drive = plain_drives.drive(runs, robot, priors.coordinates(robot, names))
+    drive = plain_drives.drive(runs, robot, priors.parameter_coordinates(robot, names))
     stated = dataclasses.replace(case.world, constants=case.world.rig.stated)
     shown = stated.readings()[0].T * np.array([rigs.CHANNELS[n][1] for n in case.world.rig.channels])
     order = [case.world.rig.channels.index(channel.name) for channel in runs.channels]

@@ -27,7 +27,7 @@ def linear(jacobian):
     readings, parameters = jacobian.shape
     posed = SimpleNamespace(coordinates=SimpleNamespace(names=tuple(f"p{k}" for k in range(parameters))))
     data = SimpleNamespace(measured=np.zeros((readings, 1)))
-    return identifiability.analyse(posed, np.zeros(parameters), data, slope=jacobian)
+    return identifiability.analyse_identifiability(posed, np.zeros(parameters), data, slope=jacobian)
 
 
 def posterior_sd(jacobian):

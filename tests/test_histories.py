@@ -10,7 +10,7 @@ from jax.flatten_util import ravel_pytree
 
 from mmrjax.effects import BY_NAME
 from mmrjax.fidelities.drive import drive
-from mmrjax.fidelities.histories import LONGEST, START, followed, grid, histories
+from mmrjax.fidelities.histories import LONGEST, START, history_signals, linearise_run, time_grid
 from mmrjax.model import paper_robots, params
 from mmrjax.model.conditions import Conditions
 
@@ -21,7 +21,7 @@ RUNS = Conditions(
     configuration=np.array([0.0, 0.0, 1.0]),
 )
 TIMES = np.concatenate([np.linspace(2e-4, 4e-3, 8), np.arange(0.02, 0.8001, 0.02)])
-GRID = grid(TIMES)
+GRID = time_grid(TIMES)
 AT = np.searchsorted(GRID, TIMES)
 STATE = ("current", "speed_motor", "speed")
 #: Every effect with a memory, and one in each of `inertia` and `inductance`.
@@ -31,7 +31,7 @@ EFFECTS = ("rotating_inertia", "thermal_drift", "armature_inductance", "cogging"
 
 def seen(robot, runs=RUNS):
     """Current [A], motor speed [rad/s] and speed [m/s] at TIMES, shape (runs, times, 3)."""
-    s = jax.vmap(lambda c: histories(robot, c, jnp.asarray(GRID)))(runs)
+    s = jax.vmap(lambda c: history_signals(robot, c, jnp.asarray(GRID)))(runs)
     return jnp.stack([getattr(s, k) for k in STATE], -1)[:, AT]
 
 
@@ -43,7 +43,7 @@ def test_grid_holds_the_instants_and_is_fine_where_a_start_is_young():
     assert GRID[0] == 0.0 and GRID[-1] == TIMES[-1] and np.isin(TIMES, GRID).all()
     assert (step > 0).all() and step[0] <= 1.5 * START[0] and step.max() <= LONGEST * (1 + 1e-9)
     assert len(GRID) < 600  # LONGEST throughout would be 320, the first step's 80 000
-    assert np.diff(grid(np.array([0.0, 600.0]))).max() > LONGEST  # a long run: no more steps than it can have
+    assert np.diff(time_grid(np.array([0.0, 600.0]))).max() > LONGEST  # a long run: no more steps than it can have
 
 
 def test_histories_follow_drive():
@@ -70,12 +70,12 @@ def test_histories_follow_drive():
 def test_derivatives_are_those_of_what_is_computed(changes):
     """By parameters and by the amplitude of every effect with a memory, against central differences."""
     robot = dataclasses.replace(paper_robots.nominal(), effects=tuple(BY_NAME[n]() for n in EFFECTS))
-    robot = params.strong(params.replace(robot, {k: jnp.asarray(v) for k, v in changes.items()}))
+    robot = params.without_weak_types(params.replace(robot, {k: jnp.asarray(v) for k, v in changes.items()}))
     names = [
         "motor.resistance", "motor.inertia", "motor.inductance", "6T2A.ground.friction.static", "4W2T.radius",
         *(f"effects.{n}.amplitude" for n in EFFECTS),
     ]  # fmt: skip
-    known = {p.name: p for p in params.walk(robot)}
+    known = {p.name: p for p in params.walk_parameters(robot)}
     theta = jnp.asarray([float(known[n].value) for n in names])
     step = jnp.asarray([1e-4 * (abs(float(known[n].value)) or known[n].spec.prior_sd(0.0)) for n in names])
 
@@ -99,10 +99,11 @@ def test_repeated_instants_change_nothing():
     short, long = GRID[:120], np.concatenate([GRID[:120], np.repeat(GRID[119], 7)])
     one = jax.tree.map(lambda x: x[0], RUNS)
     first, second = (
-        ravel_pytree(jax.tree.map(lambda x: x[119], histories(robot, one, jnp.asarray(g))))[0] for g in (short, long)
+        ravel_pytree(jax.tree.map(lambda x: x[119], history_signals(robot, one, jnp.asarray(g))))[0]
+        for g in (short, long)
     )
     np.testing.assert_array_equal(first, second)
-    last = histories(robot, one, jnp.asarray(long)).speed_motor
+    last = history_signals(robot, one, jnp.asarray(long)).speed_motor
     np.testing.assert_allclose(last[120:], last[119], rtol=1e-12)
 
 
@@ -118,10 +119,10 @@ def test_known_states_change_neither_values_nor_derivatives():
 
     def current(x, known=None):
         at = params.replace(robot, {"motor.friction_coulomb": x})
-        found = histories(at, run, times, known).current
+        found = history_signals(at, run, times, known).current
         return found, found
 
-    known = jax.jit(lambda: followed(robot, run, times))()
+    known = jax.jit(lambda: linearise_run(robot, run, times))()
     by_friction = jax.jit(jax.jacfwd(current, has_aux=True))
     (slope, value), (slope_known, value_known) = by_friction(friction), by_friction(friction, known)
     assert np.abs(value).max() > 1 and np.abs(slope).max() > 0.1

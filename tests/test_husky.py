@@ -29,7 +29,7 @@ def runs(robot):
 
 
 def test_table_is_read_as_turns_of_imposed_speeds(robot, runs):
-    assert observers.kind(runs) is SettledTurns and len(runs) == 120
+    assert observers.observer_kind(runs) is SettledTurns and len(runs) == 120
     assert set(runs["surface"]) == {"flooring", "asphalt", "ice"}
     wheels = np.asarray(runs.conditions(robot).motor_speed_left) / 78.71 * 0.165
     assert wheels[0] == pytest.approx(0.2362, rel=1e-4)  # m/s, as its column says
@@ -37,7 +37,7 @@ def test_table_is_read_as_turns_of_imposed_speeds(robot, runs):
 
 
 def test_runs_are_what_is_held_out_first(runs):
-    held = blocks.distinct(runs, SettledTurns.blocks)
+    held = blocks.distinct_blocks(runs, SettledTurns.blocks)
     assert next(iter(held)) == "run" and len(held["run"]) == len(set(runs["run_id"])) > 10
 
 
@@ -60,8 +60,8 @@ def test_loop_frees_the_friction_that_turns_show(robot, runs):
 @pytest.mark.slow
 def test_base_of_the_loop_fits_currents_as_calibrate_does(robot, runs):
     """18.8 % held out; the currents' own friction held at the file's numbers left 37 and 26 %."""
-    ready = discover.prepared(runs, dataclasses.replace(robot, effects=()), noise=NOISE)
-    space = discover.pose(ready.runs, ready.robot, ready.noise.sd, ready.settings)
+    ready = discover.prepare_loop(runs, dataclasses.replace(robot, effects=()), noise=NOISE)
+    space = discover.pose_candidates(ready.runs, ready.robot, ready.noise.sd, ready.settings)
     base = fit_base(space, ready.settings, "husky.csv")
     measured = np.asarray(space.bare.data.measured)
     rms = np.sqrt(np.mean((base.reading - measured)[: len(runs)] ** 2, 0) / np.mean(measured[: len(runs)] ** 2, 0))

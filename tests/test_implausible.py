@@ -10,7 +10,7 @@ from worlds import laws, settled, tables
 
 from calibration.discovery import findings
 from calibration.discovery.candidates import Candidate
-from calibration.discovery.search import own_p, search
+from calibration.discovery.search import search_effects, single_p_value
 from calibration.discovery.settings import WITHOUT_NAME
 from calibration.inference.linearization import amplitude_of
 from mmrjax.effects import BY_NAME
@@ -68,7 +68,7 @@ def hot(looks):
 
 def listed(traced, cost):
     space, base = traced.screened.base.space, traced.screened.base.candidate
-    return findings.alternatives(space, base, cost, traced.searched.ladder, SETTLED.settings)
+    return findings.listed_alternatives(space, base, cost, traced.searched.ladder, SETTLED.settings)
 
 
 def test_heating_of_a_plausible_size_is_named():
@@ -121,7 +121,7 @@ def test_a_pair_is_listed_where_it_explains_more_than_noise(hot):
         of("supply_sag", cost=101.0), of("churning", "load_slip", cost=99.0), of("churning", "mass_offset", cost=90.0),
         of("supply_sag", "load_slip", cost=100.5), of("series_resistance", cost=98.0, plausible=False), best,
     )  # fmt: skip
-    plausible, ruled_out = findings.alternatives(space, best, best.cost, ladder, SETTLED.settings)
+    plausible, ruled_out = findings.listed_alternatives(space, best, best.cost, ladder, SETTLED.settings)
     assert [(tuple(a.effects), a.rise_chi2) for a in plausible] == [
         (("churning", "mass_offset"), -20.0),
         (("supply_sag",), 2.0),
@@ -136,8 +136,8 @@ def test_a_pair_is_listed_where_it_explains_more_than_noise(hot):
 
 def test_own_p_is_the_share_of_tables_whose_strongest_effect_explains_as_much():
     null = np.array([1.0, 2.0, 3.0, 4.0])
-    assert own_p(9.0, null) == pytest.approx(3 / 5) and own_p(100.0, null) == pytest.approx(1 / 5)
-    assert own_p(0.0, null) == 1.0
+    assert single_p_value(9.0, null) == pytest.approx(3 / 5) and single_p_value(100.0, null) == pytest.approx(1 / 5)
+    assert single_p_value(0.0, null) == 1.0
 
 
 @pytest.mark.parametrize(
@@ -172,7 +172,7 @@ def test_an_effect_without_a_p_of_its_own_is_not_proposed(looks):
     assert "churning" in found.members[0]
     space, base, left = found.screened.base.space, found.screened.base.candidate, found.left
     quiet = lambda text: None  # noqa: E731
-    assert search(space, base, left, found.screened.bases, analyst.settings, quiet).best is not None
+    assert search_effects(space, base, left, found.screened.bases, analyst.settings, quiet).best is not None
     loud = dataclasses.replace(left.test.null, single=np.full_like(left.test.null.single, 1e3))
     left = dataclasses.replace(left, test=dataclasses.replace(left.test, null=loud))
-    assert search(space, base, left, found.screened.bases, analyst.settings, quiet).best is None
+    assert search_effects(space, base, left, found.screened.bases, analyst.settings, quiet).best is None

@@ -19,7 +19,7 @@ from mmrjax.fidelities import histories as integrator
 from mmrjax.fidelities.drive import drive
 from mmrjax.fidelities.steady import steady
 from mmrjax.model import params
-from mmrjax.model.balances import absent
+from mmrjax.model.balances import absent_balances
 from mmrjax.model.conditions import Conditions
 from sweeps.pages import comparison_figures
 
@@ -81,10 +81,10 @@ def test_a_loop_and_a_calibration_say_so_before_they_fit(tmp_path, robot, factor
     (tmp_path / "runs.csv").write_text("motor_current_A,motor_speed_rpm\n" + "".join(rows), encoding="utf-8")
     runs = records.read(tmp_path / "runs.csv", robot=robot)
     monkeypatch.setattr(checks, "check_ranges", lambda runs, robot: [])  # which refuses it where speeds show it too
-    ready = discover.prepared(runs, robot)
+    ready = discover.prepare_loop(runs, robot)
     assert any("is it in another unit" in str(note) for note in ready.at_first) == doubted
     said = []
-    monkeypatch.setattr(observers, "pose", lambda *given: said.append("fit") or 1 / 0)
+    monkeypatch.setattr(observers, "pose_problem", lambda *given: said.append("fit") or 1 / 0)
     with pytest.raises(ZeroDivisionError):
         calibrate(runs, robot, tell=said.append)
     assert any("is it in another unit" in text for text in said[: said.index("fit")]) == doubted
@@ -92,7 +92,7 @@ def test_a_loop_and_a_calibration_say_so_before_they_fit(tmp_path, robot, factor
 
 def test_the_file_says_what_is_imposed_and_needs_no_winding(robot, tmp_path):
     assert robot.rig.imposed == "motor_current"
-    assert {"electrical", "inductance", "supply"} <= absent(robot)
+    assert {"electrical", "inductance", "supply"} <= absent_balances(robot)
     robot_file.write(robot, tmp_path / "again.toml")
     assert robot_file.read(tmp_path / "again.toml").rig == robot.rig
     (tmp_path / "bad.toml").write_text(RIG.replace('["motor_speed"]', '["motor_current"]'), encoding="utf-8")
@@ -145,7 +145,7 @@ def test_a_shaft_turns_through_rest_and_is_held_there_at_its_very_moment(tmp_pat
 
     def ours(dry):
         changed = params.replace(robot, {"bench.loss_coulomb": dry, "motor.inductance": 1e-9})
-        found = integrator.histories(changed, Conditions(motor_current=jnp.asarray(levels)), jnp.asarray(times))
+        found = integrator.history_signals(changed, Conditions(motor_current=jnp.asarray(levels)), jnp.asarray(times))
         return found.speed_motor, found.speed_motor
 
     slope, shown = map(np.asarray, jax.jit(jax.jacfwd(ours, has_aux=True))(DRY))
@@ -177,7 +177,7 @@ def log(tmp_path, robot, noise, dry=DRY):
 @pytest.mark.slow
 def test_histories_follow_a_current_that_changes(robot, tmp_path):
     runs = log(tmp_path, robot, 0.0)
-    made = observers.kind(runs).of(runs, robot)
+    made = observers.observer_kind(runs).of(runs, robot)
     assert made.conditions.motor_current.shape == made.times.shape
     shown = np.asarray(eqx.filter_jit(made)(robot).reading)[:, 0]
     assert shown == pytest.approx(runs["motor_speed_rpm"] * np.pi / 30, abs=0.3)
@@ -198,14 +198,14 @@ def settled_table(tmp_path, robot, dry):
 
 def test_levels_of_the_current_are_blocks_to_hold_out(robot, tmp_path):
     runs = settled_table(tmp_path, robot, DRY)
-    kinds = holdout.distinct(runs, observers.kind(runs).blocks)
+    kinds = holdout.distinct_blocks(runs, observers.observer_kind(runs).blocks)
     assert list(kinds) == ["current"] and len(kinds["current"]) == 8
 
 
 def test_curves_are_over_a_current_that_is_imposed(robot, tmp_path):
     runs = settled_table(tmp_path, robot, DRY)
-    found = observers.kind(runs).of(runs, robot).bases(runs.columns, np.ones(len(runs), bool), robot)
-    assert ("track", "current") in bases.names(found)
+    found = observers.observer_kind(runs).of(runs, robot).bases(runs.columns, np.ones(len(runs), bool), robot)
+    assert ("track", "current") in bases.family_names(found)
 
 
 @pytest.mark.slow

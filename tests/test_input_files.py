@@ -10,9 +10,9 @@ from calibration.data import input_files, robot_file
 from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration, BadData, InputError
 from calibration.discovery.discover import without_copies
-from calibration.inference.checks import _stuck
+from calibration.inference.checks import _check_stuck_channels
 from calibration.inference.fit_notes import StiffSupply
-from mmrjax.errors import counted
+from mmrjax.errors import count_noun
 from sweeps.pages import comparison_figures
 
 RIG = """
@@ -68,11 +68,13 @@ def test_toml_that_cannot_be_is_refused_in_one_short_sentence(tmp_path, case):
 
 
 TABLES = {
-    "JSON": (b'{"time": [0, 1]}', "is JSON; expected CSV"),
-    "a list of JSON": (b'\n[[0, "a"]]', "is JSON; expected CSV"),
-    "Parquet": (b"PAR1\x15\x04", "is a Parquet file; expected CSV"),
-    "Excel": (b"PK\x03\x04\x14\x00", "is an Excel workbook or a zip file"),
-    "HDF5": (b"\x89HDF\r\n\x1a\n\0", "is an HDF5 file"),
+    "JSON": (b'{"time": [0, 1]', "cannot be read as JSON"),
+    "a list of JSON": (b'\n[[0, "a"]]', "column supply_voltage_V is missing"),
+    "deep JSON": (b"[" * 100_000, "cannot be read as JSON"),
+    "Parquet": (b"PAR1\x15\x04", "cannot be read as a Parquet file"),
+    "Excel": (b"PK\x03\x04\x14\x00", "is an Excel workbook or a zip file; expected CSV"),
+    "HDF5": (b"\x89HDF\r\n\x1a\n\0", "cannot be read as an HDF5 file"),
+    "a bag": (b"#ROSBAG V2.0\n", "cannot be read as a ROS bag"),
     "a web page": (b"<!DOCTYPE html>\n", "is a web page"),
     "a long cell": (b'supply_voltage_V,output_speed_rpm\n1,"' + b"9" * 140_000 + b'"', "a cell of more than 131,072"),
     "a long number": (b"supply_voltage_V,output_speed_rpm\n1," + b"9" * 100_000, "100,000 characters"),
@@ -151,12 +153,12 @@ def test_a_stiff_supply_is_no_stuck_instrument(tmp_path):
     robot = robot_file.read(tmp_path / "rig.toml")
     rows = "".join(f"{speed},{0.01 * k},24\n" for k, speed in enumerate((4500, 4400, 4300, 4200)))
     found = table(tmp_path, f"motor_speed_rpm,motor_current_A,motor_voltage_V\n{rows}", robot)
-    assert _stuck(found) == [StiffSupply("motor_voltage_V", 24.0)]
+    assert _check_stuck_channels(found) == [StiffSupply("motor_voltage_V", 24.0)]
 
 
 @pytest.mark.parametrize("count", [1, np.int64(1), np.int32(2), np.uint8(0)])
 def test_counts_of_numpy_are_counts(count):
-    assert counted(count, "row") == f"{int(count)} row" + ("" if int(count) == 1 else "s")
+    assert count_noun(count, "row") == f"{int(count)} row" + ("" if int(count) == 1 else "s")
 
 
 @pytest.mark.parametrize("column", ["motor_current_A", "motor_speed_rpm", None])

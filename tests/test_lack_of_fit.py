@@ -12,11 +12,11 @@ from test_loop_command import mmrjax, written
 from worlds import settled, tables
 
 from calibration.data.runs import Runs
-from calibration.discovery.discover import Sds, of_sds
+from calibration.discovery.discover import Sds, noise_remarks_before_verdict
 from calibration.inference import lack_of_fit
 from calibration.inference.calibration import calibrate
 from calibration.inference.fit_notes import Shown
-from calibration.inference.lack_of_fit import Residuals, adequacy
+from calibration.inference.lack_of_fit import Residuals, adequacy_of_residuals
 from calibration.inference.noise_factor import noise_factors, noise_remarks
 from calibration.inference.observers import SettledRuns
 from calibration.inference.simulation_errors import root_mean_square
@@ -27,7 +27,7 @@ GRID = settled.table8()
 
 
 def toy(rng, noise=1.0, missing=0.0, parameters=8, repeats=1):
-    """A linear fit with priors to readings of Table 8's rows, and what `adequacy` takes of it.
+    """A linear fit with priors to readings of Table 8's rows, and what `adequacy_of_residuals` takes of it.
 
     Args:
         noise: true sd over the stated one; missing: of a trend of the first channel over the slope [σ].
@@ -75,7 +75,7 @@ def test_a_drift_from_run_to_run_is_structure_and_no_wrong_sd():
 
 def judged(made, estimated=False):
     """Adequacy with the noise stated, or estimated from the misfit as `calibrate` does."""
-    return adequacy(made.rescaled() if estimated else made, known=not estimated)
+    return adequacy_of_residuals(made.rescaled() if estimated else made, known=not estimated)
 
 
 @pytest.mark.slow
@@ -100,7 +100,7 @@ def test_noise_that_is_larger_than_stated_is_not_adequate():
 
 def test_replicates_tell_what_the_noise_is():
     made = toy(np.random.default_rng(4), missing=1.5, repeats=2)
-    found = lack_of_fit._replicates(made)
+    found = lack_of_fit._replicate_test(made)
     assert found[0] < 0.01 and found[1] == Shown(what="repeats")
     clean = toy(np.random.default_rng(5), repeats=2)
     assert judged(clean, estimated=True).adequate
@@ -139,7 +139,7 @@ def test_no_test_of_residuals_decides_before_the_fit_is_one(
     made = dataclasses.replace(made, simulated=simulated, whitened=whitened)
     unknown = np.full(3, estimated)
     as_stated = made.runs.measured() + stated_off * SIGMA
-    found = lack_of_fit.judged(made, as_stated, sd, estimated=unknown, converged=converged)
+    found = lack_of_fit.judge_adequacy(made, as_stated, sd, estimated=unknown, converged=converged)
     assert (found.obstacle, found.adequate) == (obstacle, adequate) and len(found.misses) == 3
     if obstacle:
         assert "as stated" in found.statement and "Adequate" not in found.statement
@@ -168,12 +168,14 @@ def test_what_is_said_of_sds_beside_an_answer_is_of_what_it_leaves():
     """Before: 130 times the sds, everywhere; the answer leaves noise, or twice as much as was stated."""
     noise = SimpleNamespace(word="stated")
     before = Sds(noise, {}, tuple(noise_remarks(toy(np.random.default_rng(7), noise=130.0))))
-    assert before.remarks[0].factor > 100 and of_sds(before, toy(np.random.default_rng(9))) == ()
-    (off,) = of_sds(before, toy(np.random.default_rng(9), noise=2.0))
+    assert (
+        before.remarks[0].factor > 100 and noise_remarks_before_verdict(before, toy(np.random.default_rng(9))) == ()
+    )
+    (off,) = noise_remarks_before_verdict(before, toy(np.random.default_rng(9), noise=2.0))
     assert off.factor == pytest.approx(2.0, rel=0.2)
     changed = dataclasses.replace(before, factors={"speed": 130.0})
-    assert of_sds(changed, toy(np.random.default_rng(9))) == before.remarks
-    assert of_sds(changed, toy(np.random.default_rng(9), noise=1 / 130)) == ()
+    assert noise_remarks_before_verdict(changed, toy(np.random.default_rng(9))) == before.remarks
+    assert noise_remarks_before_verdict(changed, toy(np.random.default_rng(9), noise=1 / 130)) == ()
 
 
 def test_right_sds_and_residuals_with_structure_say_nothing_of_sds():

@@ -13,7 +13,7 @@ from mmrjax.numerics import lanes
 def halves(own):
     """How often a number is halved until it is below one, and what is left; `own` is the number and the divisor."""
     begun = lambda own: (own[0], jnp.asarray(0))  # noqa: E731
-    return lanes.until(begun, lambda own, s: (s[0] / own[1], s[1] + 1), lambda s: s[0] < 1.0, own)
+    return lanes.loop_until(begun, lambda own, s: (s[0] / own[1], s[1] + 1), lambda s: s[0] < 1.0, own)
 
 
 @pytest.mark.quick("50")
@@ -39,7 +39,7 @@ def counted(monkeypatch):
         jax.debug.callback(lambda: taken.append(1))
         return state[0], state[1] + 1
 
-    return lambda x: lanes.until(lambda own: (own, own * 0), turn, lambda s: s[1] >= s[0], x)[1], taken
+    return lambda x: lanes.loop_until(lambda own: (own, own * 0), turn, lambda s: s[1] >= s[0], x)[1], taken
 
 
 def test_a_batch_takes_as_many_turns_as_its_lanes_need(counted):
@@ -62,7 +62,7 @@ def test_members_that_have_ended_when_they_begin_cost_no_turn(counted):
 
 def test_of_the_last_state_only_what_is_kept_is_returned():
     turn, ended = (lambda own, s: (s[0] + own, s[1] + 1)), (lambda s: s[1] >= 3)
-    sums = jax.vmap(lambda x: lanes.until(lambda own: (own, own * 0), turn, ended, x, lambda s: s[0], 2))(
+    sums = jax.vmap(lambda x: lanes.loop_until(lambda own: (own, own * 0), turn, ended, x, lambda s: s[0], 2))(
         jnp.arange(5.0)
     )
     np.testing.assert_array_equal(sums, 4 * np.arange(5.0))

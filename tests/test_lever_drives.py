@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mmrjax.climbing.lever_drives import lever_drive, swing
+from mmrjax.climbing.lever_drives import lever_drive, step_levers
 from mmrjax.model import params
 from mmrjax.model.paper_robots import nominal
 
@@ -27,7 +27,9 @@ def turned(robot, load, least, most, asked=0.0, time=0.05, begins=0.0):
 
     def one(rate, _):
         free = rate - STEP * jnp.array([load, 0.0]) / INERTIA
-        done = swing(drive, STEP, rate, free, yields, asked + jnp.zeros(2), least + jnp.zeros(2), most + jnp.zeros(2))
+        done = step_levers(
+            drive, STEP, rate, free, yields, asked + jnp.zeros(2), least + jnp.zeros(2), most + jnp.zeros(2)
+        )
         return done.rate, done
 
     rates, done = jax.lax.scan(one, jnp.array([begins, 0.0]), None, length=n)
@@ -103,7 +105,7 @@ def test_both_pairs_obey_their_law_together_at_random_states():
     asked = np.where(random.random((n, 2)) < 0.7, rate + 2e-3 * random.normal(size=(n, 2)), 0.0)
     volts = np.where(random.random((n, 1)) < 0.5, 12.0, 4.0) + np.zeros((n, 2))
     for drive in drives:
-        done = jax.vmap(lambda *x, drive=drive: swing(drive, STEP, *x))(
+        done = jax.vmap(lambda *x, drive=drive: step_levers(drive, STEP, *x))(
             *(jnp.asarray(x) for x in (rate, free, yields, asked, -volts, volts))
         )
         torque, after, voltage, current = (np.asarray(x) for x in done[:4])

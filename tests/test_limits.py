@@ -5,11 +5,11 @@ import dataclasses
 import jax.numpy as jnp
 import pytest
 
-from mmrjax.fidelities.rest import creeps, direction
-from mmrjax.fidelities.result import exceeded, travels
+from mmrjax.fidelities.rest import is_at_rest, travel_direction
+from mmrjax.fidelities.result import exceeded_limits, travel_status
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.power import Battery
-from mmrjax.model.signals import CONVERGED, REVERSES, ROLLS_BACK, STATUSES, Signals, done
+from mmrjax.model.signals import CONVERGED, REVERSES, ROLLS_BACK, STATUSES, Signals, is_done
 
 FINE = dict(
     battery=1.0, voltage_source=30.0, total_current=2.0, current=1.0, speed_motor=600.0, torque_gear=2.0,
@@ -50,28 +50,28 @@ def rated(robot):
     ],
 )
 def test_limits_that_an_instant_exceeds(rated, changed, flags):
-    over = exceeded(rated, Signals(**{name: jnp.asarray(x) for name, x in {**FINE, **changed}.items()}))
+    over = exceeded_limits(rated, Signals(**{name: jnp.asarray(x) for name, x in {**FINE, **changed}.items()}))
     assert {name for name, x in over.items() if bool(x)} == flags
 
 
 def test_travel_is_named_by_what_drives_it():
     cases = [(0.4, 24.0), (0.0, 0.0), (-0.4, -24.0), (-0.4, 24.0), (0.4, -24.0)]
-    names = [STATUSES[int(travels(jnp.asarray(v), jnp.asarray(u)))] for v, u in cases]
+    names = [STATUSES[int(travel_status(jnp.asarray(v), jnp.asarray(u)))] for v, u in cases]
     assert names == ["converged", "converged", "reverses", "rolls_back", "rolls_back"]
     codes = jnp.arange(len(STATUSES))
-    assert [int(k) for k in codes if bool(done(k))] == [CONVERGED, REVERSES] and ROLLS_BACK not in (0, REVERSES)
+    assert [int(k) for k in codes if bool(is_done(k))] == [CONVERGED, REVERSES] and ROLLS_BACK not in (0, REVERSES)
 
 
 def test_a_driven_robot_creeps_where_either_lags_and_one_that_gravity_drives_where_both_do():
     rest, fast, slow = 0.002, 0.01, 0.001
     driven = [
-        bool(creeps(1.0, 24.0, a, b, rest)) for a, b in ((fast, fast), (fast, slow), (slow, fast), (slow, slow))
+        bool(is_at_rest(1.0, 24.0, a, b, rest)) for a, b in ((fast, fast), (fast, slow), (slow, fast), (slow, slow))
     ]
     rolling = [
-        bool(creeps(1.0, -24.0, a, b, rest)) for a, b in ((fast, fast), (fast, slow), (slow, fast), (slow, slow))
+        bool(is_at_rest(1.0, -24.0, a, b, rest)) for a, b in ((fast, fast), (fast, slow), (slow, fast), (slow, slow))
     ]
     assert driven == [False, True, True, True] and rolling == [False, False, False, True]
-    assert not bool(creeps(-1.0, -24.0, -fast, -fast, rest))
+    assert not bool(is_at_rest(-1.0, -24.0, -fast, -fast, rest))
 
 
 @pytest.mark.parametrize(
@@ -79,4 +79,4 @@ def test_a_driven_robot_creeps_where_either_lags_and_one_that_gravity_drives_whe
 )
 def test_travel_is_the_way_of_the_larger_torque_at_rest(robot, voltage, slope, way):
     """48 C_m U / R = 2.03 U [N·m] on a side, of which gravity asks 6.55 kg · g · sin α · 38.2 mm."""
-    assert float(direction(robot, Conditions(voltage=voltage, slope_deg=slope))) == way
+    assert float(travel_direction(robot, Conditions(voltage=voltage, slope_deg=slope))) == way

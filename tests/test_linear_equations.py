@@ -10,15 +10,15 @@ from test_log_kinds import servo, written
 
 from calibration.data import runs as records
 from calibration.inference import noise, observers, priors
-from calibration.inference.optimizers import linearised_signed
+from calibration.inference.optimizers import linearise_rollout
 from mmrjax.numerics.linear_equations import (
     factorise,
-    half_solved,
     inverse,
-    inverted,
-    regular,
-    solution,
-    solved,
+    invert,
+    regularise,
+    solve,
+    solve_factorised,
+    solve_lower,
     substitute,
 )
 
@@ -33,19 +33,19 @@ def test_equations_are_solved_as_by_numpy_whatever_the_pivots():
     matrices[10:20] = np.eye(5)[rng.permutation(5)] * 1e-9
     matrices[20:30] *= 10.0 ** rng.uniform(-8, 8, (10, 5, 1))
     b = rng.standard_normal((40, 5, 2))
-    found, inverse = jax.vmap(solved)(matrices, b), jax.vmap(inverted)(matrices)
+    found, inverse = jax.vmap(solve)(matrices, b), jax.vmap(invert)(matrices)
     np.testing.assert_allclose(found, np.linalg.solve(matrices, b), rtol=1e-9)
     np.testing.assert_allclose(inverse, np.linalg.inv(matrices), rtol=1e-9, atol=1e-12)
-    assert np.asarray(solved(matrices[0], b[0, :, 0])) == pytest.approx(found[0, :, 0])
-    assert not np.isfinite(solved(jnp.ones((3, 3)), jnp.arange(3.0))).any()
+    assert np.asarray(solve(matrices[0], b[0, :, 0])) == pytest.approx(found[0, :, 0])
+    assert not np.isfinite(solve(jnp.ones((3, 3)), jnp.arange(3.0))).any()
 
 
 def test_half_of_a_solution_is_that_of_a_cholesky_factor():
     rng = np.random.default_rng(0)
     a = rng.standard_normal((9, 5))
     lower = np.linalg.cholesky(a.T @ a)
-    np.testing.assert_allclose(half_solved(a.T @ a, a.T), np.linalg.solve(lower, a.T), rtol=1e-9, atol=1e-12)
-    assert np.isnan(half_solved(-a.T @ a, a.T)).any()
+    np.testing.assert_allclose(solve_lower(a.T @ a, a.T), np.linalg.solve(lower, a.T), rtol=1e-9, atol=1e-12)
+    assert np.isnan(solve_lower(-a.T @ a, a.T)).any()
 
 
 # --- written out, without exchanges ---------------------------------------------------------------------------------
@@ -58,13 +58,13 @@ EXCHANGE = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])  # no pivot on the diag
 @jax.jit
 def implicit(matrix, vector):
     """What an implicit derivative makes of a matrix and a right-hand side."""
-    factors, own = regular(factorise(matrix))
-    return jnp.where(own, solution(factors, vector), 0.0)
+    factors, own = regularise(factorise(matrix))
+    return jnp.where(own, solve_factorised(factors, vector), 0.0)
 
 
 @jax.jit
 def eliminate(matrix, vector):
-    return solution(factorise(matrix), vector)
+    return solve_factorised(factorise(matrix), vector)
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 4])
@@ -124,9 +124,9 @@ def test_a_step_of_a_search_on_a_log_calls_no_lapack(tmp_path):
     log = {name: column[:12] for name, column in servo(np.random.default_rng(1), levels=(0.9,), hold=0.2).items()}
     robot = written(tmp_path, "servo", log)
     runs = records.read(tmp_path / "log.csv", robot=robot)
-    known = noise.from_table(runs, observers.kind(runs).sizes(runs))
-    coordinates = priors.coordinates(robot, ("motor.torque_constant", "wheel.loss_coulomb"))
-    problem = observers.pose(runs, robot, coordinates, known.sd)
-    step = jax.make_jaxpr(lambda z: linearised_signed(problem, z, problem.data))(jnp.zeros(2))
+    known = noise.noise_from_table(runs, observers.observer_kind(runs).sizes(runs))
+    coordinates = priors.parameter_coordinates(robot, ("motor.torque_constant", "wheel.loss_coulomb"))
+    problem = observers.pose_problem(runs, robot, coordinates, known.sd)
+    step = jax.make_jaxpr(lambda z: linearise_rollout(problem, z, problem.data))(jnp.zeros(2))
     assert re.search(LAPACK, str(jax.make_jaxpr(jnp.linalg.inv)(jnp.eye(2)))), "it can fail"
     assert not re.findall(LAPACK, str(step))

@@ -19,7 +19,7 @@ from calibration.inference.observers import Histories, SettledRuns
 from mmrjax.errors import UsageError
 from mmrjax.fidelities import rest
 from mmrjax.fidelities.drive import drive_batch
-from mmrjax.fidelities.histories import grid, histories
+from mmrjax.fidelities.histories import history_signals, time_grid
 from mmrjax.fidelities.steady import steady_batch, steady_outputs
 from mmrjax.model import balances
 from mmrjax.model.conditions import Conditions
@@ -54,7 +54,7 @@ def test_a_brake_enters_as_a_constant_torque_of_the_load(loose):
     """Every signal of an instant, of a shaft with and without backlash, under an arm's weight."""
     rig, load = Rig(loose=loose), {"torque_gravity": 0.4, "backlash": 0.02 * loose}
     state = State(1.0, 120.0, 7.0, 0.0, distance=0.3, gap=0.012 if loose else None)
-    moving = jax.jit(balances.moving)
+    moving = jax.jit(balances.moving_signals)
     braked = moving(bench(rig, **load), Conditions(load_torque=0.3), state)
     stated = moving(bench(rig, torque_constant=0.3, **load), Conditions(), state)
     free = moving(bench(rig, **load), Conditions(), state)
@@ -66,7 +66,7 @@ def test_a_torque_above_what_stalls_the_motors_turns_them_back():
     robot = bench()
     for voltage, torque, way in ((24.0, 3.0, 1.0), (24.0, 7.0, -1.0), (0.0, 0.5, -1.0), (0.0, -0.5, 1.0)):
         # 24 V / 3 ohm · 0.05 N·m/A · 16 = 6.4 N·m
-        assert float(rest.direction(robot, Conditions(voltage=voltage, load_torque=torque))) == way
+        assert float(rest.travel_direction(robot, Conditions(voltage=voltage, load_torque=torque))) == way
 
 
 def test_settled_rigs_with_a_brake_are_those_of_another_implementation():
@@ -88,8 +88,8 @@ def test_settled_rigs_with_a_brake_are_those_of_another_implementation():
 
 def test_a_torque_that_changes_from_step_to_step_is_followed():
     """A run from rest, which the torque begins to turn back before the current has risen."""
-    times = grid(np.linspace(0, 0.6, 13))
-    run = jax.jit(lambda x: histories(bench(), Conditions(voltage=24.0, load_torque=x), jnp.asarray(times)))
+    times = time_grid(np.linspace(0, 0.6, 13))
+    run = jax.jit(lambda x: history_signals(bench(), Conditions(voltage=24.0, load_torque=x), jnp.asarray(times)))
     changes = run(0.3 + 0.2 * np.sin(8 * times)).speed_motor
     end = float(run(np.full(len(times), 0.3)).speed_motor[-1])
     assert np.isfinite(changes).all() and abs(float(changes[-1]) - end) > 1.0
@@ -113,8 +113,8 @@ def test_every_fidelity_settles_alike_under_a_brake():
     without = steady_batch(bench(), Conditions(voltage=VOLTS))
     assert (np.abs(at.motor_speed)[:3] < np.abs(without.motor_speed)[:3]).all()  # it brakes either way
     np.testing.assert_array_equal(at.motor_speed[3], without.motor_speed[3])
-    times = grid(np.linspace(0, 4.0, 9))
-    shown = jax.jit(histories)(bench(), Conditions(voltage=24.0, load_torque=0.5), jnp.asarray(times))
+    times = time_grid(np.linspace(0, 4.0, 9))
+    shown = jax.jit(history_signals)(bench(), Conditions(voltage=24.0, load_torque=0.5), jnp.asarray(times))
     assert float(shown.speed_motor[-1]) == pytest.approx(float(at.motor_speed[0]), rel=1e-6)
 
 
@@ -125,11 +125,13 @@ def test_derivatives_by_a_brake_are_differences():
         by_torque = jax.jvp(lambda x: settles(x).motor_speed, (jnp.asarray(TORQUE),), (jnp.ones(4),))[1]  # noqa: B023
         less, more = (settles(TORQUE + h).motor_speed for h in (-1e-4, 1e-4))
         np.testing.assert_allclose(by_torque, (more - less) / 2e-4, rtol=1e-4)
-    times = jnp.asarray(grid(np.linspace(0, 0.6, 13)))
+    times = jnp.asarray(time_grid(np.linspace(0, 0.6, 13)))
 
     @jax.jit
     def both(torque):
-        shown = lambda own: histories(bench(torque_constant=own), Conditions(load_torque=torque), times).speed_motor  # noqa: E731
+        def shown(own):
+            return history_signals(bench(torque_constant=own), Conditions(load_torque=torque), times).speed_motor
+
         return jax.jvp(shown, (0.0,), (1.0,))
 
     torque = 0.3 + 0.2 * jnp.sin(8 * times)
@@ -280,9 +282,9 @@ def test_rows_are_held_out_by_levels_of_the_torque(tmp_path):
     torque = [0.1, 0.1003, 0.2, 0.2004, 0.4, 0.4001]
     lines = ["supply_voltage_V,motor_speed_rpm,load_torque_Nm", *(f"24,{4000 - 900 * m:.6g},{m}" for m in torque)]
     runs, _ = read(tmp_path, lines)
-    found = blocks.distinct(runs, SettledRuns.blocks)
+    found = blocks.distinct_blocks(runs, SettledRuns.blocks)
     assert list(found) == ["load_torque"] and [int(m.sum()) for m in found["load_torque"].values()] == [2, 2, 2]
-    assert blocks.in_words("load_torque") == "load torque"
+    assert blocks.kind_in_words("load_torque") == "load torque"
 
 
 def test_a_drift_that_goes_with_the_torque_is_none():
@@ -294,7 +296,7 @@ def test_a_drift_that_goes_with_the_torque_is_none():
     rig = bench()
     for with_torque in (False, True):
         known = columns | ({"load_torque_Nm": np.linspace(0, 0.5, 18)} if with_torque else {})
-        over = {variable for basis in bases.families(known, np.ones(18), rig) for _, variable in basis.names}
+        over = {variable for basis in bases.curve_families(known, np.ones(18), rig) for _, variable in basis.names}
         assert ("order" in over) != with_torque
 
 

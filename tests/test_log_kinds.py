@@ -125,7 +125,7 @@ def test_curves_are_over_the_voltage_at_motors_whose_speed_no_channel_reads(tmp_
     runs = records.read(tmp_path / "log.csv", robot=robot)
     observer = observers.Histories.of(runs, robot)
     seen = {}
-    monkeypatch.setattr(bases, "families", lambda columns, *_, **__: seen.update(columns) or ())
+    monkeypatch.setattr(bases, "curve_families", lambda columns, *_, **__: seen.update(columns) or ())
     observer.bases(dict(runs.columns), np.ones(len(runs), bool), robot)
     volts = seen["supply_voltage_V"]
     assert volts[driven] == pytest.approx(0.9 * 6.0)

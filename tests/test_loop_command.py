@@ -150,7 +150,7 @@ def test_what_is_written_predicts_and_the_refit_stands_beside_it(done):
     assert said["written"] == "found" and said["gain"] > said["se"] > 0
     refit, found = (robot_file.load(done.folder / "found" / f"{name}.toml") for name in ("fitted", "robot"))
     assert not refit.effects and [e.name for e in found.effects] == [done.result["effects"][0]["name"]]
-    values = {p.name: float(p.value) for p in params.walk(refit)}
+    values = {p.name: float(p.value) for p in params.walk_parameters(refit)}
     for name, shift in done.result["base_shift"].items():
         if shift["unit"] == "-":
             assert values[name] == pytest.approx(shift["before"], rel=1e-6)

@@ -59,7 +59,7 @@ def test_a_stage_of_another_version_is_made_again(tmp_path, monkeypatch):
     found = []
     stage(lambda: 1)
     stage(refuse)
-    monkeypatch.setattr(programs, "sources", lambda: "mended")
+    monkeypatch.setattr(programs, "source_hash", lambda: "mended")
     stage(lambda: 2)
     assert found == [1, 1, 2]
 
@@ -215,4 +215,4 @@ def test_a_loop_of_kept_stages_finds_what_it_found(tmp_path):
 
 
 def test_nothing_is_kept_where_nobody_asks():
-    assert kept.nothing("base", lambda: 3) == 3
+    assert kept.keep_nothing("base", lambda: 3) == 3

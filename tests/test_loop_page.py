@@ -46,7 +46,7 @@ def happening():
 
 def test_the_legend_of_errors_hides_no_title():
     shown = tuple(
-        channels.find(n) for n in ("motor_current_left", "motor_current_right", "yaw_rate", "output_torque")
+        channels.find_channel(n) for n in ("motor_current_left", "motor_current_right", "yaw_rate", "output_torque")
     )
     rows = {when: {c.name: {"rms_percent": 1.0} for c in shown} for when in (0, 1)}
     fig = loop_figures.errors(SimpleNamespace(channels=shown, errors=rows, errors_held_out={"slope": rows}))
@@ -286,7 +286,7 @@ def test_errors_better_and_worse_are_marked_with_the_rows_that_are_reached(shown
     head, *lines = got.page.tables["errors"]
     assert [line[0] for line in lines] == [
         "seen by the fit",
-        *(f"unseen: another {words.blocks.in_words(k)}" for k in got.found.errors_held_out),
+        *(f"unseen: another {words.blocks.kind_in_words(k)}" for k in got.found.errors_held_out),
         "unseen: another configuration",  # each has friction of its own
     ]
     assert lines.pop()[-1] == "not predictable from the others" and got.document["held_out_unpredictable"] == [

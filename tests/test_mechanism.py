@@ -52,11 +52,11 @@ def found(monkeypatch):
         bare=SimpleNamespace(observe=SimpleNamespace(long=False, blocks=("speed",), noise_misfit=lambda off, counts: counts.sum())),
     )  # fmt: skip
     score = HeldOutScore({}, {})
-    monkeypatch.setattr(room.blocks_room, "predictable", lambda *_: {})
+    monkeypatch.setattr(room.blocks_room, "predictable_blocks", lambda *_: {})
     monkeypatch.setattr(room, "_held_out", lambda *_: score)
     monkeypatch.setattr(room, "_scored", lambda *_: score)
     monkeypatch.setattr(room, "_reading", lambda *_: None)
-    monkeypatch.setattr(room, "_changed", lambda *_: None)
+    monkeypatch.setattr(room, "_changed_readings", lambda *_: None)
     monkeypatch.setattr(room, "_curve_again", lambda *_: 0.9)
     monkeypatch.setattr(room, "chosen_again", lambda *_: 1.0)
 
@@ -64,7 +64,7 @@ def found(monkeypatch):
         space.bare.observe.long = long
         drawn = SimpleNamespace(chi2=(2 * BASE, 2 * BASE - curve), problem=None, z=None, reading=None)
         beside = SimpleNamespace(where=where, curve=drawn)
-        return room.mechanism(
+        return room.find_mechanism(
             space, None, fitted(explains=0.0), None, ladder, (), beside, {}, settings_for(SettledRuns)
         )  # fmt: skip
 
@@ -131,7 +131,7 @@ def test_of_mechanisms_that_cannot_be_told_apart_one_that_predicts_is_stated(fou
     """A curve has more to fit with, and may predict nothing."""
     where = dataclasses.replace(SPEED, place="electrical", alike=("electrical",), variables_alike=("current",))
     gains = iter([-1.0, -1.0, 1.0])
-    monkeypatch.setattr(room, "_gain", lambda *_: Gain(next(gains), 0.1))
+    monkeypatch.setattr(room, "_gain_over_changed", lambda *_: Gain(next(gains), 0.1))
     got = found(fitted("leads", explains=1500.0), curve=1900.0, where=where)
     assert got.families == (where.family, FAMILIES["leads"]) and got.effects == () and got.gain == 1.0
     # that other curves are as improbable does not count against an effect
@@ -163,7 +163,7 @@ def test_readings_that_it_changes_are_those_it_moves_by_half_of_the_most_moved_c
     space = SimpleNamespace(bare=SimpleNamespace(data=SimpleNamespace(sd=sd)), weight=np.ones((ROWS, 2)))
     before = np.zeros((ROWS, 2))
     after = np.stack([np.where(np.arange(ROWS) < 20, 1.0, 0.2), np.full(ROWS, 5.0)], 1)
-    changed = room._changed(space, np.zeros(ROWS), before, after)
+    changed = room._changed_readings(space, np.zeros(ROWS), before, after)
     assert changed[:, 0].tolist() == [True] * 20 + [False] * 10 and not changed[:, 1].any()
 
 
@@ -175,10 +175,10 @@ def test_the_error_of_a_gain_is_the_mean_of_its_kinds():
     after = HeldOutScore({k: gains for k in blocks}, blocks)
     before = HeldOutScore({k: np.zeros((12, 1)) for k in blocks}, blocks)
     changed = np.ones((12, 1), bool)
-    gain = room._gain(after, before, changed)
+    gain = room._gain_over_changed(after, before, changed)
     assert gain.mean == pytest.approx(gains.mean())
     assert gain.se == pytest.approx(np.mean(list(gain.errors.values()))) and set(gain.errors) == set(blocks)
-    assert room._gain(HeldOutScore({}, {}), HeldOutScore({}, {}), changed).se == np.inf
+    assert room._gain_over_changed(HeldOutScore({}, {}), HeldOutScore({}, {}), changed).se == np.inf
 
 
 def test_equations_that_act_alike_are_listed(found):
@@ -195,4 +195,6 @@ def test_a_curve_is_asked_within_the_range_that_its_fit_has_seen():
     beside = SimpleNamespace(where=SPEED, left=SimpleNamespace(linear=linear))
     space = SimpleNamespace(included=np.ones(6, bool))
     masks = [np.isin(np.arange(6), rows) for rows in ((0, 4), (1, 2), (3, 5))]
-    np.testing.assert_array_equal(room._seen(space, beside, masks), [False, True, True, False, True, False])
+    np.testing.assert_array_equal(
+        room._within_seen_range(space, beside, masks), [False, True, True, False, True, False]
+    )

@@ -55,7 +55,7 @@ def flagged(flags):
 
 @pytest.fixture(scope="module")
 def robot():
-    return params.strong(paper_robots.nominal())
+    return params.without_weak_types(paper_robots.nominal())
 
 
 MANY = (
@@ -321,7 +321,7 @@ def test_derivatives_through_stops_and_reversals_match_differences(robot):
     """Of energy, path, Wh/m and temperature, by parameters and by times and values of rows, to 1e-4."""
     time, mode, values = MANY
     start = rows(time, mode, **values)
-    base = {p.name: float(p.value) for p in params.walk(robot)}
+    base = {p.name: float(p.value) for p in params.walk_parameters(robot)}
 
     def outputs(x):
         changed = params.replace(robot, {name: base[name] * x[k] for k, name in enumerate(BY)})
@@ -354,7 +354,7 @@ def test_derivatives_by_every_parameter_and_row_match_differences(robot):
     time, mode, values = MANY
     start = rows(time, mode, **values)
     fixed = ("battery.", "6T2A", "running_gear.")  # on a supply, on wheels, with contacts lumped: not read
-    named = {p.name: float(p.value) for p in params.walk(robot) if not p.name.startswith(fixed)}
+    named = {p.name: float(p.value) for p in params.walk_parameters(robot) if not p.name.startswith(fixed)}
     names = [name for name, value in named.items() if value != 0]
     columns = [n for n in ("time", "demand", "voltage", "slope_deg", "payload") if getattr(start, n) is not None]
 
@@ -461,7 +461,7 @@ WRONG = {
     "time: row 2 is not a finite number": dict(time=[0, np.nan]),
     "cycles: got 0; expected a whole number from 1": dict(time=[0, 1], cycles=0),
     f"mode, row 1: got fly; expected {', '.join(MODES)}": dict(time=[0, 1], mode="fly"),
-    "no field slope; there are": dict(time=[0, 1], slope=3.0),
+    "no field slope; expected one of": dict(time=[0, 1], slope=3.0),
     "voltage: got 3 values; expected 2": dict(time=[0, 1], voltage=[1, 2, 3]),
     "voltage: row 2 is not finite": dict(time=[0, 1], voltage=[1, np.nan]),
     "duty: got 1.5; expected -1 to 1": dict(time=[0, 1], duty=1.5),

@@ -32,7 +32,7 @@ KEEP = 4096
 
 @pytest.fixture(scope="module")
 def robot():
-    return params.strong(paper_robots.nominal())
+    return params.without_weak_types(paper_robots.nominal())
 
 
 def with_battery(robot, cutoff=3.3, delay=1.0, **changes):
@@ -48,7 +48,7 @@ def with_battery(robot, cutoff=3.3, delay=1.0, **changes):
 def integrated(robot, cutoff, delay=1.0, slope_deg=10.0, payload=5.0):
     """Time [s] and distance [m] at which tracks at full duty are cut off: SciPy's Radau on plain rates of one motor's
     current, motor speed, speed, charge, winding, housing and way, with its root of the cell's voltage."""
-    p = {q.name: float(q.value) for q in params.walk(robot)}
+    p = {q.name: float(q.value) for q in params.walk_parameters(robot)}
     own = {name.removeprefix("6T2A."): x for name, x in p.items() if name.startswith("6T2A.")}
     ratio, k, radius, cells = p["gearbox.ratio"], p["motor.torque_constant"], own["radius"], robot.battery.cells
     mass, slope = (own["mass"] + payload) / 2, np.radians(slope_deg)
@@ -106,7 +106,7 @@ def integrated(robot, cutoff, delay=1.0, slope_deg=10.0, payload=5.0):
 def random_robot(robot):
     rng = np.random.default_rng(23)
     changed = {
-        name: float(rng.uniform(0.9, 1.1)) * float({p.name: p.value for p in params.walk(robot)}[name])
+        name: float(rng.uniform(0.9, 1.1)) * float({p.name: p.value for p in params.walk_parameters(robot)}[name])
         for name in ("motor.resistance", "motor.torque_constant", "6T2A.mass", "battery.resistance", "gearbox.ratio")
     }
     return params.replace(with_battery(robot), changed)
@@ -163,7 +163,7 @@ def test_steps_land_on_the_crossing_and_the_delay_counts_from_there(cut, robot):
 @pytest.mark.slow
 def test_endurance_and_range_are_those_of_the_cut_off(cut, robot):
     at = mm.Conditions(configuration=0, battery=1.0)
-    numbers = mission_batch.numbers(with_battery(robot), at, cut)
+    numbers = mission_batch.mission_numbers(with_battery(robot), at, cut)
     assert float(numbers["endurance"]) == float(cut.total.time) and float(numbers["state_of_charge"]) > 0.1
     assert float(numbers["range"]) == float(cut.total.of["path"])
 
@@ -184,7 +184,7 @@ def test_moment_of_the_cut_off_has_the_derivative_of_differences(robot):
     """By four parameters at once: the implicit function theorem at the event, through heat and charge."""
     names = ("battery.resistance", "battery.voltage_full", "motor.resistance", "6T2A.mass")
     low = with_battery(robot)
-    base = {p.name: float(p.value) for p in params.walk(low)}
+    base = {p.name: float(p.value) for p in params.walk_parameters(low)}
     at = mm.Conditions(configuration=0, battery=1.0, discharge=3000.0)
     weigh = jnp.asarray([1.0, 0.02, 1.0, 1.0])
 
@@ -269,7 +269,7 @@ def test_a_name_is_one_quantity_in_every_file_of_a_mission(run_folder):
         assert 2 * duty * float(row["motor_current_A"]) == pytest.approx(float(row["total_current_A"]), rel=1e-6)
     peak = max(2 * abs(float(row["motor_current_A"])) for row in history)
     assert 0.98 * peak < float(run["peak_current_A"]) < 1.02 * peak
-    shared = set(run) & set(segments[0]) & set(mission_batch.names())
+    shared = set(run) & set(segments[0]) & set(mission_batch.mission_columns())
     for name in sorted(shared & set(result)):
         if run[name] and result[name] is not None:
             assert float(run[name]) == pytest.approx(result[name], rel=1e-6, abs=1e-9), name
@@ -280,7 +280,7 @@ def test_a_name_is_one_quantity_in_every_file_of_a_mission(run_folder):
 def test_a_column_of_several_registries_has_one_unit_and_one_meaning():
     """Outputs of runs (with every channel), of missions and of what is derived: what shares a name is listed here."""
     several: dict[str, list[tuple[str, float, str]]] = {}
-    for output in (*outputs.table(channels.EVERY), *mission_batch.OUTPUTS, *derived.TABLE):
+    for output in (*outputs.output_table(channels.EVERY), *mission_batch.OUTPUTS, *derived.TABLE):
         several.setdefault(output.column, []).append((output.unit, output.factor, output.label))
     shared = {column: said for column, said in several.items() if len(said) > 1}
     assert set(shared) == {"peak_current_A"}

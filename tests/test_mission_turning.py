@@ -14,7 +14,7 @@ from mmrjax.missions import mission_batch as missions
 from mmrjax.missions import mission_straight
 from mmrjax.missions.mission import TOLERANCE, Mission, Start, Totals, initial_unknowns, mission
 from mmrjax.missions.mission_batch import simulate_batch
-from mmrjax.missions.mission_steps import BREAKS_AWAY, events_of
+from mmrjax.missions.mission_steps import BREAKS_AWAY, event_functions
 from mmrjax.missions.profile import profile
 from mmrjax.model import params
 
@@ -49,7 +49,7 @@ def with_duties(robot) -> Mission:
     """Duties held, left the slower side, the faster one, and one against the other, in steps fine enough for `drive`."""
     duties = ((0.4, 0.9), (0.9, 0.4), (-0.8, 0.8))
     one = several(*(profile([0.0, 0.5, 1.0], duty_left=left, duty_right=right) for left, right in duties))
-    return jax.device_get(simulate_batch(params.strong(robot), conditions(3), one, None, 512, 1e-7))
+    return jax.device_get(simulate_batch(params.without_weak_types(robot), conditions(3), one, None, 512, 1e-7))
 
 
 @pytest.fixture(scope="module")
@@ -58,12 +58,14 @@ def driven(robot) -> Mission:
 
 
 def test_derivative_of_breaking_away_is_there_at_every_current(robot):
-    """Of the torque that a motor's current has beyond friction: that of a minimum can vanish, see `rest.least`."""
+    """Of the torque that a motor's current has beyond friction: that of a minimum can vanish, see `rest.smallest`."""
     held = mm.Conditions(configuration=1, voltage=24.0)
     asks = profile([0.0, 1.0], "speed", demand=[0.0, 0.4], linear=True)
 
     def breaks(y):
-        return events_of(mission_straight, robot, held, asks, y, jnp.asarray(True), jnp.asarray(False))[BREAKS_AWAY]
+        return event_functions(mission_straight, robot, held, asks, y, jnp.asarray(True), jnp.asarray(False))[
+            BREAKS_AWAY
+        ]
 
     def rise(current):
         y = initial_unknowns(mission_straight, robot, held, Start(current=current)) / mission_straight.units(robot)
@@ -90,7 +92,7 @@ def test_numbers_of_either_side_follow_from_their_totals():
     peaks = {name: jnp.asarray(1.0) for name in names}
     peaks |= {f"{name}_{side}": jnp.asarray(4.0) for name in ("current", "temperature") for side in ("left", "right")}
     total = Totals(jnp.asarray(2.0), {k: jnp.asarray(x) for k, x in of.items()}, jnp.asarray(0.0), jnp.asarray(3.0))
-    found = missions.columns(missions.totals(total, peaks))
+    found = missions.numbers_by_column(missions.mission_totals(total, peaks))
     assert {o.column for o in missions.OF_TURNS} < set(found)
     assert (float(found["rms_current_left_A"]), float(found["rms_current_right_A"])) == pytest.approx((1.0, 3.0))
     assert float(found["turned_deg"]) == pytest.approx(180.0)
@@ -126,7 +128,7 @@ def test_sides_exchanged_mirror(driven, demanded):
 @pytest.mark.slow
 def test_energy_adds_up_with_both_sides(driven, demanded):
     for found in (driven, demanded):
-        numbers = missions.totals(found.total, found.peaks)
+        numbers = missions.mission_totals(found.total, found.peaks)
         assert np.abs(np.asarray(numbers["unaccounted_share"])).max() < 1e-4  # the issue asks 1e-3
         assert (found.total.of["sliding"] > 0).all()
     assert driven.total.of["sliding"][2] > driven.total.of["sliding"][0]  # on the spot
@@ -164,7 +166,7 @@ def test_held_duties_are_a_run_of_drive(robot, driven):
 def test_derivatives_of_a_turn_match_differences(robot):
     """Of energy and of what it turns by, by parameters of the robot and by speed and yaw rate that are demanded."""
     names = ("motor.resistance", "6T2A.turning.width", "6T2A.turning.lateral", "6T2A.ground.friction.static")
-    base = {p.name: float(p.value) for p in params.walk(robot) if p.name in names}
+    base = {p.name: float(p.value) for p in params.walk_parameters(robot) if p.name in names}
     held = dict(demand=[0.0, 0.3, 0.3, 0.3, 0.3], yaw_rate=[0.0, 0.6, 0.6, 0.6, 0.6], linear=True)
     asks = profile([0.0, 0.4, 0.6, 0.8, 1.0], "speed", **held)
     own = conditions(3, configuration=np.zeros(3, int), payload=np.zeros(3)).resolved(robot)
@@ -212,7 +214,7 @@ def test_sweep_of_missions_has_the_numbers_of_both_sides(robot, mmrjax, tmp_path
     of = dict(demand=[0.0, 0.3, 0.3, 0.3, 0.0], yaw_rate=[0.0, 0.8, 0.8, 0.0, 0.0], linear=True)
     asks = profile([0.0, 0.2, 0.4, 0.5, 0.6], "speed", **of)
     own = conditions(3, configuration=np.zeros(3, int), payload=np.array([0.0, 4.0, 8.0])).resolved(robot)
-    found = missions.columns(missions.numbers(robot, own, demanding(robot, own, *[asks] * 3)))
+    found = missions.numbers_by_column(missions.mission_numbers(robot, own, demanding(robot, own, *[asks] * 3)))
     for name in ("energy_Wh", "turned_deg"):
         np.testing.assert_allclose(store[name][:], found[name], rtol=1e-9)
     assert store["turned_deg"][0] > 1

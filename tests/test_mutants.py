@@ -13,7 +13,7 @@ ROOT = Path(__file__).resolve().parents[1]
 KINDS = {
     "balances", "energy", "contact", "statuses", "missions", "verdicts", "calibration", "readers", "units", "writers",
     "sweeps", "derivatives", "effects", "inertia", "posture", "climb", "sensitivity", "sizing", "words", "pages", "model",
-    "fidelities", "safety",
+    "fidelities", "safety", "export",
 }  # fmt: skip
 
 

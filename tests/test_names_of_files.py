@@ -127,7 +127,7 @@ FOREIGN = {"parameters", "set", "versions", "hashes", "prior", "blocks", "status
 def registries() -> dict[str, list[tuple[str, str]]]:
     """Unit and meaning of every name of the tables that writers use; of each table in which it is."""
     found: dict[str, list[tuple[str, str]]] = {}
-    for row in (*outputs.table(channels.EVERY), *mission_batch.OUTPUTS, *derived.TABLE):
+    for row in (*outputs.output_table(channels.EVERY), *mission_batch.OUTPUTS, *derived.TABLE):
         found.setdefault(row.column, []).append((row.unit, row.label))
     for c in channels.EVERY:
         found.setdefault(c.sd_column, []).append((c.unit_shown, f"sd of a reading: {c.label}"))
@@ -318,7 +318,7 @@ def test_columns_that_a_rig_may_lack_and_those_of_exports_are_known():
     of_heat = {
         n
         for n in registries()
-        if re.match(r"(winding|housing)_", n) and n in (*mission_batch.names(), "winding_settled_C")
+        if re.match(r"(winding|housing)_", n) and n in (*mission_batch.mission_columns(), "winding_settled_C")
     }
     assert of_heat <= set(capabilities.RESTS_ON)
 
@@ -385,7 +385,7 @@ def test_a_store_and_its_export_hold_the_numbers_of_a_table(made, swept):
     one, other = ({n: x[o] for n, x in of.items()} for of, o in zip((one, other), order, strict=True))
     shared = same(one, other)
     assert shared >= {*by, "total_current_A", "speed_mm_s", "winding_settled_C", "slip"}
-    rows = {row.name: row for row in outputs.table(channels.EVERY)}
+    rows = {row.name: row for row in outputs.output_table(channels.EVERY)}
     (group,) = (
         zarr.open_group(path.parent, mode="r") for path in stored.rglob("zarr.json") if path.parent.parent == stored
     )
@@ -413,7 +413,7 @@ def test_files_of_compare_hold_the_numbers_of_runs(made):
     sound(compared)
     one, other = (numbers(table(compared / n)) for n in ("comparison.csv", "runs.csv"))
     simulated = {n.removeprefix("simulated_"): x for n, x in one.items() if n.startswith("simulated_")}
-    assert same(simulated, other) == {c.column for c in channels.usual()}
+    assert same(simulated, other) == {c.column for c in channels.usual_channels()}
 
 
 DRIVE = "simulate", "--model", "drive", "--duration", "2", "--voltage", "24", "--slope", "2", "--no-report"
@@ -446,8 +446,8 @@ def test_files_of_a_calibration_are_those_of_compare_with_its_robot(made, folder
     rows, other = numbers(table(found / "rows.csv")), numbers(table(compared / "comparison.csv"))
     after = {n.replace("after_", "simulated_"): x for n, x in rows.items() if n.startswith("after_")}
     assert len(same(after, other)) == 3
-    assert same(rows, other) >= {f"error_{c.name}_percent" for c in channels.usual()}
-    assert {c.sd_column for c in channels.usual()} <= set(rows)
+    assert same(rows, other) >= {f"error_{c.name}_percent" for c in channels.usual_channels()}
+    assert {c.sd_column for c in channels.usual_channels()} <= set(rows)
     for name, arguments in {
         "posterior": ("simulate", "--voltage", "24"), "comparison": ("compare", "measured"), "sweeps": ("sweep", *POINTS)
     }.items():  # fmt: skip

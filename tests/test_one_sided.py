@@ -57,7 +57,7 @@ def tracked():
 def bench():
     free = {f"{part}.friction_{kind}": 0.0 for part in ("motor", "gearbox") for kind in ("coulomb", "viscous")}
     shaft = Shaft(inertia=1e-3, loss_coulomb=0.0)
-    blank = paper_robots.blank(Configurations({"bench": shaft}), sides=1.0)
+    blank = paper_robots.blank_robot(Configurations({"bench": shaft}), sides=1.0)
     return params.replace(
         blank, {**free, "gearbox.ratio": 1.0, "gearbox.efficiency_load": 0.7, "motor.inertia": 1e-6}
     )
@@ -65,8 +65,8 @@ def bench():
 
 def one_sided_differences(robot, rows, outputs):
     """Numbers, their derivatives, and differences to second order, each (rows, outputs)."""
-    names = [p.name for p in params.walk(robot)]
-    base = [float(p.value) for p in params.walk(robot)]
+    names = [p.name for p in params.walk_parameters(robot)]
+    base = [float(p.value) for p in params.walk_parameters(robot)]
 
     def numbers(vector):
         own = params.replace(robot, {name: vector[k] for k, name in enumerate(names)})
@@ -116,7 +116,7 @@ def test_a_shaft_without_inertia_speeds_up_less_with_some(name):
 
     def acceleration(added):
         own = params.replace(robot, {name: added})
-        return balances.moving(own, Conditions(voltage=8.0), State(0.5, 40.0, 40.0, 0.0)).acceleration_wheel
+        return balances.moving_signals(own, Conditions(voltage=8.0), State(0.5, 40.0, 40.0, 0.0)).acceleration_wheel
 
     value, slope = jax.value_and_grad(acceleration)(0.0)
     assert float(slope) == pytest.approx(-float(value) / 1e-6, rel=1e-3)

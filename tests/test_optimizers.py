@@ -17,7 +17,13 @@ from calibration.data.input_errors import BadConfiguration
 from calibration.inference import blocks as holdout
 from calibration.inference import identifiability, noise, observers, priors, problem, solvers
 from calibration.inference import optimizers as fit
-from calibration.inference.levenberg_marquardt import NEAR, NEARLY_ALL, OneSidedLevenbergMarquardt, counted, stride_of
+from calibration.inference.levenberg_marquardt import (
+    NEAR,
+    NEARLY_ALL,
+    OneSidedLevenbergMarquardt,
+    one_sided_step,
+    zero_inactive_residuals,
+)
 from mmrjax.model import paper_robots
 from mmrjax.model.signals import CONVERGED, SLIDES
 
@@ -26,12 +32,16 @@ STATED = "current=2%,motor_speed=0.5%,speed=1%"
 
 
 def pose(runs, robot, names=None, model="steady", stated=STATED):
-    names = priors.choose(robot, priors.default_names(runs["configuration"], robot)) if names is None else names
-    return observers.pose(runs, robot, priors.coordinates(robot, names), sds(runs, stated), model)
+    names = (
+        priors.choose_free_names(robot, priors.default_names(runs["configuration"], robot))
+        if names is None
+        else names
+    )
+    return observers.pose_problem(runs, robot, priors.parameter_coordinates(robot, names), sds(runs, stated), model)
 
 
 def sds(runs, stated):
-    return noise.from_table(runs, observers.kind(runs).sizes(runs), stated).sd
+    return noise.noise_from_table(runs, observers.observer_kind(runs).sizes(runs), stated).sd
 
 
 @pytest.fixture(scope="module")
@@ -115,7 +125,7 @@ def alone(posed, members, max_steps):
 def bent():
     """A small problem, nine searches of it with data and starts of their own, and where each ends by itself."""
     rng = np.random.default_rng(1)
-    data = problem.data_of(rng.standard_normal((6, 2)), np.full((6, 2), 0.1), 4)
+    data = problem.data_from_readings(rng.standard_normal((6, 2)), np.full((6, 2), 0.1), 4)
     measured = rng.standard_normal((9, 6, 2))
     weight = (rng.random((9, 6, 2)) > 0.1).astype(float)
     members = fit.Member(rng.standard_normal((9, 4)), weight, measured, 0.1 * rng.standard_normal((9, 4)))
@@ -129,7 +139,7 @@ def test_searches_do_not_depend_on_those_beside_them(bent, places):
     """Whatever waits, ends and takes whose place, each search is what it is alone; steps included."""
     posed, members, (wanted, seen) = bent
     assert len({*np.asarray(wanted.steps).tolist()}) > 3  # they end at different times
-    found, here = fit.searches_refilled(posed, members, 40, places)
+    found, here = fit.search_refilling(posed, members, 40, places)
     np.testing.assert_array_equal(found.steps, wanted.steps)
     np.testing.assert_allclose(found.z, wanted.z, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(found.cost, wanted.cost, rtol=1e-9)
@@ -181,7 +191,7 @@ def test_solvers_of_other_libraries_find_the_truth(bent, name):
     seen = posed.observation(truth)
     data = dataclasses.replace(posed.data, measured=seen.reading, centre=truth)
     assert (posed.excess(seen, data) < -1).all()
-    found, start, end = fit.searches_by(posed, truth[None] + 0.1, data, solvers.solver(name))
+    found, start, end = fit.search_with_solver(posed, truth[None] + 0.1, data, solvers.solver_by_name(name))
     assert found.converged[0] and found.steps[0] > 1
     np.testing.assert_allclose(found.z[0], truth, atol=2e-3)
     np.testing.assert_allclose(end.reading[0], seen.reading, atol=2e-3)
@@ -190,7 +200,7 @@ def test_solvers_of_other_libraries_find_the_truth(bent, name):
 
 def test_a_solver_that_there_is_not_is_refused_with_the_nearest():
     with pytest.raises(BadConfiguration, match=r"^solver: got dogleq; did you mean dogleg[?] allowed: lm, dogleg,"):
-        solvers.solver("dogleq")
+        solvers.solver_by_name("dogleq")
 
 
 def test_a_start_that_is_not_finite_is_no_optimum(bent):
@@ -312,7 +322,7 @@ def test_search_goes_along_the_edge_of_a_penalty():
         np.testing.assert_allclose(end.value[1:], 0.0, atol=1e-6)
         assert 0.1999 < float(end.value[0]) < 0.2
         found = end.state.found
-        assert jnp.linalg.norm(stride_of(found.residual, found.jacobian, found.one_sided, 0.0)) < 1e-6
+        assert jnp.linalg.norm(one_sided_step(found.residual, found.jacobian, found.one_sided, 0.0)) < 1e-6
 
 
 def test_stride_is_the_optimum_beyond_and_along_the_edges_of_penalties():
@@ -320,7 +330,7 @@ def test_stride_is_the_optimum_beyond_and_along_the_edges_of_penalties():
     from scipy.optimize import minimize
 
     rng, crossed, held = np.random.default_rng(5), 0, slice(10, 16)
-    stride = jax.jit(lambda r, jacobian: stride_of(r, jacobian, held, 0.3))
+    stride = jax.jit(lambda r, jacobian: one_sided_step(r, jacobian, held, 0.3))
     for _ in range(20):
         jacobian, residual = rng.standard_normal((16, 4)), rng.standard_normal(16)
         jacobian[held] *= 30.0
@@ -333,7 +343,7 @@ def test_stride_is_the_optimum_beyond_and_along_the_edges_of_penalties():
         step = np.asarray(stride(residual, jacobian))
         best = minimize(objective, step, method="BFGS", options={"gtol": 1e-9})
         assert objective(step) == pytest.approx(best.fun, rel=1e-6)
-        r, slope = counted(jnp.asarray(residual), jnp.asarray(jacobian), held)
+        r, slope = zero_inactive_residuals(jnp.asarray(residual), jnp.asarray(jacobian), held)
         plain = -np.linalg.solve(slope.T @ slope + 0.3 * np.eye(4), slope.T @ r)
         crossed += objective(plain) > objective(np.zeros(4))
     assert crossed > 5  # where the Gauss-Newton step leads to a higher place
@@ -345,28 +355,28 @@ def test_search_of_rollouts_ends_at_the_limit_of_adhesion_from_inside(measured):
     """With the noise that is estimated of them the rows pull static friction down to the margin; from just inside of
     it nothing shows the penalty."""
     posed = pose(measured, paper_robots.nominal(), stated="current=10%,motor_speed=6%,speed=4%")
-    limit = fit.searches(posed, jnp.zeros((1, len(posed.coordinates))), posed.data)[0]
+    limit = fit.search_starts(posed, jnp.zeros((1, len(posed.coordinates))), posed.data)[0]
     assert np.any(np.asarray(posed.observation(limit.z[0]).adhesion_used) > 1 - problem.MARGIN)
     inside = limit.z[0].at[posed.coordinates.names.index("6T2A.ground.friction.static")].add(3e-4)
-    r, jacobian, seen = fit.linearised(posed, inside, posed.data)
+    r, jacobian, seen = fit.linearise(posed, inside, posed.data)
     assert (np.asarray(seen.adhesion_used) < 1 - problem.MARGIN)[:10].all()
     plain = np.linalg.lstsq(np.asarray(jacobian), np.asarray(r))[0]
     assert 0.5 * np.sum((jacobian @ plain) ** 2) > 3 * fit.DECREMENT  # a gain that is not there
-    found, _, _ = fit.search_long(posed, inside, posed.data)
+    found, _, _ = fit.search_rollout(posed, inside, posed.data)
     assert found.converged and float(found.decrement) < fit.DECREMENT + fit.DECREMENT_SHARE * float(found.cost)
     assert float(found.cost) == pytest.approx(float(limit.cost[0]), abs=2 * fit.DECREMENT)
 
 
 @pytest.mark.slow
 def test_truth_is_recovered_from_clean_readings(clean, truth):
-    found, _, _ = fit.searches(clean, starts(len(truth), 16), clean.data)
+    found, _, _ = fit.search_starts(clean, starts(len(truth), 16), clean.data)
     assert np.all(found.converged)
     np.testing.assert_allclose(found.z, np.broadcast_to(truth, found.z.shape), atol=2e-4)
 
 
 @pytest.mark.slow
 def test_64_starts_on_the_packaged_data_agree(posed):
-    found, _, _ = fit.searches(posed, starts(len(posed.coordinates), 64), posed.data)
+    found, _, _ = fit.search_starts(posed, starts(len(posed.coordinates), 64), posed.data)
     assert np.all(found.converged)
     np.testing.assert_allclose(found.cost, np.asarray(found.cost).min(), rtol=1e-6)
 
@@ -405,11 +415,11 @@ def test_directions_that_no_data_tell_apart_are_the_same_from_any_basis():
     random = np.random.default_rng(4)
     plane = np.linalg.qr(np.stack([np.eye(6)[2], [3.0, 4.0, 0, 0, 0, 0], [0, 0, 0, 1.0, -1.0, 2.0]], 1))[0].T
     turned = np.linalg.qr(random.standard_normal((3, 3)))[0] @ plane
-    found = identifiability.told_apart(turned)
-    np.testing.assert_allclose(found, identifiability.told_apart(plane), atol=1e-12)
+    found = identifiability.separate_directions(turned)
+    np.testing.assert_allclose(found, identifiability.separate_directions(plane), atol=1e-12)
     np.testing.assert_allclose(found.T @ found, plane.T @ plane, atol=1e-12)
     np.testing.assert_allclose(found[:2], [np.eye(6)[2], np.array([0, 0, 0, 1.0, -1.0, 2.0]) / 6**0.5], atol=1e-12)
-    assert identifiability.told_apart(np.zeros((0, 6))).shape == (0, 6)
+    assert identifiability.separate_directions(np.zeros((0, 6))).shape == (0, 6)
 
 
 @pytest.mark.slow
@@ -422,7 +432,7 @@ def test_what_only_its_prior_holds_is_said(measured):
     )
     posed = pose(measured, robot, names)
     z = solve(posed, jnp.zeros(len(names)), posed.data).z
-    about = identifiability.analyse(posed, z)
+    about = identifiability.analyse_identifiability(posed, z)
     held = dict(zip(names, about.held_by_prior, strict=True))
     assert held["motor.inductance"] and about.sd[names.index("motor.inductance")] == pytest.approx(1.0)
     assert about.sensitivity[names.index("motor.inductance")] == 0
@@ -437,8 +447,8 @@ def test_profile_of_a_linear_problem_is_its_interval(clean, truth):
     quiet = dataclasses.replace(clean.data, sd=clean.data.sd / 500)
     small = dataclasses.replace(clean, data=quiet)
     best = solve(small, truth, quiet)
-    about = identifiability.analyse(small, best.z)
-    profile = identifiability.profile(small, best.z, float(best.cost), about)
+    about = identifiability.analyse_identifiability(small, best.z)
+    profile = identifiability.profile_likelihoods(small, best.z, float(best.cost), about)
     assert profile.better < 1e-6 and not profile.open.any()
     sure = about.sd < 0.05  # the others still reach over a good part of a prior sd
     low = np.asarray(small.coordinates.value(best.z - 1.96 * about.sd))
@@ -452,8 +462,8 @@ def test_profile_of_a_linear_problem_is_its_interval(clean, truth):
 def test_profile_of_a_parameter_held_by_the_limit_is_one_sided(measured):
     posed = pose(measured, paper_robots.nominal(), stated="current=9%,motor_speed=6%,speed=4%")
     best = solve(posed, jnp.zeros(len(posed.coordinates)), posed.data)
-    about = identifiability.analyse(posed, best.z)
-    profile = identifiability.profile(posed, best.z, float(best.cost), about)
+    about = identifiability.analyse_identifiability(posed, best.z)
+    profile = identifiability.profile_likelihoods(posed, best.z, float(best.cost), about)
     k = posed.coordinates.names.index("4W2T.ground.friction.static")
     value = float(posed.coordinates.value(best.z)[k])
     assert value - profile.low[k] < 0.2 * (profile.high[k] - value)
@@ -462,9 +472,9 @@ def test_profile_of_a_parameter_held_by_the_limit_is_one_sided(measured):
 
 @pytest.mark.slow
 def test_blocks_left_out_are_not_seen(posed, measured):
-    masks = {"slope": holdout.blocks(measured, "slope")}
+    masks = {"slope": holdout.blocks_of_kind(measured, "slope")}
     best = solve(posed, jnp.zeros(len(posed.coordinates)), posed.data).z
-    held = holdout.held_out(posed, best, masks)["slope"]
+    held = holdout.hold_out_by_kind(posed, best, masks)["slope"]
     assert held.labels == ("0.0", "5.0", "10.0", "15.0", "20.0") and held.converged.all()
     # the refit without slope 10, done alone, says the same of those rows
     rows = masks["slope"]["10.0"]
@@ -473,14 +483,17 @@ def test_blocks_left_out_are_not_seen(posed, measured):
     np.testing.assert_allclose(held.reading[rows], np.asarray(posed.observation(z).reading)[rows], rtol=1e-4)
     # readings of a block do not change what is predicted for it
     shifted = dataclasses.replace(posed.data, measured=posed.data.measured.at[rows].multiply(1.3))
-    other = holdout.held_out(dataclasses.replace(posed, data=shifted), best, masks)["slope"]
+    other = holdout.hold_out_by_kind(dataclasses.replace(posed, data=shifted), best, masks)["slope"]
     np.testing.assert_allclose(other.reading[rows], held.reading[rows], rtol=1e-4)
 
 
 def test_blocks_of_what_does_not_vary_are_none(measured):
     flat = measured.where(measured["slope_deg"] == 0)
-    assert holdout.blocks(flat, "slope") == {} and len(holdout.blocks(flat, "voltage_configuration")) == 4
-    assert holdout.blocks(flat, "run") == {}
+    assert (
+        holdout.blocks_of_kind(flat, "slope") == {}
+        and len(holdout.blocks_of_kind(flat, "voltage_configuration")) == 4
+    )
+    assert holdout.blocks_of_kind(flat, "run") == {}
 
 
 @pytest.mark.slow
@@ -523,14 +536,14 @@ def test_histories_calibrate_with_drive():
     """A start tells the inductance and the rotor's inertia, which no steady row can."""
     base = paper_robots.nominal()
     names = ("motor.inductance", "motor.inertia", "6T2A.track.loss_coulomb", "6T2A.ground.friction.static")
-    c = priors.coordinates(base, names)
+    c = priors.parameter_coordinates(base, names)
     truth = jnp.asarray([1.0, -0.8, 1.2, 1.8])
     runs = history_runs(c.robot(base, truth), seed=5)
-    assert observers.kind(runs) is observers.Histories
-    posed = observers.pose(runs, base, c, sds(runs, "current=0.1A,motor_speed=20rpm,speed=5mm/s"), "drive")
+    assert observers.observer_kind(runs) is observers.Histories
+    posed = observers.pose_problem(runs, base, c, sds(runs, "current=0.1A,motor_speed=20rpm,speed=5mm/s"), "drive")
     best = solve(posed, jnp.zeros(4), posed.data)
     assert best.converged
-    about = identifiability.analyse(posed, best.z)
+    about = identifiability.analyse_identifiability(posed, best.z)
     assert np.all(about.sd[:2] < 0.5)
     assert np.all(np.abs(np.asarray(best.z - truth)) < 4 * about.sd)
 
@@ -565,17 +578,17 @@ def test_rival_searches_end_where_three_agree_unless_one_is_lower():
     data = problem.Data(0 * one, one, one, jnp.zeros(2), jnp.asarray(1.0))
     begin = jnp.asarray([[0.1, 0.0], [0.2, 0.0], [0.3, 0.0], [-1.2, 1.0], [-1.9, 2.0], [0.0, 0.0]])
     weights = jnp.ones((6, 1, 3))
-    found, _ = fit.searches_long(evaluate, begin, data, weights, 40, 2, rivals=True)
+    found, _ = fit.search_rollouts(evaluate, begin, data, weights, 40, 2, rivals=True)
     np.testing.assert_allclose(found.cost[3:5], 0, atol=1e-3)
     assert found.converged[3:5].all() and found.steps[3] > found.steps[0]
     evaluated.clear()
-    alone, _ = fit.searches_long(evaluate, begin, data, weights, 40, 2)
+    alone, _ = fit.search_rollouts(evaluate, begin, data, weights, 40, 2)
     assert max(evaluated) == 2 and sum(evaluated) == alone.steps.sum()  # what has ended leaves its place
     np.testing.assert_allclose(alone.cost[:5], [30, 30, 30, 0, 0], atol=1e-3)
     # Nor does a search go on that cannot come down to where another one is.
     assert (found.steps[[0, 1, 2, 5]] < alone.steps[[0, 1, 2, 5]]).all()
     assert (found.cost[:3] < 31).all()
-    same, _ = fit.searches_long(evaluate, begin[:3], data, weights[:3], 40, 2, rivals=True)
+    same, _ = fit.search_rollouts(evaluate, begin[:3], data, weights[:3], 40, 2, rivals=True)
     assert (same.steps <= alone.steps[:3]).all()
 
 
@@ -590,7 +603,7 @@ def test_a_rival_that_promises_much_and_brings_nothing_ends():
     one = jnp.ones((1, 2))
     data = problem.Data(0 * one, one, one, jnp.zeros(1), jnp.asarray(1.0))
     found, alone = (
-        fit.searches_long(evaluate, np.array([[0.5], [0.0]]), data, np.ones((2, 1, 2)), 40, 2, rivals=r)[0]
+        fit.search_rollouts(evaluate, np.array([[0.5], [0.0]]), data, np.ones((2, 1, 2)), 40, 2, rivals=r)[0]
         for r in (True, False)
     )
     np.testing.assert_allclose(found.cost, [2, 2000], atol=1e-3)

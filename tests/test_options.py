@@ -20,6 +20,7 @@ KINDS = {
     "render": (config.Render, config.OneRun),
     "calibrate": (config.Calibrate, config.MembersPart),
     "loop": (config.Loop, config.MembersPart),
+    "export": (config.Export,),
     "sensitivity": (config.Sensitivity,),
     "resonance": (config.Resonance,),
     "climb": (config.Climb,),

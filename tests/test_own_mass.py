@@ -13,11 +13,11 @@ from calibration.data import own_mass, robot_file
 from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.discovery import discover, findings
-from calibration.discovery.candidates import Candidate, filled
+from calibration.discovery.candidates import Candidate, fill_slots
 from calibration.inference.calibration import calibrate
-from calibration.inference.linearization import shape_of, shape_scales, shaped
+from calibration.inference.linearization import shape_at, shape_of, shape_scales
 from calibration.inference.observers import SettledRuns
-from calibration.inference.optimizers import read
+from calibration.inference.optimizers import observe_robot
 from mmrjax.effects import ALL, BY_NAME, UNNAMED
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import channels, paper_robots, params
@@ -36,7 +36,7 @@ def table(masses=MASSES, surface=None) -> records.Runs:
         "total_mass_kg": np.array([masses[n] for n in names]) + payload,
         "payload_kg": payload,
         "slope_deg": np.tile([0.0, 5.0, 12.0], 4)[::-1],
-    } | {c.column: np.linspace(1.0, 2.0, 12) for c in channels.usual()}
+    } | {c.column: np.linspace(1.0, 2.0, 12) for c in channels.usual_channels()}
     return records.Runs("runs.csv", columns | ({} if surface is None else {"surface": np.full(12, surface)}))
 
 
@@ -64,7 +64,7 @@ class Written:
         have = {e.name: e for e in back.effects}
         assert set(have) == {e.name for e in robot.effects}
         whole = dataclasses.replace(back, effects=tuple(have.get(e.name, e) for e in self.effects))
-        return jax.device_get(_swept(params.strong(whole), self.runs.conditions(back)))
+        return jax.device_get(_swept(params.without_weak_types(whole), self.runs.conditions(back)))
 
 
 # --- every effect ---------------------------------------------------------------------------------------
@@ -82,7 +82,7 @@ def fits(tmp_path_factory):
     robot = robot_file.with_effects(paper_robots.nominal(), UNSEEN)
     robot = params.replace(robot, {f"effects.{n}.amplitude": 0.3 * _sd(BY_NAME[n]) for n in UNSEEN})
     sd = 0.02 * np.abs(runs.measured())
-    space = discover.pose(runs, robot, sd, SETTLED.settings, stated, BY_NAME)
+    space = discover.pose_candidates(runs, robot, sd, SETTLED.settings, stated, BY_NAME)
     z = np.zeros(len(space.coordinates))
     z[: space.free] = np.random.default_rng(3).normal(0.0, 0.5, space.free)
     # The exponent of sinkage is then beyond its bounds, which a file could not state.
@@ -90,9 +90,9 @@ def fits(tmp_path_factory):
     written = Written(runs, tmp_path_factory.mktemp("written"), ALL)
 
     def of(name):
-        active = filled([name] if name else [], SETTLED.settings)
+        active = fill_slots([name] if name else [], SETTLED.settings)
         problem = space.problem(active)
-        seen = jax.device_get(read(problem, problem.robot(jnp.asarray(z))))
+        seen = jax.device_get(observe_robot(problem, problem.robot(jnp.asarray(z))))
         candidate = Candidate(active, z, z, 0.0, z, z, True, True, True)
         again, status = written(findings.proposed_robot(space, candidate))
         return seen.reading[: len(runs)], seen.status[: len(runs)], again, status
@@ -101,7 +101,7 @@ def fits(tmp_path_factory):
 
 
 def _sd(effect) -> float:
-    return next(p for p in params.walk(effect()) if p.spec.amplitude).spec.prior_sd(0.0)
+    return next(p for p in params.walk_parameters(effect()) if p.spec.amplitude).spec.prior_sd(0.0)
 
 
 def shown(name):
@@ -122,7 +122,7 @@ def test_robot_that_the_loop_writes_is_the_one_that_it_fitted(name, fits):
 def test_shape_that_a_fit_reaches_is_one_that_a_file_may_state(effect):
     shape = shape_of(effect())
     z = np.linspace(-6.0, 6.0, 61)
-    value = np.asarray(shaped(shape_scales(shape), jnp.asarray(z)))
+    value = np.asarray(shape_at(shape_scales(shape), jnp.asarray(z)))
     low, high = shape.spec.bounds
     assert low <= value.min() and value.max() <= high
     if shape.name == "phase":
@@ -137,7 +137,7 @@ def test_comparison_can_fail(tmp_path):
     runs, robot = table(), paper_robots.nominal()
     written = Written(runs, tmp_path, ())
     conditions = runs.conditions(robot)
-    before, _ = jax.device_get(_swept(params.strong(robot), conditions))
+    before, _ = jax.device_get(_swept(params.without_weak_types(robot), conditions))
     assert np.abs(written(robot)[0] / before - 1).max() > 0.02
     np.testing.assert_allclose(written(own_mass.with_table_mass(robot, runs))[0], before, rtol=1e-9)
 
@@ -166,7 +166,7 @@ def curves(tmp_path_factory):
         (present,) = with_it.effects
         whole = tuple(present if e.name == name else e() for e in every)
         fitted = dataclasses.replace(with_it, effects=whole)
-        reading, _ = jax.device_get(_swept(params.strong(fitted), runs.conditions(fitted)))
+        reading, _ = jax.device_get(_swept(params.without_weak_types(fitted), runs.conditions(fitted)))
         return reading, written(with_it)[0]
 
     return of

@@ -11,7 +11,7 @@ from sweeps.pages import mission_page, runs_page, sweep_page
 from sweeps.paper import error_tables
 from sweeps.report.words import fit_words, sensitivity_words
 
-SHOWN = [channels.find("total_current"), channels.find("speed")]
+SHOWN = [channels.find_channel("total_current"), channels.find_channel("speed")]
 
 
 def table(statuses, flags):

@@ -18,7 +18,7 @@ from mmrjax.model.params import parameter
 def test_nominal_values_are_those_of_the_reference(robot):
     # The track model has a reference of its own, C MuJoCo; what of its running gear the paper prints is checked below.
     own = ("running_gear.", "6T2A.turning.", "4W2T.turning.")  # of turns see test_turning.py
-    values = {p.name: float(p.value) for p in params.walk(robot) if not p.name.startswith(own)}
+    values = {p.name: float(p.value) for p in params.walk_parameters(robot) if not p.name.startswith(own)}
     assert set(values) == set(paper.NOMINAL)
     for name, expected in paper.NOMINAL.items():
         assert values[name] == pytest.approx(expected, rel=1e-12), name
@@ -36,13 +36,13 @@ def test_running_gear_is_that_of_tables_6_and_7(robot):
 
 @pytest.mark.parametrize("name", sorted(paper_robots.ROBOTS))
 def test_parameters_lie_within_their_bounds(name):
-    for p in params.walk(paper_robots.ROBOTS[name]()):
+    for p in params.walk_parameters(paper_robots.ROBOTS[name]()):
         low, high = p.spec.bounds
         assert low < high and low <= float(p.value) <= high, p.name
 
 
 def test_parameters_state_unit_meaning_source_and_prior(robot_with_effects):
-    for p in params.walk(robot_with_effects):
+    for p in params.walk_parameters(robot_with_effects):
         assert p.spec.unit and p.spec.meaning and p.spec.source, p.name
         assert (p.spec.sd is None) != (p.spec.relative_sd is None), p.name
         if float(p.value) == 0.0 or p.spec.amplitude:
@@ -58,7 +58,7 @@ def test_parameter_refuses_two_standard_deviations_and_none():
 
 def test_walk_collects_every_differentiable_leaf(robot_with_effects):
     leaves = jax.tree.leaves(eqx.filter(robot_with_effects, eqx.is_inexact_array))
-    found = list(params.walk(robot_with_effects))
+    found = list(params.walk_parameters(robot_with_effects))
     # what a configuration moves on and how many motors drive are facts, no numbers to be found
     facts = {id(chassis.on_tracks) for chassis in robot_with_effects.configurations.members}
     facts.add(id(robot_with_effects.sides))
@@ -67,10 +67,10 @@ def test_walk_collects_every_differentiable_leaf(robot_with_effects):
 
 
 def test_replace_changes_the_named_and_nothing_else(robot_with_effects):
-    before = {p.name: float(p.value) for p in params.walk(robot_with_effects)}
+    before = {p.name: float(p.value) for p in params.walk_parameters(robot_with_effects)}
     for name in before:
         changed = params.replace(robot_with_effects, {name: jnp.asarray(0.125)})
-        after = {p.name: float(p.value) for p in params.walk(changed)}
+        after = {p.name: float(p.value) for p in params.walk_parameters(changed)}
         assert {n for n in before if before[n] != after[n]} <= {name} and after[name] == 0.125
 
 
@@ -88,7 +88,7 @@ def test_replace_takes_batches_and_tracers(robot):
 
 def test_parameters_have_no_weak_types(robot_with_effects):
     # A weak type would make one more compilation of each model when a number is replaced.
-    changed = params.replace(robot_with_effects, {p.name: 1.0 for p in params.walk(robot_with_effects)})
+    changed = params.replace(robot_with_effects, {p.name: 1.0 for p in params.walk_parameters(robot_with_effects)})
     for tree in (robot_with_effects, changed):
         assert not any(leaf.weak_type for leaf in jax.tree.leaves(tree))
     given = jnp.asarray(0.7)  # as users give them
@@ -105,7 +105,7 @@ def test_parameters_have_no_weak_types(robot_with_effects):
 
 
 def test_spec_is_frozen(robot):
-    spec = next(params.walk(robot)).spec
+    spec = next(params.walk_parameters(robot)).spec
     with pytest.raises(dataclasses.FrozenInstanceError):
         spec.unit = "kg"
 

@@ -37,7 +37,7 @@ def changed(robot, values):
 
 def half(robot, configuration="6T2A", payload=0.0):
     run = Conditions(configuration, payload=payload).resolved(robot)
-    return masses.masses(robot, run, robot.chassis(run.configuration).mass + payload)
+    return masses.masses_of_parts(robot, run, robot.chassis(run.configuration).mass + payload)
 
 
 def whole(robot, configuration="6T2A", payload=0.0):
@@ -97,7 +97,7 @@ def test_inertia_is_that_of_points(robot, configuration):
 def test_each_part_payload_and_posture_count_in_every_member_with_derivatives(robot):
     """A batch in which each member has one number changed: none is as before, and as its derivative says."""
     robot = changed(robot, AT)
-    start = {p.name: p.value for p in params.walk(robot)}
+    start = {p.name: p.value for p in params.walk_parameters(robot)}
     at = jnp.stack([start[name] for name in PARTS] + [jnp.asarray(5.0)])
 
     def of(x):

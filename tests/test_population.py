@@ -55,14 +55,14 @@ def truth():
 
 @pytest.fixture(scope="module")
 def known(runs):
-    return noise.from_table(runs, SettledRuns.sizes(runs), "current=1%,motor_speed=0.2%,speed=0.2%")
+    return noise.noise_from_table(runs, SettledRuns.sizes(runs), "current=1%,motor_speed=0.2%,speed=0.2%")
 
 
 @pytest.fixture(scope="module")
 def posed(runs, truth, known):
     """Readings of a robot at `truth`, with priors that are right about it."""
     robot = paper_robots.nominal()
-    problem = observers.pose(runs, robot, priors.coordinates(robot, NAMES), known.sd)
+    problem = observers.pose_problem(runs, robot, priors.parameter_coordinates(robot, NAMES), known.sd)
     reading = problem.observation(jnp.asarray(truth)).reading
     return dataclasses.replace(
         problem, data=dataclasses.replace(problem.data, measured=reading, centre=jnp.asarray(truth))
@@ -73,7 +73,7 @@ def evolve(posed, known, generations=30, file=None, seed=3):
     members = Members(posed, file)
     size = len(NAMES)
     return population.evolve(
-        members, population.objective(posed, known), np.zeros(size), np.eye(size), size=SIZE, seed=seed,
+        members, population.member_objective(posed, known), np.zeros(size), np.eye(size), size=SIZE, seed=seed,
         generations=generations,
     )  # fmt: skip
 
@@ -103,7 +103,7 @@ def test_same_seed_same_members_and_another_seed_others(posed, known, found):
 @pytest.mark.slow
 def test_objective_is_the_misfit_where_the_noise_is_known(posed, known, found):
     rows = Rows(found.reading[:3], found.adhesion_used[:3], found.status[:3], found.flags[:3])
-    for z, cost in zip(found.z[:3], population.objective(posed, known)(found.z[:3], rows), strict=True):
+    for z, cost in zip(found.z[:3], population.member_objective(posed, known)(found.z[:3], rows), strict=True):
         readings = np.asarray(posed.misfit(jnp.asarray(z), posed.data))[: posed.data.measured.size]
         lost = np.isin(np.asarray(posed.observation(jnp.asarray(z)).status), (2, 3, 4))
         if not lost.any():
@@ -114,10 +114,10 @@ def test_objective_is_the_misfit_where_the_noise_is_known(posed, known, found):
 @pytest.mark.slow
 def test_objective_with_noise_to_be_estimated_takes_the_most_probable(posed, runs, found):
     """n ln s is, but for a constant, ½ Σ (e/σ)² + n ln σ at the σ that makes it smallest."""
-    unknown = noise.from_table(runs, SettledRuns.sizes(runs))
+    unknown = noise.noise_from_table(runs, SettledRuns.sizes(runs))
     worst = found.order[-2:]  # far above the least share that is taken for noise
     rows = Rows(found.reading[worst], found.adhesion_used[worst], found.status[worst], found.flags[worst])
-    costs = population.objective(posed, unknown)(found.z[worst], rows)
+    costs = population.member_objective(posed, unknown)(found.z[worst], rows)
     size, measured = SettledRuns.sizes(runs), np.asarray(posed.data.measured)
 
     def at(k, share):
@@ -143,7 +143,7 @@ def test_row_that_is_not_reached_costs_and_a_reading_that_is_missing_ends_it(pos
     status[0, 0] = 2
     reached = Rows(found.reading[:1], found.adhesion_used[:1], np.zeros_like(status), found.flags[:1])
     lost = reached._replace(status=status)
-    cost = population.objective(posed, known)
+    cost = population.member_objective(posed, known)
     assert cost(found.z[:1], lost) - cost(found.z[:1], reached) == pytest.approx(population.LOST)
     broken = reached._replace(reading=np.full_like(reached.reading, np.nan))
     assert np.isinf(cost(found.z[:1], broken))
@@ -175,7 +175,7 @@ def test_members_of_another_calibration_are_refused(posed, known, tmp_path):
     file = tmp_path / "members.npz"
     evolve(posed, known, 1, file)
     other = dataclasses.replace(posed, data=dataclasses.replace(posed.data, measured=posed.data.measured * 1.01))
-    with pytest.raises(BadConfiguration, match="its members are of another calibration"):
+    with pytest.raises(BadConfiguration, match="its members belong to another calibration"):
         Members(other, file)
     noisier = dataclasses.replace(posed, data=dataclasses.replace(posed.data, sd=2 * posed.data.sd))
     assert len(Members(noisier, file)._kept) == SIZE  # the noise is none of what was run
@@ -186,7 +186,7 @@ def test_members_of_another_calibration_are_refused(posed, known, tmp_path):
 def test_file_that_holds_no_members_is_refused(posed, tmp_path, content):
     file = tmp_path / "members.npz"
     file.write_bytes(content)
-    with pytest.raises(BadConfiguration, match="not a file of members that can be read"):
+    with pytest.raises(BadConfiguration, match="not a readable file of members"):
         Members(posed, file)
 
 
@@ -196,8 +196,8 @@ def never(*_, **__):
 
 def test_damaged_members_are_refused_before_the_first_search(tmp_path, monkeypatch, mmrjax):
     (tmp_path / "kept.npz").write_bytes(b"cut")
-    monkeypatch.setattr(multistart, "search", never)
-    with pytest.raises(BadConfiguration, match="not a file of members that can be read"):
+    monkeypatch.setattr(multistart, "search_from_starts", never)
+    with pytest.raises(BadConfiguration, match="not a readable file of members"):
         calibrate(
             records.read("measured"),
             paper_robots.nominal(),
@@ -207,7 +207,7 @@ def test_damaged_members_are_refused_before_the_first_search(tmp_path, monkeypat
         )
     monkeypatch.setattr("sweeps.commands.loop.discover", never)
     code, _, err = mmrjax("loop", "measured", "--resolve", "--members", "kept.npz", "--out", "x")
-    assert code == 2 and "--members kept.npz: not a file of members that can be read" in err
+    assert code == 2 and "--members kept.npz: not a readable file of members" in err
     assert [p.name for p in tmp_path.iterdir()] == ["kept.npz"]
 
 
@@ -232,11 +232,11 @@ def test_full_disk_is_said_and_leaves_what_was_there(posed, known, tmp_path, mon
 @pytest.mark.slow
 def test_regression_over_members_is_the_derivative_of_a_smooth_model(posed, found):
     at = int(found.order[0])
-    about = identifiability.analyse(posed, jnp.asarray(found.z[at]))
-    slope, left = population.regression(posed, found, at)
+    about = identifiability.analyse_identifiability(posed, jnp.asarray(found.z[at]))
+    slope, left = population.local_regression(posed, found, at)
     assert np.linalg.norm(slope - about.jacobian) < 0.15 * np.linalg.norm(about.jacobian) and left < 1.0
     members = Members(posed)
-    assert not population.apart(posed, members, found.z[at], about.jacobian, about.sd).any()
+    assert not population.unreliable_derivatives(posed, members, found.z[at], about.jacobian, about.sd).any()
 
 
 @pytest.mark.slow
@@ -245,8 +245,8 @@ def test_parameter_across_whose_threshold_differences_lead_is_named(posed, found
     stepped = eqx.tree_at(
         lambda p: p.observe, posed, Stepped(posed.observe.conditions, "steady"), is_leaf=lambda x: x is posed.observe
     )
-    about = identifiability.analyse(stepped, jnp.zeros(len(NAMES)))
-    off = population.apart(stepped, Members(stepped), np.zeros(len(NAMES)), about.jacobian, about.sd)
+    about = identifiability.analyse_identifiability(stepped, jnp.zeros(len(NAMES)))
+    off = population.unreliable_derivatives(stepped, Members(stepped), np.zeros(len(NAMES)), about.jacobian, about.sd)
     assert off.tolist() == [True, False, False, False]
 
 
@@ -264,8 +264,8 @@ def test_parameter_at_the_edge_of_its_prior_or_at_a_bound_is_named(posed):
     coordinates = dataclasses.replace(
         posed.coordinates, high=np.where(np.arange(4) == 3, np.log(0.07), posed.coordinates.high)
     )
-    assert population.edges(coordinates, np.array([2.4, -2.4, 0.0, 0.0])) == {}
-    said = population.edges(coordinates, np.array([2.6, -3.0, 0.0, 9.0]))
+    assert population.parameters_at_edge(coordinates, np.array([2.4, -2.4, 0.0, 0.0])) == {}
+    said = population.parameters_at_edge(coordinates, np.array([2.6, -3.0, 0.0, 9.0]))
     assert list(said) == [NAMES[0], NAMES[1], NAMES[3]]
     assert [*said.values()] == [Edge("", 2.6), Edge("", -3.0), Edge("upper", 9.0)]
 
@@ -326,7 +326,7 @@ def test_population_of_which_no_member_can_be_run_is_refused(runs, monkeypatch):
     ("options", "says"),
     [
         (dict(generations=3), "there is no population"),
-        (dict(population=50), "settled rows with --model drive or track alone"),
+        (dict(population=50), "a population search needs settled rows and --model drive or track"),
         (dict(population=2, model="drive"), "at least 4 members"),
         (dict(generations=3, population=0, model="track"), "there is no population"),
     ],
@@ -355,7 +355,7 @@ def test_running_gear_is_found_through_the_track_model(tmp_path):
     robot = params.replace(paper_robots.nominal(), changed)
     shown = track_batch(robot, table.conditions(robot), duration=0.6, step=5e-5, rolling=True).result.reading
     columns = dict(table.columns)
-    for channel in channels.usual():
+    for channel in channels.usual_channels():
         columns[channel.column] = np.asarray(shown[channel.name]) / channel.factor
     data = dataclasses.replace(table, columns=columns)
     found = calibrate(

@@ -15,7 +15,7 @@ from calibration.data.input_errors import BadData
 from calibration.data.posterior_file import ANGLE, LOG, NORMAL, Posterior
 from calibration.data.runs import read
 from calibration.inference import priors
-from calibration.inference.fit_posterior import of_coordinates
+from calibration.inference.fit_posterior import posterior_of_coordinates
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.fidelities.variation import Variation
 from mmrjax.model import params
@@ -27,13 +27,13 @@ NAMES = ("motor.resistance", "6T2A.track.guide_share", "6T2A.ground.friction.sta
 
 @pytest.fixture
 def coordinates(robot):
-    return priors.coordinates(robot, NAMES)
+    return priors.parameter_coordinates(robot, NAMES)
 
 
 @pytest.fixture
 def posterior(coordinates):
     a = np.array([[0.3, 0, 0, 0], [-0.2, 0.25, 0, 0], [0.05, 0.02, 0.1, 0], [0, 0.1, 0, 0.9]])
-    return of_coordinates(coordinates, np.array([0.4, 0.2, 1.2, 0.0]), a @ a.T)
+    return posterior_of_coordinates(coordinates, np.array([0.4, 0.2, 1.2, 0.0]), a @ a.T)
 
 
 @pytest.fixture
@@ -108,8 +108,8 @@ def test_draws_reproduce_the_linear_standard_error_of_readings(posterior, fitted
 @pytest.mark.slow
 def test_draws_that_do_not_travel_are_counted_and_leave_the_rest(robot):
     names = ("6T2A.ground.friction.static",)
-    coordinates = priors.coordinates(robot, names)
-    wide = of_coordinates(coordinates, np.zeros(1), np.eye(1))
+    coordinates = priors.parameter_coordinates(robot, names)
+    wide = posterior_of_coordinates(coordinates, np.zeros(1), np.eye(1))
     runs = read("measured").where(np.array([0, 2]))  # flat, and 10°, where one in seven slides
     found = uncertainty.intervals(robot, wide, runs, config.Compare(), 300)
     share = found.columns[uncertainty.SHARE]

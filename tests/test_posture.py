@@ -19,7 +19,9 @@ FLUSH = -math.degrees(math.asin((world.TRACK - world.ROLLER) / world.LEVER))
 #: By hand: radius over the grousers, half of the wheelbase, centre of mass above the axles without and with 8 kg [m].
 RADIUS, HALF, UP, UP_LOADED = 0.0437, 0.15, 5e-3, (13.1 * 5e-3 + 8 * 73e-3) / 21.1
 
-highest_step, limits, rest = (jax.jit(f) for f in (static_limits.step, static_limits.limits, resting_posture.rest))
+highest_step, limits, rest = (
+    jax.jit(f) for f in (static_limits.find_highest_step, static_limits.posture_limits, resting_posture.rest_outline)
+)
 
 
 def run(front=None, rear=None, **of):
@@ -28,7 +30,7 @@ def run(front=None, rear=None, **of):
 
 def held(robot, front, rear, up=UP):
     """An outline whose centre of mass is as high as stated, over the middle of the wheelbase."""
-    side = resting_posture.outline(robot, run(front, rear))
+    side = resting_posture.side_outline(robot, run(front, rear))
     return dataclasses.replace(side, centre_forward=jnp.zeros(()), centre_up=jnp.asarray(up))
 
 
@@ -141,13 +143,13 @@ def test_on_wheels_a_robot_rests_on_them(robot):
 @pytest.mark.slow
 def test_derivatives_of_posture_and_step_are_those_of_differences(robot):
     names = ("running_gear.lever_length", "running_gear.levers.roller", "running_gear.lever_mass", "6T2A.radius")
-    known = {p.name: p.value for p in params.walk(robot)}
+    known = {p.name: p.value for p in params.walk_parameters(robot)}
 
     def outputs(x):
         made = params.replace(robot, {name: known[name] * x[k + 2] for k, name in enumerate(names)})
         here = run(-50.0 * x[0], -30.0 * x[1], payload=4.0)
         rests = resting_posture.posture(made, here)
-        step = static_limits.step(resting_posture.outline(made, here))
+        step = static_limits.find_highest_step(resting_posture.side_outline(made, here))
         return jnp.stack([rests.pitch, rests.height, rests.load_front, rests.inertia, step.height])
 
     start = jnp.ones(6)
@@ -166,7 +168,7 @@ def test_derivative_where_two_parts_decide_the_step(robot, angles):
 
     @jax.jit
     def height(angles):
-        return static_limits.step(resting_posture.outline(robot, run(angles[0], angles[1]))).height
+        return static_limits.find_highest_step(resting_posture.side_outline(robot, run(angles[0], angles[1]))).height
 
     exact, at = jax.jit(jax.grad(height))(jnp.array(angles)), np.array(angles)
     for k, step in enumerate(0.02 * np.eye(2)):
@@ -193,7 +195,7 @@ def test_no_posture_stands_on_a_higher_step_than_the_best(robot, least):
     def angles(at):
         return np.unique(np.clip([*np.arange(-180.0, 181.0, 30.0), *(at + np.linspace(-3, 3, 7))], least, 180.0))
 
-    heights = np.asarray(static_limits.over_levers(of, conditions, angles(front), angles(rear))[0].height)
+    heights = np.asarray(static_limits.steps_over_lever_angles(of, conditions, angles(front), angles(rear))[0].height)
     assert heights.max() <= float(best.height) + 1e-8
     assert heights.max() == pytest.approx(float(best.height), abs=1e-6)
     assert np.median(heights) < float(best.height) - 0.02
@@ -206,13 +208,13 @@ def test_no_posture_stands_on_a_higher_step_than_the_best(robot, least):
 
 @pytest.mark.slow
 def test_map_over_levers_is_that_of_single_postures(robot):
-    found, margin = static_limits.over_levers(
+    found, margin = static_limits.steps_over_lever_angles(
         robot, run(payload=2.0), np.array([-54.0, 180.0]), np.array([-39.0, 0.0, 180.0])
     )
     assert found.height.shape == (2, 3)
     for i, front in enumerate((-54.0, 180.0)):
         for k, rear in enumerate((-39.0, 0.0, 180.0)):
-            single = highest_step(resting_posture.outline(robot, run(front, rear, payload=2.0)))
+            single = highest_step(resting_posture.side_outline(robot, run(front, rear, payload=2.0)))
             assert float(found.height[i, k]) == pytest.approx(float(single.height), abs=1e-12)
             rest = resting_posture.posture(robot, run(front, rear, payload=2.0))
             assert float(margin[i, k]) == pytest.approx(float(rest.margin), abs=1e-12)
@@ -230,7 +232,7 @@ def test_folded_levers_stand_as_none_stated(robot, name):
 
 @pytest.mark.slow
 def test_straight_travel_does_not_change_with_posture(robot):
-    speeds = [steady.operating(robot, c)[0].speed for c in (run(), run(180.0, 180.0), run(-30.0, 40.0))]
+    speeds = [steady.operating_state(robot, c)[0].speed for c in (run(), run(180.0, 180.0), run(-30.0, 40.0))]
     assert float(speeds[0]) == float(speeds[1]) == float(speeds[2])
 
 

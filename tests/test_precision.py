@@ -14,7 +14,7 @@ from test_public_api import python
 import mmrjax as mm
 from mmrjax.compile import precision
 from mmrjax.model import params
-from mmrjax.model.params import walk
+from mmrjax.model.params import walk_parameters
 
 #: Numbers that single precision does not hold.
 RUNS = dict(configuration="6T2A", voltage=[24.1, 15.3], slope_deg=5.1)
@@ -61,7 +61,7 @@ def test_results_are_those_of_double_precision_where_jax_is_single(robot):
             assert isinstance(a, np.ndarray)
             np.testing.assert_array_equal(a, b)
     assert later is found.slip and found.table() == double.table()
-    assert all(isinstance(p.value, np.ndarray) and p.value.dtype == float for p in walk(plain))
+    assert all(isinstance(p.value, np.ndarray) and p.value.dtype == float for p in walk_parameters(plain))
 
 
 def test_threads_have_the_precision_of_who_hands_them_work(single):
@@ -115,5 +115,5 @@ def test_gradients_in_single_precision_are_those_in_double():
 
 
 def test_strong_numbers_keep_their_digits(single):
-    robot = params.strong(mm.replace(mm.nominal(), {"motor.resistance": 0.6113}))
+    robot = params.without_weak_types(mm.replace(mm.nominal(), {"motor.resistance": 0.6113}))
     assert robot.motor.resistance == 0.6113

@@ -11,8 +11,8 @@ from calibration.data import robot_file
 from calibration.data.runs import Runs
 from calibration.discovery import findings, prediction
 from calibration.discovery.discover import discover
-from calibration.discovery.prediction import Gain, HeldOutScore, scored, smallest
-from calibration.inference.blocks import distinct, predictable, unpredictable
+from calibration.discovery.prediction import Gain, HeldOutScore, score_readings, smallest_predictive_set
+from calibration.inference.blocks import distinct_blocks, predictable_blocks, unpredictable_kinds
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import channels, paper_robots
 from sweeps.inputs import read_runs
@@ -39,7 +39,7 @@ def test_score_is_the_log_density_and_what_is_not_reached_counts(runs):
     reading["slope"][3, 1] = np.nan
     counts = np.ones((12, 2), bool)
     counts[5] = False
-    found = scored(reading, measured, sd, counts, distinct(runs, ("slope", "voltage")))
+    found = score_readings(reading, measured, sd, counts, distinct_blocks(runs, ("slope", "voltage")))
     for kind in reading:
         off = np.where(np.isfinite(reading[kind]), reading[kind], measured + prediction.UNREACHED * sd)
         wanted = stats.t.logpdf((off - measured) / sd, prediction.FREEDOM) - np.log(sd)
@@ -75,11 +75,11 @@ def test_smallest_set_within_one_error_of_the_best_is_chosen(monkeypatch, runs, 
     noise -= noise.mean(1, keepdims=True)
     candidates = [SimpleNamespace(effects=tuple("abc"[:k])) for k in range(4)]
     scores = {c.effects: score(noise[k] + ([0.0, *gains])[k], np.arange(12)) for k, c in enumerate(candidates)}
-    monkeypatch.setattr(prediction, "score_of", lambda space, runs, c: scores[c.effects])
+    monkeypatch.setattr(prediction, "score_candidate", lambda space, runs, c: scores[c.effects])
     space = SimpleNamespace(
         bare=SimpleNamespace(base=None, coordinates=NONE_FREE, observe=SimpleNamespace(blocks=("slope", "voltage")))
     )
-    found = smallest(space, runs, candidates[0], candidates[1:])
+    found = smallest_predictive_set(space, runs, candidates[0], candidates[1:])
     assert (found is None) if chosen == 0 else (found is candidates[chosen])
 
 
@@ -90,17 +90,17 @@ def test_what_candidates_predict_is_kept_and_not_fitted_again(monkeypatch, runs)
     shown = {c.effects: {kind: np.full((12, 2), len(c.effects)) for kind in ("slope", "voltage")} for c in candidates}
     monkeypatch.setattr(
         prediction,
-        "score_of",
+        "score_candidate",
         lambda space, runs, c: dataclasses.replace(score(np.zeros(12), np.arange(12)), reading=shown[c.effects]),
     )
     space = SimpleNamespace(
         bare=SimpleNamespace(base=None, coordinates=NONE_FREE, observe=SimpleNamespace(blocks=("slope", "voltage")))
     )
     predicted = {}
-    smallest(space, runs, candidates[0], candidates[1:], predicted)
-    assert [predicted[prediction.key(c)] for c in candidates] == [shown[c.effects] for c in candidates]
+    smallest_predictive_set(space, runs, candidates[0], candidates[1:], predicted)
+    assert [predicted[prediction.candidate_key(c)] for c in candidates] == [shown[c.effects] for c in candidates]
     assert (
-        prediction.key(SimpleNamespace(active=(), z=np.ones(2))) not in predicted
+        prediction.candidate_key(SimpleNamespace(active=(), z=np.ones(2))) not in predicted
     )  # another fit of the same effects
 
     @dataclasses.dataclass
@@ -118,15 +118,15 @@ def test_what_candidates_predict_is_kept_and_not_fitted_again(monkeypatch, runs)
         fitted.append(z[0])
         return SimpleNamespace(reading=np.full((12, 2), -1.0))
 
-    monkeypatch.setattr(findings, "unseen", unseen)
+    monkeypatch.setattr(findings, "predict_unseen", unseen)
     problem = SimpleNamespace(
         base=None,
         coordinates=NONE_FREE,
         observe=SimpleNamespace(blocks=("slope",), unreachable=lambda status: status > 0),
     )
     before, after = (Fit(problem, c.z) for c in candidates)
-    known = predicted[prediction.key(candidates[0])]
-    found = findings.readings(runs, np.ones((12, 2)), before, after, known)
+    known = predicted[prediction.candidate_key(candidates[0])]
+    found = findings.readings_of_rows(runs, np.ones((12, 2)), before, after, known)
     assert fitted == [1.0]
     np.testing.assert_array_equal(found.held_out["slope"][0], known["slope"])
     np.testing.assert_array_equal(found.held_out["slope"][1], -1.0)
@@ -136,7 +136,7 @@ def test_nothing_is_chosen_where_nothing_can_be_held_out(runs):
     space = SimpleNamespace(
         bare=SimpleNamespace(base=None, coordinates=NONE_FREE, observe=SimpleNamespace(blocks=()))
     )
-    assert smallest(space, runs, None, [None]) is None
+    assert smallest_predictive_set(space, runs, None, [None]) is None
     assert HeldOutScore({"slope": np.full((2, 1), np.nan)}, {"slope": np.arange(2)}).gain(
         HeldOutScore({"slope": np.zeros((2, 1))}, {"slope": np.arange(2)})
     ) == Gain(0.0, np.inf)
@@ -171,7 +171,7 @@ def test_measured_runs_show_a_voltage_drop_and_a_slip_that_rests_on_a_row(tmp_pa
     assert float(again.configurations["4W2T"].mass) == 13.1
     unweighed = {k: v for k, v in runs.columns.items() if k != "total_mass_kg"}
     shown = steady_batch(again, dataclasses.replace(runs, columns=unweighed).conditions(again)).reading
-    swept = np.stack([np.asarray(shown[c.name]) for c in channels.usual()], -1)
+    swept = np.stack([np.asarray(shown[c.name]) for c in channels.usual_channels()], -1)
     np.testing.assert_allclose(swept, found.readings_of_rows.after, rtol=1e-7)
 
 
@@ -197,6 +197,6 @@ def test_a_block_with_parameters_of_its_own_is_not_predicted(names, tied, droppe
     problem = SimpleNamespace(base=None, coordinates=coordinates, observe=observe)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Runs, "configurations_named", lambda self, robot: self["configuration"])
-        kinds, lost = predictable(runs, problem), unpredictable(runs, problem)
+        kinds, lost = predictable_blocks(runs, problem), unpredictable_kinds(runs, problem)
     assert set(kinds.get("configuration", {})) == {"a", "b"} - set(dropped)
     assert len(kinds["voltage"]) == 2 and lost == (("configuration",) if dropped else ())

@@ -42,14 +42,14 @@ def held_out(before, after, kind="voltage"):
 def test_an_error_that_rises_is_listed_and_said():
     readings = held_out(4.3, 4.3)
     readings["voltage"][1][:, 1] = 4.72
-    found = preference.worse(readings, errors)
+    found = preference.worse_predictions(readings, errors)
     assert found == (Worse("voltage", "motor_speed", 10, pytest.approx(4.3), pytest.approx(4.72)),)
 
 
 def test_an_error_that_falls_or_stays_is_not_said():
     readings = held_out(4.3, 4.3)
     readings["voltage"][1][:, 1], readings["voltage"][1][:, 2] = 4.0, 4.3 * 1.005
-    assert preference.worse(readings, errors) == ()
+    assert preference.worse_predictions(readings, errors) == ()
 
 
 def test_errors_are_of_the_rows_that_both_predict():
@@ -57,9 +57,9 @@ def test_errors_are_of_the_rows_that_both_predict():
     readings = held_out(4.0, 4.0)
     before, after = readings["voltage"]
     before[:2], after[:2] = np.nan, 40.0
-    assert preference.worse(readings, errors) == ()
+    assert preference.worse_predictions(readings, errors) == ()
     after[2:, 0] = 5.0
-    assert [(w.rows, w.before, w.after) for w in preference.worse(readings, errors)] == [(8, 4.0, 5.0)]
+    assert [(w.rows, w.before, w.after) for w in preference.worse_predictions(readings, errors)] == [(8, 4.0, 5.0)]
 
 
 # --- among alternatives ---------------------------------------------------------------------------------
@@ -82,16 +82,16 @@ def test_order_of_alternatives(rms, lost, first):
 def test_it_is_said_by_what_the_leader_was_chosen():
     best, other = alternative("series_resistance", 3.0, leads=True), alternative("supply_sag", 2.0, rise=1.4)
     names = ("series_resistance", "supply_sag")
-    (note,) = preference.remarks((best, other), "fit")
+    (note,) = preference.leader_remarks((best, other), "fit")
     assert note == Led(names, (3.0, 2.0), 0, 0, 1, "fit", "fit", preference.TOLD, 0.0)
     led = (dataclasses.replace(best, leads=False), dataclasses.replace(other, leads=True))
-    (note,) = preference.remarks(led, HELD_OUT)
+    (note,) = preference.leader_remarks(led, HELD_OUT)
     assert note == Led(names, (3.0, 2.0), 1, 0, 1, HELD_OUT, HELD_OUT, preference.TOLD, 1.4)
-    (note,) = preference.remarks((best, dataclasses.replace(other, rms_sigma=2.99)), HELD_OUT)
+    (note,) = preference.leader_remarks((best, dataclasses.replace(other, rms_sigma=2.99)), HELD_OUT)
     assert (note.leader, note.best, note.by) == (0, 0, DRAW)
-    (note,) = preference.remarks((best, other), HELD_OUT)
+    (note,) = preference.leader_remarks((best, other), HELD_OUT)
     assert (note.leader, note.best, note.by) == (0, 1, HELD_OUT)
-    assert preference.remarks((), "fit") == []
+    assert preference.leader_remarks((), "fit") == []
 
 
 def test_another_preference_lists_the_choices():
@@ -134,14 +134,14 @@ def test_held_out_data_choose_the_leader(traced):
 
 @pytest.mark.slow
 def test_what_follows_is_of_the_leader_that_was_chosen(traced, monkeypatch):
-    real = preference.compared
+    real = preference.compare_alternatives
     for k in range(1, len(traced.held_out)):
 
         def turned(*arguments, k=k):
             rows = enumerate(real(*arguments))
             return tuple(dataclasses.replace(a, rms_sigma=0.5 if j == k else 1.0) for j, a in rows)
 
-        monkeypatch.setattr(preference, "compared", turned)
+        monkeypatch.setattr(preference, "compare_alternatives", turned)
         other = trace()
         assert other.best.effects == traced.held_out[k].effects and other.held_out[k].leads
         assert other.members[0][0] == other.best.effects[0] and other.verdict == "class"

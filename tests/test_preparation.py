@@ -10,14 +10,14 @@ from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.data.runs import Runs
 from calibration.discovery import discover
 from calibration.inference.calibration import calibrate
-from calibration.inference.foresight import foresee
+from calibration.inference.foresight import predict_identifiability
 from mmrjax.model import paper_robots
 
 ALL = {
     "calibrate": lambda runs, robot: calibrate(runs, robot),
     "discover": lambda runs, robot: discover.discover(runs, robot),
-    "a campaign": lambda runs, robot: discover.prepared(runs, robot),
-    "rig check": lambda runs, robot: foresee(runs, robot),
+    "a campaign": lambda runs, robot: discover.prepare_loop(runs, robot),
+    "rig check": lambda runs, robot: predict_identifiability(runs, robot),
 }
 
 
@@ -33,7 +33,7 @@ def test_a_table_whose_masses_have_another_unit_is_refused_by_all(who):
 
 def test_a_prior_of_a_mass_that_the_table_states_is_refused_by_the_loop_too():
     with pytest.raises(BadConfiguration, match=r"--prior 4W2T\.mass: .* states total_mass_kg"):
-        discover.prepared(records.read("measured"), paper_robots.nominal(), stated={"4W2T.mass": (11.0, 0.5)})
+        discover.prepare_loop(records.read("measured"), paper_robots.nominal(), stated={"4W2T.mass": (11.0, 0.5)})
 
 
 @pytest.mark.slow
@@ -52,7 +52,7 @@ def test_a_campaign_sees_the_instruments_that_the_table_shows(tmp_path):
     table.write_text(
         "\n".join([",".join(columns), *(",".join(map(str, row)) for row in zip(*columns.values(), strict=True))])
     )
-    given = discover.prepared(records.read(table, robot=robot), robot)
+    given = discover.prepare_loop(records.read(table, robot=robot), robot)
     seen = given.robot.rig.instruments[0]
     assert seen.signed is False and seen.quantum == pytest.approx(0.01)
     assert given.noise.sd.min() >= 0.01 / 12**0.5  # with the error of the step

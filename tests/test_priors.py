@@ -15,27 +15,30 @@ from calibration.inference.foreign import inherited_priors
 from mmrjax.effects import ALL
 from mmrjax.model import paper_robots, params
 
-EVERY = [p.name for p in params.walk(dataclasses.replace(paper_robots.nominal(), effects=tuple(e() for e in ALL)))]
+EVERY = [
+    p.name
+    for p in params.walk_parameters(dataclasses.replace(paper_robots.nominal(), effects=tuple(e() for e in ALL)))
+]
 
 
 @pytest.fixture(scope="module")
 def every(robot_with_effects):
     """Coordinates of every parameter of the robot with all effects."""
-    return priors.coordinates(robot_with_effects, EVERY)
+    return priors.parameter_coordinates(robot_with_effects, EVERY)
 
 
 def test_coordinates_start_at_the_nominal_robot(every, robot_with_effects):
-    nominal = np.array([float(p.value) for p in params.walk(robot_with_effects)])
+    nominal = np.array([float(p.value) for p in params.walk_parameters(robot_with_effects)])
     value = np.asarray(every.value(jnp.zeros(len(every))))
     bounded = {"4W2T.track.guide_share", "running_gear.inertia_tracked", "running_gear.inertia_wheeled"}
-    on_bound = np.array([p.name in bounded for p in params.walk(robot_with_effects)])
-    sd = np.array([p.spec.prior_sd(float(p.value)) for p in params.walk(robot_with_effects)])
+    on_bound = np.array([p.name in bounded for p in params.walk_parameters(robot_with_effects)])
+    sd = np.array([p.spec.prior_sd(float(p.value)) for p in params.walk_parameters(robot_with_effects)])
     assert np.all(np.abs(value - nominal)[~on_bound] <= 1e-5 * sd[~on_bound])  # nearest bound: half an sd
     assert np.all((value[on_bound] > 0) & (value[on_bound] < 0.01))  # their nominal value is their bound
 
 
 def test_coordinates_never_leave_the_bounds_and_never_die(every, robot_with_effects):
-    bounds = np.array([p.spec.bounds for p in params.walk(robot_with_effects)])
+    bounds = np.array([p.spec.bounds for p in params.walk_parameters(robot_with_effects)])
     for z in np.linspace(-40, 40, 33):
         value = np.asarray(every.value(jnp.full(len(every), z)))
         rounding = 1e-12 * (1 + np.abs(bounds))  # of exp(log(bound)); bounds reach 1e6
@@ -52,7 +55,7 @@ def test_amplitudes_have_a_full_gradient_at_zero(every):
 
 
 def test_slope_on_a_bound_is_half(robot):
-    c = priors.coordinates(robot, ["4W2T.track.guide_share"])
+    c = priors.parameter_coordinates(robot, ["4W2T.track.guide_share"])
     np.testing.assert_allclose(c.slope(jnp.zeros(1)) / c.spread, 0.5, rtol=1e-6)
     assert c.beyond(np.array([-1.0])) == -1 and c.beyond(np.array([1.0])) == 0 and c.beyond(np.array([9.0])) == 1
 
@@ -68,7 +71,7 @@ def test_slope_is_the_finite_difference(every):
 
 
 def test_relative_prior_is_log_normal_with_that_spread(robot):
-    c = priors.coordinates(robot, ["6T2A.ground.rolling_resistance", "6T2A.track.guide_share"])
+    c = priors.parameter_coordinates(robot, ["6T2A.ground.rolling_resistance", "6T2A.track.guide_share"])
     assert c.scale == (True, False)
     draws = np.asarray(jax.vmap(c.value)(jax.random.normal(jax.random.key(0), (200_000, 2))))
     np.testing.assert_allclose(draws[:, 0].std() / 0.06, 0.15 * np.sqrt(1.0225), rtol=0.01)
@@ -78,7 +81,7 @@ def test_relative_prior_is_log_normal_with_that_spread(robot):
 def test_friction_pairs_keep_their_ratio_unless_freed(robot):
     z = jnp.ones(1)
     moved = (
-        priors.coordinates(robot, ["6T2A.ground.friction.static"])
+        priors.parameter_coordinates(robot, ["6T2A.ground.friction.static"])
         .robot(robot, z)
         .configurations["6T2A"]
         .ground.friction
@@ -86,18 +89,20 @@ def test_friction_pairs_keep_their_ratio_unless_freed(robot):
     np.testing.assert_allclose(moved.dynamic / moved.static, 0.8)
     assert moved.static > 0.4
     both = ["6T2A.ground.friction.static", "6T2A.ground.friction.dynamic"]
-    assert priors.coordinates(robot, both).tied == ()
+    assert priors.parameter_coordinates(robot, both).tied == ()
 
 
 def test_choose_takes_default_groups_and_fixes(robot):
     default = priors.default_names(("6T2A", "4W2T"), robot)
     assert len(default) == 11 and len(priors.default_names(("6T2A",), robot)) == 6
-    assert priors.choose(robot, default) == default
-    assert priors.choose(robot, default, ["default", "motor.resistance"]) == (*default, "motor.resistance")
-    assert priors.choose(robot, default, ["motor.*"], ["motor.inertia"]) == tuple(
+    assert priors.choose_free_names(robot, default) == default
+    assert priors.choose_free_names(robot, default, ["default", "motor.resistance"]) == (*default, "motor.resistance")
+    assert priors.choose_free_names(robot, default, ["motor.*"], ["motor.inertia"]) == tuple(
         n for n in EVERY if n.startswith("motor.") and n != "motor.inertia"
     )
-    assert priors.choose(robot, default, fix=["6T2A.*"]) == tuple(n for n in default if n.startswith("4W2T."))
+    assert priors.choose_free_names(robot, default, fix=["6T2A.*"]) == tuple(
+        n for n in default if n.startswith("4W2T.")
+    )
 
 
 @pytest.mark.parametrize(
@@ -117,13 +122,13 @@ def test_choose_takes_default_groups_and_fixes(robot):
 )
 def test_choose_refuses_with_the_choices(robot, free, fix, says):
     with pytest.raises(BadConfiguration, match=says):
-        priors.choose(robot, priors.default_names(("6T2A", "4W2T"), robot), free, fix)
+        priors.choose_free_names(robot, priors.default_names(("6T2A", "4W2T"), robot), free, fix)
 
 
 def test_default_set_is_friction_of_what_has_rows_with_the_guides_share_on_tracks(robot):
     names = priors.default_names(["4W2T"], robot)
     assert names == tuple(f"4W2T.{n}" for n in priors.FRICTION)
-    assert set(priors.friction(robot, "6T2A")) == {f"6T2A.{n}" for n in (*priors.FRICTION, priors.GUIDE_SHARE)}
+    assert set(priors.friction_names(robot, "6T2A")) == {f"6T2A.{n}" for n in (*priors.FRICTION, priors.GUIDE_SHARE)}
 
 
 def test_parse_prior_reads_all_forms():
@@ -150,17 +155,19 @@ def test_parse_prior_refuses(text):
 )
 def test_coordinates_refuse_stated_priors(robot, names, stated, says):
     with pytest.raises(BadConfiguration, match=says):
-        priors.coordinates(robot, names, stated)
+        priors.parameter_coordinates(robot, names, stated)
 
 
 def test_coordinates_refuse_a_prior_without_width():
 
     with pytest.raises(BadConfiguration, match=r"motor.friction_viscous: its prior has no width"):
-        priors.coordinates(paper_robots.sm1(), ["motor.friction_viscous"])
+        priors.parameter_coordinates(paper_robots.sm1(), ["motor.friction_viscous"])
 
 
 def test_stated_prior_moves_the_centre(robot):
-    c = priors.coordinates(robot, ["6T2A.ground.friction.static"], {"6T2A.ground.friction.static": (0.5, 0.05)})
+    c = priors.parameter_coordinates(
+        robot, ["6T2A.ground.friction.static"], {"6T2A.ground.friction.static": (0.5, 0.05)}
+    )
     np.testing.assert_allclose(c.value(jnp.zeros(1)), 0.5)
     np.testing.assert_allclose(c.slope(jnp.zeros(1)), 0.05, rtol=0.01)
 

@@ -9,7 +9,7 @@ import jax
 import pytest
 
 from mmrjax.compile import programs
-from mmrjax.compile.private import exposure
+from mmrjax.compile.private import exposure_reason
 from sweeps import compilation_cache
 
 
@@ -22,10 +22,10 @@ def cache(tmp_path, monkeypatch):
 
 
 def test_a_folder_of_the_users_alone_is_private(cache):
-    assert exposure(cache) == ""  # and one that does not exist yet
+    assert exposure_reason(cache) == ""  # and one that does not exist yet
     cache.mkdir(parents=True, mode=0o700)
     (cache / "program").write_text("")
-    assert exposure(cache) == ""
+    assert exposure_reason(cache) == ""
 
 
 def others_write(cache):
@@ -58,7 +58,7 @@ def test_a_folder_that_others_could_change_is_not_used_and_that_is_said(cache, c
     mine, kept = os.geteuid, jax.config.values["jax_compilation_cache_dir"]
     try:
         reason = change(cache)
-        assert exposure(cache) == reason
+        assert exposure_reason(cache) == reason
         jax.config.update("jax_compilation_cache_dir", None)  # as in a process that begins
         assert compilation_cache.keep_programs() is None
         assert f"compiled programs are not kept: {reason}" in capsys.readouterr().err.replace("\n", " ")
@@ -73,7 +73,7 @@ def test_a_folder_that_others_could_change_is_not_used_and_that_is_said(cache, c
 def test_a_sticky_folder_above_is_no_danger(cache):
     cache.mkdir(parents=True, mode=0o700)
     cache.parent.chmod(0o1777)
-    assert exposure(cache) == ""
+    assert exposure_reason(cache) == ""
 
 
 def test_a_file_of_another_user_in_a_private_folder_is_not_read(cache, monkeypatch):
@@ -87,7 +87,7 @@ def test_a_file_of_another_user_in_a_private_folder_is_not_read(cache, monkeypat
         return os.stat_result(found)
 
     monkeypatch.setattr(Path, "lstat", theirs)
-    assert exposure(cache) == f"{cache / 'planted'} belongs to another user"
+    assert exposure_reason(cache) == f"{cache / 'planted'} belongs to another user"
 
 
 def test_a_program_of_an_exposed_folder_is_neither_read_nor_written(tmp_path, monkeypatch):
@@ -95,9 +95,9 @@ def test_a_program_of_an_exposed_folder_is_neither_read_nor_written(tmp_path, mo
     Path(tmp_path).chmod(0o777)
     asked = []
     monkeypatch.setattr(programs.Programs, "_obtained", lambda *a: lambda: asked.append(a))
-    assert programs.Programs(exposure).of(((1.0,), {})) is None and not asked
+    assert programs.Programs(exposure_reason).of(((1.0,), {})) is None and not asked
     Path(tmp_path).chmod(0o700)
     programs._private.cache_clear()
-    programs.Programs(exposure).of(((1.0,), {}))
+    programs.Programs(exposure_reason).of(((1.0,), {}))
     assert asked
     programs._private.cache_clear()

@@ -57,7 +57,7 @@ def test_packaged_patrol_is_an_hour_with_120_starts():
 def test_range_of_other_consumers_is_the_batterys():
     from mmrjax.model import params
 
-    (found,) = (p for p in params.walk(paper_robots.nominal()) if p.name == "battery.current_other")
+    (found,) = (p for p in params.walk_parameters(paper_robots.nominal()) if p.name == "battery.current_other")
     assert profiles.QUANTITIES["current_other"].range == found.spec.bounds
 
 
@@ -97,7 +97,7 @@ def test_units_in_names(read, column, cell, field, value):
 
 
 def test_units_of_a_channel_are_those_of_its_row():
-    for channel in channels.usual():
+    for channel in channels.usual_channels():
         found = channel.units
         assert channel.column == f"{channel.name}_{next(iter(found))}"
         assert len(found) == 1 + len(channel.other_units)
@@ -177,7 +177,7 @@ WRONG = {
     "unknown column": ("time_s,dutty\n0,1\n5,1\n", r"mission.csv: unknown column dutty; .*duty"),
     "column without a name": ("time_s,,duty\n0,1,1\n5,1,1\n", r"unknown column \(without a name\)"),
     "unknown unit": ("time_s,speed_kmh\n0,1\n5,1\n", r"column speed_kmh: got the unit kmh; expected one of speed_mm_s, speed_m_s, speed_km_h"),
-    "no unit": ("time,duty\n0,1\n5,1\n", r"column time: got the unit none; expected one of time_s, time_ms, time_min, time_h"),
+    "no unit": ("time,duty\n0,1\n5,1\n", r"column time: got the unit none; expected one of time_s, time_ms, time_us, time_ns, time_min, time_h"),
     "unit of another quantity": ("time_s,motor_speed_mm_s\n0,1\n5,1\n", r"column motor_speed_mm_s: got the unit mm_s; expected one of motor_speed_rpm"),
     "a quantity twice": ("time_s,speed_mm_s,speed_m_s\n0,1,1\n5,1,1\n", r"got columns speed_mm_s and speed_m_s; expected one of them"),
     "a column twice": ("time_s,duty,duty\n0,1,1\n5,1,1\n", r"got column duty twice"),

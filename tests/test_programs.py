@@ -115,7 +115,7 @@ def test_settings_and_source_are_part_of_a_name(monkeypatch, tmp_path):
         patch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=true")
         assert named(sine, MATRIX) != before
     with monkeypatch.context() as patch:
-        patch.setattr(programs, "sources", lambda: "other")
+        patch.setattr(programs, "source_hash", lambda: "other")
         assert named(sine, MATRIX) != before
     assert named(sine, MATRIX) == before
     found = set()
@@ -123,7 +123,7 @@ def test_settings_and_source_are_part_of_a_name(monkeypatch, tmp_path):
         (tmp_path / package / "room").mkdir(parents=True)
         for content in ("x = 1\n", "x = 2\n"):
             (tmp_path / package / "room" / "module.py").write_text(content)
-            found.add(programs.sources.__wrapped__(tmp_path))
+            found.add(programs.source_hash.__wrapped__(tmp_path))
     assert len(found) == 2 * len(programs.OWN)
 
 
@@ -154,7 +154,7 @@ def test_an_option_that_this_xla_does_not_have_is_left_out_alone():
             return jax.jit(lambda x: 2 * x).lower(1.0).compile(options)
 
     options = {"xla_cpu_no_such_option": True, "xla_backend_optimization_level": 1}
-    assert programs.compile_by(Lowered(), options)(1.5) == 3.0
+    assert programs.compile_with_options(Lowered(), options)(1.5) == 3.0
     assert seen == [options, {"xla_backend_optimization_level": 1}]
 
 

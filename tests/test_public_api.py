@@ -96,7 +96,7 @@ def test_a_robot_shows_values_and_units(robot):
     assert (
         "  motor: resistance 0.611 ohm, inductance 0.000119 H" in text and "effects.mass_error: amplitude 0.1" in text
     )
-    assert all(f"{p.name.rpartition('.')[2]} " in text for p in params.walk(robot))
+    assert all(f"{p.name.rpartition('.')[2]} " in text for p in params.walk_parameters(robot))
     batch = mm.replace(robot, {"motor.resistance": jnp.ones(3)})
     assert "resistance array[3] ohm" in repr(batch)
     traced = []
@@ -213,7 +213,7 @@ def test_to_dict_has_the_columns_of_runs_csv(robot):
     conditions = ["configuration", "supply_voltage_V", "total_mass_kg", "payload_kg", "slope_deg"]
     assert list(columns) == [
         *conditions,
-        *(output.column for output in outputs.table(channels.usual())),
+        *(output.column for output in outputs.output_table(channels.usual_channels())),
         "status",
         "flags",
     ]
@@ -230,10 +230,10 @@ def test_to_dict_has_the_columns_of_runs_csv(robot):
 
 
 def test_outputs_name_every_number_of_a_result_once():
-    named = [output.name for output in outputs.table(channels.usual())]
+    named = [output.name for output in outputs.output_table(channels.usual_channels())]
     fields = [field.name for field in dataclasses.fields(Result)]
     assert sorted(named) == sorted({*channels.USUAL, *fields} - {"reading", "mass", "status", "flags"})
-    for output in outputs.table(channels.usual()):
+    for output in outputs.output_table(channels.usual_channels()):
         assert output.column == output.name or output.column.startswith(f"{output.name}_")
         assert output.label and output.unit
 
@@ -270,7 +270,7 @@ def test_track_keeps_histories_with_reactions(robot):
 def in_fours(monkeypatch):
     """Runs in one call of `steady` four at a time; returns the shapes of the calls that are made."""
     sizes = []
-    whole = fidelities.get("steady")
+    whole = fidelities.get_fidelity("steady")
 
     def run(robot, conditions, options):
         sizes.append(("run", conditions.shape))
@@ -280,7 +280,9 @@ def in_fours(monkeypatch):
         sizes.append((names, conditions.shape))
         return whole.outputs(robot, conditions, names)
 
-    monkeypatch.setitem(fidelities.TABLE, "steady", dataclasses.replace(fidelities.facts("steady"), chunk=(4, 4)))
+    monkeypatch.setitem(
+        fidelities.TABLE, "steady", dataclasses.replace(fidelities.fidelity_facts("steady"), chunk=(4, 4))
+    )
     few = dataclasses.replace(whole, run=run, outputs=some)
     monkeypatch.setattr("mmrjax.fidelities.steady.FIDELITY", few)
     return sizes

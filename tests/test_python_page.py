@@ -15,7 +15,7 @@ from calibration.data import effect_file
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 #: Pages whose blocks continue each other; blocks that read what a command wrote are left out.
-TUTORIALS = ("start/python", "howto/sweep", "howto/mission", "howto/turn", "explanation/track-model")
+TUTORIALS = ("start/python", "howto/sweep", "howto/mission", "howto/turn", "howto/formats", "explanation/track-model")
 
 
 def blocks(page):

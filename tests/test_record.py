@@ -43,7 +43,7 @@ def test_table8_is_as_recorded(name):
     conditions = Conditions(
         was["configuration"], was["supply_voltage_V"], was["slope_deg"], was["payload_kg"]
     ).resolved(robot)
-    fidelity = fidelities.get(name)
+    fidelity = fidelities.get_fidelity(name)
     result = fidelity.run(robot, conditions, fidelity.facts.resolved(), lambda share: None).result
     np.testing.assert_array_equal(result.status, was[f"{name}_status"])
     for quantity in NUMBERS:

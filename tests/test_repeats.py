@@ -30,8 +30,8 @@ def table(sd, times=4, seed=0):
 
 
 def enlarged(runs, stated):
-    known = noise.from_table(runs, SettledRuns.sizes(runs), stated)
-    return known, *repeats.enlarged(known, runs)
+    known = noise.noise_from_table(runs, SettledRuns.sizes(runs), stated)
+    return known, *repeats.enlarge_noise(known, runs)
 
 
 def test_noise_that_repeats_contradict_is_enlarged():
@@ -61,7 +61,7 @@ def test_the_probability_of_a_median_is_right(count):
     magnitudes = np.abs(np.random.default_rng(0).standard_normal((40_000, count)))
     # Of an even number the larger of the two in the middle is below half of them.
     share = np.mean(np.sort(magnitudes, 1)[:, count // 2] > 1.2)
-    least = repeats._tail(1.2, count)
+    least = repeats._median_tail(1.2, count)
     assert least >= share - 0.01 and (count % 2 == 0 or least == pytest.approx(share, abs=0.01))
 
 
@@ -81,4 +81,4 @@ def test_every_command_takes_the_larger_noise():
     ],
 )
 def test_runs_beside_a_row_are_at_levels_that_a_person_sets(levels, here, beside):
-    assert discover.levels_beside(np.array(levels), here) == pytest.approx(beside)
+    assert discover.neighbouring_levels(np.array(levels), here) == pytest.approx(beside)

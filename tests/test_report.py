@@ -45,7 +45,7 @@ def _asked(configuration, voltage, payload, slope):
 def _table(asked, robot=None):
     """A finished table of runs, as the command line hands it over."""
     robot = ROBOTS["nominal"]() if robot is None else robot
-    outcome = outputs.columns(jax.device_get(steady_batch(robot, asked.conditions(robot))), robot.channels)
+    outcome = outputs.output_columns(jax.device_get(steady_batch(robot, asked.conditions(robot))), robot.channels)
     return {**run.conditions(robot, asked), **outcome}
 
 
@@ -101,7 +101,7 @@ def test_extremes_are_those_of_the_settled_runs(small):
     _, _, tables, runs = small
     settled = runs["status"] == "converged"
     shown = {row[0]: row[1] for row in tables.tables["extremes"][1:]}
-    for channel in channels.usual():
+    for channel in channels.usual_channels():
         largest = runs[channel.column][settled].max()
         assert float(shown[f"largest {channel.label}"].split()[0]) == pytest.approx(largest, rel=5e-3)
 
@@ -224,7 +224,7 @@ def test_power_chain_sums_to_what_supply_and_slope_give():
 def driven(robot, tmp_path_factory):
     """Folder, page and batch of three runs from standstill: one climbs, one slides, one cannot move."""
     asked = Conditions(["6T2A", "6T2A", "4W2T"], [33.0, 33.0, 0.3], [5.0, 25.0, 5.0]).resolved(robot)
-    batch = jax.device_get(fidelities.get("drive").histories(robot, asked, {"duration": 2.0}))
+    batch = jax.device_get(fidelities.get_fidelity("drive").histories(robot, asked, {"duration": 2.0}))
     runs = records.Runs("the test", {
         "configuration": np.array(["6T2A", "6T2A", "4W2T"]), "supply_voltage_V": np.asarray(asked.voltage),
         "payload_kg": np.zeros(3), "slope_deg": np.asarray(asked.slope_deg),

@@ -164,7 +164,7 @@ def test_run_of_the_track_model_shows_its_own_running_gear(robot, tmp_path):
         "configuration": np.array(["4W2T"]), "supply_voltage_V": np.array([33.0]), "payload_kg": np.zeros(1),
         "slope_deg": np.zeros(1),
     })  # fmt: skip
-    kept = fidelities.get("track").histories(robot, runs.conditions(robot), {"duration": 0.9, "step": 1e-4})
+    kept = fidelities.get_fidelity("track").histories(robot, runs.conditions(robot), {"duration": 0.9, "step": 1e-4})
     batch = jax.device_get(kept)
     short = dataclasses.replace(batch, history=jax.tree.map(lambda x: x[:, :100], batch.history))
     for name, shown, figures in (("whole", batch, {"history", "power", "slip", "ripple", "reactions"}),

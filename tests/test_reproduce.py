@@ -100,8 +100,9 @@ def test_robot_of_another_kind_is_shown_and_not_set_against_the_bench(reproduced
 def test_error_table_equals_equation_35(paper):
     tables = paper[2]
     measured, printed = (data.stacked(records.read(n).columns) for n in ("measured", "simulated_by_paper"))
-    points = outputs.columns(
-        steady_batch(ROBOTS["nominal"](), records.read("measured").conditions(ROBOTS["nominal"]())), channels.usual()
+    points = outputs.output_columns(
+        steady_batch(ROBOTS["nominal"](), records.read("measured").conditions(ROBOTS["nominal"]())),
+        channels.usual_channels(),
     )
     ours = residual.relative_error(data.stacked(points), measured)
     kind = records.read("measured")["configuration"]
@@ -128,8 +129,8 @@ def test_error_table_gives_the_papers_own_errors(paper):
 def test_row_table_shows_bench_paper_and_own_numbers(paper):
     tables = paper[2]
     measured = records.read("measured")
-    points = outputs.columns(
-        steady_batch(ROBOTS["nominal"](), measured.conditions(ROBOTS["nominal"]())), channels.usual()
+    points = outputs.output_columns(
+        steady_batch(ROBOTS["nominal"](), measured.conditions(ROBOTS["nominal"]())), channels.usual_channels()
     )
     rows = [r for r in tables.tables["rowtable"][2:] if r[0]]
     assert len(rows) == 20

@@ -42,7 +42,7 @@ def where(balance, alike=()):
     ],
 )  # fmt: skip
 def test_it_is_asked_about_slip_track_and_ground_alone(case, asked):
-    assert room.asked(found(**case)) == asked
+    assert room.question_of_verdict(found(**case)) == asked
 
 
 def test_nothing_is_run_where_it_has_no_say(monkeypatch):

@@ -145,4 +145,4 @@ def test_histories_of_a_shaft_have_bases_of_what_may_be_missing(tmp_path):
         "payload_kg": np.zeros(12),
     }
     found = observer.bases(seen, np.ones(12, bool), robot)
-    assert not any("belt" in str(name) for name in bases.names(found))
+    assert not any("belt" in str(name) for name in bases.family_names(found))

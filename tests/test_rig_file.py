@@ -130,7 +130,7 @@ def test_bench_is_what_its_file_states(tmp_path):
         ("bench.loss_coulomb", 0.1, 0.05),
     )
     zero = ("motor.friction_coulomb", "motor.friction_viscous", "gearbox.friction_coulomb", "bench.loss_viscous")
-    known = {p.name: float(p.value) for p in params.walk(robot)}
+    known = {p.name: float(p.value) for p in params.walk_parameters(robot)}
     assert [known[name] for name in zero] == [0.0] * 4 and known["bench.radius"] == 1.0
     assert robot.gearbox.torque_limit is None and robot.motor.speed_limit > 1e8
 
@@ -267,10 +267,10 @@ def test_what_is_known_exactly_is_never_freed(tmp_path):
     assert set(freed) - set(held) == {"bench.radius"}
     dry = read(tmp_path, BENCH.replace("0.1 ± 0.05", "0.1 ± 0"))
     assert "bench.loss_coulomb" not in (*priors.default_names(["bench"], dry), *priors.free_names(dry, ["bench"]))
-    assert "bench.radius" not in uncertain_inputs.default_names(robot, ["bench"], battery=False)
+    assert "bench.radius" not in uncertain_inputs.default_input_names(robot, ["bench"], battery=False)
     with pytest.raises(BadConfiguration, match=r"--free bench\.radius: the robot's file states it as exact \(± 0\)"):
-        priors.coordinates(robot, ["bench.radius"])
-    assert len(priors.coordinates(robot, ["bench.radius"], {"bench.radius": (0.02, 0.001)})) == 1
+        priors.parameter_coordinates(robot, ["bench.radius"])
+    assert len(priors.parameter_coordinates(robot, ["bench.radius"], {"bench.radius": (0.02, 0.001)})) == 1
 
 
 def test_inductance_that_is_not_stated_follows_the_resistance(tmp_path):

@@ -15,7 +15,7 @@ from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.inference import noise, observers, priors
 from calibration.inference.calibration import calibrate
-from calibration.inference.linearization import probe
+from calibration.inference.linearization import balance_probe
 from calibration.inference.observers import time_histories as histories_room
 from calibration.inference.observers.time_histories import Histories
 from mmrjax.effects import UNNAMED
@@ -75,7 +75,7 @@ def written(tmp_path, robot, columns, sd, readings=0.0):
 def history(tmp_path, robot, truth, columns, sd, seed):
     """A table whose readings are those of `truth` with noise of the sds [the columns' units]."""
     blank = written(tmp_path, robot, columns, sd)
-    shown = np.asarray(eqx.filter_jit(observers.kind(blank).of(blank, truth))(truth).reading)
+    shown = np.asarray(eqx.filter_jit(observers.observer_kind(blank).of(blank, truth))(truth).reading)
     factor = np.array([c.factor for c in robot.channels])
     noise = np.array(sd) * np.random.default_rng(seed).standard_normal(shown.shape)
     return written(tmp_path, robot, columns, sd, shown / factor + noise)
@@ -89,13 +89,13 @@ def test_the_speed_at_which_a_run_begins_moves_with_the_robot(tmp_path):
     robot, times = robot_file.load(str(path)), jnp.array([0.0, 0.1, 0.2])
     given = Conditions(motor_speed=100.0, motor_acceleration=0.0)
     names = ("cart.radius", "gearbox.ratio")
-    values = {p.name: float(p.value) for p in params.walk(robot) if p.name in names}
+    values = {p.name: float(p.value) for p in params.walk_parameters(robot) if p.name in names}
 
     @jax.jit
     def slopes(shares):
         def speed(shares):
             changed = {name: values[name] * share for name, share in zip(names, shares, strict=True)}
-            found = integrator.histories(params.replace(robot, changed), given, times).speed
+            found = integrator.history_signals(params.replace(robot, changed), given, times).speed
             return found, found
 
         return jax.jacfwd(speed, has_aux=True)(shares)
@@ -124,7 +124,7 @@ def test_readings_without_a_sign_are_refused_unless_the_file_says_so(tmp_path, l
     robot, t = robot_file.load(str(path)), np.arange(0, 2, 0.02)
     way = np.where(t < 1, 1.0, -1.0)
     driven = {"supply_voltage_V": 12.0, "duty": way / 2} if duty else {"supply_voltage_V": 6 * way}
-    columns = {"time_s": t, **driven, channels.find(shown).column: np.abs(way)}
+    columns = {"time_s": t, **driven, channels.find_channel(shown).column: np.abs(way)}
     cells = np.stack(np.broadcast_arrays(*columns.values()), 1)
     np.savetxt(tmp_path / "log.csv", cells, delimiter=",", header=",".join(columns), comments="")
     runs = records.read(tmp_path / "log.csv", robot=robot)
@@ -192,14 +192,14 @@ def test_beginnings_are_measured_by_the_first_samples(tmp_path):
         lines += [f"{t},6,{60 + 100 * t},{30 + 360 * t + 300 * t**2}" for t in np.arange(0, 0.2, 0.01)]
         table.write_text("\n".join(lines))
         runs = records.read(table, robot=robot)
-        kind = observers.kind(runs)
-        known = noise.from_table(runs, kind.sizes(runs), "output_speed=1rpm,output_angle=1deg")
+        kind = observers.observer_kind(runs)
+        known = noise.noise_from_table(runs, kind.sizes(runs), "output_speed=1rpm,output_angle=1deg")
         begun = kind.with_initial_states(robot, runs, known)
         assert begun.rig.begins.names == ("begin_",)
         begin = begun.rig.begins.members[0]
         assert float(begin.motor_speed) == pytest.approx(60 * channels.RPM * 16, rel=1e-9)
         assert float(begin.angle) == pytest.approx(np.radians(30), abs=0.002)
-        assert bool(priors.begins(begun)) == (start == "free")
+        assert bool(priors.initial_state_names(begun)) == (start == "free")
 
 
 def test_a_robot_at_rest_has_no_beginnings(tmp_path):
@@ -257,7 +257,7 @@ def imposed_speed(tmp_path, runs, filled=written):
 def test_a_defect_moves_the_current_of_an_imposed_speed_at_once(tmp_path):
     """The sum over all knots against the derivative by a constant defect."""
     robot, runs = imposed_speed(tmp_path, 1)
-    observer, effect = observers.kind(runs).of(runs, robot), probe("track")
+    observer, effect = observers.observer_kind(runs).of(runs, robot), balance_probe("track")
 
     def readings(amplitude):
         return observer(
@@ -277,7 +277,7 @@ def test_curves_of_a_drive_that_reverses_count_along_its_travel(tmp_path):
     speed = np.repeat(np.linspace(-400, 400, 20)[None], 2, 0)
     speed[1] = -speed[0]
     runs = dataclasses.replace(runs, columns={**runs.columns, "motor_speed_rpm": speed.ravel() / channels.RPM})
-    observer = observers.kind(runs).of(runs, robot)
+    observer = observers.observer_kind(runs).of(runs, robot)
     columns = {**runs.columns, "total_current_A": np.sign(speed.ravel()) + speed.ravel() / 100}
     bases = observer.bases(columns, np.ones(len(runs), bool), robot)
     seen = 0
@@ -290,7 +290,9 @@ def test_curves_of_a_drive_that_reverses_count_along_its_travel(tmp_path):
                 seen += 1
     assert seen >= 2
     curve = UNNAMED["curve_track_speed_motor"](amplitude=1.0, y1=2.0, y3=-1.0)
-    term = jax.jit(lambda speed: curve.term(robot, balances.begin(robot, Conditions(0), State(0.0, speed, 0.0, 0.0))))
+    term = jax.jit(
+        lambda speed: curve.term(robot, balances.begin_signals(robot, Conditions(0), State(0.0, speed, 0.0, 0.0)))
+    )
     ahead, back = (float(term(way * 300.0)) for way in (1, -1))
     assert ahead == pytest.approx(-back) and abs(ahead) > 0.1
 
@@ -299,8 +301,8 @@ def test_curves_of_a_drive_that_reverses_count_along_its_travel(tmp_path):
 @pytest.mark.parametrize("count", [1, 3])
 def test_an_imposed_speed_changes_within_each_run_and_nothing_else_does(tmp_path, count):
     robot, runs = imposed_speed(tmp_path, count)
-    made = observers.kind(runs).of(
-        runs, observers.kind(runs).with_initial_states(robot, runs, noise.from_table(runs, 1.0))
+    made = observers.observer_kind(runs).of(
+        runs, observers.observer_kind(runs).with_initial_states(robot, runs, noise.noise_from_table(runs, 1.0))
     )
     conditions = made.conditions
     assert conditions.motor_speed.shape == conditions.motor_acceleration.shape == made.times.shape
@@ -365,11 +367,11 @@ def test_steps_follow_the_rows_of_a_log_whose_input_changes_at_each(tmp_path, mo
     table = tmp_path / "log.csv"
     table.write_text("time_s,supply_voltage_V,total_current_A,motor_speed_rpm\n" + "\n".join(rows))
     runs = records.read(table, robot=robot)
-    made = observers.kind(runs).of(runs, robot)
+    made = observers.observer_kind(runs).of(runs, robot)
     shown = np.asarray(made(robot).reading)
     monkeypatch.setattr(histories_room, "CHANGE", (1e-6, 0.1))
     monkeypatch.setattr(histories_room, "LONGEST", 5e-5)
-    fine = observers.kind(runs).of(runs, robot)
+    fine = observers.observer_kind(runs).of(runs, robot)
     exact = np.asarray(fine(robot).reading)
     assert made.times.size < 7 * len(runs) and 25 * made.times.size < fine.times.size
     error = np.sqrt(np.mean((shown - exact) ** 2, 0) / np.mean(exact**2, 0))
@@ -431,14 +433,14 @@ def test_a_voltage_on_lines_is_the_mean_of_each_step_and_no_jump(tmp_path):
         "time_s,supply_voltage_V,duty,motor_speed_rpm\n0,2,1,0\n0.1,12,1,0\n0.3,4,0.5,0\n0.4,4,0.5,0\n"
     )
     runs = records.read(tmp_path / "log.csv", robot=robot)
-    made = observers.kind(runs).of(runs, robot)
+    made = observers.observer_kind(runs).of(runs, robot)
     volts, times = np.asarray(made.conditions.voltage)[0], np.asarray(made.times)[0]
     assert np.sum(volts[:-1] * np.diff(times)) == pytest.approx(0.1 * 7 + 0.2 * 8 + 0.1 * 4)
     after = np.searchsorted(times, 0.1)
     assert volts[after] == pytest.approx(12 - 40 * 0.5 * (times[after + 1] - 0.1)) and volts[-1] == 4
     duty = np.asarray(made.conditions.duty)[0]
     assert duty[np.searchsorted(times, 0.2)] == pytest.approx(0.75, abs=0.01)
-    held = observers.kind(runs).of(
+    held = observers.observer_kind(runs).of(
         runs, dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, between_rows="held"))
     )
     jumps = np.asarray(held.times)[0]
@@ -462,7 +464,7 @@ def test_what_is_imposed_is_held_or_goes_on_lines_between_rows(tmp_path):
         rows = [f"{a:.4f},{b:.6f},0" for a, b in zip(t, volts, strict=True)]
         (tmp_path / "log.csv").write_text("time_s,supply_voltage_V,motor_speed_rpm\n" + "\n".join(rows))
         runs = records.read(tmp_path / "log.csv", robot=robot)
-        made = observers.kind(runs).of(runs, robot)
+        made = observers.observer_kind(runs).of(runs, robot)
         reading = np.asarray(made(robot).reading)[:, 0]
         return reading[:: round(0.02 / step)]
 
@@ -496,9 +498,9 @@ def test_a_jump_of_the_voltage_is_exact_in_every_step(tmp_path):
 
     def of(resistance):
         changed = params.replace(robot, {"motor.resistance": resistance})
-        steps = integrator.within(changed, driven, times)
+        steps = integrator.course_between_instants(changed, driven, times)
         currents = tuple(x.current for x in (steps.first, steps.begin, steps.end))
-        between = integrator.Within.read((*currents, steps.decays), jnp.array([0.5, 0.5, 0.4, 0.5, 0.5]))
+        between = integrator.StepCourse.read((*currents, steps.decays), jnp.array([0.5, 0.5, 0.4, 0.5, 0.5]))
         found = jnp.append(steps.first.current, between[2])
         return found[1:], found[1:]
 
@@ -521,16 +523,16 @@ def through_rest(tmp_path_factory):
     path.write_text(DRIVE.format(imposed="voltage", channels='"motor_current", "motor_speed"', start="rest") + BENCH)
     robot = robot_file.read(path)
     every = np.arange(0, 1.2, 0.02)
-    values = {p.name: float(p.value) for p in params.walk(robot)}
+    values = {p.name: float(p.value) for p in params.walk_parameters(robot)}
 
     def speeds(longest):
-        times = integrator.grid(every, longest=longest)
+        times = integrator.time_grid(every, longest=longest)
         volts = 6.0 * np.where(np.sin(2 * np.pi * (1.3 * times + 0.4 * times**2)) >= 0, 1.0, -1.0)
         held = Conditions(voltage=volts)
 
         def of(shares):
             changed = {name: values[name] * (1 + share) for name, share in zip(THROUGH_REST, shares, strict=True)}
-            found = integrator.histories(params.replace(robot, changed), held, jnp.asarray(times))
+            found = integrator.history_signals(params.replace(robot, changed), held, jnp.asarray(times))
             return found.speed_motor[np.searchsorted(times, every)]
 
         return of

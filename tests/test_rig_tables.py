@@ -37,7 +37,7 @@ DRIVE = {
 
 def rig(load, *, sides=1.0, **stated):
     """A rig from nothing with one load, with its channels."""
-    robot = paper_robots.blank(Configurations({"rig": load}), sides, Rig(**stated))
+    robot = paper_robots.blank_robot(Configurations({"rig": load}), sides, Rig(**stated))
     return params.replace(robot, DRIVE)
 
 
@@ -345,10 +345,10 @@ def test_the_step_of_an_instrument_is_in_its_noise(tmp_path):
     runs = read(
         tmp_path, f"{BENCH}900,0.4\n1900,0.5\n", bench(instruments=(Instrument("total_current", quantum=0.06),))
     )
-    sizes = observers.kind(runs).sizes(runs)
-    known = noise.from_table(runs, sizes, "current=0.01A")
+    sizes = observers.observer_kind(runs).sizes(runs)
+    known = noise.noise_from_table(runs, sizes, "current=0.01A")
     assert known.sd == pytest.approx(np.sqrt(0.01**2 + 0.06**2 / 12))
-    assert noise.from_table(runs, sizes).sd == pytest.approx(
+    assert noise.noise_from_table(runs, sizes).sd == pytest.approx(
         0.02 * runs.measured()
     )  # an estimate has it in it already
 
@@ -388,14 +388,14 @@ def test_what_is_not_the_ground_follows_the_first_surface(tmp_path):
     names = priors.free_names(apart, runs.configurations_named(apart))
     assert "rig-felt.radius" in names and "rig-tiles.radius" not in names
     assert {"rig-felt.ground.rolling_resistance", "rig-tiles.ground.rolling_resistance"} <= set(names)
-    coordinates = priors.coordinates(apart, names)
+    coordinates = priors.parameter_coordinates(apart, names)
     z = np.linspace(-1, 1, len(names))
     there = coordinates.robot(apart, z)
     felt, tiles = there.configurations.members
     assert felt.radius == tiles.radius != apart.configurations["rig-felt"].radius
     assert felt.track.loss_coulomb == tiles.track.loss_coulomb
     assert felt.ground.rolling_resistance != tiles.ground.rolling_resistance
-    held = priors.coordinates(apart, ["rig-tiles.ground.rolling_resistance"])
+    held = priors.parameter_coordinates(apart, ["rig-tiles.ground.rolling_resistance"])
     assert held.robot(apart, np.ones(1)).configurations["rig-tiles"].radius == 0.05
 
 
@@ -433,34 +433,34 @@ def test_options_name_a_configuration_that_gave_way_to_its_surfaces(tmp_path):
 def test_blocks_of_an_imposed_speed_are_its_levels(tmp_path):
     rows = "".join(f"{n},0.4\n" for n in (501, 498, 1003, 996, 2000, 2010))
     runs = read(tmp_path, BENCH + rows, bench())
-    found = blocks.blocks(runs, "speed")
+    found = blocks.blocks_of_kind(runs, "speed")
     assert [m.tolist().count(True) for m in found.values()] == [2, 2, 2]
-    assert blocks.blocks(runs, "voltage") == {} == blocks.blocks(runs, "slope")
+    assert blocks.blocks_of_kind(runs, "voltage") == {} == blocks.blocks_of_kind(runs, "slope")
 
 
 def test_blocks_of_a_duty_hold_data_out_where_it_alone_varies(tmp_path):
     robot = bench("voltage", ("output_speed",))
     rows = "".join(f"12,{d},{50 * d}\n" for d in (0.3, 0.3, 0.6, 0.6, 0.9, 0.9))
     runs = read(tmp_path, f"supply_voltage_V,duty,output_speed_rad_s\n{rows}", robot)
-    assert [m.tolist().count(True) for m in blocks.blocks(runs, "duty").values()] == [2, 2, 2]
-    assert "duty" in blocks.distinct(runs, observers.kind(runs).blocks)
+    assert [m.tolist().count(True) for m in blocks.blocks_of_kind(runs, "duty").values()] == [2, 2, 2]
+    assert "duty" in blocks.distinct_blocks(runs, observers.observer_kind(runs).blocks)
 
 
 def test_curves_are_over_the_fitted_motor_speed_where_only_the_output_is_read(tmp_path):
     robot = bench("voltage", ("output_speed",))
     rows = "".join(f"{u},{2 * u}\n" for u in range(4, 12))
     runs = read(tmp_path, f"supply_voltage_V,output_speed_rad_s\n{rows}", robot)
-    observe = observers.kind(runs).of(runs, robot)
+    observe = observers.observer_kind(runs).of(runs, robot)
     found = observe.bases(dict(runs.columns), np.ones(len(runs), bool), robot)
-    variables = {variable for _, variable in bases.names(found)}
+    variables = {variable for _, variable in bases.family_names(found)}
     assert {"speed_motor", "current", "voltage"} <= variables
 
 
 def test_what_is_said_of_constant_conditions_is_of_the_rig(tmp_path):
     robot = bench()
     runs = read(tmp_path, f"{BENCH}900,0.4\n900,0.41\n900,0.4\n900,0.41\n", robot)
-    known = noise.from_table(runs, observers.kind(runs).sizes(runs), "current=5%")
-    said = checks.check(runs, robot, (), known)
+    known = noise.noise_from_table(runs, observers.observer_kind(runs).sizes(runs), "current=5%")
+    said = checks.check_data(runs, robot, (), known)
     assert [note for note in said if isinstance(note, Constant)] == [Constant("motor_speed_rpm", 900.0, "speed")]
 
 
@@ -516,7 +516,7 @@ def test_an_arm_is_simulated_over_time_alone():
     robot = bench("voltage", ("motor_speed",), load={"torque_gravity": 0.2})
     config = configuration.Simulate(model="steady")
     with pytest.raises(
-        BadConfiguration, match=r"--model steady: rig is an arm .* --model drive, and tables with a col"
+        BadConfiguration, match=r"--model steady: rig has a torque of gravity .* --model drive, and tables with a col"
     ):
         run.refuse(robot, Conditions(np.zeros(1, int), voltage=np.array([9.0])), config)
 
@@ -536,13 +536,13 @@ def test_curves_of_runs_both_ways_count_along_the_travel(tmp_path):
     conditions = Conditions(0, voltage=voltage, slope_deg=slope)
     columns = {"configuration": ["rig"] * 2 * n, "supply_voltage_V": voltage, "slope_deg": slope}
     runs = measured(tmp_path, robot, conditions, columns, share=0.0)
-    observe = observers.kind(runs).of(runs, robot)
+    observe = observers.observer_kind(runs).of(runs, robot)
     seen = {**runs.columns, "order": np.tile(np.arange(n), 2)}
     over = set()
     for basis in observe.bases(seen, np.ones(2 * n, bool), robot):
         for (place, variable), shapes in zip(basis.names, np.asarray(basis.columns), strict=True):
             np.testing.assert_allclose(shapes[:n], -shapes[n:], atol=1e-9, err_msg=f"{place} over {variable}")
-            over.add((bases.window(variable) and "window") or variable)
+            over.add((bases.window_from_name(variable) and "window") or variable)
     assert {"voltage", "slope", "speed_motor", bases.CONDITIONS, "window"} <= over
 
 
@@ -662,7 +662,7 @@ def test_an_instrument_left_free_is_what_its_table_shows(tmp_path):
     assert instruments.with_inferred_instruments(free, runs).rig.instruments == runs.layout.instruments
     assert instruments.with_inferred_instruments(stated, runs) is stated
     size = np.ones((8, 1))
-    sds = [noise.from_table(records.read(path, robot=r), size).sd for r in (free, stated)]
+    sds = [noise.noise_from_table(records.read(path, robot=r), size).sd for r in (free, stated)]
     np.testing.assert_allclose(sds[0], sds[1], rtol=1e-9)
     np.testing.assert_allclose(sds[0], np.hypot(0.01, 0.03 / np.sqrt(12)), rtol=1e-9)
     with pytest.raises(BadData, match="negative backward; or signed = false"):

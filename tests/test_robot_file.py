@@ -10,7 +10,7 @@ from mmrjax.model import paper_robots, params
 
 
 def values(robot):
-    return {p.name: float(p.value) for p in params.walk(robot)}
+    return {p.name: float(p.value) for p in params.walk_parameters(robot)}
 
 
 @pytest.mark.parametrize("name", paper_robots.ROBOTS)

@@ -17,7 +17,7 @@ from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration
 from calibration.discovery import discover, scales
 from mmrjax import effects
-from mmrjax.effects.scaled import amplitude_of, scaled, shape_of
+from mmrjax.effects.scaled import amplitude_of, scaled_effect, shape_of
 from mmrjax.model import params
 from mmrjax.model.quantities import RPM
 from sweeps.commands import rig_new
@@ -32,7 +32,7 @@ def rig(kind, imposed, folder):
     rigs.case(world).write(folder)
     robot = robot_file.read(folder / "rig.toml")
     runs = records.read(folder / "table.csv", robot=robot)
-    return robot, runs, scales.library_for(robot, runs.conditions(robot), effects.BY_NAME)
+    return robot, runs, scales.library_of_size(robot, runs.conditions(robot), effects.BY_NAME)
 
 
 def with_all(robot, library, share):
@@ -73,12 +73,17 @@ def test_every_effect_of_a_rigs_size_is_read_again_as_it_was_written(tmp_path, k
         robot_file.write(whole, tmp_path / "robot.toml")
         again = robot_file.read(tmp_path / "robot.toml")
         assert eqx.tree_equal(whole.effects, again.effects)
-        specs = [{p.name: p.spec for p in params.walk(r) if p.name.startswith("effects.")} for r in (whole, again)]
+        specs = [
+            {p.name: p.spec for p in params.walk_parameters(r) if p.name.startswith("effects.")}
+            for r in (whole, again)
+        ]
         assert specs[0] == specs[1]
         assert eqx.tree_equal(pickle.loads(pickle.dumps(again)), again)
-        plain = {p.name: p.spec.bounds for name in library for p in params.walk(effects.BY_NAME[name]())}
+        plain = {p.name: p.spec.bounds for name in library for p in params.walk_parameters(effects.BY_NAME[name]())}
         off_library += sum(
-            plain[p.name.rpartition(".")[2]] != p.spec.bounds for p in params.walk(again) if "effects." in p.name
+            plain[p.name.rpartition(".")[2]] != p.spec.bounds
+            for p in params.walk_parameters(again)
+            if "effects." in p.name
         )
     assert off_library  # else there would be nothing to state
 
@@ -88,7 +93,7 @@ def test_effects_of_turns_of_a_rigs_size_are_read_again_as_they_were_written(tmp
     """The loop writes them into the robot of a table of turns, which every command takes."""
     robot, *_ = rig("wheeled", "voltage", tmp_path)
     beside = effects.OF_TURNS | effects.OF_CHANNELS
-    library = {name: scaled(kind, (3.0, 1.0, 2.0)) for name, kind in beside.items()}
+    library = {name: scaled_effect(kind, (3.0, 1.0, 2.0)) for name, kind in beside.items()}
     whole = with_all(robot, library, 0.5)
     robot_file.write(whole, tmp_path / "robot.toml")
     assert library and eqx.tree_equal(whole.effects, robot_file.read(tmp_path / "robot.toml").effects)
@@ -152,14 +157,18 @@ def test_a_motor_that_states_what_it_bears_is_judged_by_that(tmp_path):
         able = dataclasses.replace(robot, motor=dataclasses.replace(robot.motor, temperature_limit=hot))
         path = {"motor.resistance_thermal_winding": 4.0, "motor.resistance_thermal_housing": 400.0}
         able = params.replace(able, {name: jnp.asarray(value) for name, value in path.items()})
-        kind = scales.library_for(able, runs.conditions(able), effects.BY_NAME)["torque_constant_saturation"]
+        kind = scales.library_of_size(able, runs.conditions(able), effects.BY_NAME)["torque_constant_saturation"]
         limits.append(amplitude_of(kind()).spec.bounds[1] * float(able.current_continuous) ** 2)
     assert limits[0] == pytest.approx(limits[1], rel=1e-6)
 
 
 def test_one_class_for_the_same_factors():
     kind = effects.BY_NAME["churning"]
-    assert scaled(kind, (2.0, 1.0, 2.0)) is scaled(kind, (2.0, 1.0, 2.0)) is not scaled(kind, (3.0, 1.0, 3.0))
+    assert (
+        scaled_effect(kind, (2.0, 1.0, 2.0))
+        is scaled_effect(kind, (2.0, 1.0, 2.0))
+        is not scaled_effect(kind, (3.0, 1.0, 3.0))
+    )
 
 
 @pytest.mark.parametrize("stated", ["3", "[1, 2]", "[1, 2, 0]", '[1, 2, "x"]'])
@@ -179,20 +188,20 @@ def test_friction_along_the_travel_is_sized_by_the_travel_and_looked_for_where_a
         "supply_voltage_V,duty,time_s,output_angle_deg\n" + "\n".join(f"6,{r}" for r in rows) + "\n"
     )
     runs = records.read(tmp_path / "log.csv", robot=robot)
-    turned = scales.turned_in(runs, robot)
+    turned = scales.output_rotation(runs, robot)
     assert turned == pytest.approx(2 * np.pi * np.sqrt((1 + 4 + 4) / 3))
     kinds = [
-        scales.library_for(robot, runs.conditions(robot), effects.BY_NAME, x)["position_friction"]
+        scales.library_of_size(robot, runs.conditions(robot), effects.BY_NAME, x)["position_friction"]
         for x in (turned, 2 * turned)
     ]
     one, two = (amplitude_of(kind()).spec for kind in kinds)
     assert two.sd == pytest.approx(0.5 * one.sd) and two.bounds[1] == pytest.approx(0.5 * one.bounds[1])
     # At its sd it is as large over the travel as a torque of the same share.
-    offset = scales.library_for(robot, runs.conditions(robot), effects.BY_NAME, turned)["presliding"]
+    offset = scales.library_of_size(robot, runs.conditions(robot), effects.BY_NAME, turned)["presliding"]
     assert one.sd * turned == pytest.approx(amplitude_of(offset()).spec.sd, rel=0.2)
     blind = dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, channels=("output_speed",)))
-    assert not scales.present(effects.BY_NAME["position_friction"], blind)
-    assert scales.present(effects.BY_NAME["angle_friction"], blind)
+    assert not scales.effect_applies(effects.BY_NAME["position_friction"], blind)
+    assert scales.effect_applies(effects.BY_NAME["angle_friction"], blind)
 
 
 def servo(folder):
@@ -241,7 +250,7 @@ def metered(tmp_path, off):
 
 def test_the_loop_looks_for_an_error_of_every_instrument(tmp_path):
     runs, robot = metered(tmp_path, 0.0)
-    scored = [e for e in discover.prepared(runs, robot).library.values() if e.balance == "sensor"]
+    scored = [e for e in discover.prepare_loop(runs, robot).library.values() if e.balance == "sensor"]
     assert {e.channel for e in scored} == set(robot.rig.channels)
     (torque,) = (e for e in scored if e.name == "output_torque_offset")
     size = np.sqrt(np.mean(runs["output_torque_Nm"] ** 2))

@@ -12,7 +12,7 @@ from calibration.data import robot_file
 from calibration.inference import multistart, noise, observers, priors, scans
 from calibration.inference.calibration import calibrate
 from calibration.inference.observers import time_histories
-from calibration.inference.optimizers import evaluated
+from calibration.inference.optimizers import evaluate_residuals
 from calibration.inference.scans import Scan
 from mmrjax.model import params
 
@@ -36,9 +36,11 @@ def coarse(tmp_path_factory):
 
 
 def posed(robot, runs):
-    kind = observers.kind(runs)
+    kind = observers.observer_kind(runs)
     names = ("bench.loss_coulomb", "rig.delay")
-    return observers.pose(runs, robot, priors.coordinates(robot, names), noise.from_table(runs, kind.sizes(runs)).sd)
+    return observers.pose_problem(
+        runs, robot, priors.parameter_coordinates(robot, names), noise.noise_from_table(runs, kind.sizes(runs)).sd
+    )
 
 
 @pytest.mark.nightly
@@ -46,11 +48,13 @@ def posed(robot, runs):
 def test_a_search_finds_a_delay_between_coarse_samples(coarse):
     """From the prior mean, 1.5 prior sds away and behind two cliffs."""
     robot, runs = coarse
-    problem, kind = posed(robot, runs), observers.kind(runs)
-    known = noise.from_table(runs, kind.sizes(runs))
+    problem, kind = posed(robot, runs), observers.observer_kind(runs)
+    known = noise.noise_from_table(runs, kind.sizes(runs))
     starts = problem.observe.starts(problem, np.random.default_rng(0), 1)
-    found = multistart.search_one_by_one(problem, known, starts, multistart.first_shares(known), lambda said: None)
-    low, high = (0.02 * z for z in scans.profiles(problem, found.best.z)[1].interval())
+    found = multistart.search_one_by_one(
+        problem, known, starts, multistart.initial_noise_shares(known), lambda said: None
+    )
+    low, high = (0.02 * z for z in scans.scan_all(problem, found.best.z)[1].interval())
     assert found.best.converged
     assert low <= TRUTH <= high and 0.02 < low < high < 0.04
     assert abs(0.02 * found.best.z[1] - TRUTH) < 4 * 0.02 * found.best.sd[1] < 0.01
@@ -73,11 +77,11 @@ def test_a_scan_sees_the_misfit_of_runs_at_each_delay(coarse):
     """A delay shifts one run: where the others are held, the scan's objective is that of a run of its own."""
     robot, runs = coarse
     problem = posed(robot, runs)
-    only = dataclasses.replace(problem, coordinates=priors.coordinates(robot, ("rig.delay",)))
+    only = dataclasses.replace(problem, coordinates=priors.parameter_coordinates(robot, ("rig.delay",)))
     only = dataclasses.replace(only, data=dataclasses.replace(only.data, centre=only.data.centre[:1]))
     at = np.array([-0.5, 0.3, 1.1, 1.6])
     cost, others = only.observe.scan(only, np.zeros(1), only.data, 0, at)
-    alone = [0.5 * np.sum(np.asarray(evaluated(only, z, only.data)) ** 2) for z in at[:, None]]
+    alone = [0.5 * np.sum(np.asarray(evaluate_residuals(only, z, only.data)) ** 2) for z in at[:, None]]
     np.testing.assert_allclose(cost, alone, rtol=1e-9)
     np.testing.assert_array_equal(np.asarray(others)[:, 0], at)
 
@@ -86,7 +90,7 @@ def test_a_scan_sees_the_misfit_of_runs_at_each_delay(coarse):
 def test_a_scan_is_as_fine_as_the_rise_of_a_current(coarse):
     robot, runs = coarse
     problem = posed(robot, runs)
-    assert scans.scanned(problem) == (1,)
+    assert scans.scanned_coordinates(problem) == (1,)
     count = problem.observe.scan_points(problem, 1)
     assert 2 * scans.RANGE * 0.02 / count <= 0.5 * 1e-3 / 3.0
 
@@ -121,8 +125,8 @@ def test_searches_that_converged_elsewhere_are_counted():
     seen = {1: Scan(at, 0.5 * ((at - 0.5) / 0.1) ** 2, at[:, None])}
     ends = np.array([[0.0, 0.5], [9.0, 0.55], [0.0, -1.0], [0.0, -1.0]])
     converged = np.array([True, True, True, False])
-    assert scans.apart(seen, ends, converged) == 1
-    assert scans.apart({}, ends, converged) == scans.apart(seen, None, converged) == 0
+    assert scans.count_outside(seen, ends, converged) == 1
+    assert scans.count_outside({}, ends, converged) == scans.count_outside(seen, None, converged) == 0
 
 
 def test_a_fit_that_may_be_proposed_goes_on_until_it_is_an_optimum(monkeypatch):
@@ -136,7 +140,7 @@ def test_a_fit_that_may_be_proposed_goes_on_until_it_is_an_optimum(monkeypatch):
             z=np.asarray(starts) + 1, cost=cost, converged=np.array([True, len(calls) > 1, False])
         ), None
 
-    monkeypatch.setattr(time_histories, "searches_long", ended)
+    monkeypatch.setattr(time_histories, "search_rollouts", ended)
     monkeypatch.setattr(time_histories, "_evaluator", lambda *_: None)
     observer = SimpleNamespace(policy=SimpleNamespace(steps=30, batch=8))
     search = functools.partial(time_histories.Histories.search, observer, SimpleNamespace(data=None))

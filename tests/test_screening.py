@@ -13,11 +13,11 @@ from synthetic import Analyst, table
 from worlds import histories, rigs
 
 from calibration.discovery import candidates, screening
-from calibration.discovery.candidates import Candidate, filled
+from calibration.discovery.candidates import Candidate, fill_slots
 from calibration.discovery.result import Ranked, Ranking
 from calibration.discovery.score_tests import ScoreTable
 from calibration.discovery.settings import settings_for
-from calibration.inference.held_out import unseen
+from calibration.inference.held_out import predict_unseen
 from calibration.inference.observers import Histories
 from calibration.inference.optimizers import Optimum
 from mmrjax.effects import BY_NAME
@@ -104,7 +104,7 @@ def ranked_sets(space, **explained):
     """Screened single effects that explain so much [σ²], of 1000."""
     at = np.zeros(space.free + 4)
     return [
-        Candidate(filled([n], ANALYST.settings), at, at, 500 - x / 2, np.zeros(2), np.zeros(2), True, True, True,
+        Candidate(fill_slots([n], ANALYST.settings), at, at, 500 - x / 2, np.zeros(2), np.zeros(2), True, True, True,
                   simulated=False)
         for n, x in explained.items()
     ]  # fmt: skip
@@ -132,7 +132,7 @@ def test_simulation_confirms_the_first_and_its_rivals_or_another_is_tried(
 
     monkeypatch.setattr(screening, "fit_candidates", fit)
     screened = ranked_sets(space, churning=900, stribeck_track=890, series_resistance=500, brush_drop=480)
-    found = screening.confirmed(space.with_room(NAMES), screened, ANALYST.settings)
+    found = screening.confirm_by_simulation(space.with_room(NAMES), screened, ANALYST.settings)
     assert (found.asked, found.otherwise) == (asked, otherwise)
     assert [c.simulated for c in found.candidates].count(True) == asked
     assert tried[:4] == ["churning", "series_resistance", "stribeck_track", "churning"]  # from the prior mean too
@@ -143,7 +143,7 @@ def test_simulation_confirms_the_first_and_its_rivals_or_another_is_tried(
 
 def test_fits_with_other_sds_are_few_steps_from_those_that_are_known(space, monkeypatch):
     """Such a fit begins where it ended with the other sds; one that is not known takes as many steps as it needs."""
-    known, other, new = filled(["churning"], ANALYST.settings), filled(["brush_drop"], ANALYST.settings), []
+    known, other, new = fill_slots(["churning"], ANALYST.settings), fill_slots(["brush_drop"], ANALYST.settings), []
     size, at = len(space.coordinates), np.full(len(space.coordinates), 0.3)
 
     def search(problem, starts, weights, active, most=None):
@@ -173,7 +173,7 @@ def test_a_refit_without_a_block_is_a_step_of_gauss_and_newton():
     observe = SimpleNamespace(long=True, at=at, unreachable=lambda status: status > 0)
     data = SimpleNamespace(weight=np.ones((rows, 2)), sd=sd)
     block = np.arange(rows) < 4
-    found = unseen(SimpleNamespace(observe=observe, data=data), np.zeros(3), [block])
+    found = predict_unseen(SimpleNamespace(observe=observe, data=data), np.zeros(3), [block])
     kept = np.concatenate([(slopes[~block] / sd[~block][..., None]).reshape(-1, 3), np.eye(3)])
     wanted = np.concatenate([(measured[~block] / sd[~block]).ravel(), np.zeros(3)])
     z = np.linalg.lstsq(kept, wanted, rcond=None)[0]

@@ -18,12 +18,12 @@ from test_sensitivity_methods import shapley_of_linear
 from calibration.data import posterior_file as posteriors
 from calibration.data import robot_file
 from calibration.inference import priors
-from calibration.inference.fit_posterior import of_coordinates
+from calibration.inference.fit_posterior import posterior_of_coordinates
 from calibration.sensitivity import information
 from calibration.sensitivity import uncertain_inputs as room
-from calibration.sensitivity.analyse import analyse
-from calibration.sensitivity.local import inert, local
-from calibration.sensitivity.methods import correlated, shapley_effects
+from calibration.sensitivity.analyse import analyse_sensitivity
+from calibration.sensitivity.local import inert_inputs, local_derivatives
+from calibration.sensitivity.methods import correlated_inputs, shapley_effects
 from calibration.sensitivity.model import chosen_outputs
 from calibration.sensitivity.result import Points
 from calibration.sensitivity.sensitivity_notes import Inert
@@ -45,7 +45,7 @@ SMALL = (
 
 @pytest.fixture(scope="module")
 def study(robot):
-    inputs = room.of_priors(robot, NAMES, {})
+    inputs = room.inputs_from_priors(robot, NAMES, {})
     points = Points(
         np.array(["6T2A", "4W2T", "6T2A", "6T2A"]), np.array([24.0, 15, 33, 24]), np.array([3.0, 0, 8, 0]),
         np.array([0.0, 5, 0, 25]),
@@ -58,9 +58,9 @@ def study(robot):
 
 @pytest.mark.slow
 def test_local_derivatives_are_finite_differences_and_zero_across_configurations(study, robot):
-    found = local(study)
+    found = local_derivatives(study)
     step = 1e-6
-    fields = priors.known(robot)
+    fields = priors.parameters_by_name(robot)
     for k, name in enumerate(NAMES):
         value = float(fields[name].value)
         up, down = (
@@ -76,8 +76,8 @@ def test_local_derivatives_are_finite_differences_and_zero_across_configurations
 
 @pytest.mark.slow
 def test_swings_are_runs_at_the_ends_of_the_intervals(study, robot):
-    found = local(study)
-    coordinates = priors.coordinates(robot, NAMES)
+    found = local_derivatives(study)
+    coordinates = priors.parameter_coordinates(robot, NAMES)
     for side, z in enumerate((-1.959963984540054, 1.959963984540054)):
         value = coordinates.value(jnp.zeros(4).at[1].set(z))[1]
         run = steady_batch(params.replace(robot, {NAMES[1]: value}), study.conditions)
@@ -85,7 +85,7 @@ def test_swings_are_runs_at_the_ends_of_the_intervals(study, robot):
 
 
 def test_inputs_are_those_of_the_priors(robot, study):
-    coordinates = priors.coordinates(robot, NAMES)
+    coordinates = priors.parameter_coordinates(robot, NAMES)
     u = np.random.default_rng(0).uniform(size=(50, 4))
     from scipy.stats import norm
 
@@ -104,23 +104,23 @@ def test_values_of_a_design_compile_nothing(study, compilations):
 
 
 def test_conditions_vary_uniformly_beside_parameters(robot):
-    inputs = room.of_priors(robot, NAMES[:1], {"voltage": (20.0, 28.0)})
+    inputs = room.inputs_from_priors(robot, NAMES[:1], {"voltage": (20.0, 28.0)})
     values = np.asarray(inputs.values(inputs.scores(np.array([[0.5, 0.25]]))))
     assert inputs.columns == (NAMES[0], "voltage")
     np.testing.assert_allclose(values, [[0.0259, 22.0]], rtol=1e-3)
 
 
 def test_default_inputs_are_what_has_a_prior_and_acts_here(robot):
-    names = room.default_names(robot, ("4W2T",), battery=False)
+    names = room.default_input_names(robot, ("4W2T",), battery=False)
     assert "motor.resistance" in names and "4W2T.mass" in names
     assert not any(n.startswith(("6T2A.", "battery.")) for n in names)
     assert "4W2T.track.guide_share" not in names  # it has no guides
-    assert "battery.resistance" in room.default_names(robot, ("4W2T",), battery=True)
+    assert "battery.resistance" in room.default_input_names(robot, ("4W2T",), battery=True)
 
 
 @pytest.mark.slow
 def test_sobol_of_a_nearly_linear_study_is_its_linear_share(study):
-    found = {method: analyse(study, method, 40_000) for method in ("local", "sobol")}
+    found = {method: analyse_sensitivity(study, method, 40_000) for method in ("local", "sobol")}
     assert sum(found["sobol"].sampled["steady"].values()) == found["sobol"].evaluations > 0
     shares = {method: of.outputs["speed"] for method, of in found.items()}
     linear, sampled = shares["local"].share[:2], shares["sobol"].at_points["total"]
@@ -131,14 +131,14 @@ def test_sobol_of_a_nearly_linear_study_is_its_linear_share(study):
 
 @pytest.mark.slow
 def test_shapley_effects_of_a_posterior_are_those_of_its_linear_model(robot, study):
-    coordinates = priors.coordinates(robot, NAMES[:2])
+    coordinates = priors.parameter_coordinates(robot, NAMES[:2])
     covariance = np.array([[0.02, 0.012], [0.012, 0.02]])
-    inputs = room.of_posterior(robot, of_coordinates(coordinates, np.zeros(2), covariance), {})
+    inputs = room.inputs_from_posterior(robot, posterior_of_coordinates(coordinates, np.zeros(2), covariance), {})
     points = Points(*(x[:1] for x in study.points.columns().values()))
     one = Study(robot, inputs, points, chosen_outputs(("total_current",), robot))
-    found = analyse(one, "shapley", 20_000)
+    found = analyse_sensitivity(one, "shapley", 20_000)
     assert sum(found.sampled["steady"].values()) == found.evaluations > 0
-    z_slopes = local(one).by_score["total_current"][0] @ np.linalg.inv(inputs.parameters.root)
+    z_slopes = local_derivatives(one).by_score["total_current"][0] @ np.linalg.inv(inputs.parameters.root)
     truth = shapley_of_linear(z_slopes, covariance)
     estimate = found.outputs["total_current"].overall["shapley"]
     half = (estimate.high - estimate.low) / 2
@@ -151,11 +151,13 @@ def test_shapley_effects_of_inputs_that_do_nothing_are_those_of_their_correlatio
     # guides' share is linked with the inductance through the 4W2T's loss alone.
     names = (NAMES[0], NAMES[2], NAMES[3], NAMES[1])
     covariance = 0.02 * np.array([[1, 0.6, 0, 0], [0.6, 1, 0.5, 0], [0, 0.5, 1, 0], [0, 0, 0, 1.0]])
-    inputs = room.of_posterior(robot, of_coordinates(priors.coordinates(robot, names), np.zeros(4), covariance), {})
+    inputs = room.inputs_from_posterior(
+        robot, posterior_of_coordinates(priors.parameter_coordinates(robot, names), np.zeros(4), covariance), {}
+    )
     points = Points(*(x[:2] for x in study.points.columns().values()))
     one = Study(robot, inputs, points, chosen_outputs(("speed",), robot))
-    found = analyse(one, "shapley", 40_000)
-    slopes = local(one).by_score["speed"] @ np.linalg.inv(inputs.parameters.root)
+    found = analyse_sensitivity(one, "shapley", 40_000)
+    slopes = local_derivatives(one).by_score["speed"] @ np.linalg.inv(inputs.parameters.root)
     at = found.outputs["speed"].at_points["shapley"]
     assert abs(slopes[0, 1]) < 1e-9 and np.all(np.abs(slopes[:, 2]) < 1e-9)
     for k in range(2):
@@ -164,22 +166,26 @@ def test_shapley_effects_of_inputs_that_do_nothing_are_those_of_their_correlatio
     assert at.value[0, 1] > 0.05 and at.value[0, 2] > 0.01
     assert found.inputs["motor.inductance"].inert and "motor.inductance" not in found.negligible
     assert Inert(("motor.inductance",), correlated=True) in found.remarks
-    assert correlated(inputs, [3]) == (3,) and correlated(inputs, [2, 3]) == (0, 1, 2, 3)
+    assert correlated_inputs(inputs, [3]) == (3,) and correlated_inputs(inputs, [2, 3]) == (0, 1, 2, 3)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("variances", [(0.02, 0.01), (0.01, 0.02)])
 def test_inputs_of_a_posterior_that_do_nothing_are_found_whatever_their_variance(robot, study, variances):
-    coordinates = priors.coordinates(robot, (NAMES[0], NAMES[3]))
-    inputs = room.of_posterior(robot, of_coordinates(coordinates, np.zeros(2), np.diag(variances)), {})
+    coordinates = priors.parameter_coordinates(robot, (NAMES[0], NAMES[3]))
+    inputs = room.inputs_from_posterior(
+        robot, posterior_of_coordinates(coordinates, np.zeros(2), np.diag(variances)), {}
+    )
     points = Points(*(x[:1] for x in study.points.columns().values()))
     one = Study(robot, inputs, points, chosen_outputs(("speed",), robot))
-    np.testing.assert_array_equal(inert(one, local(one), 0), [False, True])
+    np.testing.assert_array_equal(inert_inputs(one, local_derivatives(one), 0), [False, True])
 
 
 def test_overall_shapley_effects_keep_their_intervals_where_one_point_loses_pairs(robot, study, monkeypatch):
-    coordinates = priors.coordinates(robot, NAMES[:2])
-    inputs = room.of_posterior(robot, of_coordinates(coordinates, np.zeros(2), np.array([[1, 0.5], [0.5, 1.0]])), {})
+    coordinates = priors.parameter_coordinates(robot, NAMES[:2])
+    inputs = room.inputs_from_posterior(
+        robot, posterior_of_coordinates(coordinates, np.zeros(2), np.array([[1, 0.5], [0.5, 1.0]])), {}
+    )
     points = Points(*(x[[0, 3]] for x in study.points.columns().values()))
     two = Study(robot, inputs, points, chosen_outputs(("speed",), robot))
     edge = np.inf
@@ -208,9 +214,9 @@ def test_overall_shapley_effects_keep_their_intervals_where_one_point_loses_pair
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["sobol", "morris", "derivative", "shapley"])
 def test_evaluations_are_those_whose_statuses_are_counted(robot, study, method):
-    inputs = room.of_priors(robot, (*NAMES[:3], "6T2A.ground.friction.static"), {})  # a size of design each
+    inputs = room.inputs_from_priors(robot, (*NAMES[:3], "6T2A.ground.friction.static"), {})  # a size of design each
     points = Points(*(x[:2] for x in study.points.columns().values()))
-    found = analyse(Study(robot, inputs, points, chosen_outputs(("speed",), robot)), method, 3000)
+    found = analyse_sensitivity(Study(robot, inputs, points, chosen_outputs(("speed",), robot)), method, 3000)
     assert sum(found.sampled["steady"].values()) == found.evaluations > 0
     if method == "sobol":
         assert found.outputs["speed"].convergence[-1][0] == found.evaluations
@@ -276,7 +282,7 @@ def test_other_methods_have_indices_of_their_own(mmrjax, tmp_path, method, keys)
 
 
 def test_a_share_of_a_reading_of_zero_tells_nothing():
-    told = information.fisher(np.ones((1, 2, 1)), np.array([[0.0, 2.0]]))
+    told = information.fisher_information(np.ones((1, 2, 1)), np.array([[0.0, 2.0]]))
     np.testing.assert_array_equal(told, [[[0.25]]])
 
 
@@ -300,8 +306,8 @@ def test_schema_can_fail():
 
 @pytest.mark.slow
 def test_posterior_of_a_robot_is_its_inputs_and_gives_runs_their_uncertainty(mmrjax, tmp_path, robot):
-    coordinates = priors.coordinates(robot, NAMES[:2])
-    found = of_coordinates(coordinates, np.zeros(2), 0.01 * np.eye(2))
+    coordinates = priors.parameter_coordinates(robot, NAMES[:2])
+    found = posterior_of_coordinates(coordinates, np.zeros(2), 0.01 * np.eye(2))
     values = np.asarray(found.at(np.zeros(2)))
     fitted = params.replace(robot, {n: jnp.asarray(v) for n, v in zip(found.names, values, strict=True)})
     robot_file.write(fitted, tmp_path / "robot.toml", note="of a test")

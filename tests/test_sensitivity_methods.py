@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from calibration.sensitivity import derivative, information, morris, shapley, sobol
-from calibration.sensitivity.replicates import REPLICATES, ratio
+from calibration.sensitivity.replicates import REPLICATES, ratio_estimate
 
 A, B = 7.0, 0.1
 
@@ -42,12 +42,12 @@ def within(estimate, truth, widths=1.5):
 
 @pytest.fixture(scope="module")
 def design():
-    return sobol.design(3, 64, 1)
+    return sobol.sobol_design(3, 64, 1)
 
 
 @pytest.fixture(scope="module")
 def found(design):
-    return sobol.indices(sobol.terms(design, ishigami(design.points)))
+    return sobol.indices_of_terms(sobol.sobol_terms(design, ishigami(design.points)))
 
 
 def test_sobol_indices_are_those_of_ishigami(found):
@@ -66,7 +66,7 @@ def test_sobol_indices_are_saltelli_estimates_of_salib(design):
     y = ishigami(design.points)
     problem = {"num_vars": 3, "names": ["a", "b", "c"], "bounds": [[0, 1]] * 3}
     theirs = salib.analyze(problem, y, calc_second_order=True, num_resamples=2, seed=0)
-    ours = sobol.indices(sobol.terms(design, y))
+    ours = sobol.indices_of_terms(sobol.sobol_terms(design, y))
     # SALib takes the mean of all points off, we that of the two independent samples
     np.testing.assert_allclose(ours.first.value, theirs["S1"], atol=1e-4)
     np.testing.assert_allclose(ours.total.value, theirs["ST"], atol=1e-4)
@@ -82,47 +82,47 @@ def test_sobol_interval_of_another_function_does_not_hold(found):
 def test_sobol_replicates_are_unlike_one_another(design):
     first = design.points.reshape(REPLICATES, -1, 3)[:, 0]
     assert len(np.unique(first, axis=0)) == REPLICATES
-    again = sobol.design(3, 64, 1)
+    again = sobol.sobol_design(3, 64, 1)
     np.testing.assert_array_equal(again.points, design.points)
-    assert not np.array_equal(sobol.design(3, 64, 2).points, design.points)
+    assert not np.array_equal(sobol.sobol_design(3, 64, 2).points, design.points)
 
 
 def test_sobol_leaves_out_rows_without_numbers_exactly_where_one_input_decides_them(design):
     # y = x0 + x1 with no number below x0 = 0.25: x0 is then uniform above it.
     y = np.where(design.points[:, 0] < 0.25, np.nan, design.points[:, 0] + design.points[:, 1])
-    terms = sobol.terms(design, y)
+    terms = sobol.sobol_terms(design, y)
     share = 0.75**2 / (0.75**2 + 1)
-    found = sobol.indices(terms)
+    found = sobol.indices_of_terms(terms)
     assert within(found.first, [share, 1 - share, 0]) and within(found.total, [share, 1 - share, 0])
     assert terms.lost / (terms.lost + terms.rows) == pytest.approx(1 - 0.75**2, abs=0.01)
 
 
 def test_sobol_of_nothing_but_missing_numbers_is_none(design):
-    assert sobol.terms(design, np.full(len(design.points), np.nan)) is None
+    assert sobol.sobol_terms(design, np.full(len(design.points), np.nan)) is None
 
 
 def test_sobol_of_several_outputs_together_weighs_them_by_their_variance(design):
     a, b = design.points[:, 0], 3 * design.points[:, 1]
-    both = sobol.terms(design, a) + sobol.terms(design, b)
-    assert within(sobol.indices(both).total, [0.1, 0.9, 0.0])
+    both = sobol.sobol_terms(design, a) + sobol.sobol_terms(design, b)
+    assert within(sobol.indices_of_terms(both).total, [0.1, 0.9, 0.0])
 
 
 def test_sobol_inputs_that_do_not_act_add_nothing_to_pairs():
-    design = sobol.design(2, 64, 3)
-    narrow = sobol.terms(design, design.points[:, 0] * design.points[:, 1])
-    wide = sobol.indices(narrow.widened((1, 3), 4))
+    design = sobol.sobol_design(2, 64, 3)
+    narrow = sobol.sobol_terms(design, design.points[:, 0] * design.points[:, 1])
+    wide = sobol.indices_of_terms(narrow.widened((1, 3), 4))
     assert wide.second.value[0, 1] == 0 and wide.second.value[0, 2] == 0
-    assert wide.second.value[1, 3] == sobol.indices(narrow).second.value[0, 1] != 0
+    assert wide.second.value[1, 3] == sobol.indices_of_terms(narrow).second.value[0, 1] != 0
 
 
 def test_constant_output_has_no_indices(design):
-    found = sobol.indices(sobol.terms(design, np.ones(len(design.points))))
+    found = sobol.indices_of_terms(sobol.sobol_terms(design, np.ones(len(design.points))))
     assert np.isnan(found.first.value).all()
 
 
 def test_size_covers_the_evaluations_that_are_asked_for():
     for evaluations in (1_000, 100_000, 123_456):
-        size = sobol.size_of(evaluations, 5, second=True)
+        size = sobol.base_points(evaluations, 5, second=True)
         assert size * REPLICATES * 12 >= evaluations and size & (size - 1) == 0
 
 
@@ -132,8 +132,8 @@ def test_size_covers_the_evaluations_that_are_asked_for():
 def test_sobol_intervals_cover_in_ninety_to_ninety_eight_of_a_hundred(size):
     held = np.zeros((2, 3))
     for seed in range(200):
-        design = sobol.design(3, size, seed, second=False)
-        found = sobol.indices(sobol.terms(design, ishigami(design.points)))
+        design = sobol.sobol_design(3, size, seed, second=False)
+        found = sobol.indices_of_terms(sobol.sobol_terms(design, ishigami(design.points)))
         for k, (e, truth) in enumerate(((found.first, FIRST), (found.total, TOTAL))):
             held[k] += (e.low <= truth) & (truth <= e.high)
     assert np.all((held / 200 >= 0.9) & (held / 200 <= 0.98)), held / 200
@@ -156,13 +156,13 @@ def test_sobol_intervals_cover_those_of_the_steady_model_in_scipy():
 
 def test_bounds_meet_at_the_indices_of_a_linear_model():
     slopes, normal = np.array([1.0, 2.0, 3.0]), np.array([True, True, False])
-    rng_points = derivative.design(3, 64, 0)
+    rng_points = derivative.derivative_design(3, 64, 0)
     scores = rng_points.copy()
     from scipy.special import ndtri
 
     scores[:, :2] = ndtri(rng_points[:, :2])
-    terms = derivative.terms(scores, scores @ slopes, np.tile(slopes, (len(scores), 1)), normal)
-    found = derivative.bounds(terms)
+    terms = derivative.derivative_terms(scores, scores @ slopes, np.tile(slopes, (len(scores), 1)), normal)
+    found = derivative.index_bounds(terms)
     parts = slopes**2 * np.array([1, 1, 1 / 12])
     assert within(found.lower, parts / parts.sum(), 2)
     # a uniform score's Poincaré bound is 12/π² above what a straight line has
@@ -170,25 +170,27 @@ def test_bounds_meet_at_the_indices_of_a_linear_model():
 
 
 def test_bounds_bracket_the_indices_of_ishigami():
-    u = derivative.design(3, 64, 0)
-    found = derivative.bounds(derivative.terms(u, ishigami(u), ishigami_gradient(u), np.zeros(3, bool)))
+    u = derivative.derivative_design(3, 64, 0)
+    found = derivative.index_bounds(
+        derivative.derivative_terms(u, ishigami(u), ishigami_gradient(u), np.zeros(3, bool))
+    )
     assert np.all(found.upper.value >= TOTAL) and np.all(found.lower.value <= FIRST + 0.02)
 
 
 def test_bounds_leave_out_points_without_numbers():
-    u = derivative.design(2, 64, 0)
+    u = derivative.derivative_design(2, 64, 0)
     y = np.where(u[:, 0] < 0.1, np.nan, u.sum(1))
-    terms = derivative.terms(u, y, np.ones_like(u), np.zeros(2, bool))
-    assert terms.lost == np.isnan(y).sum() and np.isfinite(derivative.bounds(terms).upper.value).all()
-    assert derivative.terms(u, np.full(len(u), np.nan), np.ones_like(u), np.zeros(2, bool)) is None
+    terms = derivative.derivative_terms(u, y, np.ones_like(u), np.zeros(2, bool))
+    assert terms.lost == np.isnan(y).sum() and np.isfinite(derivative.index_bounds(terms).upper.value).all()
+    assert derivative.derivative_terms(u, np.full(len(u), np.nan), np.ones_like(u), np.zeros(2, bool)) is None
 
 
 # --- Morris -------------------------------------------------------------------------------------------------------
 
 
 def test_elementary_effects_of_a_linear_model_are_its_slopes():
-    u = morris.design(3, 40, 0)
-    found = morris.effects(u, u @ np.array([1.0, -2.0, 0.0]))
+    u = morris.morris_design(3, 40, 0)
+    found = morris.elementary_effects(u, u @ np.array([1.0, -2.0, 0.0]))
     np.testing.assert_allclose(found.mean, [1, -2, 0], atol=1e-12)
     np.testing.assert_allclose(found.size.value, [1, 2, 0], atol=1e-12)
     np.testing.assert_allclose(found.spread, 0, atol=1e-12)
@@ -196,9 +198,9 @@ def test_elementary_effects_of_a_linear_model_are_its_slopes():
 
 
 def test_elementary_effects_tell_what_is_not_linear_and_leave_out_whole_trajectories():
-    u = morris.design(2, 200, 0)
+    u = morris.morris_design(2, 200, 0)
     y = np.where(u[:, 1] > 0.9, np.nan, u[:, 0] ** 2 + u[:, 1])
-    found = morris.effects(u, y)
+    found = morris.elementary_effects(u, y)
     assert found.lost > 0 and found.trajectories + found.lost == 200
     assert found.spread[0] > 0.05 and found.spread[1] == pytest.approx(0, abs=1e-12)
 
@@ -206,9 +208,9 @@ def test_elementary_effects_tell_what_is_not_linear_and_leave_out_whole_trajecto
 def test_morris_design_is_repeatable_and_leaves_the_global_generator_alone():
     np.random.seed(3)  # noqa: NPY002
     before = np.random.get_state()[1].copy()  # noqa: NPY002
-    first = morris.design(3, 10, 5)
+    first = morris.morris_design(3, 10, 5)
     np.testing.assert_array_equal(np.random.get_state()[1], before)  # noqa: NPY002
-    np.testing.assert_array_equal(first, morris.design(3, 10, 5))
+    np.testing.assert_array_equal(first, morris.morris_design(3, 10, 5))
 
 
 # --- Shapley ------------------------------------------------------------------------------------------------------
@@ -234,8 +236,8 @@ SLOPES = np.array([1.0, -0.5, 2.0, 0.0])
 
 
 def test_shapley_effects_of_a_linear_model_of_correlated_inputs():
-    design = shapley.design(np.array([1.0, 2.0, 3.0, 4.0]), COVARIANCE, 600, 0)
-    found = shapley.effects(shapley.terms(design, design.points @ SLOPES))
+    design = shapley.shapley_design(np.array([1.0, 2.0, 3.0, 4.0]), COVARIANCE, 600, 0)
+    found = shapley.effects_of_terms(shapley.shapley_terms(design, design.points @ SLOPES))
     truth = shapley_of_linear(SLOPES, COVARIANCE)
     assert within(found, truth) and found.value.sum() == pytest.approx(1)
     assert truth[3] > 0  # it does nothing, and is known through others
@@ -255,8 +257,8 @@ def test_shapley_effects_of_independent_inputs_are_their_shares():
 
 
 def test_shapley_without_numbers_is_none():
-    design = shapley.design(np.zeros(2), np.eye(2), 50, 0)
-    assert shapley.terms(design, np.full(len(design.points), np.nan)) is None
+    design = shapley.shapley_design(np.zeros(2), np.eye(2), 50, 0)
+    assert shapley.shapley_terms(design, np.full(len(design.points), np.nan)) is None
 
 
 # --- information --------------------------------------------------------------------------------------------------
@@ -265,9 +267,9 @@ def test_shapley_without_numbers_is_none():
 def test_chosen_runs_are_the_best_of_all_sets():
     rng = np.random.default_rng(0)
     jacobian = rng.normal(size=(9, 2, 3)) * rng.uniform(0.2, 3, size=(9, 1, 1))
-    each = information.fisher(jacobian, np.full((9, 2), 0.5))
+    each = information.fisher_information(jacobian, np.full((9, 2), 0.5))
     value = lambda rows: np.linalg.slogdet(np.eye(3) + each[list(rows)].sum(0))[1]  # noqa: E731
-    choice = information.choose(each, 3)
+    choice = information.choose_runs(each, 3)
     best = max(itertools.combinations(range(9), 3), key=value)
     assert value(choice.rows) == pytest.approx(value(best))
     assert np.sum(choice.gain) * 2 * np.log(2) == pytest.approx(value(choice.rows))
@@ -276,11 +278,11 @@ def test_chosen_runs_are_the_best_of_all_sets():
 
 def test_missing_readings_tell_nothing():
     jacobian = np.array([[[1.0], [np.nan]]])
-    assert information.fisher(jacobian, np.array([[0.5, 1.0]]))[0, 0, 0] == 4.0
+    assert information.fisher_information(jacobian, np.array([[0.5, 1.0]]))[0, 0, 0] == 4.0
 
 
 def test_ratio_interval_is_that_of_students_t_for_a_constant_denominator():
     x = np.array([1.0, 2.0, 4.0, 3.0])
-    e = ratio(x[:, None], np.full(4, 2.0))
+    e = ratio_estimate(x[:, None], np.full(4, 2.0))
     assert e.value[0] == 1.25
     assert e.high[0] - e.value[0] == pytest.approx(3.182446 * x.std(ddof=1) / 2 / 2, rel=1e-6)

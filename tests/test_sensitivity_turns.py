@@ -40,13 +40,13 @@ def test_outputs_of_turns_are_refused_of_straight_travel_with_what_turns_it(name
 
 @pytest.mark.parametrize("name", ["start", "peak_current", "steepest_slope"])
 def test_outputs_of_straight_travel_are_refused_of_turns(name):
-    with pytest.raises(BadConfiguration, match=f"--outputs {name}: of straight travel"):
+    with pytest.raises(BadConfiguration, match=f"--outputs {name}: only for straight travel"):
         chosen_outputs((name,), TURNS, turns=True)
 
 
 def test_turns_have_inputs_of_turns():
     straight, turns = (
-        uncertain_inputs.default_names(ROBOT, ("6T2A",), False, turns=turns) for turns in (False, True)
+        uncertain_inputs.default_input_names(ROBOT, ("6T2A",), False, turns=turns) for turns in (False, True)
     )
     assert {*turns} - {*straight} == {f"6T2A.turning.{n}" for n in ("width", "lateral", "rule", "inertia")}
 
@@ -87,7 +87,7 @@ def test_radius_of_a_run_and_its_derivative():
 
     found = mm.simulate(ROBOT, asked).reading
     moves = np.hypot(found["speed"], found["lateral_speed"])
-    at = next(p.value for p in params.walk(ROBOT) if p.name == "6T2A.turning.lateral")
+    at = next(p.value for p in params.walk_parameters(ROBOT) if p.name == "6T2A.turning.lateral")
     assert float(of(jnp.asarray(at))) == pytest.approx(float(moves / found["yaw_rate"]), rel=1e-9)
     exact = jax.jit(jax.grad(of))(jnp.asarray(at))
     jitted = jax.jit(of)

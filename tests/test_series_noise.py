@@ -35,7 +35,7 @@ def table(sd, share=False, slopes=SLOPES, seed=0, payloads=(0.0, 8.0), volts=(15
 
 
 def found(runs):
-    return series_noise.estimate(runs, np.nan_to_num(SettledRuns.sizes(runs), nan=1.0))
+    return series_noise.estimate_noise(runs, np.nan_to_num(SettledRuns.sizes(runs), nan=1.0))
 
 
 def test_degrees_of_freedom_are_those_of_second_differences():
@@ -59,7 +59,7 @@ def test_estimates_are_right_on_average(share):
 
 
 def test_both_parts_of_the_noise_add_as_squares():
-    mixed = series_noise.SeriesNoise(channels.find("total_current"), 0.03, 0.04, 7.4, "slope_deg", 4)
+    mixed = series_noise.SeriesNoise(channels.find_channel("total_current"), 0.03, 0.04, 7.4, "slope_deg", 4)
     np.testing.assert_allclose(mixed.sd(np.array([0.0, 1.0])), [0.03, 0.05])
 
 
@@ -80,7 +80,7 @@ def test_uneven_steps_and_repeats_count_as_they_are():
     uneven = table(0.0, slopes=np.array([0.0, 1.0, 7.0, 9.0, 20.0]), seed=1)
     straight = 1 + 0.1 * uneven["slope_deg"]
     weights, used = series_noise._differences(
-        straight, uneven["slope_deg"], series_noise.series_of(uneven, "slope_deg")
+        straight, uneven["slope_deg"], series_noise.series_along(uneven, "slope_deg")
     )
     assert used == 4 and np.abs(weights @ straight).max() < 1e-12
     repeats = np.array([3.0, 3.0, 3.0])
@@ -99,11 +99,11 @@ def test_a_display_shows_nothing_finer_than_its_step():
 
 def test_a_coarse_display_with_few_readings_has_a_floor():
     """With 0.1, 0.2 and 0.4 A the smallest reading would else have the largest weight by far."""
-    current = channels.find("total_current")
+    current = channels.find_channel("total_current")
     assert display_step(np.array([0.1, 0.2, 0.4, 0.4, 0.1]), current) == pytest.approx(0.1)
     assert display_step(np.array([0.137, 0.2242, 0.41, 0.433]), current) < 1e-3
     levels = np.array([1000.0, 2000.0, 3000.0]) * channels.RPM
-    assert display_step(levels, channels.find("motor_speed")) == pytest.approx(100 * channels.RPM)
+    assert display_step(levels, channels.find_channel("motor_speed")) == pytest.approx(100 * channels.RPM)
 
 
 def test_rows_without_series_are_assumed_as_usual_and_stated_ones_stay():
@@ -113,21 +113,21 @@ def test_rows_without_series_are_assumed_as_usual_and_stated_ones_stay():
     alone = dataclasses.replace(runs, columns=scattered)
     assert found(alone) == (None, None, None)
     with np.errstate(invalid="ignore"):
-        known = noise.inferred(alone, SettledRuns.sizes(alone))
-        mine = noise.inferred(runs, SettledRuns.sizes(runs), "current=0.2A")
+        known = noise.infer_noise(alone, SettledRuns.sizes(alone))
+        mine = noise.infer_noise(runs, SettledRuns.sizes(runs), "current=0.2A")
     assert known.source == ("assumed", "assumed", "no readings") and known.word == "assumed"
     assert np.all(np.isinf(known.freedom))
     assert mine.source == ("stated", "series", "no readings") and mine.word == "estimated"
-    assert channels.names(mine.silent) == ("motor_speed",)
+    assert channels.channel_names(mine.silent) == ("motor_speed",)
     np.testing.assert_allclose(mine.sd[:, 0], 0.2)
     assert mine.freedom[1] == mine.along_series[0].freedom
 
 
 def test_series_that_go_backward_are_others():
     runs = table(0.05, volts=(-20.0, -10.0, 10.0, 20.0), slopes=np.zeros(1), payloads=(0.0,))
-    assert series_noise.series_of(runs, "supply_voltage_V") == []  # two and two
+    assert series_noise.series_along(runs, "supply_voltage_V") == []  # two and two
     longer = table(0.05, volts=(-30.0, -20.0, -10.0, 10.0, 20.0, 30.0), slopes=np.zeros(1), payloads=(0.0,))
-    assert [len(s) for s in series_noise.series_of(longer, "supply_voltage_V")] == [3, 3]
+    assert [len(s) for s in series_noise.series_along(longer, "supply_voltage_V")] == [3, 3]
 
 
 def test_replicates_are_drawn_with_sds_that_an_estimate_might_have_been_of():

@@ -185,7 +185,7 @@ BAD = {
         r"row 301, time_s: goes back from 2\.99 to 0 s; give each recording its own run_id, or sort the rows",
     ),
     "time twice": (
-        lambda c: c | {"time_s": np.repeat(c["time_s"][:300], 2)},
+        lambda c: c | {"time_s": np.r_[c["time_s"][0], c["time_s"][0], c["time_s"][2:]]},
         r"row 2, time_s: 0 s stands twice; give each sample its own time",
     ),
     "no time": (
@@ -297,7 +297,7 @@ SIGNS = [case for case in WRONG if "sign" in case or "round" in case]
 def test_rig_check_says_of_a_log_that_signs_are_wrong(tmp_path, monkeypatch, case):
     changes, said = WRONG.get(case, ({}, ""))
     bench(tmp_path, both_ways(**changes), '"total_current", "motor_speed", "output_angle"')
-    monkeypatch.setattr(rig_check.foresight, "foresee", lambda runs, robot: NOTHING_FORESEEN)
+    monkeypatch.setattr(rig_check.foresight, "predict_identifiability", lambda runs, robot: NOTHING_FORESEEN)
     found = rig_check.examined(tmp_path / "rig.toml", str(tmp_path / "log.csv"))
     if not said:
         assert found.doubts == ()
@@ -310,7 +310,7 @@ def test_rig_check_says_of_a_log_that_signs_are_wrong(tmp_path, monkeypatch, cas
 def test_rig_check_says_which_current_a_total_one_is_beside_a_duty(tmp_path, monkeypatch, duty):
     columns = both_ways() | ({"duty": np.full(800, 0.5)} if duty else {})
     bench(tmp_path, columns)
-    monkeypatch.setattr(rig_check.foresight, "foresee", lambda runs, robot: NOTHING_FORESEEN)
+    monkeypatch.setattr(rig_check.foresight, "predict_identifiability", lambda runs, robot: NOTHING_FORESEEN)
     said = rig_check.examined(tmp_path / "rig.toml", str(tmp_path / "log.csv")).remarks()
     assert any("what a sensor in a motor's leads shows is motor_current" in s for s in said) == duty
 
@@ -642,7 +642,7 @@ def test_a_log_in_which_nothing_moves_is_refused_unless_a_shaft_is_locked(tmp_pa
     runs = records.read(tmp_path / "log.csv", robot=robot)
     refused = pytest.raises(BadData, match=said) if said else contextlib.nullcontext()
     with refused:
-        checks._nothing_moves(runs, noises.from_table(runs, observers.kind(runs).sizes(runs), noise))
+        checks._check_motion(runs, noises.noise_from_table(runs, observers.observer_kind(runs).sizes(runs), noise))
     if volts == 0.5:  # nor is it a settled run
         with pytest.raises(BadData, match="no settled stretch: nothing moves beyond its noise"):
             settled(tmp_path, robot)

@@ -82,7 +82,7 @@ def ends_of(runs, p):
     problem = ANALYST.space(runs).bare
     ends = settled_ends.settled_ends(problem)
     truth, sound = settled.readings(histories.starts(p), p)
-    return ends, settled_ends._sliding(problem, ends), truth.T, sound
+    return ends, settled_ends._slides_at_end(problem, ends), truth.T, sound
 
 
 @pytest.mark.slow

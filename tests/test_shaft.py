@@ -10,7 +10,7 @@ import pytest
 
 from mmrjax.effects import BY_NAME
 from mmrjax.fidelities.drive import drive_batch
-from mmrjax.fidelities.histories import grid, histories
+from mmrjax.fidelities.histories import history_signals, time_grid
 from mmrjax.fidelities.steady import steady_batch, steady_outputs
 from mmrjax.model import balances, paper_robots, params
 from mmrjax.model.conditions import Conditions
@@ -28,7 +28,7 @@ SPEEDS = np.array([-300.0, -40.0, 25.0, 180.0])
 
 def bench(rig=None, **load):
     shaft = Shaft(**{"inertia": 0.01, "loss_coulomb": 0.2, "loss_viscous": 0.01, **load})
-    return params.replace(paper_robots.blank(Configurations({"bench": shaft}), sides=2.0, rig=rig), DRIVE)
+    return params.replace(paper_robots.blank_robot(Configurations({"bench": shaft}), sides=2.0, rig=rig), DRIVE)
 
 
 def current_of(w, load=0.0, coulomb=0.2, viscous=0.01):
@@ -91,7 +91,7 @@ def test_friction_holds_a_shaft_that_its_motors_cannot_turn():
 def test_derivatives_at_an_imposed_speed_are_those_of_the_formula():
     robot = bench()
     names = ("bench.loss_coulomb", "bench.loss_viscous", "gearbox.efficiency_load", "motor.resistance")
-    at = {p.name: p.value for p in params.walk(robot) if p.name in names}
+    at = {p.name: p.value for p in params.walk_parameters(robot) if p.name in names}
 
     def current(values):
         return steady_outputs(params.replace(robot, values), Conditions(motor_speed=SPEEDS), ("motor_current",))
@@ -114,9 +114,9 @@ def test_a_pendulum_swings_as_the_textbook_says():
         robot,
         {"gearbox.efficiency_load": 1.0, "motor.friction_coulomb": 0.0, "motor.friction_viscous": 0.0},
     )
-    times = grid(np.linspace(0, 2, 201))
+    times = time_grid(np.linspace(0, 2, 201))
     conditions = dataclasses.replace(Conditions(voltage=0.0, open=1.0), begin=jnp.asarray(0))
-    angle = np.asarray(jax.jit(histories)(robot, conditions, jnp.asarray(times)).angle)
+    angle = np.asarray(jax.jit(history_signals)(robot, conditions, jnp.asarray(times)).angle)
     omega = np.sqrt(0.5 / (0.02 + 16**2 * 2e-6))
     period = 2 * np.pi / omega * (1 + 0.05**2 / 16)
     np.testing.assert_allclose(angle, 0.05 * np.cos(2 * np.pi / period * times), atol=5e-4)
@@ -130,7 +130,7 @@ def test_an_imposed_history_takes_the_torque_of_its_acceleration():
     conditions = dataclasses.replace(
         Conditions(), motor_speed=jnp.asarray(speed), motor_acceleration=jnp.full(21, 80.0)
     )
-    seen = jax.jit(histories)(robot, conditions, jnp.asarray(times))
+    seen = jax.jit(history_signals)(robot, conditions, jnp.asarray(times))
     np.testing.assert_allclose(seen.speed_motor, speed, rtol=1e-9)
     expected = current_of(speed) + (0.01 * 80 / 16 / (16 * 0.8) + 2e-6 * 80) / 0.05
     np.testing.assert_allclose(seen.current, expected, rtol=1e-6)
@@ -146,7 +146,7 @@ def test_derivatives_of_an_imposed_history_are_differences():
     conditions = dataclasses.replace(conditions, motor_speed=speed, motor_acceleration=slope)
 
     def current(x):
-        return histories(params.replace(bench(), {"bench.inertia": x}), conditions, times).current
+        return history_signals(params.replace(bench(), {"bench.inertia": x}), conditions, times).current
 
     slope = jax.jvp(current, (jnp.asarray(0.01),), (jnp.asarray(1.0),))[1]
     difference = (current(0.01 + 1e-6) - current(0.01 - 1e-6)) / 2e-6
@@ -158,7 +158,7 @@ def test_the_beginning_of_a_history_has_derivatives():
     def speed(x):
         rig = Rig(begins=Begins({"begin": Begin(motor_speed=x)}))
         conditions = dataclasses.replace(Conditions(voltage=6.0), begin=jnp.asarray(0))
-        return histories(bench(rig=rig), conditions, jnp.asarray(grid(np.linspace(0, 0.2, 5)))).speed_motor
+        return history_signals(bench(rig=rig), conditions, jnp.asarray(time_grid(np.linspace(0, 0.2, 5)))).speed_motor
 
     both = jax.jit(lambda x: jax.jvp(speed, (x,), (1.0,)))
     slope = np.asarray(both(50.0)[1])
@@ -177,7 +177,7 @@ def test_an_instrument_without_sign_shows_magnitude():
 def test_power_of_a_shaft_adds_up():
     """What the motors give goes into friction, the load's torque and the gearbox, instant by instant."""
     robot = bench(torque_constant=0.3)
-    moving = jax.jit(lambda state: balances.moving(robot, Conditions(voltage=12.0), state))
+    moving = jax.jit(lambda state: balances.moving_signals(robot, Conditions(voltage=12.0), state))
     for speed, current in itertools.product((120.0, -120.0), (1.0, -0.5)):
         s = moving(State(current, speed, speed / 16, 0.0))
         given = float(s.torque_motor * s.speed_motor)
@@ -190,7 +190,9 @@ def test_loads_state_what_they_can_do():
     """Each says of the other's what it has none of, so that nobody has to ask which it is."""
     shaft, vehicle = bench(torque_constant=0.3, torque_gravity=0.2, angle_zero=-np.pi / 2), paper_robots.nominal()
     load, chassis = shaft.configurations["bench"], vehicle.configurations["6T2A"]
-    assert not shaft.has_ground and vehicle.has_ground and balances.absent(shaft) >= {"ground", "slip", "mass"}
+    assert (
+        not shaft.has_ground and vehicle.has_ground and balances.absent_balances(shaft) >= {"ground", "slip", "mass"}
+    )
     assert load.mass == 0 and load.on_tracks == 0 and load.speed_grip == np.inf  # nothing slides
     assert chassis.torque_constant == chassis.torque_gravity == chassis.backlash == 0
     assert float(load.torque_weight(5.0, 0.1)) == pytest.approx(0.5)  # whatever a vehicle's mass and slope
@@ -202,4 +204,4 @@ def test_loads_state_what_they_can_do():
 
 def test_an_effect_of_the_ground_adds_nothing_to_a_shaft():
     slipping = dataclasses.replace(bench(), effects=(dataclasses.replace(BY_NAME["load_slip"](), amplitude=0.1),))
-    assert balances.added(slipping, Signals(), "slip") == 0.0
+    assert balances.effects_sum(slipping, Signals(), "slip") == 0.0

@@ -289,7 +289,7 @@ def two(robot):
 def test_simulate_over_a_profile_has_the_columns_of_the_table(two):
     assert two.model == "drive" and two.shape == (2,) and list(two.statuses) == ["converged"] * 2
     table = two.to_dict()
-    assert set(missions.names()) < set(table) and not {"slip", "total_current_A"} & set(table)
+    assert set(missions.mission_columns()) < set(table) and not {"slip", "total_current_A"} & set(table)
     assert two.energy_Wh.shape == (2,) and (two.energy_Wh > 0).all()
     np.testing.assert_allclose(two.energy_Wh, two.mission.total.energy / 3600)
     assert np.isnan(two.state_of_charge[0]) and 0.99 < two.state_of_charge[1] < 1
@@ -297,8 +297,8 @@ def test_simulate_over_a_profile_has_the_columns_of_the_table(two):
 
 
 def test_numbers_are_described_once():
-    assert len({o.name for o in OUTPUTS}) == len(OUTPUTS) == len(set(missions.names()))
-    assert set(missions.USUAL) < set(missions.names())
+    assert len({o.name for o in OUTPUTS}) == len(OUTPUTS) == len(set(missions.mission_columns()))
+    assert set(missions.USUAL) < set(missions.mission_columns())
     assert {f"energy_to_{name}" for name in energy.SINKS} < {o.name for o in OUTPUTS}
 
 
@@ -306,7 +306,7 @@ def test_numbers_are_described_once():
 def test_energy_has_forward_derivatives_by_the_robot_and_by_the_profile(robot):
     """Along one direction in both; central differences agree."""
     at = mm.Conditions(configuration="6T2A", voltage=24.0)
-    (friction,) = (p.value for p in params.walk(robot) if p.name == "motor.friction_coulomb")
+    (friction,) = (p.value for p in params.walk_parameters(robot) if p.name == "motor.friction_coulomb")
 
     def spent(x):
         changed = mm.replace(robot, {"motor.friction_coulomb": friction * (1 + x)})

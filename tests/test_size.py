@@ -16,8 +16,8 @@ import pytest
 from calibration.data import requirements_file, robot_file
 from calibration.data.parts import gearboxes, motors
 from calibration.sizing import chart, design_search, sheet
-from calibration.sizing.design import OBJECTIVES, build, evaluate, task
-from calibration.sizing.part_options import BELT_STAGE, MOTOR, drives, options
+from calibration.sizing.design import OBJECTIVES, build_robot, evaluate_design, sizing_task
+from calibration.sizing.part_options import BELT_STAGE, MOTOR, drive_options, options_for_robot
 from mmrjax.derived.requirements import QUANTITIES
 from mmrjax.model import params
 from sweeps.results.size_results import verdict
@@ -55,7 +55,7 @@ def asked(text):
 
 @pytest.fixture(scope="module")
 def found(robot, asked):
-    return design_search.size(robot, asked, ("mass",), starts=256)
+    return design_search.size_robot(robot, asked, ("mass",), starts=256)
 
 
 @pytest.fixture(scope="module")
@@ -68,13 +68,13 @@ def folder(text, tmp_path_factory):
 
 
 def space(robot, asked, found):
-    of = task(robot, asked, found.options)
-    return of, design_search.space(robot, of, found.options)
+    of = sizing_task(robot, asked, found.options)
+    return of, design_search.choice_space(robot, of, found.options)
 
 
 def meets(f, asked):
     """Whether a design meets every requirement; each is a structure of its own to compile."""
-    outcomes = sheet.check(f.robot, asked, changes=False)
+    outcomes = sheet.check_requirements(f.robot, asked, changes=False)
     assert all(o.met for o in outcomes), (f.to_json(), outcomes)
     assert float(f.robot.chassis(0).mass) == pytest.approx(f.objectives["mass"])
 
@@ -118,7 +118,7 @@ def test_no_design_of_a_grid_is_lighter(robot, asked, found):
     box = np.stack(np.meshgrid(*(np.linspace(0, 1, k) for k in (6, 5, 8)), indexing="ij"), -1).reshape(-1, 3)
     every = np.repeat(rows, len(box))
     x = choice.low[every] + (choice.high[every] - choice.low[every]) * np.tile(box, (len(rows), 1))
-    f, g = design_search.measured(of, choice, every, x)
+    f, g = design_search.evaluate_designs(of, choice, every, x)
     good = np.all(g >= 0, axis=1)
     assert good.sum() > 20 and f[good, 0].min() >= ideal.objectives["mass"]
 
@@ -137,7 +137,7 @@ def test_binding_limits_are_why_it_is_no_lighter(robot, asked, found):
         and found.options.cells[choice.cell[k]] == ideal.cell and choice.in_series[k] == ideal.in_series
     )  # fmt: skip
     x = np.log([[ideal.ratio, ideal.radius, ideal.parallel * 0.97]])
-    assert design_search.measured(of, choice, np.array([row]), x)[1].min() < 0
+    assert design_search.evaluate_designs(of, choice, np.array([row]), x)[1].min() < 0
 
 
 @pytest.mark.slow
@@ -150,7 +150,7 @@ def test_margins_are_differentiable(robot, asked, found):
 
     @jax.jit
     def margins(x):
-        objectives, g = evaluate(of, type(design)(x, design.drive, design.cell, design.cells))
+        objectives, g = evaluate_design(of, type(design)(x, design.drive, design.cell, design.cells))
         return jnp.concatenate([objectives[:2], g])
 
     exact = np.asarray(jax.jacrev(margins)(jnp.asarray(x[0])))
@@ -162,9 +162,9 @@ def test_margins_are_differentiable(robot, asked, found):
 
 def test_paper_parts_make_the_papers_robot(robot, asked):
     """Its own motor, gearbox, ratio, radius and cells give back its numbers; the sheet's where the paper's are others."""
-    chosen = options(robot)
-    of = task(robot, asked, chosen)
-    choice = design_search.space(robot, of, chosen)
+    chosen = options_for_robot(robot)
+    of = sizing_task(robot, asked, chosen)
+    choice = design_search.choice_space(robot, of, chosen)
     name = next(
         d for d in range(len(chosen.drives)) if chosen.drives[d].motor.name == MOTOR and chosen.drives[d].stages == 2
     )
@@ -173,9 +173,9 @@ def test_paper_parts_make_the_papers_robot(robot, asked):
     )
     x = np.log([[48.0, float(robot.chassis(0).radius), 1.0]])
     design = jax.tree.map(lambda v: v[0], choice.designs(np.array([row]), x))
-    made, _ = build(of.robot, of.base_mass, of.configuration, design)
-    own = {p.name: float(p.value) for p in params.walk(robot)}
-    other = {p.name: float(p.value) for p in params.walk(made)}
+    made, _ = build_robot(of.robot, of.base_mass, of.configuration, design)
+    own = {p.name: float(p.value) for p in params.walk_parameters(robot)}
+    other = {p.name: float(p.value) for p in params.walk_parameters(made)}
     assert {n for n in own if not math.isclose(own[n], other[n], rel_tol=1e-9)} == set()
 
 
@@ -221,11 +221,11 @@ def test_report_shows_designs_and_what_binds_where(folder):
 @pytest.mark.slow
 def test_chart_has_the_limits_of_the_robot(robot, asked):
     """On the bench's surface adhesion ends at 14.6°; the required speed counts within its envelope alone."""
-    of = chart.chart(robot, requirements_file.read("speed_m_s = 0.1", "r.toml"), (8.0, 30.0))
+    of = chart.margin_chart(robot, requirements_file.read("speed_m_s = 0.1", "r.toml"), (8.0, 30.0))
     steep = of.slope > 14.6
     assert np.all(of.margin[steep] < 0) and chart.LIMITS[of.nearest[-1, 0]] in ("adhesion", "gearbox input speed")
     assert of.margin.shape == (chart.POINTS, chart.POINTS) and np.isfinite(of.margin).all()
-    payload, slope = chart.extent(asked)
+    payload, slope = chart.chart_extent(asked)
     assert payload == pytest.approx(1.6 * 8) and slope == pytest.approx(16)
 
 
@@ -234,11 +234,11 @@ def test_what_no_parts_meet_is_left_out_and_said(robot):
     asked = requirements_file.read(
         "speed_m_s = 0.5\nslope_deg = 20\n[envelope]\nstate_of_charge = [0.1, 1]", "r.toml"
     )
-    found = design_search.size(robot, asked, ("mass",), starts=32, motors=(MOTOR,))
+    found = design_search.size_robot(robot, asked, ("mass",), starts=32, motors=(MOTOR,))
     assert found.unmeetable == ("steepest slope held",) and found.best is not None
     assert [verdict(f, found.unmeetable) for f in (found.best, *found.motors.values())] == ["meets the others"] * 2
     assert verdict(found.best, ()) == "meets"
-    assert set(found.motors) == {MOTOR} and len(drives((MOTOR,))) == 3
+    assert set(found.motors) == {MOTOR} and len(drive_options((MOTOR,))) == 3
 
 
 @pytest.mark.slow
@@ -246,7 +246,7 @@ def test_step_that_is_asked_for_decides_the_design(robot):
     """Smaller pulleys stand on higher steps: 290 mm without payload takes 3/4 of the robot's, with which it does 270."""
     text = "speed_m_s = 0.5\nstep_mm = { least = 290, payload_kg = 0 }\n[envelope]\nstate_of_charge = [0.1, 1]"
     asked = requirements_file.read(text, "r.toml")
-    best = design_search.size(robot, asked, ("mass",), starts=32, motors=(MOTOR,)).best
+    best = design_search.size_robot(robot, asked, ("mass",), starts=32, motors=(MOTOR,)).best
     meets(best, asked)
     assert 0.6 <= best.radius / float(robot.radius_pulley) < 0.75
 
@@ -256,7 +256,9 @@ def test_step_that_is_asked_for_decides_the_design(robot):
 def test_ratings_of_parts_are_asked_somewhere_whatever_else_is(robot, name):
     """Of a robot that only has to turn, climb or be light too."""
     limit = {"endurance_min": '{ least = 9, duty = "driving" }', "stairs_rise_mm": "{ least = 9, tread_mm = 290 }"}
-    of = task(robot, requirements_file.read(f"{name} = {limit.get(name, 9)}", "r.toml"), options(robot))
+    of = sizing_task(
+        robot, requirements_file.read(f"{name} = {limit.get(name, 9)}", "r.toml"), options_for_robot(robot)
+    )
     assert all(d.rows for d in of.demands) and {d.requirement is None for d in of.demands} == {True, False}
 
 

@@ -20,7 +20,7 @@ from calibration.discovery import setups
 from calibration.inference.noise import Noise
 from mmrjax import effects
 from mmrjax.effects import curve
-from mmrjax.effects.scaled import scaled
+from mmrjax.effects.scaled import scaled_effect
 from mmrjax.model import channels, paper_robots
 from sweeps import stage_files
 from sweeps.store import RunFolder
@@ -76,13 +76,13 @@ def test_arrays_on_devices_keep_what_programs_are_compiled_for(tmp_path):
 
 def test_our_own_classes_come_back_by_name(tmp_path):
     robot = paper_robots.nominal()
-    strong = scaled(effects.BY_NAME["iron_loss"], (2.0, 1.0, 3.0))
+    strong = scaled_effect(effects.BY_NAME["iron_loss"], (2.0, 1.0, 3.0))
     robot = dataclasses.replace(robot, effects=(strong(), next(iter(curve.CURVES.values()))()))
-    now = again(tmp_path, (robot, Noise, channels.find("speed"), setups.blocked, records.read("measured")))
+    now = again(tmp_path, (robot, Noise, channels.find_channel("speed"), setups.blocked, records.read("measured")))
     assert jax.tree.structure(now[0]) == jax.tree.structure(robot)
     assert all(map(np.array_equal, jax.tree.leaves(now[0]), jax.tree.leaves(robot)))
     assert type(now[0].effects[0]) is strong
-    assert now[1] is Noise and now[2] is channels.find("speed") and now[3] is setups.blocked
+    assert now[1] is Noise and now[2] is channels.find_channel("speed") and now[3] is setups.blocked
     assert list(now[4].columns) == list(records.read("measured").columns)
 
 

@@ -13,26 +13,26 @@ from synthetic import SETTLED, STATED, Analyst, table
 from worlds import histories, laws, settled, tables
 
 from calibration.discovery import discover
-from calibration.discovery.candidates import Candidate, filled, fit_candidates, start
-from calibration.discovery.discrepancy import locate
+from calibration.discovery.candidates import Candidate, fill_slots, fit_candidates, start_of_fit
+from calibration.discovery.discrepancy import locate_discrepancy
 from calibration.discovery.loop_notes import CurveOver, NameSupport, NameTest
 from calibration.discovery.projection import Projection
 from calibration.discovery.score_tests import augment_with_columns
-from calibration.discovery.search import Search, diagnose
+from calibration.discovery.search import Search, diagnose_candidate
 from calibration.discovery.settings import WITHOUT_NAME, settings_for
-from calibration.discovery.smooth import FALL, LENGTHS, PRODUCT, SIZES, WIDE, smooth, surface
+from calibration.discovery.smooth import FALL, LENGTHS, PRODUCT, SIZES, WIDE, smooth_curve, smooth_surface
 from calibration.discovery.standing import (
     _chosen_again,
     _curves,
+    _deficient_equations,
     _evidence_over_curves,
-    _lacks,
     _root,
     _varies_most,
     _weakest_run,
     cost_of_names,
-    equation,
+    equation_of_place,
     evidence_of_names,
-    standing,
+    judge_names,
 )
 from calibration.inference import bases
 from calibration.inference.linearization import PROBED
@@ -75,8 +75,8 @@ def gained(toy, columns):
 
 
 def test_evidence_of_a_curve_is_the_largest_marginal_likelihood(toy):
-    found = smooth(toy.linear, "track", "speed_motor", toy.counts)
-    raw = bases.signature(toy.linear, "track", found.basis(toy.linear.variable("speed_motor")))
+    found = smooth_curve(toy.linear, "track", "speed_motor", toy.counts)
+    raw = bases.place_signature(toy.linear, "track", found.basis(toy.linear.variable("speed_motor")))
     assert found.evidence == pytest.approx(gained(toy, found.scale * raw @ found.root), rel=1e-6)
     # no other prior that is tried makes the readings more likely
     distance = np.subtract.outer(np.arange(6), np.arange(6))
@@ -87,7 +87,7 @@ def test_evidence_of_a_curve_is_the_largest_marginal_likelihood(toy):
         root = np.linalg.cholesky(prior + 1e-6 * np.eye(6))
         scale = size / np.sqrt(np.diag(a).max())
         assert gained(toy, scale * raw @ root) < found.evidence + 1e-6
-    others = [smooth(toy.linear, *at, toy.counts) for at in (("slip", "slope"), ("track", "slope"))]
+    others = [smooth_curve(toy.linear, *at, toy.counts) for at in (("slip", "slope"), ("track", "slope"))]
     assert found.evidence > 1.5 * max(o.evidence for o in others) > 0  # what is missing is where it is
 
 
@@ -95,7 +95,7 @@ def test_a_curve_of_rows_in_mirror_image_is_the_same(toy):
     way = np.where(np.arange(toy.rows) % 2, 1.0, -1.0)
     signals = SimpleNamespace(speed_motor=way * toy.linear.signals.speed_motor, direction=way)
     turned = dataclasses.replace(toy.linear, defects=toy.linear.defects * way[:, None], signals=signals)
-    found, wanted = (smooth(linear, "track", "speed_motor", toy.counts) for linear in (turned, toy.linear))
+    found, wanted = (smooth_curve(linear, "track", "speed_motor", toy.counts) for linear in (turned, toy.linear))
     assert (found.low, found.high) == (wanted.low, wanted.high) and wanted.evidence > 10
     assert found.evidence == pytest.approx(wanted.evidence, rel=1e-9)
 
@@ -121,7 +121,7 @@ def test_a_wave_is_weighed_as_curves_are_and_said_where_it_is_the_better_one(toy
 
     scores = SimpleNamespace(curve=np.array([9.0, 5.0, 8.5]), explained=np.array([90.0, 50.0, 80.0]))
     left = SimpleNamespace(scores=scores, linear=linear)
-    where = locate(left, (SimpleNamespace(names=offered),), toy.counts)
+    where = locate_discrepancy(left, (SimpleNamespace(names=offered),), toy.counts)
     assert (where.place, where.variable) == ("track", order)
 
 
@@ -145,7 +145,7 @@ def test_a_constant_is_weighed_against_waves_of_which_runs_show_a_piece(law, nam
     angle = np.concatenate([(0.6 + 0.4 * k) * np.sin(np.pi * t) ** 2 for k in range(3)])
     speed = np.concatenate([(0.6 + 0.4 * k) * np.pi * np.sin(2 * np.pi * t) for k in range(3)])
     rows, n = np.arange(3 * samples).reshape(3, samples), 3 * samples
-    waves = bases.waves(np.zeros(n, bool), angle, rows, rows)
+    waves = bases.wave_families(np.zeros(n, bool), angle, rows, rows)
     only = np.array([1.0, 0.0, 0.0])
     defects = np.zeros((len(PROBED), n, 3))
     defects[PROBED.index("track")] = only
@@ -183,14 +183,14 @@ def test_a_constant_is_weighed_against_waves_of_which_runs_show_a_piece(law, nam
 
 
 def test_evidence_of_a_surface_is_the_largest_marginal_likelihood(toy):
-    found = surface(toy.linear, "track", ("speed_motor", "slope"), toy.counts, Projection(toy.linear))
+    found = smooth_surface(toy.linear, "track", ("speed_motor", "slope"), toy.counts, Projection(toy.linear))
     assert found.evidence == pytest.approx(gained(toy, found.columns), rel=1e-6)
     sides = []
     for name in ("speed_motor", "slope"):
         x = toy.linear.variable(name)
         x = 2 * (x - x.min()) / np.ptp(x) - 1
         sides.append(legendre.legvander(x, PRODUCT - 1) * np.exp(-FALL * np.arange(PRODUCT)))
-    raw = bases.signature(toy.linear, "track", np.einsum("ri,rj->rij", *sides).reshape(toy.rows, -1))
+    raw = bases.place_signature(toy.linear, "track", np.einsum("ri,rj->rij", *sides).reshape(toy.rows, -1))
     ratio = found.columns[:, 0] / raw[:, 0]
     np.testing.assert_allclose(found.columns, ratio[0] * raw, rtol=1e-9)
     for factor in (0.3, 0.6, 1.7, 3.0):
@@ -211,7 +211,7 @@ def test_evidence_of_a_name_is_its_marginal_likelihood_less_what_was_searched(to
     """Of one effect among a library of twelve; the prior of its amplitude is standard normal, or where the data have
     it far smaller, of the size that they find most likely."""
     over = np.sin(toy.linear.variable("speed_motor") / 120)[:, None]
-    column = scale * bases.signature(toy.linear, "track", over)
+    column = scale * bases.place_signature(toy.linear, "track", over)
     whole = np.concatenate([toy.slopes, column], 1)
     posterior = np.linalg.inv(whole.T @ whole + np.eye(5))
 
@@ -256,7 +256,7 @@ def test_cost_of_names_grows_with_the_library_and_their_number():
 def test_effect_and_curve_pay_for_what_was_searched_in_their_equation(monkeypatch):
     """Of a library of twelve effects three are of the track's equation, of seven curves two."""
     places = ["track"] * 2 + ["gearbox", "motor"] + ["electrical"] * 8
-    assert [equation(p) for p in places[:4]] == [equation("track")] * 4
+    assert [equation_of_place(p) for p in places[:4]] == [equation_of_place("track")] * 4
 
     class Library(tuple):
         names = property(lambda self: [f"e{i}" for i in range(len(self))])
@@ -272,7 +272,7 @@ def test_effect_and_curve_pay_for_what_was_searched_in_their_equation(monkeypatc
     monkeypatch.setattr("calibration.discovery.standing._curves", lambda *_: curves)
     without = dataclasses.replace(best, cost=best.cost + 20.0)
     found = _evidence_over_curves(space, best, without, "e0", None, (), settings)
-    own = sum(equation(p) == equation("track") for p in places)
+    own = sum(equation_of_place(p) == equation_of_place("track") for p in places)
     of_effect = 2 * 20.0 + 2 * math.log(0.1) - 2 * math.log(own)
     assert found == pytest.approx(of_effect - (7.0 - 2 * math.log(2)), rel=1e-12)
 
@@ -372,7 +372,9 @@ def test_amplitude_that_changes_with_a_variable_is_seen_and_one_that_does_not_is
 
 @pytest.mark.parametrize(("single", "lacks"), [(3.4, {"slip"}), (5.0, {"slip", "track"})])
 def test_what_is_left_lies_where_its_curve_and_where_its_strongest_effect_would(monkeypatch, single, lacks):
-    monkeypatch.setattr("calibration.discovery.standing.locate", lambda *a: SimpleNamespace(place="speed"))
+    monkeypatch.setattr(
+        "calibration.discovery.standing.locate_discrepancy", lambda *a: SimpleNamespace(place="speed")
+    )
 
     class Library(SimpleNamespace):
         def __getitem__(self, name):
@@ -384,9 +386,9 @@ def test_what_is_left_lies_where_its_curve_and_where_its_strongest_effect_would(
     space = SimpleNamespace(included=None, library=Library(names=("a", "b"), of=np.array([0, 1, 1])))
     test = SimpleNamespace(rejected_with_margin=True, beyond_doubt=lambda kind: single > 3.7)
     seen = SimpleNamespace(test=test, scores=SimpleNamespace(single=np.array([1.0, 0.0, -single])))
-    assert _lacks(space, seen, ()) == lacks
+    assert _deficient_equations(space, seen, ()) == lacks
     test.rejected_with_margin = False
-    assert _lacks(space, seen, ()) == set()
+    assert _deficient_equations(space, seen, ()) == set()
 
 
 def test_effect_has_to_be_the_strongest_again_without_blocks_that_leave_half_of_it(toy):
@@ -422,7 +424,7 @@ def test_effect_has_to_be_the_strongest_again_without_blocks_that_leave_half_of_
 
 def candidate_of(*effects):
     return Candidate(
-        filled(effects, SETTLED.settings), np.zeros(12), np.ones(12), 0.0, *[np.zeros(4)] * 2, True, True, True
+        fill_slots(effects, SETTLED.settings), np.zeros(12), np.ones(12), 0.0, *[np.zeros(4)] * 2, True, True, True
     )
 
 
@@ -453,23 +455,25 @@ def test_model_holds_what_is_established_and_what_predicts(monkeypatch, adequate
         tests = [NameTest(e, 9.0 if e in established else 1.0, 3.0, (), evidence.get(e, 0.0)) for e in those.effects]
         return NameSupport(bool(established), "beside", tests=tuple(tests))
 
-    monkeypatch.setattr(discover, "standing", judged)
-    monkeypatch.setattr(discover.prediction, "smallest", lambda *a: few)
-    monkeypatch.setattr(discover, "diagnose", lambda *a: seen)
-    monkeypatch.setattr(discover, "start", lambda *a: None)
+    monkeypatch.setattr(discover, "judge_names", judged)
+    monkeypatch.setattr(discover.prediction, "smallest_predictive_set", lambda *a: few)
+    monkeypatch.setattr(discover, "diagnose_candidate", lambda *a: seen)
+    monkeypatch.setattr(discover, "start_of_fit", lambda *a: None)
     monkeypatch.setattr(
         discover,
         "fit_candidates",
         lambda space, wanted, settings: [candidate_of(*(n for n in w if n)) for w, _ in wanted],
     )
-    monkeypatch.setattr(discover.blocks_room, "predictable", lambda *a: {"slope": {"0": np.ones(3, bool)}})
+    monkeypatch.setattr(discover.blocks_room, "predictable_blocks", lambda *a: {"slope": {"0": np.ones(3, bool)}})
     bare = SimpleNamespace(observe=SimpleNamespace(long=False, blocks=("slope",)))
     screened = SimpleNamespace(
         base=SimpleNamespace(candidate=candidate_of(), space=SimpleNamespace(bare=bare)), bases=()
     )
     left = SimpleNamespace(test=SimpleNamespace(null=None), scores=None)
     searched = Search((candidate_of("a"), candidate_of("b"), best), best, seen)
-    found, _, stood = discover.choose(None, screened, left, searched, SETTLED.settings, lambda note: None, None, None)
+    found, _, stood = discover.choose_effects(
+        None, screened, left, searched, SETTLED.settings, lambda note: None, None, None
+    )
     assert (None if found is None else tuple(sorted(found[0].effects))) == model
     assert asked == [best.effects if adequate or few is None else few.effects]
     if found is not None:
@@ -504,11 +508,11 @@ def stood(analyst, runs, effects):
     screened = analyst.screened(runs)
     space, base, bases = screened.base.space, screened.base.candidate, screened.bases
     left = discover.diagnosis_of_base(screened, analyst.settings)
-    active = filled(effects, analyst.settings)
-    first = start(space, base, active, analyst.settings, left.scores)
+    active = fill_slots(effects, analyst.settings)
+    first = start_of_fit(space, base, active, analyst.settings, left.scores)
     (best,) = fit_candidates(space, [(active, first)], analyst.settings)
-    after = diagnose(space, best, bases, left.test.null, analyst.settings)
-    return standing(space, base, Search((best,), best, after), left, bases, analyst.settings), best, after
+    after = diagnose_candidate(space, best, bases, left.test.null, analyst.settings)
+    return judge_names(space, base, Search((best,), best, after), left, bases, analyst.settings), best, after
 
 
 @pytest.mark.nightly

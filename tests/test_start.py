@@ -12,7 +12,7 @@ import pytest
 from worlds import paper
 
 from mmrjax.fidelities import start_stages
-from mmrjax.fidelities.base import History, as_tables
+from mmrjax.fidelities.base import History, in_table_time
 from mmrjax.model import paper_robots
 from mmrjax.model.params import replace
 from mmrjax.model.quantities import MM
@@ -105,12 +105,12 @@ def test_stages_are_seen_through_the_ripple_of_a_running_gear():
     rolled = 1 - np.exp(-t / 0.003)
     gone = np.minimum(2 * t, 0.99)
     swing = 0.03 * np.cos(2 * np.pi * t / 0.035)
-    even = start_stages.stages(t, gone, rolled, rolled - gone, V_S, 0.035)
-    uneven = start_stages.stages(t, gone + swing, rolled, rolled - gone - swing, V_S, 0.035)
+    even = start_stages.stages_of_start(t, gone, rolled, rolled - gone, V_S, 0.035)
+    uneven = start_stages.stages_of_start(t, gone + swing, rolled, rolled - gone - swing, V_S, 0.035)
     assert uneven.slipping == pytest.approx(even.slipping, abs=0.012) and 0.47 < uneven.slipping < 0.51
     assert uneven.settled == pytest.approx(even.settled, abs=0.02)
     assert uneven.slip == pytest.approx(even.slip, abs=0.01)
-    blind = start_stages.stages(t, gone + swing, rolled, rolled - gone - swing, V_S)
+    blind = start_stages.stages_of_start(t, gone + swing, rolled, rolled - gone - swing, V_S)
     assert blind.slipping > 1.4 and blind.settled > 1.4
 
 
@@ -165,7 +165,7 @@ def test_a_delay_that_is_none_changes_no_number():
 def test_what_a_delay_moves_is_moved_by_one_program(compilations):
     t = jnp.asarray(np.linspace(0, 1, 6)[None])
     values = {str(k): t + k for k in range(30)}
-    _, late = as_tables(Rig(delay=0.1), t, values)
+    _, late = in_table_time(Rig(delay=0.1), t, values)
     assert len(compilations) < 10
     np.testing.assert_allclose(late["7"][0, 2:], t[0, 2:] + 7)
 

@@ -69,7 +69,7 @@ def test_a_calibration_frees_what_its_rig_states(tmp_path, monkeypatch):
         asked.extend(names)
         raise InterruptedError  # what follows is the search
 
-    monkeypatch.setattr(priors, "coordinates", chosen)
+    monkeypatch.setattr(priors, "parameter_coordinates", chosen)
     with pytest.raises(InterruptedError):
         calibrate(runs, robot)
     stated = {world.rig.public(name) for name in world.rig.tolerances}
@@ -80,12 +80,12 @@ def test_a_calibration_frees_what_its_rig_states(tmp_path, monkeypatch):
 def test_a_prior_is_shown_as_it_is_stated(tmp_path):
     robot = bench(tmp_path)
     names = ("motor.friction_coulomb", "motor.resistance")
-    sds = priors.coordinates(robot, names).prior_sd
+    sds = priors.parameter_coordinates(robot, names).prior_sd
     assert sds == pytest.approx([0.002, 0.06])  # the slope of the log-normal one is 0.0019
     (tmp_path / "runs.csv").write_text(
         "supply_voltage_V,total_current_A,motor_speed_rpm\n12,2.0,1600\n24,2.1,3900\n", encoding="utf-8"
     )
-    seen = foresight.foresee(records.read(tmp_path / "runs.csv", robot=robot), robot)
+    seen = foresight.predict_identifiability(records.read(tmp_path / "runs.csv", robot=robot), robot)
     assert {p.name: p.prior_sd for p in seen.parameters}[names[0]] == pytest.approx(0.002)
 
 
@@ -94,12 +94,12 @@ def test_nothing_to_fit_is_not_put_down_to_an_option_that_nobody_gave(tmp_path):
         tmp_path, lambda text: text.replace('"1.2 ± 5 %"', "1.2").replace("loss_coulomb = 0.1", "loss_coulomb = 0.0")
     )
     with pytest.raises(
-        BadConfiguration, match=r"^no parameter to fit: every loss .* state what is not known"
+        BadConfiguration, match=r"^no parameter to fit: every loss .* give unknown values one"
     ) as error:
-        priors.choose(robot, ())
+        priors.choose_free_names(robot, ())
     assert "--fix" not in str(error.value)
     with pytest.raises(BadConfiguration, match="--fix leaves no parameter to fit"):
-        priors.choose(robot, ("motor.resistance",), fix=("motor.resistance",))
+        priors.choose_free_names(robot, ("motor.resistance",), fix=("motor.resistance",))
 
 
 def test_a_width_of_the_programs_is_said(tmp_path, mmrjax):

@@ -10,7 +10,7 @@ from worlds import laws, settled, tables
 
 from calibration.discovery import discover, findings
 from calibration.discovery.loop_notes import FreedValue
-from calibration.discovery.stated_values import scores, shifts
+from calibration.discovery.stated_values import find_prior_shifts, prior_shift_scores
 from sweeps.report.words import loop_words as words
 
 NOMINAL = settled.CLIMBING["motor.resistance"]
@@ -45,7 +45,7 @@ def refitted(toy, without=()):
 
 
 def test_scores_are_falls_of_chi2_without_a_prior(toy):
-    explained, values = scores(toy.jacobian, toy.residual)
+    explained, values = prior_shift_scores(toy.jacobian, toy.residual)
     whole, _ = refitted(toy)
     for k in range(4):
         without, z = refitted(toy, [k])
@@ -55,7 +55,7 @@ def test_scores_are_falls_of_chi2_without_a_prior(toy):
 
 
 def test_a_coordinate_that_nothing_shows_cannot_be_the_wrong_one(toy):
-    explained, values = scores(toy.jacobian, toy.residual)
+    explained, values = prior_shift_scores(toy.jacobian, toy.residual)
     assert explained[4] == values[4] == 0.0
 
 
@@ -94,7 +94,7 @@ def test_resistance_freed_of_its_prior_is_the_right_one(wrong, truth, looks):
     analyst, grid = looks
     runs = made(**wrong, grid=grid)
     fitted = analyst.base(runs)
-    found = {s.name: s for s in shifts(fitted.space, fitted.candidate, NEEDED, analyst.settings)}
+    found = {s.name: s for s in find_prior_shifts(fitted.space, fitted.candidate, NEEDED, analyst.settings)}
     assert "motor.resistance" in found
     shift = found["motor.resistance"]
     said = findings._stated(fitted.space, fitted.candidate, shift)
@@ -112,7 +112,7 @@ def test_resistance_freed_of_its_prior_is_the_right_one(wrong, truth, looks):
 def test_nothing_is_shifted_where_the_sheet_is_right(looks):
     analyst, grid = looks
     fitted = analyst.base(made(grid=grid))
-    assert shifts(fitted.space, fitted.candidate, NEEDED, analyst.settings) == []
+    assert find_prior_shifts(fitted.space, fitted.candidate, NEEDED, analyst.settings) == []
 
 
 def test_verdict_lists_the_resistance_that_may_be_wrong(looks):
@@ -121,6 +121,6 @@ def test_verdict_lists_the_resistance_that_may_be_wrong(looks):
     assert found.verdict == "class"
     (members,), (stated,) = found.alike.members, found.alike.stated
     assert "series_resistance" in members and [s.name for s in stated] == ["motor.resistance"]
-    (missing,) = discover.summary(found, np.arange(1, 100)).missing
+    (missing,) = discover.verdict_summary(found, np.arange(1, 100)).missing
     (value,) = missing.values
     assert missing.names == members and value.name == "motor.resistance" and f"{value.value:.1f}" == "1.4"

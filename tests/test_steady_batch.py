@@ -18,7 +18,7 @@ from mmrjax.model.conditions import Conditions
 from mmrjax.model.signals import STATUSES
 
 EFFECTS = {"series_resistance": 0.3, "churning": 5e-4, "winding_heating": 1.0, "nonlinear_slip": 0.05}
-ALL = tuple(output.name for output in outputs.table(channels.usual()))
+ALL = tuple(output.name for output in outputs.output_table(channels.usual_channels()))
 #: Driving, sliding, stalled and overhauling in one batch, in both configurations.
 MIXED = dict(
     voltage=[24.0, 33.0, 0.5, 24.0, 15.0, 24.0],
@@ -84,7 +84,7 @@ def test_steady_outputs_are_those_of_steady_batch(robot, effects):
         "converged", "slides", "stalled", "converged", "converged", "failed",
     ]  # fmt: skip
     found = steady_outputs(robot, runs, (*ALL, "status", "flags"))
-    for output in outputs.table(channels.usual()):
+    for output in outputs.output_table(channels.usual_channels()):
         np.testing.assert_allclose(found[output.name], output.get(whole), rtol=1e-13, err_msg=output.name)
     np.testing.assert_array_equal(found["status"], whole.status)
     np.testing.assert_array_equal(found["flags"], whole.flags)
@@ -149,7 +149,7 @@ WANTED = ("total_current", "speed", "efficiency_chassis")
 @pytest.mark.parametrize("effects", [False, True])
 def test_derivatives_in_reverse_are_those_forward(robot, effects):
     robot, runs = with_effects(robot) if effects else robot, Conditions(**MIXED)
-    at = jnp.asarray([p.value for name in PARAMETERS for p in params.walk(robot) if p.name == name])
+    at = jnp.asarray([p.value for name in PARAMETERS for p in params.walk_parameters(robot) if p.name == name])
 
     def numbers(x):
         return steady_outputs(params.replace(robot, dict(zip(PARAMETERS, x, strict=True))), runs, WANTED)

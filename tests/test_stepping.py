@@ -14,7 +14,7 @@ import mmrjax as mm
 from mmrjax import fidelities
 from mmrjax.effects import BY_NAME
 from mmrjax.fidelities import drive
-from mmrjax.fidelities.drive import rates as rates_of_unknowns
+from mmrjax.fidelities.drive import drive_rates as rates_of_unknowns
 from mmrjax.model import paper_robots
 from mmrjax.model.robot import Configurations
 from mmrjax.model.shaft import Shaft
@@ -31,7 +31,7 @@ RUNS = {
 def bench():
     """A motor that lifts a mass on a drum, and is not known further."""
     drum = Shaft(inertia=2e-3, loss_coulomb=0.02, torque_gravity=0.1)
-    robot = paper_robots.blank(Configurations({"winch": drum}), sides=1.0)
+    robot = paper_robots.blank_robot(Configurations({"winch": drum}), sides=1.0)
     motor = {"motor.resistance": 2.0, "motor.torque_constant": 0.05, "motor.inertia": 1e-5, "gearbox.ratio": 10.0}
     return mm.replace(robot, {**motor, "motor.inductance": 1e-3})
 
@@ -44,9 +44,9 @@ def test_states_hold_numbers_in_si_units_and_rates_are_those_of_drive(robot):
         state = dataclasses.replace(at_rest, current=3.0, speed_motor=500.0, speed=0.4, distance=1.5)
         found = mm.rates(one, state, None, conditions)
         assert jax.tree.structure(found) == jax.tree.structure(at_rest)
-        sizes = jnp.asarray(drive.units(one))
+        sizes = jnp.asarray(drive.drive_units(one))
         y = jnp.stack([jnp.asarray(x, float) for x in (3.0, 500.0, 0.4, 1.5, 0.0, *state.memory.values())]) / sizes
-        wanted = drive.state_of(one, rates_of_unknowns(one, conditions, y))
+        wanted = drive.state_of_unknowns(one, rates_of_unknowns(one, conditions, y))
         assert float(found.distance) == 0.4 and float(found.current) != 0
         for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
             np.testing.assert_allclose(a, b, rtol=1e-12)
@@ -196,7 +196,7 @@ REFUSED = r"derivatives are forward \(jax.jacfwd, jax.jvp\); for jax.grad use mo
 
 def test_reverse_mode_is_refused_in_a_sentence_where_a_fidelity_has_none(monkeypatch):
     assert reverse("steady").shape == ()
-    forward_alone = dataclasses.replace(fidelities.facts("steady"), reverse=False)
+    forward_alone = dataclasses.replace(fidelities.fidelity_facts("steady"), reverse=False)
     monkeypatch.setitem(fidelities.TABLE, "steady", forward_alone)
     with pytest.raises(RuntimeError, match=f"^steady: {REFUSED}"):
         reverse("steady")
@@ -205,7 +205,7 @@ def test_reverse_mode_is_refused_in_a_sentence_where_a_fidelity_has_none(monkeyp
 @pytest.mark.slow
 @pytest.mark.parametrize("model", ["drive", "track"])
 def test_fidelities_have_reverse_mode_as_they_state(model):
-    if fidelities.facts(model).reverse:
+    if fidelities.fidelity_facts(model).reverse:
         assert reverse(model, duration=0.002).shape == ()
         return
     with pytest.raises(RuntimeError, match=f"^{model}: {REFUSED}"):

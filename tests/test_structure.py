@@ -13,7 +13,7 @@ from pathlib import Path, PurePosixPath
 
 import pytest
 
-from mmrjax.errors import counted
+from mmrjax.errors import count_noun
 from mmrjax.model import channels
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -213,9 +213,9 @@ REPRODUCTION = ("sweeps", "paper")
 SPELLED = {
     ("calibration/discovery/menu.py", "TURNING, STANDING"),
     ("sweeps/report/words/effect_words.py", "CHECKED_BY"),  # which act checks which instrument
-    ("calibration/inference/bases.py", "VARIABLES"),
+    ("calibration/data/contents.py", "MEANINGS"),  # words in the names of other people's signals
     ("calibration/inference/blocks.py", "BLOCKS"),  # what is imposed may be a channel's column
-    ("calibration/inference/observers/settled_ends.py", "_sliding"),  # the two that show slip
+    ("calibration/inference/observers/settled_ends.py", "_slides_at_end"),  # the two that show slip
 }
 
 
@@ -223,7 +223,7 @@ def channels_are_counted_in_one_place(path: PurePosixPath, tree: ast.Module) -> 
     """No literal outside the table of channels spells two or more of them."""
     if path.parts[0] == "mmrjax" or path.parts[:2] == REPRODUCTION:
         return
-    spelled = {word: c.name for c in channels.usual() for word in (c.name, c.column, c.sd_column)}
+    spelled = {word: c.name for c in channels.usual_channels() for word in (c.name, c.column, c.sd_column)}
     place, inner = places(tree), set()
     for node in walked(tree):
         if id(node) in inner or not isinstance(node, ast.Tuple | ast.List | ast.Set | ast.Dict):
@@ -290,8 +290,8 @@ def front_door_fits_nothing(path: PurePosixPath, tree: ast.Module) -> Iterator[B
 KEPT = {
     ("mmrjax/__init__.py", "globals"): "a public name, once it is imported",
     ("mmrjax/undercarriage/mjcf.py", "_template"): "pure: the topology of the track model",
-    ("mmrjax/effects/scaled.py", "scaled"): "pure: a class of a class and its factors",
-    ("mmrjax/model/params.py", "own_spec"): "pure, of hashable arguments",
+    ("mmrjax/effects/scaled.py", "scaled_effect"): "pure: a class of a class and its factors",
+    ("mmrjax/model/params.py", "rig_spec"): "pure, of hashable arguments",
     ("calibration/data/effect_file.py", "_instants"): "pure: signals of the nominal robot",
     ("calibration/data/effect_file.py", "sys.modules"): "a user's module, by a name that follows from its path",
     ("calibration/data/parts.py", "motors"): "a packaged table",
@@ -305,7 +305,7 @@ KEPT = {
         "_compiled",
     ): "a worker's compiled job, by its name; computes the same when compiled again",
     ("sweeps/points/cluster.py", "_start"): "where jax keeps programs, once a process",
-    ("mmrjax/compile/programs.py", "sources"): "a hash of the files of this program",
+    ("mmrjax/compile/programs.py", "source_hash"): "a hash of the files of this program",
     ("mmrjax/compile/programs.py", "_linear_algebra"): "lets jax find LAPACK, once a process",
     ("mmrjax/compile/programs.py", "_private"): "that a folder is private, as it is first used",
     ("sweeps/compilation_cache.py", "os.environ"): "set for jax, before it is imported",
@@ -659,14 +659,17 @@ def test_front_door_loads_nothing_heavy():
 #: What `calibrate`, `discover` and `foresee` do to a table and a robot inside, from instruments to the base fit.
 INNER = {
     "with_inferred_instruments", "with_surface_configurations", "of_surfaces", "with_table_mass",
-    "with_initial_states", "with_begins", "check_start", "inferred", "library_for", "settings_for", "without_copies",
-    "pose", "fit_base", "trace",
+    "with_initial_states", "measure_initial_states", "check_start", "infer_noise", "library_of_size", "settings_for",
+    "without_copies", "pose", "pose_problem", "pose_candidates", "fit_base", "trace",
 }  # fmt: skip
 #: Campaigns and notebooks that call a part of that all the same, and why.
 CALLED: dict[tuple[str, str], str] = {
-    ("loop_baselines", "pose"): "other ways to select effects, on the loop's own problem after its own preparation",
+    (
+        "loop_baselines",
+        "pose_candidates",
+    ): "other ways to select effects, on the loop's own problem after its own preparation",
     ("loop_baselines", "fit_base"): "the same",
-    ("loop_findings", "pose"): "further runs, read by fits that the loop made after its own preparation",
+    ("loop_findings", "pose_candidates"): "further runs, read by fits that the loop made after its own preparation",
     ("track_table", "pose"): "a function of its own by that name: rows of the paper through a resolved running gear",
     ("track_table", "with_table_mass"): "the same rows, searched by members and not by `calibrate`",
 }
@@ -686,11 +689,11 @@ def test_modules_have_base_names_of_their_own():
 
 
 def inner_calls(source: str) -> Iterator[tuple[int, str]]:
-    """Calls of `INNER` functions in a module, but of methods of what `prepared` gives."""
+    """Calls of `INNER` functions in a module, but of methods of what `prepare_loop` gives."""
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Call) and getattr(node.func, "attr", getattr(node.func, "id", "")) in INNER:
             whose, _, name = ast.unparse(node.func).rpartition(".")
-            prepared = whose == "given" or whose.startswith("prepared(")
+            prepared = whose == "given" or whose.startswith("prepare_loop(")
             if not (name == "trace" and prepared):
                 yield node.lineno, name
 
@@ -707,16 +710,18 @@ def test_campaigns_and_notebooks_take_the_way_of_users():
     }
     assert found == set(CALLED)
     shared = dict.fromkeys(("loop", "loop_series", "rigs", "rig_logs"), "campaign.looped")  # which takes the one way
-    ways = shared | {"loop_baselines": "campaign.begun", "campaign": "calibration.discovery.discover.prepared"}
+    ways = shared | {"loop_baselines": "campaign.begun", "campaign": "calibration.discovery.discover.prepare_loop"}
     for campaign, name in ways.items():
         tree = ast.parse((ROOT / f"benchmarks/{campaign}.py").read_text(encoding="utf-8"))
         assert name in {imported for imported, _ in names_imported(tree, "")}, campaign
 
 
 def test_a_campaign_of_its_own_way_is_found():
-    bad = "space = pose(runs, robot)\nfound = discover.trace(runs, robot)\nnoise.inferred(runs)"
-    assert [name for _, name in inner_calls(bad)] == ["pose", "trace", "inferred"]
-    assert not [*inner_calls("given = prepared(runs, robot)\ngiven.trace()\nprepared(runs).trace()\ncalibrate(runs)")]
+    bad = "space = pose(runs, robot)\nfound = discover.trace(runs, robot)\nnoise.infer_noise(runs)"
+    assert [name for _, name in inner_calls(bad)] == ["pose", "trace", "infer_noise"]
+    assert not [
+        *inner_calls("given = prepare_loop(runs, robot)\ngiven.trace()\nprepare_loop(runs).trace()\ncalibrate(runs)")
+    ]
 
 
 def test_one_preparation_serves_all():
@@ -838,8 +843,8 @@ def test_toml_is_read_in_one_place():
 
 
 def test_how_many_of_something_is_said_in_the_singular_where_it_is_one():
-    """By `errors.counted`: what is of a larger number (`3 of {n} rows`), or cannot be one, may have its plural."""
-    assert [counted(n, "row") for n in (0, 1, 2, 2000)] == ["0 rows", "1 row", "2 rows", "2,000 rows"]
+    """By `errors.count_noun`: what is of a larger number (`3 of {n} rows`), or cannot be one, may have its plural."""
+    assert [count_noun(n, "row") for n in (0, 1, 2, 2000)] == ["0 rows", "1 row", "2 rows", "2,000 rows"]
     unless, things = (
         r"(?<!of )(?<!first )(?<!--runs: got )",
         "runs|rows|cells|values|parameters|samples|lines|designs",

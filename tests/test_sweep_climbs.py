@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from calibration.data.input_errors import BadConfiguration
 from mmrjax.climbing import terrain
-from mmrjax.climbing.climb_simulation import NAMES, OVER, SLIDES, TIPS, climb_batch, still
+from mmrjax.climbing.climb_simulation import NAMES, OVER, SLIDES, TIPS, climb_batch, constant_angles
 from mmrjax.fidelities.variation import STATUS, Variation
 from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
@@ -116,8 +116,8 @@ def test_points_of_which_the_robot_varies_are_single_climbs():
     robot = params.replace(ROBOT, {"motor.resistance": 1.5})
     one = climb_batch(
         robot, Conditions(np.zeros(1, int), voltage=24.0, payload=4.0).resolved(robot),
-        jax.tree.map(lambda x: jnp.asarray(x)[None], terrain.step(0.09)),
-        jax.tree.map(lambda x: x[None], still(np.radians(50.0), 0.0 + np.pi - robot.running_gear.lever_rear)),
+        jax.tree.map(lambda x: jnp.asarray(x)[None], terrain.single_step(0.09)),
+        jax.tree.map(lambda x: x[None], constant_angles(np.radians(50.0), 0.0 + np.pi - robot.running_gear.lever_rear)),
         duration=0.5, step=2e-4, sample=climbs.SAMPLE,
     )  # fmt: skip
     alone = climbs._numbers(one)

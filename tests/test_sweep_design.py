@@ -111,13 +111,13 @@ def test_distribution_is_that_of_scipy(kind, nominal):
 
 
 def test_prior_is_the_one_of_calibrate_and_sensitivity(nominal):
-    found = {p.name: p for p in params.walk(nominal)}
+    found = {p.name: p for p in params.walk_parameters(nominal)}
     name = "6T2A.ground.friction.speed_static"
     assert found[name].spec.relative_sd is not None  # a scale
     u = np.linspace(0.01, 0.99, 99)
     for each in (name, "motor.resistance"):
         values = sampled(nominal, **{each: "prior"}).samples.marginals[each](u)
-        expected = priors.coordinates(nominal, [each]).value(stats.norm.ppf(u)[:, None])[:, 0]
+        expected = priors.parameter_coordinates(nominal, [each]).value(stats.norm.ppf(u)[:, None])[:, 0]
         np.testing.assert_allclose(values, expected, rtol=1e-14)
     median, sd = float(found[name].value), found[name].spec.prior_sd(float(found[name].value))
     quantile = sampled(nominal, **{name: "prior"}).samples.marginals[name]

@@ -17,7 +17,7 @@ UNIFORM = {"distribution": "uniform", "low": 0, "high": 8}
 @pytest.fixture
 def folder(tmp_path):
     """A run folder with the posterior of two correlated parameters of the nominal robot."""
-    value = {p.name: float(p.value) for p in params.walk(paper_robots.nominal())}
+    value = {p.name: float(p.value) for p in params.walk_parameters(paper_robots.nominal())}
     centre, none = np.array([value[n] for n in NAMES]), np.zeros(2)
     found = posteriors.Posterior(
         coordinates=NAMES, units=("Ω", "N·m"), mean=none, covariance=np.array([[1.0, 0.8], [0.8, 1.0]]), location=centre,

@@ -111,7 +111,7 @@ def test_store_is_opened_by_xarray_with_units_and_long_names(whole):
     assert units == {
         "total_current": "A", "motor_speed": "rpm", "speed": "mm/s", "status": None, "configuration": None,
         "slope_deg": "deg", "motor.resistance": "Ohm", "voltage": "V",
-    } | {"motor.resistance": next(p.spec.unit for p in params.walk(paper_robots.nominal()) if p.name == "motor.resistance")}  # fmt: skip
+    } | {"motor.resistance": next(p.spec.unit for p in params.walk_parameters(paper_robots.nominal()) if p.name == "motor.resistance")}  # fmt: skip
     assert all(found[name].attrs["long_name"] for name in units)
     meanings = dict(zip(found.status.attrs["flag_values"], found.status.attrs["flag_meanings"].split(), strict=True))
     assert [meanings[k] for k in range(len(STATUSES))] == list(STATUSES) and found.status.dtype == np.uint8

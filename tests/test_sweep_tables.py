@@ -36,7 +36,7 @@ def runs(robot):
 
 @pytest.fixture(scope="module")
 def posterior(robot):
-    value = {p.name: float(p.value) for p in params.walk(robot)}
+    value = {p.name: float(p.value) for p in params.walk_parameters(robot)}
     centre, none = np.array([value[n] for n in NAMES]), np.zeros(2)
     return Posterior(
         coordinates=NAMES, units=("ohm", "N·m"), mean=none, covariance=np.array([[1.0, 0.8], [0.8, 1.0]]), location=centre,
@@ -135,7 +135,9 @@ def test_what_takes_long_runs_in_parts_and_says_how_far_it_is(robot, runs, monke
         return honest.run(robot, conditions, options)
 
     plain, said = run.evaluate(robot, runs, chunked(2), None), []
-    monkeypatch.setitem(fidelities.TABLE, "steady", dataclasses.replace(fidelities.facts("steady"), slow=True))
+    monkeypatch.setitem(
+        fidelities.TABLE, "steady", dataclasses.replace(fidelities.fidelity_facts("steady"), slow=True)
+    )
     monkeypatch.setattr(steady, "FIDELITY", dataclasses.replace(honest, run=in_two))
     found = run.evaluate(robot, runs, chunked(2), None, said.append)
     same(found, plain, rtol=1e-12)

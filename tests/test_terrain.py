@@ -12,8 +12,8 @@ from mmrjax.model.paper_robots import nominal
 from mmrjax.undercarriage import belt
 
 NAMED = {
-    "flat": (terrain.flat(8), [(-100, 0), (100, 0)]),
-    "step": (terrain.step(0.12, size=8), [(-100, 0), (0, 0), (0, 0.12), (100, 0.12)]),
+    "flat": (terrain.flat_ground(8), [(-100, 0), (100, 0)]),
+    "step": (terrain.single_step(0.12, size=8), [(-100, 0), (0, 0), (0, 0.12), (100, 0.12)]),
     "stairs": (
         terrain.stairs(0.17, 0.29, 2, size=8),
         [(-100, 0), (0, 0), (0, 0.17), (0.29, 0.17), (0.29, 0.34), (100.29, 0.34)],
@@ -59,7 +59,7 @@ def test_signed_distance_is_that_of_brute_force_and_normal_its_gradient(name):
 
 @pytest.mark.slow
 def test_rounded_nose_is_a_circle_that_touches_riser_and_tread():
-    ground = terrain.step(0.1, nose=0.02)
+    ground = terrain.single_step(0.1, nose=0.02)
     on = np.array(
         [[-0.0, 0.05], [0.05, 0.1], *[[0.02 - 0.02 * np.cos(a), 0.08 + 0.02 * np.sin(a)] for a in (0.4, 1.2)]]
     )
@@ -77,7 +77,7 @@ def test_only_convex_corners_are_corners():
 
 @pytest.mark.slow
 def test_distance_of_points_on_an_edge_has_a_finite_derivative():
-    ground = terrain.step(0.1)
+    ground = terrain.single_step(0.1)
     slope = jax.jacfwd(lambda p: ground.distance(p[None])[0][0])(jnp.array([-0.3, 0.0]))
     assert np.isfinite(np.asarray(slope)).all()
 
@@ -87,7 +87,7 @@ def test_distance_of_points_on_an_edge_has_a_finite_derivative():
     [
         ([0, 1, 0.5], [0, 0, 0], "x falls from 1 to 0.5 m at point 3"),
         ([0], [0], "two points or more"),
-        ([0, np.nan], [0, 0], "no number"),
+        ([0, np.nan], [0, 0], "not a number"),
     ],
 )
 def test_polylines_that_are_none_are_refused(x, z, message):
@@ -117,8 +117,8 @@ def test_belt_of_equal_pulleys_is_the_main_track_of_the_track_model():
     )
     path = belt.Path(robot.radius_pulley, gear)
     place = np.concatenate([np.linspace(0, 0.23, 60), np.linspace(0.61, 0.83, 60)])  # all but the upper run's ends
-    mine = belt_loop.tips(main, jnp.asarray(place))
-    theirs = belt.tips(path, jnp.mod(jnp.asarray(place) + gear.wheelbase / 2, path.length))
+    mine = belt_loop.grouser_tips(main, jnp.asarray(place))
+    theirs = belt.tips_on_path(path, jnp.mod(jnp.asarray(place) + gear.wheelbase / 2, path.length))
     assert np.asarray(mine.at[:, 0]) - float(gear.wheelbase) / 2 == pytest.approx(
         np.asarray(theirs.forward), abs=1e-12
     )
@@ -136,5 +136,7 @@ def test_points_project_on_the_belt_where_they_came_from_and_tips_move_as_they_s
     assert np.asarray(height) == pytest.approx(0.004, abs=1e-12)
     off = np.abs(np.asarray(back - place))
     assert np.minimum(off, float(belt_.length) - off) == pytest.approx(0, abs=1e-10)
-    moved = (belt_loop.tips(belt_, place[5:-5] + 1e-7).at - belt_loop.tips(belt_, place[5:-5] - 1e-7).at) / 2e-7
-    assert np.asarray(belt_loop.tips(belt_, place[5:-5]).rate) == pytest.approx(np.asarray(moved), abs=1e-5)
+    moved = (
+        belt_loop.grouser_tips(belt_, place[5:-5] + 1e-7).at - belt_loop.grouser_tips(belt_, place[5:-5] - 1e-7).at
+    ) / 2e-7
+    assert np.asarray(belt_loop.grouser_tips(belt_, place[5:-5]).rate) == pytest.approx(np.asarray(moved), abs=1e-5)

@@ -15,7 +15,7 @@ from calibration.discovery import discover
 from calibration.inference import calibration as calibrate
 from calibration.inference import foresight
 from calibration.inference.fit_notes import Thinned
-from calibration.inference.noise import inferred
+from calibration.inference.noise import infer_noise
 from calibration.inference.observers import Histories
 from mmrjax.model import paper_robots
 from sweeps.commands import rig_check
@@ -138,7 +138,7 @@ def test_that_a_log_is_thinned_is_said():
     runs = log()
     some = thinned(runs, 100)
     said = [
-        n for x in (some, runs) for n in Histories.check(x, inferred(x, Histories.sizes(x))) if type(n) is Thinned
+        n for x in (some, runs) for n in Histories.check(x, infer_noise(x, Histories.sizes(x))) if type(n) is Thinned
     ]
     assert said == [Thinned("log.csv", len(runs), len(some))]
     assert f"{len(some)} of {len(runs)} rows" in describe(said[0])
@@ -154,7 +154,7 @@ def test_rig_check_says_how_many_rows_are_used(tmp_path, monkeypatch, capsys):
         runs = thinned(runs)
         return foresight.Foresight((), ("converged",) * len(runs), ("columns",) * len(runs.channels), (), (), robot)
 
-    monkeypatch.setattr(rig_check.foresight, "foresee", foresee)
+    monkeypatch.setattr(rig_check.foresight, "predict_identifiability", foresee)
     found = rig_check.examined(tmp_path / "rig.toml", str(tmp_path / "log.csv"))
     used = len(found.foresight.status)
     assert 0.9 * 4000 < used < 4200 < len(found.runs)
@@ -174,7 +174,11 @@ def test_python_takes_as_many_rows_as_the_command_line(monkeypatch, way, rows):
         raise InterruptedError
 
     monkeypatch.setattr(f"{room.__name__}.{before}", prepared)
-    call = {calibrate: calibrate.calibrate, discover: discover.discover, foresight: foresight.foresee}[room]
+    call = {
+        calibrate: calibrate.calibrate,
+        discover: discover.discover,
+        foresight: foresight.predict_identifiability,
+    }[room]
     with pytest.raises(InterruptedError):
         call(runs, paper_robots.nominal(), **({} if rows is None else {"rows": rows}))
     (used,) = seen

@@ -10,7 +10,7 @@ from sweeps import pages
 from sweeps.pages import figure_style, page
 from sweeps.pages.time_overlay import POINTS, time_overlay
 
-SPEED, CURRENT = channels.find("motor_speed"), channels.find("motor_current")
+SPEED, CURRENT = channels.find_channel("motor_speed"), channels.find_channel("motor_current")
 
 
 def overlay(rows=200, offset=(1.0, 5.0)):

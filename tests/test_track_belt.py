@@ -11,7 +11,7 @@ from mmrjax.model import balances, params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.signals import State
 from mmrjax.undercarriage import side_contacts
-from mmrjax.undercarriage.belt import POLYGON, Path, runs, tension_along, tips, travel
+from mmrjax.undercarriage.belt import POLYGON, Path, belt_runs, belt_travel, tension_along, tips_on_path
 from mmrjax.undercarriage.running_gear import GROUSERS, TEETH_BELT
 
 
@@ -32,8 +32,10 @@ def test_tip_rates_are_derivatives_of_its_place(path, recess):
     gear = params.replace(path.gear, {"guide_recess": jnp.asarray(recess)})
     path = Path(path.radius, gear)
     places = jnp.linspace(1e-3, 0.8391, 517)  # off the joints of the path
-    slope = jax.vmap(jax.jacfwd(lambda p: jnp.stack([tips(path, p).forward, tips(path, p).up])))(places)
-    at = tips(path, places)
+    slope = jax.vmap(jax.jacfwd(lambda p: jnp.stack([tips_on_path(path, p).forward, tips_on_path(path, p).up])))(
+        places
+    )
+    at = tips_on_path(path, places)
     np.testing.assert_allclose(slope[:, 0], at.rate_forward, atol=1e-9)
     np.testing.assert_allclose(slope[:, 1], at.rate_up, atol=1e-9)
 
@@ -41,7 +43,7 @@ def test_tip_rates_are_derivatives_of_its_place(path, recess):
 @pytest.mark.slow
 def test_tip_is_continuous_round_the_whole_path(path):
     places = jnp.linspace(0.0, path.length, 8401)
-    at = tips(path, places)
+    at = tips_on_path(path, places)
     for value in (at.forward, at.up):
         assert float(jnp.max(jnp.abs(jnp.diff(value)))) < 1.2e-4 * 1.15  # 0.1 mm of belt moves a tip this far
         assert float(value[0]) == pytest.approx(float(value[-1]), abs=1e-9)
@@ -62,8 +64,8 @@ def test_point_of_the_belt_follows_the_pulleys_by_its_weight(path):
 
 def test_mesh_is_the_swing_of_a_polygon(path):
     angle = jnp.linspace(0.0, 0.5, 400)
-    _, lever = jax.vmap(lambda a: travel(path.radius, a))(angle)
-    slope = jax.vmap(jax.grad(lambda a: travel(path.radius, a)[0]))(angle)
+    _, lever = jax.vmap(lambda a: belt_travel(path.radius, a))(angle)
+    slope = jax.vmap(jax.grad(lambda a: belt_travel(path.radius, a)[0]))(angle)
     np.testing.assert_allclose(lever, slope, rtol=1e-12)
     apothem = float(path.radius) * np.cos(np.pi / 48)
     assert float(lever.max() - lever.min()) == pytest.approx(float(path.radius) - apothem, rel=1e-3)
@@ -74,28 +76,28 @@ def test_runs_pull_as_their_energy_falls(path):
     gear = path.gear
 
     def energy(angles):
-        stretch = travel(path.radius, angles[0])[0] - travel(path.radius, angles[1])[0]
+        stretch = belt_travel(path.radius, angles[0])[0] - belt_travel(path.radius, angles[1])[0]
         p, k = gear.pretension, gear.span_stiffness
         return ((p + k * stretch) ** 2 + (p - k * stretch) ** 2) / (2 * k)
 
     angles = jnp.asarray([0.3012, 0.3])
     torque = -jax.grad(energy)(angles)
-    at = runs(path, angles, jnp.zeros(2))
+    at = belt_runs(path, angles, jnp.zeros(2))
     np.testing.assert_allclose(torque, jnp.stack([at.torque_front, at.torque_rear]), rtol=1e-9)
 
 
 def test_slack_run_pulls_nothing(path):
-    at = runs(path, jnp.asarray([0.5, 0.0]), jnp.zeros(2))
+    at = belt_runs(path, jnp.asarray([0.5, 0.0]), jnp.zeros(2))
     assert float(at.lower) == 0.0 and float(at.upper) > 100.0
 
 
 def test_centrifugal_tension_is_mass_per_length_times_speed_squared(path):
-    at = runs(path, jnp.zeros(2), jnp.full(2, 25.0))
+    at = belt_runs(path, jnp.zeros(2), jnp.full(2, 25.0))
     assert float(at.centrifugal) == pytest.approx(0.040 / 0.840 * (25.0 * float(path.radius)) ** 2)
 
 
 def test_tension_jumps_by_the_force_on_the_belt(path):
-    at = runs(path, jnp.asarray([0.301, 0.3]), jnp.zeros(2))
+    at = belt_runs(path, jnp.asarray([0.301, 0.3]), jnp.zeros(2))
     place, force = jnp.asarray([0.1, 0.2]), jnp.asarray([7.0, 11.0])
     along = tension_along(path, at, place, force, jnp.asarray([0.05, 0.15, 0.25, 0.6]))
     np.testing.assert_allclose(jnp.diff(along)[:2], [7.0, 11.0], rtol=1e-9)
@@ -116,14 +118,14 @@ def test_generalized_forces_do_the_work_of_the_contacts(path, robot, wheeled):
     q, v = _posture(path, wheeled, robot)
     run = Conditions(configuration=wheeled)
     chassis = robot.chassis(run.configuration)
-    at = side_contacts.touch(path, chassis, q, v)
-    signals = balances.begin(robot, run, State(jnp.asarray(3.0), 48 * v[3], v[0], jnp.asarray(0.0)))
+    at = side_contacts.contact_state(path, chassis, q, v)
+    signals = balances.begin_signals(robot, run, State(jnp.asarray(3.0), 48 * v[3], v[0], jnp.asarray(0.0)))
     signals = dataclasses.replace(signals, resistance=jnp.asarray(5.0), speed_slip_terms=jnp.asarray(0.0))
-    done = side_contacts.pull(path, chassis, signals, at, q[1])
+    done = side_contacts.contact_forces(path, chassis, signals, at, q[1])
     assert float(at.normal) > 10.0 and float(jnp.abs(done.traction)) > 0.1
 
     def point(q):  # of each contact in the world
-        now = side_contacts.touch(path, chassis, q, v)
+        now = side_contacts.contact_state(path, chassis, q, v)
         return q[0] + now.lever_x, q[1] + now.lever_z
 
     slope_x, slope_z = jax.jacfwd(point)(q)
@@ -145,10 +147,10 @@ def test_contact_pairs_are_720_on_tracks_and_4_on_wheels(path, robot):
         q = q.at[1].add(-1.0).at[2].set(0.0)  # under the ground, so that every contact that can bear does
         run = Conditions(configuration=wheeled)
         chassis = robot.chassis(run.configuration)
-        at = side_contacts.touch(path, chassis, q, 0 * v)
-        signals = balances.begin(robot, run, State(*(jnp.asarray(0.0) for _ in range(4))))
-        done = side_contacts.pull(path, chassis, signals, at, q[1])
-        teeth = side_contacts.reactions(path, at, done).teeth(path)
+        at = side_contacts.contact_state(path, chassis, q, 0 * v)
+        signals = balances.begin_signals(robot, run, State(*(jnp.asarray(0.0) for _ in range(4))))
+        done = side_contacts.contact_forces(path, chassis, signals, at, q[1])
+        teeth = side_contacts.inner_loads(path, at, done).teeth(path)
         ground = int(jnp.sum(at.force > 0))
         guides = sum(t.size for t in teeth) if wheeled == 0.0 else 0
         assert robot.sides * (ground + guides) == pairs
@@ -156,10 +158,10 @@ def test_contact_pairs_are_720_on_tracks_and_4_on_wheels(path, robot):
 
 def test_teeth_carry_what_the_guide_carries(path, robot):
     q, v = _posture(path, 0.0, robot)
-    at = side_contacts.touch(path, robot.configurations["6T2A"], q, v)
-    signals = balances.begin(robot, Conditions(), State(*(jnp.asarray(0.0) for _ in range(4))))
-    loads = side_contacts.reactions(
-        path, at, side_contacts.pull(path, robot.configurations["6T2A"], signals, at, q[1])
+    at = side_contacts.contact_state(path, robot.configurations["6T2A"], q, v)
+    signals = balances.begin_signals(robot, Conditions(), State(*(jnp.asarray(0.0) for _ in range(4))))
+    loads = side_contacts.inner_loads(
+        path, at, side_contacts.contact_forces(path, robot.configurations["6T2A"], signals, at, q[1])
     )
     lower, upper = loads.teeth(path)
     assert lower.shape == upper.shape == (168,)

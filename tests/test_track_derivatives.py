@@ -45,7 +45,7 @@ OUTPUTS = ("total_current", "motor_speed", "speed")
 @pytest.fixture(scope="module")
 def averages(robot):
     """Outputs and status over (relative changes of the parameters, command), not compiled."""
-    values = {p.name: p.value for p in params.walk(robot)}
+    values = {p.name: p.value for p in params.walk_parameters(robot)}
 
     def outputs(theta, run):
         changes = {}
@@ -114,10 +114,10 @@ def test_robot_at_rest_is_borne_with_exact_derivatives():
 
     def borne(payload, slope_deg, configuration):
         conditions = Conditions(configuration, voltage=24.0, slope_deg=slope_deg, payload=payload)
-        run = half_robot.system(robot, conditions, 1e-4)
+        run = half_robot.half_robot_system(robot, conditions, 1e-4)
         q = half_robot.stand(run, 0.1).q
-        at = half_robot.side_contacts.touch(run.path, run.chassis, q, jnp.zeros(5))
-        return q[1:3], at.normal / (half_robot.centre(run)[2] * GRAVITY * jnp.cos(run.conditions.slope))
+        at = half_robot.side_contacts.contact_state(run.path, run.chassis, q, jnp.zeros(5))
+        return q[1:3], at.normal / (half_robot.centre_of_mass(run)[2] * GRAVITY * jnp.cos(run.conditions.slope))
 
     both = jax.jit(jax.vmap(lambda *given: (*borne(*given), jax.jacrev(borne)(*given)[0])))
     cases = jnp.asarray([3.0, 6.0]), jnp.asarray([12.0, -5.0]), jnp.asarray([0.0, 1.0])

@@ -33,7 +33,7 @@ def slopes():
     """Derivatives of the outputs by every amplitude at zero, in the track and in the steady model."""
     names = [f"effects.{effect.name}.amplitude" for effect in SETTLED]
     bare = dataclasses.replace(paper_robots.nominal(), effects=tuple(effect() for effect in SETTLED))
-    sizes = [dict((p.name, p.spec) for p in params.walk(bare))[n].prior_sd(0.0) for n in names]
+    sizes = [dict((p.name, p.spec) for p in params.walk_parameters(bare))[n].prior_sd(0.0) for n in names]
 
     def robot(theta, share):
         amplitudes = {name: theta[k] * sizes[k] for k, name in enumerate(names)}
@@ -74,7 +74,7 @@ def start_slopes():
     """Derivatives of a start's history by the amplitudes of the effects that only a series shows."""
     bare = dataclasses.replace(paper_robots.nominal(), effects=tuple(effect() for effect in TRANSIENT))
     sizes = [
-        dict((p.name, p.spec) for p in params.walk(bare))[f"effects.{e.name}.amplitude"].prior_sd(0.0)
+        dict((p.name, p.spec) for p in params.walk_parameters(bare))[f"effects.{e.name}.amplitude"].prior_sd(0.0)
         for e in TRANSIENT
     ]
 

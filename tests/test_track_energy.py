@@ -10,8 +10,8 @@ from mmrjax.fidelities.track import track
 from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.signals import GRAVITY
-from mmrjax.undercarriage.belt import travel
-from mmrjax.undercarriage.half_robot import advance, centre, instant, stand, system
+from mmrjax.undercarriage.belt import belt_travel
+from mmrjax.undercarriage.half_robot import advance, centre_of_mass, half_robot_system, instant, stand
 
 RUNS = Conditions(
     voltage=jnp.asarray([33.0, 15.0, 24.0, 33.0]),
@@ -28,7 +28,7 @@ def ledger(robot):
     @jax.jit
     @jax.vmap
     def run(command):
-        setup = system(robot, command, 1e-4)
+        setup = half_robot_system(robot, command, 1e-4)
         radius, gear = setup.path.radius, setup.path.gear
         chassis = robot.chassis(command.configuration)
 
@@ -39,7 +39,7 @@ def ledger(robot):
             belt = radius * (mean[3] * (1 - at.weight) + mean[4] * at.weight)
             speed_x = mean[0] + mean[2] * at.lever_z + at.rate_x * belt
             speed_z = mean[1] - mean[2] * at.lever_x + at.rate_z * belt
-            stretch = travel(radius, motion.q[3])[1] * mean[3] - travel(radius, motion.q[4])[1] * mean[4]
+            stretch = belt_travel(radius, motion.q[3])[1] * mean[3] - belt_travel(radius, motion.q[4])[1] * mean[4]
             loss = chassis.track.torque_loss(signals.speed_wheel, signals.direction)
             out = {
                 "in": signals.voltage * (signals.current + after.current) / 2,
@@ -60,11 +60,11 @@ def ledger(robot):
         energy = jax.tree.map(lambda p: jnp.sum(p) * 1e-4, powers)
 
         def stored(m):
-            forward, up, mass = centre(setup)
+            forward, up, mass = centre_of_mass(setup)
             sin, cos = jnp.sin(command.slope), jnp.cos(command.slope)
             place_x = m.q[0] + forward * jnp.cos(m.q[2]) + up * jnp.sin(m.q[2])
             place_z = m.q[1] - forward * jnp.sin(m.q[2]) + up * jnp.cos(m.q[2])
-            drawn = travel(radius, m.q[3])[0] - travel(radius, m.q[4])[0]
+            drawn = belt_travel(radius, m.q[3])[0] - belt_travel(radius, m.q[4])[0]
             kinetic = 0.5 * mass * (m.v[0] ** 2 + m.v[1] ** 2)  # pitch rates are of the order of 0.01 rad/s
             rotor = 0.5 * robot.motor.inertia * (robot.gearbox.ratio * m.v[3]) ** 2
             pulleys = 0.5 * setup.half.inertia_pulley * jnp.sum(m.v[3:5] ** 2)

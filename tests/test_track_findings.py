@@ -10,7 +10,7 @@ from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.signals import FLAGS, STATUSES
 from mmrjax.undercarriage.belt import Path
-from mmrjax.undercarriage.ripple import period_pitch, ripple, stages, touchdowns
+from mmrjax.undercarriage.ripple import period_pitch, ripple, slipping_stages, touchdowns
 
 pytestmark = pytest.mark.slow
 
@@ -152,7 +152,7 @@ def test_current_peaks_when_a_grouser_touches_down(runs, robot, k):
 def test_stages_are_starting_slipping_and_uniform(runs, k):
     """Figs. 23, 24: V_theoretical runs ahead of V while the robot gathers speed, then they meet."""
     time, speed, theoretical = runs.time[k], series(runs, k, "speed"), series(runs, k, "speed_theoretical")
-    found = stages(time, speed, theoretical, 0.02)
+    found = slipping_stages(time, speed, theoretical, 0.02)
     assert 0 < found.slipping < 0.05 < found.uniform < 1.1
     assert found.slip > 0.2
     current = series(runs, k, "total_current")

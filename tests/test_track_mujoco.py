@@ -10,7 +10,7 @@ from mmrjax.model import balances, params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.signals import State
 from mmrjax.undercarriage import mjcf
-from mmrjax.undercarriage.half_robot import advance, generalized, instant, resistance, stand, system
+from mmrjax.undercarriage.half_robot import advance, generalized, half_robot_system, instant, resistance, stand
 
 RUNS = {
     "tracked": dict(voltage=33.0, slope_deg=5.0, payload=3.0),
@@ -22,8 +22,8 @@ STEP = 1e-4
 def native(robot, run):
     """The same half robot compiled by C MuJoCo from its own MJCF."""
     rest = State(*(jnp.asarray(0.0) for _ in range(4)))
-    mass = float(balances.begin(robot, run, rest).mass)
-    return mujoco.MjModel.from_xml_string(mjcf.text(robot, run, mass, STEP))
+    mass = float(balances.begin_signals(robot, run, rest).mass)
+    return mujoco.MjModel.from_xml_string(mjcf.mjcf_text(robot, run, mass, STEP))
 
 
 @pytest.mark.parametrize("name", sorted(RUNS))
@@ -31,7 +31,7 @@ def test_member_has_the_constants_that_mujoco_compiles(robot, name):
     """Against stale derived constants (mujoco issue 1607): MJX's are replaced, MuJoCo's compiled afresh."""
     changes = {"running_gear.lever_front": jnp.asarray(2.5), "running_gear.centre_offset": jnp.asarray(0.01)}
     changed, run = params.replace(robot, changes), Conditions(**RUNS[name])
-    ours, theirs = system(changed, run, STEP).model, native(changed, run)
+    ours, theirs = half_robot_system(changed, run, STEP).model, native(changed, run)
     for field in ("body_mass", "body_subtreemass", "body_inertia", "body_ipos", "body_pos", "jnt_axis"):
         np.testing.assert_allclose(
             getattr(ours, field), getattr(theirs, field), rtol=1e-12, atol=1e-15, err_msg=field
@@ -44,7 +44,7 @@ def test_member_has_the_constants_that_mujoco_compiles(robot, name):
 @pytest.mark.parametrize("name", sorted(RUNS))
 def test_masses_make_up_the_robot(robot, name):
     run = Conditions(**RUNS[name])
-    half = system(robot, run, STEP).half
+    half = half_robot_system(robot, run, STEP).half
     chassis = robot.chassis(run.configuration)
     assert float(half.chassis + 2 * half.pulley) == pytest.approx(float(chassis.mass + run.payload) / 2)
     assert float(2 * half.inertia_pulley) == pytest.approx(float(chassis.inertia))
@@ -55,7 +55,7 @@ def test_masses_make_up_the_robot(robot, name):
 def step_both(robot):
     @jax.jit
     def forces(run, motion):
-        constants = system(robot, run, STEP)
+        constants = half_robot_system(robot, run, STEP)
         signals, at, pulled = instant(constants, motion)
         after, _, _ = advance(constants, motion)
         return *generalized(constants, signals, pulled), resistance(constants, motion, signals, at, pulled), after
@@ -78,7 +78,7 @@ def test_c_mujoco_agrees_over_a_second(robot, step_both, name):
     def second(motion):
         return jax.lax.scan(lambda m, _: (step_both(run, m)[-1], None), motion, None, length=10_000)[0]
 
-    start = stand(system(robot, run, STEP))
+    start = stand(half_robot_system(robot, run, STEP))
     end = second(start)
     data.qpos[:], motion = start.q, start
     mass = np.zeros((model.nv, model.nv))
@@ -113,7 +113,7 @@ def test_c_mujoco_shakes_alike():
 def test_wrong_mass_is_seen(robot, step_both):
     """The comparison can fail: one gram more, one step."""
     run = Conditions(**RUNS["tracked"])
-    motion = stand(system(robot, run, STEP))
+    motion = stand(half_robot_system(robot, run, STEP))
     force, armature, damping, after = step_both(run, motion)
     heavier = Conditions(**(RUNS["tracked"] | {"payload": 3.002}))
     model = native(robot, heavier)

@@ -10,11 +10,11 @@ from mmrjax.fidelities.steady import steady_batch
 from mmrjax.fidelities.track import track_batch
 from mmrjax.model import balances, params
 from mmrjax.model.conditions import Conditions
-from mmrjax.model.masses import masses
+from mmrjax.model.masses import masses_of_parts
 from mmrjax.model.signals import CONVERGED, GRAVITY, State
 from mmrjax.turning.two_sides import SIDES, Law
 from mmrjax.undercarriage import both_sides, half_robot, mjcf, rendering_from_above
-from mmrjax.undercarriage.half_robot import system
+from mmrjax.undercarriage.half_robot import half_robot_system
 
 STEP, STEPS = 1e-4, 3000
 #: Two turns that mirror one another, one on the spot across a slope, one of wheels under load, and sides alike.
@@ -88,7 +88,7 @@ def runs(robot):
     @jax.jit
     @jax.vmap
     def every(conditions):
-        run = system(robot, conditions, STEP)
+        run = half_robot_system(robot, conditions, STEP)
 
         def step(motion, _):
             after, powers, travel = _power(run, motion)
@@ -153,7 +153,7 @@ def test_sides_swapped_mirror(runs):
 def test_sides_alike_are_the_half_robot(robot, runs):
     """To 1e-6 of every coordinate's and rate's size, and of the current; nothing to the side."""
     straight = jax.tree.map(lambda x: x[ALIKE], RUNS).straight()
-    run = system(robot, straight, STEP)
+    run = half_robot_system(robot, straight, STEP)
 
     def step(motion, _):
         after = half_robot.advance(run, motion)[0]
@@ -181,7 +181,7 @@ def test_forces_do_the_work_of_contacts_and_friction_takes_it(robot):
 
     @jax.jit
     def all_of(motion):
-        run = system(robot, conditions, STEP)
+        run = half_robot_system(robot, conditions, STEP)
         found = b.instant(run, motion)
         return run.path, run.chassis, b._contacts(run, motion), *found, b.generalized(run, motion, *found)
 
@@ -210,14 +210,14 @@ def test_bodies_are_the_robot_that_mujoco_compiles(robot, configuration):
     """Mass, and the moment of inertia in yaw about the centre, of all; and of half a robot twice the planar ones."""
     run = Conditions(configuration, payload=3.0, heading_deg=0.0)
     zero = jnp.asarray(0.0)
-    total = balances.begin(robot, run, State(zero, zero, zero, zero)).mass
+    total = balances.begin_signals(robot, run, State(zero, zero, zero, zero)).mass
     changed = params.replace(robot, {"running_gear.centre_offset": jnp.asarray(0.02)})
-    model = mujoco.MjModel.from_xml_string(mjcf.text(changed, run, float(total), STEP))
+    model = mujoco.MjModel.from_xml_string(mjcf.mjcf_text(changed, run, float(total), STEP))
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     mass = np.zeros((model.nv, model.nv))
     mujoco.mj_fullM(model, data, mass)
-    half = masses(changed, run, total)
+    half = masses_of_parts(changed, run, total)
     turning = robot.chassis(configuration).turning
     ahead = float(half.centre[0])
     assert mass[0, 0] == pytest.approx(float(total))
@@ -225,8 +225,8 @@ def test_bodies_are_the_robot_that_mujoco_compiles(robot, configuration):
     pitching = 2 * float(half.pitching(robot.running_gear.wheelbase) + 2 * half.inertia_pulley)
     assert mass[4, 4] == pytest.approx(pitching)
     assert 0.02 < mass[5, 5] < mass[3, 3]
-    ours, _ = mjcf.template(True)
-    ours = mjcf.member(ours, mjcf.bodies(changed, half, run), run.slope, STEP)
+    ours, _ = mjcf.model_template(True)
+    ours = mjcf.member_model(ours, mjcf.robot_bodies(changed, half, run), run.slope, STEP)
     for field in ("body_mass", "body_subtreemass", "body_inertia", "body_ipos", "body_pos", "jnt_axis"):
         np.testing.assert_allclose(getattr(ours, field), getattr(model, field), rtol=1e-12, atol=1e-15, err_msg=field)
 

@@ -27,7 +27,7 @@ STEP = 1e-7
 @pytest.fixture(scope="module", params=[True, False], ids=["rolling", "standstill"])
 def found(request, robot):
     """Derivatives of averages and of the path at four times, and differences of the same."""
-    values = {p.name: p.value for p in params.walk(robot)}
+    values = {p.name: p.value for p in params.walk_parameters(robot)}
     turn = Conditions("6T2A", voltage=24.0, duty_left=1.0, duty_right=0.42).resolved(robot)
 
     def shown(theta):

@@ -23,7 +23,7 @@ MOTION = ("motor_speed_left", "motor_speed_right", "yaw_rate")
 SHOWN = (*CURRENTS, *MOTION)
 #: Sds of the instruments, in the units of the columns.
 SDS = dict(zip(SHOWN, (0.02, 0.02, 8.0, 8.0, 0.01), strict=True))
-NOISE = ",".join(f"{name}={sd}{channels.find(name).unit}" for name, sd in SDS.items())
+NOISE = ",".join(f"{name}={sd}{channels.find_channel(name).unit}" for name, sd in SDS.items())
 #: Duties of left and right side.
 DUTIES = (
     (1.0, 1.0), (1.0, 0.7), (1.0, 0.3), (1.0, 0.0), (1.0, -0.5), (1.0, -1.0), (0.6, 0.5), (0.3, 0.7), (0.1, 0.8),
@@ -43,7 +43,7 @@ def written(path, configuration, mass, readings):
     }
     columns |= {f"duty_{side}": [d[k] for d in DUTIES] for k, side in enumerate(("left", "right"))}
     for name, values in readings.items():
-        channel = channels.find(name)
+        channel = channels.find_channel(name)
         columns[channel.column] = np.asarray(values) / channel.factor + SDS[name] * random.normal(size=len(DUTIES))
     lines = [",".join(str(v) for v in row) for row in zip(*columns.values(), strict=True)]
     path.write_text("\n".join([",".join(columns), *lines]) + "\n")
@@ -78,11 +78,11 @@ TRUE = {LATERAL: 1.45, WIDTH: 0.236}
 
 @pytest.mark.slow
 def test_settled_turns_are_observed_as_turns(robot, of_world):
-    assert observers.kind(of_world) is SettledTurns
+    assert observers.observer_kind(of_world) is SettledTurns
     names = tuple(f"6T2A.{n}" for n in (LATERAL, WIDTH))
-    sd = np.broadcast_to([channels.find(n).factor * SDS[n] for n in SHOWN], of_world.measured().shape)
+    sd = np.broadcast_to([channels.find_channel(n).factor * SDS[n] for n in SHOWN], of_world.measured().shape)
     truth = {name: (TRUE[name.partition(".")[2]], 0.05) for name in names}
-    posed = observers.pose(of_world, robot, priors.coordinates(robot, names, truth), sd)
+    posed = observers.pose_problem(of_world, robot, priors.parameter_coordinates(robot, names, truth), sd)
     seen = posed.observation(jnp.zeros(2))
     whitened = (np.asarray(seen.reading) - of_world.measured()) / sd
     assert np.sqrt((whitened**2).mean()) == pytest.approx(1.0, abs=0.2)  # noise alone
@@ -91,8 +91,8 @@ def test_settled_turns_are_observed_as_turns(robot, of_world):
 
 def posed_turns(robot, runs):
     names = tuple(f"6T2A.{n}" for n in (LATERAL, WIDTH, "ground.friction.static"))
-    sd = np.broadcast_to([channels.find(n).factor * SDS[n] for n in SHOWN], runs.measured().shape)
-    return observers.pose(runs, robot, priors.coordinates(robot, names), sd)
+    sd = np.broadcast_to([channels.find_channel(n).factor * SDS[n] for n in SHOWN], runs.measured().shape)
+    return observers.pose_problem(runs, robot, priors.parameter_coordinates(robot, names), sd)
 
 
 @pytest.mark.slow
@@ -118,7 +118,7 @@ def test_one_evaluation_of_turns_has_the_derivatives_of_the_root(robot, of_world
         return (posed.signed(posed.observation(z), posed.data),) * 2
 
     z = jnp.asarray([0.3, -0.4, 0.2])
-    apart = fit.rooted(posed, z)
+    apart = fit.with_roots(posed, z)
     r, jacobian = jax.jit(lambda z: apart.linearised(apart.robot, z, apart.data)[:2])(z)
     wanted, value = jax.jit(jax.jacfwd(through, has_aux=True))(z)
     np.testing.assert_allclose(r, value, rtol=1e-6, atol=1e-6)
@@ -132,7 +132,7 @@ def test_turns_free_what_turns_show(robot):
 
 
 def test_turns_are_held_out_by_how_sharp_they_are(of_world):
-    found = blocks.blocks(of_world, blocks.TURN)
+    found = blocks.blocks_of_kind(of_world, blocks.TURN)
     assert list(found) == ["-1 to -0.5", "-0.44 to 0", "0.12 to 0.43", "0.7 to 1"]
     assert np.sum(list(found.values()), 0).tolist() == [1] * len(DUTIES)
 
@@ -203,9 +203,9 @@ def test_wheels_that_creep_tell_the_effective_width_alone(tmp_path):
     table = written(tmp_path / "turns.csv", "4W2T", mass, {name: seen[name] for name in MOTION})
     runs = records.read(table, robot=robot)
     names = tuple(f"4W2T.{n}" for n in (LATERAL, WIDTH))
-    sd = np.broadcast_to([channels.find(n).factor * SDS[n] for n in MOTION], runs.measured().shape)
-    about = identifiability.analyse(
-        observers.pose(runs, robot, priors.coordinates(robot, names), sd), jnp.zeros(len(names))
+    sd = np.broadcast_to([channels.find_channel(n).factor * SDS[n] for n in MOTION], runs.measured().shape)
+    about = identifiability.analyse_identifiability(
+        observers.pose_problem(runs, robot, priors.parameter_coordinates(robot, names), sd), jnp.zeros(len(names))
     )
     ((one, other, correlation),) = about.correlated()
     assert {one, other} == set(names)

@@ -222,7 +222,7 @@ def test_radius_is_that_of_the_circle_on_which_the_centre_of_mass_moves():
     """Beside a braked side it moves aside by a third of how it moves ahead, so its circle is the larger one."""
     reading = {"yaw_rate": [-2.0, 2.0, 0.0], "speed": [0.3, -0.3, 0.3], "lateral_speed": [0.1, 0.1, 0.0]}
     reading |= {f"motor_{what}_{side}": np.ones(3) for what in ("speed", "current", "voltage") for side in SIDES}
-    found = derived.columns(paper_robots.nominal(), reading, np.full(3, 0.04))
+    found = derived.turning_columns(paper_robots.nominal(), reading, np.full(3, 0.04))
     size = 1000 * np.hypot(0.3, 0.1) / 2
     np.testing.assert_allclose(found["turning_radius_mm"], [-size, -size, np.inf], rtol=1e-12)
     away = np.hypot(found["centre_x_mm"][:2], found["centre_y_mm"][:2])

@@ -26,7 +26,9 @@ MOTION = PlaneMotion(*(jnp.asarray(x) for x in ([2.0, -0.7], [900.0, -150.0], 0.
 
 
 def amplitude(name):
-    return SIZE * next(p.spec for p in params.walk(effects.OF_TURNS[name]()) if p.spec.amplitude).prior_sd(0.0)
+    return SIZE * next(p.spec for p in params.walk_parameters(effects.OF_TURNS[name]()) if p.spec.amplitude).prior_sd(
+        0.0
+    )
 
 
 def with_amplitudes(robot, values):
@@ -40,7 +42,7 @@ MIRRORED = mm.Conditions("6T2A", voltage=33.0, duty_left=-0.2, duty_right=0.9).r
 
 @jax.jit
 def rates(values, run, y):
-    return circling.rates(with_amplitudes(paper_robots.nominal(), values), run, y)
+    return circling.turning_rates(with_amplitudes(paper_robots.nominal(), values), run, y)
 
 
 def amplitudes(**some):
@@ -51,7 +53,7 @@ def amplitudes(**some):
 @pytest.mark.parametrize("name", effects.OF_TURNS)
 def test_effect_moves_the_turn_and_mirrors(name):
     y = flat(MOTION)
-    plain = circling.rates(paper_robots.nominal(), RUN, y)
+    plain = circling.turning_rates(paper_robots.nominal(), RUN, y)
     np.testing.assert_allclose(rates(amplitudes(), RUN, y), plain, rtol=1e-12, atol=1e-12)
     size = amplitude(name)
     moved = np.asarray(rates(amplitudes(**{name: size}), RUN, y))
@@ -83,7 +85,7 @@ PLACES = [8, 9, 7, 4, 5, 6, 0, 1, 2, 3, 10]
 
 def test_terms_are_their_equations():
     robot, values = paper_robots.nominal(), {name: amplitude(name) for name in effects.OF_TURNS}
-    travel = jax.jit(lambda m: balances.turning(robot, RUN, m))(MOTION)
+    travel = jax.jit(lambda m: balances.turning_signals(robot, RUN, m))(MOTION)
     signals, grip = travel.signals, travel.grip
     terms = {}
     for name, a in values.items():
@@ -109,20 +111,20 @@ def test_energy_is_kept_and_resistance_to_turning_takes_it():
     robot = with_amplitudes(paper_robots.nominal(), {name: amplitude(name) for name in effects.OF_TURNS})
 
     def stored(m):
-        return energy.stored_turning(robot, balances.turning(robot, RUN, m), m)
+        return energy.stored_energy_turning(robot, balances.turning_signals(robot, RUN, m), m)
 
     @jax.jit
     def powers(m):
-        rate = circling.motion_of(robot, circling.rates(robot, RUN, flat(m)))
-        travel = balances.turning(robot, RUN, m)
-        source = jnp.mean(jax.vmap(lambda c, s: energy.source(robot, c, s))(RUN.of_sides(), travel.signals))
-        return source, energy.sinks_turning(robot, RUN, travel), jax.jvp(stored, (m,), (rate,))[1]
+        rate = circling.motion_of(robot, circling.turning_rates(robot, RUN, flat(m)))
+        travel = balances.turning_signals(robot, RUN, m)
+        source = jnp.mean(jax.vmap(lambda c, s: energy.source_power(robot, c, s))(RUN.of_sides(), travel.signals))
+        return source, energy.sink_powers_turning(robot, RUN, travel), jax.jvp(stored, (m,), (rate,))[1]
 
     source, sinks, change = powers(MOTION)
     assert float(sum(sinks.values()) + change) == pytest.approx(float(source), rel=1e-9)
     rolls = with_amplitudes(paper_robots.nominal(), {"side_radius": amplitude("side_radius")})  # slides as much
-    plain = energy.sinks_turning(rolls, RUN, balances.turning(rolls, RUN, MOTION))
-    seen = balances.turning(robot, RUN, MOTION)
+    plain = energy.sink_powers_turning(rolls, RUN, balances.turning_signals(rolls, RUN, MOTION))
+    seen = balances.turning_signals(robot, RUN, MOTION)
     load, moment = float(jnp.sum(seen.signals.normal)), float(jnp.sum(seen.grip.moment))
     taken = amplitude("turning_resistance") * load * 1.1**2 + amplitude("lateral_grip") * moment * 1.1**2
     assert float(sinks["sliding"] - plain["sliding"]) == pytest.approx(taken, rel=1e-6)
@@ -132,8 +134,10 @@ def test_straight_travel_shows_none_of_them():
     robot = paper_robots.nominal()
     run = mm.Conditions("6T2A", slope_deg=3.0).resolved(robot)
     state = State(*(jnp.asarray(x) for x in (2.0, 900.0, 0.7, 0.0)))
-    plain = balances.settled(robot, run, state, 1.0)[0]
-    moved = balances.settled(with_amplitudes(robot, {n: amplitude(n) for n in effects.OF_TURNS}), run, state, 1.0)[0]
+    plain = balances.settled_signals(robot, run, state, 1.0)[0]
+    moved = balances.settled_signals(
+        with_amplitudes(robot, {n: amplitude(n) for n in effects.OF_TURNS}), run, state, 1.0
+    )[0]
     for mine, theirs in zip(jax.tree.leaves(plain), jax.tree.leaves(moved), strict=True):
         np.testing.assert_array_equal(mine, theirs)
 

@@ -12,11 +12,11 @@ from worlds import turns as planted
 
 import mmrjax as mm
 from calibration.data import runs as records
-from calibration.discovery.discover import discover, pose, prepared
+from calibration.discovery.discover import discover, pose_candidates, prepare_loop
 from calibration.inference import bases as bases_room
 from calibration.inference.observers.turns import TurnLinearization
 from mmrjax import effects
-from mmrjax.effects.curve import weights
+from mmrjax.effects.curve import ordinate_weights
 from mmrjax.model import params
 
 pytestmark = pytest.mark.slow
@@ -32,8 +32,8 @@ def posed(tmp_path_factory):
     table, file = planted.write(tmp_path_factory.mktemp("turns"), "friction", COUNT)
     robot = mm.read_robot(str(file))
     library = {name: kind for name, kind in effects.BY_NAME.items() if name in SOME}
-    ready = prepared(records.read(table, robot=robot), robot, noise=planted.NOISE, library=library)
-    space = pose(ready.runs, ready.robot, ready.noise.sd, ready.settings, ready.stated, ready.library)
+    ready = prepare_loop(records.read(table, robot=robot), robot, noise=planted.NOISE, library=library)
+    space = pose_candidates(ready.runs, ready.robot, ready.noise.sd, ready.settings, ready.stated, ready.library)
     return space.bare, space
 
 
@@ -103,8 +103,8 @@ def test_column_of_a_curve_is_what_the_curve_does(linear, shown, name):
     ends = {"low": float(x.min()), "high": float(x.max())}
     effect = params.replace(effects.UNNAMED[name](), {n: jnp.asarray(v) for n, v in (ordinates | ends).items()})
 
-    shapes = np.asarray(weights(jnp.asarray(x), ends["low"], ends["high"]))
-    columns = bases_room.signature(linear, balance, way[:, None] * shapes) @ np.array(list(ordinates.values()))
+    shapes = np.asarray(ordinate_weights(jnp.asarray(x), ends["low"], ends["high"]))
+    columns = bases_room.place_signature(linear, balance, way[:, None] * shapes) @ np.array(list(ordinates.values()))
     size = 1e-4 * float(effect.amplitude or 1.0)
     wanted = shown(effect, size)
     assert np.abs(wanted).max() > 1.0

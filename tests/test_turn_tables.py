@@ -365,6 +365,6 @@ def test_gearbox_loses_though_no_inertia_is_stated(rig):
     robot = rig(KINEMATIC)
     run = mm.Conditions("rover", motor_speed=100.0).resolved(robot)
     state = State(*(jnp.asarray(x) for x in (1.6, 100.0, 0.2, 0.0)))
-    signals, _ = balances.settled(robot, run, state, 1.0)
+    signals, _ = balances.settled_signals(robot, run, state, 1.0)
     assert float(signals.efficiency_load) == pytest.approx(0.7)
     assert np.isfinite(float(signals.torque_output))

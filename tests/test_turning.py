@@ -46,7 +46,7 @@ def turns(robot):
     right = [b for _, b in DUTIES] + [a for a, _ in DUTIES] + [-b for _, b in DUTIES] + [0.7]
     which = np.repeat(CONFIGURATIONS, len(left))
     runs = mm.Conditions(which, voltage=33.0, duty_left=left * 2, duty_right=right * 2).resolved(robot)
-    _, motion, status = jax.jit(jax.vmap(lambda c: turning.circling(robot, c)))(runs)
+    _, motion, status = jax.jit(jax.vmap(lambda c: turning.circling_signals(robot, c)))(runs)
     return jax.device_get(motion), np.array(STATUSES)[np.asarray(status)]
 
 
@@ -131,9 +131,9 @@ def test_every_turn_settles(turns):
 @pytest.mark.slow
 def test_nothing_is_settled_on_a_slope_where_the_heading_changes(robot, monkeypatch):
     run = mm.Conditions("6T2A", voltage=33.0, duty_left=1.0, duty_right=0.5, slope_deg=5.0).resolved(robot)
-    motion = turning.motion_of(robot, turning.start(robot, run).at[4].set(0.5))
-    found = balances.turning(robot, run, motion), motion, jnp.asarray(STATUSES.index("converged"))
-    monkeypatch.setattr(turning, "circling", lambda *_: found)
+    motion = turning.motion_of(robot, turning.turning_start(robot, run).at[4].set(0.5))
+    found = balances.turning_signals(robot, run, motion), motion, jnp.asarray(STATUSES.index("converged"))
+    monkeypatch.setattr(turning, "circling_signals", lambda *_: found)
     assert STATUSES[int(turning.operating_point(robot, run)[0].status)] == "not_settled"
 
 
@@ -156,16 +156,16 @@ def test_energy_in_is_what_sinks_take_and_what_is_stored(robot, configuration):
     )
 
     def stored(m):
-        return energy.stored_turning(robot, balances.turning(robot, run, m), m)
+        return energy.stored_energy_turning(robot, balances.turning_signals(robot, run, m), m)
 
     @jax.jit
     def powers(m):
-        rate = turning.motion_of(robot, turning.rates(robot, run, flat(m)))
+        rate = turning.motion_of(robot, turning.turning_rates(robot, run, flat(m)))
         # What is stored in shafts and windings changes with their rates; inductance and inertias do not.
         _, change = jax.jvp(stored, (m,), (rate,))
-        travel = balances.turning(robot, run, m)
-        source = jnp.mean(jax.vmap(lambda c, s: energy.source(robot, c, s))(run.of_sides(), travel.signals))
-        return source, energy.sinks_turning(robot, run, travel), change
+        travel = balances.turning_signals(robot, run, m)
+        source = jnp.mean(jax.vmap(lambda c, s: energy.source_power(robot, c, s))(run.of_sides(), travel.signals))
+        return source, energy.sink_powers_turning(robot, run, travel), change
 
     source, sinks, change = powers(motion)
     assert float(sum(sinks.values()) + change) == pytest.approx(float(source), rel=1e-9)
@@ -179,7 +179,7 @@ def test_rates_are_those_of_a_second_implementation(robot, configuration):
         configuration, voltage=24.0, duty_left=0.9, duty_right=-0.3, slope_deg=11.0, payload=3.0
     ).resolved(robot)
     inputs = world.Inputs(0.9, -0.3, kind="duty", slope=np.radians(11.0), supply=24.0)
-    law = jax.jit(lambda y: turning.rates(robot, run, y))
+    law = jax.jit(lambda y: turning.turning_rates(robot, run, y))
     size, random = np.asarray(turning._UNITS), np.random.default_rng(5)
     for _ in range(12):
         y = random.normal(size=11) * np.array([0.2, 0.2, 0.8, 0.8, 0.4, 0.2, 0.15, 2.0, 1.0, 1.0, 0.0])
@@ -195,7 +195,7 @@ def test_settled_turns_of_a_second_implementation_are_settled(robot, configurati
     other = of_world(robot, configuration)
     size = np.asarray(turning._UNITS)
     law = jax.jit(
-        lambda left, right, y: turning.rates(
+        lambda left, right, y: turning.turning_rates(
             robot, mm.Conditions(CONFIGURATIONS.index(configuration), duty_left=left, duty_right=right), y
         )
     )
@@ -230,7 +230,7 @@ def test_run_over_time_is_that_of_a_second_implementation(robot):
 def test_derivatives_over_time_are_differences(robot):
     """Heading and place of a turn across a slope, by the ratio of frictions, adhesion and the left duty."""
     names, times = ("6T2A.turning.lateral", "6T2A.ground.friction.static"), jnp.asarray([0.0, 0.5, 1.0, 2.0])
-    known = {p.name: float(p.value) for p in params.walk(robot)}
+    known = {p.name: float(p.value) for p in params.walk_parameters(robot)}
 
     @jax.jit
     def course(theta):
@@ -364,7 +364,7 @@ def test_forces_and_their_derivatives_are_those_of_loads_in_balance(height, lift
 
 def pressure(stance, centre):
     """Nodes of a contact [m], from its middle, and the share of the load that each bears."""
-    middle, half, tilt = room.footprint(stance, centre)
+    middle, half, tilt = room.loaded_part(stance, centre)
     line, weight = np.polynomial.legendre.leggauss(stance.nodes)
     place, share = (line, weight / 2) if stance.on_tracks else (np.array([-1, 1]), 0.5)
     return middle + place * half, share * (1 + tilt * place)

@@ -67,7 +67,7 @@ def shown(runs):
 
 
 def test_independent_readings_are_no_copies(tmp_path, robot):
-    assert uninformative.copied(table(tmp_path, robot), robot) == []
+    assert uninformative.copied_channels(table(tmp_path, robot), robot) == []
 
 
 @pytest.mark.parametrize(
@@ -84,18 +84,18 @@ def test_independent_readings_are_no_copies(tmp_path, robot):
 )
 def test_a_channel_that_is_a_line_of_another_is_refused_by_the_loop(tmp_path, robot, foreseen, copy, column, said):
     runs = table(tmp_path, robot, **copy)
-    (found,) = uninformative.copied(runs, robot)
+    (found,) = uninformative.copied_channels(runs, robot)
     assert (found.column, found.tied) == (column, False) and said in describe(found)
     foreseen(shown(runs))
     with pytest.raises(BadData, match=rf"t\.csv, {column}: in every row .* remove it from channels and table"):
-        discover.prepared(runs, robot, replicates=192)
+        discover.prepare_loop(runs, robot, replicates=192)
 
 
 @pytest.mark.parametrize(
     "torque", [0.64 * CURRENT + 2e-4 * RNG.standard_normal(12), np.round(0.64 * CURRENT, 2), 0.64 * CURRENT**2]
 )
 def test_what_follows_another_within_noise_or_a_display_or_on_a_curve_is_no_copy(tmp_path, robot, torque):
-    assert uninformative.copied(table(tmp_path, robot, torque=torque), robot) == []
+    assert uninformative.copied_channels(table(tmp_path, robot, torque=torque), robot) == []
 
 
 def test_readings_that_a_rigid_gear_ties_are_said_and_not_refused(tmp_path, robot):
@@ -106,7 +106,7 @@ def test_readings_that_a_rigid_gear_ties_are_said_and_not_refused(tmp_path, robo
     path = tmp_path / "t.csv"
     rows = (",".join(f"{x:.6g}" for x in row) for row in zip(*columns.values(), strict=True))
     path.write_text("\n".join([",".join(columns), *rows]) + "\n", encoding="utf-8")
-    (found,) = uninformative.copied(records.read(path, robot=driven), driven)
+    (found,) = uninformative.copied_channels(records.read(path, robot=driven), driven)
     assert found.tied and found.slope == pytest.approx(0.05) and "counts twice" in describe(found)
 
 
@@ -116,8 +116,8 @@ def test_runs_of_one_condition_are_refused_by_the_loop(tmp_path, robot, foreseen
     speed = 1000 + np.linspace(0, 1, 12)
     runs = table(tmp_path, robot, 0.6 + 0.01 * RNG.standard_normal(12), 0.3 + 0.01 * RNG.standard_normal(12),
                  50 + 0.1 * RNG.standard_normal(12), speed, wind_V=speed)  # fmt: skip
-    kind = observers.kind(runs)
-    known = noise.inferred(runs, kind.sizes(runs), "motor_current=0.01A,output_torque=0.01Nm,output_speed=1rpm")
+    kind = observers.observer_kind(runs)
+    known = noise.infer_noise(runs, kind.sizes(runs), "motor_current=0.01A,output_torque=0.01Nm,output_speed=1rpm")
     middle = np.mean(shown(runs), 0)
     foreseen(middle + spread * np.median(known.sd, 0) * np.linspace(-0.5, 0.5, 12)[:, None])
     found = uninformative.nothing_varies(runs, robot, known)
@@ -127,7 +127,7 @@ def test_runs_of_one_condition_are_refused_by_the_loop(tmp_path, robot, foreseen
         with pytest.raises(
             BadData, match=r"t\.csv: nothing varies in these 12 runs but noise, .* wind_V varies and is"
         ):
-            discover.prepared(
+            discover.prepare_loop(
                 runs, robot, noise="motor_current=0.01A,output_torque=0.01Nm,output_speed=1rpm", replicates=192
             )
 

@@ -16,7 +16,7 @@ BY_HAND = {
     "A": 1.0, "mA": 0.001, "V": 1.0, "mV": 0.001, "Nm": 1.0, "mNm": 0.001, "kNm": 1000.0, "C": 1.0,
     "rpm": 2 * math.pi / 60, "rad/s": 1.0, "turns/s": 2 * math.pi, "deg/s": math.pi / 180,
     "mm/s": 0.001, "m/s": 1.0, "cm/s": 0.01, "km/h": 1000 / 3600, "m/min": 1 / 60,
-    "kg": 1.0, "g": 0.001, "s": 1.0, "ms": 0.001, "min": 60.0, "h": 3600.0, "": 1.0, "percent": 0.01, "rad/s^2": 1.0,
+    "kg": 1.0, "g": 0.001, "s": 1.0, "ms": 0.001, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "": 1.0, "percent": 0.01, "rad/s^2": 1.0,
     "mm": 0.001, "m": 1.0, "cm": 0.01, "um": 1e-6,
     "deg": math.pi / 180, "rad": 1.0, "turns": 2 * math.pi,
 }  # fmt: skip
@@ -32,7 +32,7 @@ def test_units_of_a_channel_are_those_of_the_table_by_hand(channel):
 def test_units_of_a_condition_are_those_of_the_table_by_hand(condition):
     for unit, factor in ((condition.unit, condition.factor), *condition.other_units):
         assert factor == pytest.approx(BY_HAND[unit], rel=1e-12), unit
-        assert condition.value(2.0, quantities.spelled(unit)) == pytest.approx(2.0 * factor / condition.factor)
+        assert condition.value(2.0, quantities.unit_in_column(unit)) == pytest.approx(2.0 * factor / condition.factor)
 
 
 def test_per_cent_of_a_slope_are_those_of_its_tangent():
@@ -46,7 +46,7 @@ def test_per_cent_of_a_slope_are_those_of_its_tangent():
     [("U/min", "rpm"), ("1/min", "rpm"), ("min-1", "rpm"), ("°/s", "deg_s"), ("Nmm", "mNm"), ("N·m", "Nm"), ("%", "percent")],
 )  # fmt: skip
 def test_units_as_people_write_them_are_those_of_columns(written, column):
-    assert quantities.spelled(written) == column
+    assert quantities.unit_in_column(written) == column
 
 
 # --- a quantity is one row -----------------------------------------------------------------------------------
@@ -81,7 +81,7 @@ def test_a_quantity_is_read_written_and_explained_by_its_row(two_rows_more, tmp_
         records.read(path)
     path.write_text(TABLE.format("Air_Pressure_Pa,terminal_voltage_mV", 98000))
     assert "Air_Pressure_Pa is read as air_pressure_Pa" in records.read(path).notes[0]
-    (output,) = (o for o in outputs.table(runs.channels) if o.name == CHANNEL.name)
+    (output,) = (o for o in outputs.output_table(runs.channels) if o.name == CHANNEL.name)
     assert (output.column, output.unit, output.label) == ("terminal_voltage_V", "V", "terminal voltage")
     for kind, name in (("channel", "terminal_voltage"), ("condition", "air_pressure_kPa")):
         assert dict(explain.EXPLAINED[kind](name, {}))["column"].startswith(f"{name.removesuffix('_kPa')}_")

@@ -63,7 +63,11 @@ def read(tmp_path, text, imposed, more=""):
 
 def elsewhere(robot):
     """The same rig beside another packaged robot: three times of what is unknown of its motor and battery."""
-    drive = [p for p in params.walk(robot) if p.name in robot.rig.unknown and not p.name.startswith("running_gear.")]
+    drive = [
+        p
+        for p in params.walk_parameters(robot)
+        if p.name in robot.rig.unknown and not p.name.startswith("running_gear.")
+    ]
     values = {p.name: jnp.clip(3.0 * jnp.asarray(p.value), *p.spec.bounds) for p in drive}
     return dataclasses.replace(params.replace(robot, values), rig=robot.rig)
 

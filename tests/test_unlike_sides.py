@@ -65,7 +65,7 @@ SIDE_RADIUS = 'base = "nominal"\n[effects.side_radius]\namplitude = 0.01\nconfig
 
 def test_a_file_of_unlike_sides_is_said_to_turn_and_by_how_much(tmp_path, capsys, monkeypatch):
     found = types.SimpleNamespace(reading={"yaw_rate": [1e-18, -0.0175], "speed": [0.99, 1.31]}, status=[0, 0])
-    monkeypatch.setattr(inputs, "by_itself", lambda robot, imposed: found)
+    monkeypatch.setattr(inputs, "turns_under_equal_commands", lambda robot, imposed: found)
     file = of_file(tmp_path, SIDE_RADIUS)
     (remark,) = file.remarks
     assert remark.startswith("robot.toml: the robot's sides differ, ") and "(side_radius)" in remark
@@ -91,7 +91,7 @@ def test_unlike_sides_turn_as_those_that_are_driven_alike(tmp_path):
     asked = mm.Conditions(["6T2A", "4W2T"], voltage=33.0, duty_left=1.0, duty_right=1.0)
     rates = mm.simulate(file.robot, asked).reading["yaw_rate"]
     np.testing.assert_allclose(
-        turning_figures.by_itself(file.robot, 33.0).reading["yaw_rate"], rates, rtol=1e-9, atol=1e-12
+        turning_figures.turns_under_equal_commands(file.robot, 33.0).reading["yaw_rate"], rates, rtol=1e-9, atol=1e-12
     )
     assert abs(rates[0]) < 1e-9 and rates[1] > 0.01  # the left side's radius is the smaller
     assert f"4W2T by {rates[1]:.3g} rad/s to the left" in file.remarks[0]

@@ -12,7 +12,7 @@ from calibration.described import sentences
 from calibration.discovery import description
 from calibration.inference import noise
 from calibration.inference.observers import SettledRuns
-from calibration.inference.unused import no_load_gives, unused
+from calibration.inference.unused import unexplained_torque_notes, unused_notes
 
 RIG = IDEAL.replace("loss_coulomb = 0.0", "loss_coulomb = 0.1")
 #: Of an ideal motor at 24 V, R 0.5, k 0.05, M0 0.01: torque of a brake [N·m], speed [rpm], current [A].
@@ -56,32 +56,32 @@ def test_a_column_is_likened_to_what_the_table_lacks(column, near):
 def test_numbers_that_vary_and_have_no_role_are_said(tmp_path):
     counted = {"row_id": np.arange(6), "epoch": 1e9 + 7.0 * np.arange(6), "rig_no": np.full(6, 3)}
     runs = table(tmp_path, CHANNELS, brake_torque_Nm=TORQUE, **counted)
-    (note,) = unused(runs)
+    (note,) = unused_notes(runs)
     assert note.columns == (("brake_torque_Nm", "load_torque_Nm"),)
     assert sentences((note,)) == (
         "runs.csv: brake_torque_Nm varies from row to row and is not used; if brake_torque_Nm is load_torque_Nm, state "
         '[columns] load_torque_Nm = "brake_torque_Nm" in the robot\'s file',
     )
-    assert description.unused(runs) == ("brake_torque_Nm",)
-    assert unused(table(tmp_path, CHANNELS, load_torque_Nm=TORQUE)) == ()
+    assert description.unused_inputs(runs) == ("brake_torque_Nm",)
+    assert unused_notes(table(tmp_path, CHANNELS, load_torque_Nm=TORQUE)) == ()
 
 
 def test_a_torque_that_no_load_gives_may_be_a_brakes(tmp_path):
     imposed = 'imposed = "motor_speed"\nchannels = ["motor_current", "output_torque"]'
     runs = table(tmp_path, imposed, output_torque_Nm=TORQUE)
-    (note,) = no_load_gives(runs)
-    assert note.share > 0.99 and description.unused(runs) == ("output_torque_Nm as a condition",)
+    (note,) = unexplained_torque_notes(runs)
+    assert note.share > 0.99 and description.unused_inputs(runs) == ("output_torque_Nm as a condition",)
     for friction in (0.3 + 1e-4 * SPEED, np.full(6, 0.3), 0.5 - 1e-9 * SPEED):
-        assert no_load_gives(table(tmp_path, imposed, output_torque_Nm=friction)) == ()
+        assert unexplained_torque_notes(table(tmp_path, imposed, output_torque_Nm=friction)) == ()
     backward = table(tmp_path, imposed, motor_speed_rpm=-SPEED, motor_current_A=-CURRENT, output_torque_Nm=-TORQUE)
-    assert no_load_gives(backward)
+    assert unexplained_torque_notes(backward)
 
 
 def test_readings_that_a_brake_explains_are_no_contradiction(tmp_path):
     """As a condition it tells rows apart; without it the message says how it becomes one."""
 
     def checked(runs):
-        return SettledRuns.check(runs, noise.inferred(runs, SettledRuns.sizes(runs), None))
+        return SettledRuns.check(runs, noise.infer_noise(runs, SettledRuns.sizes(runs), None))
 
     runs = table(tmp_path, 'channels = ["motor_current", "motor_speed", "output_torque"]', output_torque_Nm=TORQUE)
     with pytest.raises(BadData, match=r'state \[columns\] load_torque_Nm = "output_torque_Nm"'):

@@ -12,7 +12,7 @@ import pytest
 from mmrjax import fidelities
 from mmrjax.errors import UsageError
 from mmrjax.fidelities.steady import steady
-from mmrjax.fidelities.variation import CONDITIONS, Variation, evaluate
+from mmrjax.fidelities.variation import CONDITIONS, Variation, evaluate_points
 from mmrjax.model import paper_robots, params, quantities
 from mmrjax.model.conditions import Conditions
 
@@ -48,7 +48,9 @@ def test_configuration_is_an_index_and_total_mass_may_be_none_before():
 
 @pytest.mark.slow
 def test_evaluate_steady_is_each_point_by_itself(variation):
-    found = evaluate(variation, "steady", jnp.asarray(VALUES), Conditions(), {}, ("total_current", "speed", "flags"))
+    found = evaluate_points(
+        variation, "steady", jnp.asarray(VALUES), Conditions(), {}, ("total_current", "speed", "flags")
+    )
     for k, row in enumerate(VALUES):
         alone = one_by_one(variation.robot, row)
         assert int(found["status"][k]) == int(alone.status)
@@ -63,11 +65,11 @@ def test_evaluate_steady_is_each_point_by_itself(variation):
 def test_evaluate_drive_is_the_run_of_each_robot(names):
     robot, chosen = paper_robots.nominal(), [NAMES.index(n) for n in names]
     values, options = jnp.asarray(VALUES[:2, chosen]), {"duration": 0.5}
-    found = evaluate(Variation(robot, names), "drive", values, Conditions(), options, ("total_current",))
+    found = evaluate_points(Variation(robot, names), "drive", values, Conditions(), options, ("total_current",))
     for k, row in enumerate(values):
         given = {n: v for n, v in zip(names, row, strict=True)}
         conditions = Conditions(slope_deg=given.pop("slope_deg")[None], voltage=given.pop("voltage")[None])
-        alone = fidelities.get("drive").run(params.replace(robot, given), conditions, options).result
+        alone = fidelities.get_fidelity("drive").run(params.replace(robot, given), conditions, options).result
         np.testing.assert_allclose(found["total_current"][k], alone.total_current[0], rtol=1e-10)
         assert int(found["status"][k]) == int(alone.status[0])
 
@@ -75,21 +77,23 @@ def test_evaluate_drive_is_the_run_of_each_robot(names):
 @pytest.mark.slow
 def test_evaluate_compiles_once_a_shape(variation, compilations):
     def call(shift):
-        found = evaluate(variation, "steady", jnp.asarray(VALUES + shift), Conditions(), {}, ("slip",))
+        found = evaluate_points(variation, "steady", jnp.asarray(VALUES + shift), Conditions(), {}, ("slip",))
         return jax.block_until_ready(found)
 
     other = Variation(params.replace(variation.robot, {"motor.inductance": jnp.asarray(2e-4)}), NAMES)
     call(0.0)
     compilations.clear()
     call(0.01)
-    evaluate(other, "steady", jnp.asarray(VALUES), Conditions(), {}, ("slip",))
+    evaluate_points(other, "steady", jnp.asarray(VALUES), Conditions(), {}, ("slip",))
     assert compilations == []
 
 
 @pytest.mark.slow
 def test_derivatives_go_through_evaluate(variation):
     def current(values):
-        return evaluate(variation, "steady", values, Conditions(), {}, ("total_current",))["total_current"].sum()
+        return evaluate_points(variation, "steady", values, Conditions(), {}, ("total_current",))[
+            "total_current"
+        ].sum()
 
     values, h = jnp.asarray(VALUES[:2]), 1e-6
     exact = jax.grad(current)(values)[1, 0]
@@ -101,7 +105,7 @@ def test_derivatives_go_through_evaluate(variation):
 def test_axes_know_unit_bounds_prior_and_meaning(variation):
     axes = variation.axes
     resistance = axes["motor.resistance"]
-    spec = next(p.spec for p in params.walk(variation.robot) if p.name == "motor.resistance")
+    spec = next(p.spec for p in params.walk_parameters(variation.robot) if p.name == "motor.resistance")
     assert (resistance.unit, resistance.bounds, resistance.meaning) == (spec.unit, spec.bounds, spec.meaning)
     assert resistance.prior_sd == spec.prior_sd(float(variation.robot.motor.resistance)) > 0
     slope = axes["slope_deg"]
@@ -127,9 +131,9 @@ def test_unknown_and_repeated_names_are_refused_with_those_that_are_near():
 @pytest.mark.quick(1)
 @pytest.mark.parametrize("model", ["steady", "drive"])
 def test_unknown_output_is_refused_with_the_choices(variation, model):
-    options = fidelities.facts(model).resolved()
+    options = fidelities.fidelity_facts(model).resolved()
     with pytest.raises(UsageError, match=r"outputs: got total_curent; did you mean total_current.*efficiency_motor"):
-        evaluate(variation, model, jnp.asarray(VALUES), Conditions(), options, ("total_curent",))
+        evaluate_points(variation, model, jnp.asarray(VALUES), Conditions(), options, ("total_curent",))
 
 
 def test_status_is_named_in_one_place():

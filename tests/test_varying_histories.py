@@ -14,17 +14,17 @@ from calibration.data.columns import DRIVEN
 from calibration.data.courses import applied, courses, stretches, varies
 from calibration.data.input_errors import BadData
 from calibration.data.runs import Runs
-from calibration.discovery.reach import reach
+from calibration.discovery.reach import reach_of_table
 from calibration.discovery.settings import settings_for
 from calibration.inference import checks
-from calibration.inference.blocks import blocks, distinct
+from calibration.inference.blocks import blocks_of_kind, distinct_blocks
 from calibration.inference.calibration import calibrate
 from calibration.inference.fit_notes import StopsOnSlope
-from calibration.inference.linearization import probe
+from calibration.inference.linearization import balance_probe
 from calibration.inference.noise import Noise
 from calibration.inference.observers import Histories, settled_ends
 from mmrjax.effects import BY_NAME
-from mmrjax.fidelities.histories import CHANGE, LONGEST, START, grid, histories
+from mmrjax.fidelities.histories import CHANGE, LONGEST, START, history_signals, time_grid
 from mmrjax.missions.mission import mission
 from mmrjax.missions.profile import MODES, profile
 from mmrjax.model import paper_robots, params
@@ -41,7 +41,7 @@ EVERY = 0.02
 SD = {"total_current_A": 0.05, "motor_speed_rpm": 15.0, "speed_mm_s": 4.0}
 #: What the robot that is measured has in place of the nominal values.
 TRUTH = {"motor.resistance": 0.68, "6T2A.track.loss_coulomb": 0.30, "6T2A.ground.rolling_resistance": 0.05}
-NOMINAL = {p.name: float(p.value) for p in params.walk(paper_robots.nominal()) if p.name in TRUTH}
+NOMINAL = {p.name: float(p.value) for p in params.walk_parameters(paper_robots.nominal()) if p.name in TRUTH}
 UNDECLARED = "series_resistance"
 #: Largest difference of a derivative from differences of runs, over its largest.
 DERIVATIVES, DIFFERENCE = 1e-6, 3e-6
@@ -53,7 +53,7 @@ def engine():
 
     @jax.jit
     def course(values, modes, voltage, slope):
-        known = {p.name: p for p in params.walk(paper_robots.nominal())}
+        known = {p.name: p for p in params.walk_parameters(paper_robots.nominal())}
         cold = {"motor.time_constant_winding": jnp.asarray(known["motor.time_constant_winding"].spec.bounds[1])}
         robot = dataclasses.replace(paper_robots.nominal(), effects=(BY_NAME[UNDECLARED](),))
         robot = params.replace(robot, {f"effects.{UNDECLARED}.amplitude": jnp.asarray(0.0), **cold, **values})
@@ -151,27 +151,29 @@ def test_grid_is_fine_after_every_change_and_bounded():
         np.array([0.5, 1.2, 1.21]),
         np.array([2.0, 1.0, 1e-3]),
     )
-    found = grid(times, changes, sizes)
+    found = time_grid(times, changes, sizes)
     step = np.diff(found)
     assert np.isin(times, found).all() and np.isin(changes, found).all() and (step > 0).all()
     assert step.max() <= LONGEST * (1 + 1e-9)
     for begin, first in ((0.0, START[0]), (0.5, CHANGE[0] / 2), (1.2, CHANGE[0])):
         assert 0.5 * first < step[np.searchsorted(found, begin)] <= 1.5 * first
     assert step[np.searchsorted(found, 1.21)] > 0.8 * LONGEST  # after a small one they are long at once
-    np.testing.assert_array_equal(grid(times), grid(times, np.array([0.0, 2.5]), np.ones(2)))  # no change within
-    before = grid(times)
+    np.testing.assert_array_equal(
+        time_grid(times), time_grid(times, np.array([0.0, 2.5]), np.ones(2))
+    )  # no change within
+    before = time_grid(times)
     np.testing.assert_array_equal(found[found < 0.5], before[before < 0.5])
     # one small change a sample takes no more steps than none
     often = np.arange(1, 4000) * 0.005
-    assert len(grid(often, often, np.full(len(often), 0.01))) <= len(grid(often)) + 3
+    assert len(time_grid(often, often, np.full(len(often), 0.01))) <= len(time_grid(often)) + 3
 
 
 @pytest.mark.slow
 def test_constant_values_at_every_instant_are_those_of_a_constant_run():
-    robot, g = paper_robots.nominal(), jnp.asarray(grid(np.arange(0.02, 0.3, 0.02)))
+    robot, g = paper_robots.nominal(), jnp.asarray(time_grid(np.arange(0.02, 0.3, 0.02)))
     one = Conditions(0, 24.0, 5.0, 2.0)
     many = Conditions(0, jnp.full(len(g), 24.0), 5.0, 2.0)
-    a, b = (histories(robot, c, g) for c in (one, many))
+    a, b = (history_signals(robot, c, g) for c in (one, many))
     for name in ("current", "speed_motor", "speed"):
         np.testing.assert_allclose(getattr(b, name), getattr(a, name), rtol=1e-12, atol=1e-15)
 
@@ -191,7 +193,7 @@ def test_runs_are_those_of_missions(simulated):
 @pytest.fixture(scope="module")
 def of_values(observer):
     """Names of parameters, their values, the readings by values, and those of several values, compiled."""
-    known = {p.name: float(p.value) for p in params.walk(paper_robots.nominal())}
+    known = {p.name: float(p.value) for p in params.walk_parameters(paper_robots.nominal())}
     names = [*TRUTH, "motor.inertia", "motor.inductance", "6T2A.ground.friction.static"]
 
     def readings(x):
@@ -256,7 +258,7 @@ def test_only_what_changes_has_a_value_an_instant(observer, runs):
 @pytest.mark.slow
 def test_defects_of_all_knots_are_a_constant_defect(observer):
     """Their linear response, through changes of conditions, against the derivative by an amplitude."""
-    robot, effects = paper_robots.nominal(), tuple(probe(balance) for balance in ("electrical", "track"))
+    robot, effects = paper_robots.nominal(), tuple(balance_probe(balance) for balance in ("electrical", "track"))
 
     def readings(amplitudes):
         put = tuple(dataclasses.replace(e, amplitude=a) for e, a in zip(effects, amplitudes, strict=True))
@@ -295,11 +297,11 @@ def test_blocks_of_runs_that_vary_are_whole_runs(runs):
     level["run_id"] = np.concatenate([runs["run_id"], np.full(5, "level")])
     level["supply_voltage_V"][-5:], level["mode"][-5:] = 24.0, "voltage"
     more = Runs("more", level)
-    assert set(blocks(more, "voltage")) == {"run stair", "run reversal", "run coasting", "24.0"}
-    for mask in blocks(more, "voltage").values():
+    assert set(blocks_of_kind(more, "voltage")) == {"run stair", "run reversal", "run coasting", "24.0"}
+    for mask in blocks_of_kind(more, "voltage").values():
         assert len(np.unique(more["run_id"][mask])) == 1
-    assert blocks(runs, "voltage") == {} and set(blocks(runs, "slope")) == {"0.0", "4.0", "-3.0"}
-    assert "voltage" not in distinct(runs, Histories.blocks)
+    assert blocks_of_kind(runs, "voltage") == {} and set(blocks_of_kind(runs, "slope")) == {"0.0", "4.0", "-3.0"}
+    assert "voltage" not in distinct_blocks(runs, Histories.blocks)
     assert varies(more).sum() == len(runs) and len(set(courses(more))) == 4 and courses(more)[-1] == ""
 
 
@@ -314,7 +316,7 @@ def test_ends_are_those_of_stretches_driven_forwards(runs):
 def test_reach_takes_what_the_motors_were_given(observer):
     driven = observer.driven
     assert driven.shape[0] > 4 and (np.asarray(driven.voltage) > 0).all() and (np.asarray(driven.duty) == 1).all()
-    found = reach(paper_robots.nominal(), driven, ("speed",))
+    found = reach_of_table(paper_robots.nominal(), driven, ("speed",))
     assert found.voltages == (12.0, 15.0, 18.0, 24.0, 33.0) and found.used[0].slopes == (-4.0, -3.0, 0.0, 3.0, 4.0)
 
 
@@ -403,7 +405,7 @@ def test_what_cannot_change_within_a_run_is_refused(runs):
     with pytest.raises(BadData, match=r"configuration: run coasting has several values; a run has one configuration"):
         Histories.check(changed(runs, configuration=other), nothing)
     mass = 11.5 + runs["payload_kg"] + 0.5 * (runs["time_s"] > 1)
-    with pytest.raises(BadData, match=r"total_mass_kg: run coasting changes by 0.5 kg beside its payload"):
+    with pytest.raises(BadData, match=r"total_mass_kg: run coasting changes by 0.5 kg apart from its payload"):
         Histories.check(changed(runs, total_mass_kg=mass), nothing)
     payload = runs["payload_kg"] + 3.0 * (runs["time_s"] > 1)
     Histories.check(changed(runs, payload_kg=payload, total_mass_kg=11.5 + payload), nothing)

@@ -157,7 +157,7 @@ def test_loop_finds_the_effect_in_what_the_track_model_made():
         "configuration": np.where(kind == 0, "6T2A", "4W2T"), "supply_voltage_V": voltage, "payload_kg": payload,
         "slope_deg": slope, "total_mass_kg": np.where(kind == 0, 13.1, 11.5) + payload,
     }  # fmt: skip
-    for channel, sd in zip(channels.usual(), (0.01, 0.003, 0.003), strict=True):
+    for channel, sd in zip(channels.usual_channels(), (0.01, 0.003, 0.003), strict=True):
         noise = 1 + sd * rng.standard_normal(len(kind))
         columns[channel.column] = np.asarray(shown.reading[channel.name]) / channel.factor * noise
     table = Runs("made by the track model", columns).where(goes_on)

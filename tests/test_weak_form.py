@@ -84,17 +84,17 @@ def space(tmp_path_factory):
 
 def posed(runs, robot, sd=SD):
     library = {n: BY_NAME[n] for n in NAMES}
-    return discover.pose(runs, robot, np.broadcast_to(sd, runs.measured().shape), SETTINGS, {}, library)
+    return discover.pose_candidates(runs, robot, np.broadcast_to(sd, runs.measured().shape), SETTINGS, {}, library)
 
 
 @pytest.fixture(scope="module")
 def before(space):
-    return screening.beforehand(space, SETTINGS)
+    return screening.screen_by_weak_form(space, SETTINGS)
 
 
 def test_a_window_integrates_by_parts():
     time = np.linspace(0.0, 0.3, 31)
-    w, slope, bend = shown_states.window(time / 0.3, 0.3)
+    w, slope, bend = shown_states.window_function(time / 0.3, 0.3)
     x, rate, second = np.sin(9 * time), 9 * np.cos(9 * time), -81 * np.sin(9 * time)
     assert w @ rate == pytest.approx(-slope @ x, rel=1e-5)
     assert w @ second == pytest.approx(bend @ x, rel=1e-4)
@@ -104,10 +104,10 @@ def test_windows_end_before_what_they_may_not_hold():
     time = np.arange(40) * 0.01
     usable, broken = np.ones(40, bool), np.zeros(40, bool)
     usable[12], broken[25] = False, True
-    found = [set(rows) for rows, _ in shown_states.windows_in(time, usable, broken)]
+    found = [set(rows) for rows, _ in shown_states.windows_of_run(time, usable, broken)]
     assert any(max(rows) < 12 for rows in found) and any(min(rows) >= 25 for rows in found)
     assert not any(12 in rows or {24, 25} <= rows for rows in found)
-    assert not shown_states.windows_in(time * 100, usable, broken)  # too far apart to show how states change
+    assert not shown_states.windows_of_run(time * 100, usable, broken)  # too far apart to show how states change
 
 
 def test_base_parameters_are_those_of_the_log(space, before):
@@ -119,7 +119,7 @@ def test_base_parameters_are_those_of_the_log(space, before):
 
 
 def test_the_effect_of_the_log_is_ranked_first_and_not_by_chance(space, before):
-    found = findings.ranking_beforehand(space, before, SETTINGS)
+    found = findings.rank_by_weak_form(space, before, SETTINGS)
     assert found.missing and found.windows == before.windows > 0
     assert "churning" in [e.name for e in found.effects[:2]]
     assert found.effects[0].score > found.chance
@@ -156,7 +156,7 @@ def test_noise_of_windows_is_that_of_their_readings(space, before):
 
 def test_windows_across_a_jump_are_wrong(space, before, monkeypatch):
     names, plan = space.bare.coordinates.names, shown_states.plan_of(space.bare)
-    cut = shown_states.windows_of(space.bare, plan, shown_states.rates_of(space.bare, plan))
+    cut = shown_states.windows_of_log(space.bare, plan, shown_states.motion_rates(space.bare, plan))
     volts = np.asarray(space.bare.observe.of_rows.voltage)
     for w in cut:
         for weight in w.weight:
@@ -182,11 +182,11 @@ def test_a_current_or_a_speed_may_be_imposed(tmp_path, imposed, channel):
     mine = posed(
         records.read(str(tmp_path / "log.csv"), robot=robot).of(robot), robot, SD[int(channel == "motor_current")]
     )
-    found = screening.beforehand(mine, SETTINGS)
+    found = screening.screen_by_weak_form(mine, SETTINGS)
     names, value = mine.coordinates.base.names, mine.coordinates.base.value(found.base.z[: mine.free])
     ratio = value[names.index("motor.inertia")] / value[names.index("motor.torque_constant")]
     assert ratio == pytest.approx(TRUE["inertia"] / TRUE["torque_constant"], rel=0.03)
-    ranked = findings.ranking_beforehand(mine, found, SETTINGS)
+    ranked = findings.rank_by_weak_form(mine, found, SETTINGS)
     assert imposed == "motor_speed" or "churning" in [e.name for e in ranked.effects[:2]]
 
 

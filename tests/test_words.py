@@ -101,8 +101,8 @@ SAMPLES = [
     of_loop.AssumedNoise(("speed",), "speed=2%"),
     of_loop.NoiseFromSeries(
         (
-            SeriesNoise(channels.find("total_current"), 0.0546, 0.0133, 7.45, "slope_deg", 4),
-            SeriesNoise(channels.find("speed"), 0.0, 0.0124, 7.44, "slope_deg", 4, 0.004),
+            SeriesNoise(channels.find_channel("total_current"), 0.0546, 0.0133, 7.45, "slope_deg", 4),
+            SeriesNoise(channels.find_channel("speed"), 0.0, 0.0124, 7.44, "slope_deg", 4, 0.004),
         )
     ),
     of_loop.RefitWorse("total_current", 0.44, 0.54, "estimated"),

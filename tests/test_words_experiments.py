@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 
 from calibration.discovery import menu
-from calibration.discovery.experiments import more_runs
+from calibration.discovery.experiments import denser_runs_instruction
 from calibration.discovery.instructions import CarryOut, NothingPossible, NothingTells, TooWeak
 from calibration.discovery.loop_notes import Heat, Overspeed, Overvoltage
 from calibration.discovery.reach import Reach, Used
@@ -29,7 +29,7 @@ HELD = dataclasses.replace(DRIVEN, torques=(0.0, 0.0412))
 
 
 def on(reach):
-    return {e.name: words.experiment(e) for e in menu.menu(reach)}
+    return {e.name: words.experiment(e) for e in menu.experiment_menu(reach)}
 
 
 def test_acts_say_what_to_set_and_to_read():
@@ -133,12 +133,14 @@ def test_runs_of_a_shaft_are_at_what_is_imposed():
 )
 def test_what_can_do_damage_is_said(about, said):
     assert words.watch(about) == said
-    run = dataclasses.replace(next(e for e in menu.menu(ONE) if e.name == "crawl, rover"), watch=(about,))
+    run = dataclasses.replace(next(e for e in menu.experiment_menu(ONE) if e.name == "crawl, rover"), watch=(about,))
     assert words.experiment(run).endswith(f"; read speed. Watch {said}")
 
 
 def test_instructions_are_said():
-    crawl, reverse = (next(e for e in menu.menu(ONE) if e.name == f"{n}, rover") for n in ("crawl", "reverse"))
+    crawl, reverse = (
+        next(e for e in menu.experiment_menu(ONE) if e.name == f"{n}, rover") for n in ("crawl", "reverse")
+    )
     both = f"{words.experiment(crawl)}. And: {words.experiment(reverse)}"
     assert words.instruction(CarryOut((crawl, reverse))) == both
     assert words.instruction(NothingPossible()) == "Every experiment of the menu is forbidden or beyond reach"
@@ -211,7 +213,7 @@ MORE = [
 
 @pytest.mark.parametrize(("reach", "variable", "said"), MORE, ids=[v for _, v, _ in MORE])
 def test_more_runs_are_said_within_reach(reach, variable, said):
-    assert words.instruction(more_runs("slip", variable, reach)) == (
+    assert words.instruction(denser_runs_instruction("slip", variable, reach)) == (
         f"{said}; read every channel. What the slip balance lacks then shows its shape"
     )
 
@@ -231,14 +233,14 @@ def test_more_runs_are_said_within_reach(reach, variable, said):
 )
 def test_runs_that_a_duty_drives_are_repeated_over_the_duty(reach, variable, said):
     reach = dataclasses.replace(reach, duties=(0.3, 0.9))
-    assert words.instruction(more_runs("slip", variable, reach, by_duty=True)).startswith(f"{said}; ")
+    assert words.instruction(denser_runs_instruction("slip", variable, reach, by_duty=True)).startswith(f"{said}; ")
 
 
 def test_every_kind_of_runs_has_words():
     reaches = (REACH, ONE, BENCH, DRIVEN)
-    assert {e.doing for r in reaches for e in menu.menu(r) if isinstance(e, menu.Run)} == set(words.DOING)
+    assert {e.doing for r in reaches for e in menu.experiment_menu(r) if isinstance(e, menu.Run)} == set(words.DOING)
     metered = dataclasses.replace(BENCH, measured=("motor_current", "output_torque"))
-    acts = {k for r in (REACH, metered) for e in menu.menu(r) if isinstance(e, menu.Act) for k in e.kinds}
+    acts = {k for r in (REACH, metered) for e in menu.experiment_menu(r) if isinstance(e, menu.Act) for k in e.kinds}
     assert acts == {"weigh", *words.ACTS} and set(words.ACTS) == {*words.UNITS, "zero reading"}
 
 
@@ -253,7 +255,7 @@ def test_steps_are_those_that_a_person_sets(span, count, step):
 
 
 def test_a_temperature_that_nobody_stated_is_not_watched():
-    stated, unknown = (more_runs("slip", "time", dataclasses.replace(ONE, hot=t)) for t in (125.0, 1e9))
+    stated, unknown = (denser_runs_instruction("slip", "time", dataclasses.replace(ONE, hot=t)) for t in (125.0, 1e9))
     assert "(125 °C is allowed)" in words.instruction(stated)
     assert words.instruction(unknown).count("watch the winding's temperature;") == 1
 
@@ -265,4 +267,6 @@ def test_a_temperature_that_nobody_stated_is_not_watched():
 def test_more_runs_are_said_of_a_table_that_varied_nothing(reach, variable):
     """Where a speed is imposed the table has no voltage at all."""
     used = tuple(dataclasses.replace(u, voltages=(0.0,), slopes=(0.0,), payloads=(0.0,)) for u in reach.used)
-    assert words.instruction(more_runs("track", variable, dataclasses.replace(reach, used=used))).startswith("Re")
+    assert words.instruction(
+        denser_runs_instruction("track", variable, dataclasses.replace(reach, used=used))
+    ).startswith("Re")

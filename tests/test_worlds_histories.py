@@ -43,7 +43,7 @@ def package():
     base = params.replace(paper_robots.nominal(), CLIMBING)
     full = dataclasses.replace(base, effects=tuple(BY_NAME[n]() for n in PASSING))
     times = np.arange(round(DURATION / EVERY) + 1) * EVERY
-    every = {p.name: p.value for p in params.walk(full)}
+    every = {p.name: p.value for p in params.walk_parameters(full)}
 
     def read(battery, values=None):
         slope = np.degrees(RUNS.slope)
@@ -216,8 +216,8 @@ def test_table_of_histories_passes_the_input_checks(quick, tmp_path):
         made = histories.case(w, seed=1)
         made.write(tmp_path)
         runs = records.read(tmp_path / "table.csv")
-        kind = observers.kind(runs)
-        known = noise.from_table(runs, kind.sizes(runs))
+        kind = observers.observer_kind(runs)
+        known = noise.noise_from_table(runs, kind.sizes(runs))
         assert runs.has("time_s") and len(runs) == made.label["rows"]
         assert kind.check(runs, known) == kind.check_start(runs, known, paper_robots.nominal()) == []
         assert np.isnan(runs.measured()).sum() == made.label["missing"]

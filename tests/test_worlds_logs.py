@@ -12,7 +12,7 @@ from worlds.settled import remainder
 from calibration.data import robot_file
 from calibration.data import runs as records
 from calibration.inference import bases, noise, observers, ranges
-from calibration.inference.observers.time_histories import _common
+from calibration.inference.observers.time_histories import _common_length
 from calibration.inference.ranges import check_ranges
 from mmrjax.effects import BY_NAME
 from mmrjax.model import params
@@ -33,8 +33,8 @@ def shown(tmp_path, case, terms=()):
     for t in terms:
         own = {"speed_fade": t.shapes["fade"] * case.rig.w_k} if "fade" in t.shapes else t.shapes
         truth |= {f"effects.{t.name}.{k}": x for k, x in own.items()}
-    kind = observers.kind(runs)
-    robot = kind.with_initial_states(robot, runs, noise.from_table(runs, kind.sizes(runs)))
+    kind = observers.observer_kind(runs)
+    robot = kind.with_initial_states(robot, runs, noise.noise_from_table(runs, kind.sizes(runs)))
     made = kind.of(runs, robot)
     names = [c.name for c in robot.channels]
     factors = np.array([c.factor for c in robot.channels])
@@ -93,19 +93,19 @@ def test_a_speed_that_still_rises_is_no_matter_of_units(tmp_path, monkeypatch):
     # None of its rows has settled, so nothing is compared.
     monkeypatch.setattr(ranges, "_check_masses", lambda *_: pytest.fail("rows that still rise are compared"))
     assert check_ranges(runs, robot) == []
-    kind = observers.kind(runs)
+    kind = observers.observer_kind(runs)
     assert len(kind.settled(runs)[0]) > len(kind.settled(runs, steady=True)[0]) == 0
 
 
 def test_logs_of_about_one_length_share_what_is_compiled():
-    lengths = [_common(n) for n in range(1, 5000)]
+    lengths = [_common_length(n) for n in range(1, 5000)]
     assert all(n <= long <= 1.125 * n for n, long in enumerate(lengths, 1))
     assert len({long for long in lengths if 2048 <= long < 4096}) == 8
     rows = np.arange(200)[None]
     slow, fast = (
-        bases.waves(np.zeros(200, bool), np.linspace(0, 2 * np.pi * n, 200), rows, rows) for n in (30.0, 60.0)
+        bases.wave_families(np.zeros(200, bool), np.linspace(0, 2 * np.pi * n, 200), rows, rows) for n in (30.0, 60.0)
     )
-    resolved = [set(v for _, v in bases.names(b)) for b in (slow, fast)]
+    resolved = [set(v for _, v in bases.family_names(b)) for b in (slow, fast)]
     assert resolved[1] < resolved[0] and slow[0].columns.shape == fast[0].columns.shape
 
 

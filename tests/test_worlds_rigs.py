@@ -47,7 +47,7 @@ def robot(w):
     else:
         load = Shaft(inertia=0.0, loss_coulomb=0.0)
     rig = Rig(imposed="motor_speed" if r.wide else "voltage")
-    blank = paper_robots.blank(Configurations({"load": load}), float(r.sides), rig)
+    blank = paper_robots.blank_robot(Configurations({"load": load}), float(r.sides), rig)
     values = {n if n.startswith(("motor.", "gearbox.")) else f"load.{n}": jnp.asarray(v) for n, v in p.items()}
     return params.replace(blank, values)
 
@@ -266,7 +266,7 @@ def test_laws_are_those_of_the_library(worlds, names):
             effect = BY_NAME[name]()
             assert form.cls == name
             assert form.balance == (effect.channel if effect.balance == "sensor" else effect.balance)
-            mine = [p.name for p in params.walk(effect) if p.name != "amplitude"]
+            mine = [p.name for p in params.walk_parameters(effect) if p.name != "amplitude"]
             shapes = dict(zip(mine, term.shapes.values(), strict=False))
             values = {"amplitude": term.amplitude, **shapes}
             effect = params.replace(effect, {k: jnp.asarray(v) for k, v in values.items()})

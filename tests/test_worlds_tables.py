@@ -37,7 +37,7 @@ def package():
     base = params.replace(paper_robots.nominal(), CLIMBING)
     full = dataclasses.replace(base, effects=tuple(BY_NAME[name]() for name in laws.LIBRARY))
     run = Conditions(GRID.wheeled, GRID.U, np.degrees(GRID.slope), GRID.payload, total_mass=GRID.mass)
-    every = {p.name: p.value for p in params.walk(full)}
+    every = {p.name: p.value for p in params.walk_parameters(full)}
 
     def read(constants=None, term=None):
         values = every | (constants or {})
@@ -443,9 +443,9 @@ def test_laws_follow_the_size_of_the_robot():
 
 def test_priors_are_those_of_the_fields_and_truths_are_where_the_package_has_them():
     robot = robot_file.load("nominal")
-    c = priors.coordinates(robot, priors.free_names(robot, ("6T2A", "4W2T")))
+    c = priors.parameter_coordinates(robot, priors.free_names(robot, ("6T2A", "4W2T")))
     assert set(c.names) == set(PAPER.free)
-    known = {p.name: p for p in params.walk(robot)}
+    known = {p.name: p for p in params.walk_parameters(robot)}
     for name in c.names:
         spec, short = known[name].spec, tables._last(name)
         if short in tables.ABSOLUTE:

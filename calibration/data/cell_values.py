@@ -9,7 +9,7 @@ import numpy as np
 
 from calibration.data import surfaces
 from calibration.data.columns import DRIVEN, DUTY, WORDS, Column, Layout
-from calibration.data.input_errors import choices, number, parsed
+from calibration.data.input_errors import allowed_words, number, parsed
 from calibration.data.named_arrays import Raw, missing, numbers, texts
 from mmrjax.model import quantities
 
@@ -61,7 +61,7 @@ def _allowed_words(column: str, word: str, layout: Layout) -> str:
     if column == "surface":
         return surfaces.refused(word, layout)
     if column == "mode" and word not in DRIVEN:
-        return f"one of these; {choices(word, DRIVEN)}"
+        return f"one of these; {allowed_words(word, DRIVEN)}"
     if column == "configuration" and not word:
         return "the name of one of the robot's configurations"
     return ""
@@ -113,7 +113,7 @@ def _hint(meaning: Column, cell: str, units: bool, readings: tuple[str, ...]) ->
 
 def _unit_hint(value: str, written: str, mine: str, named: Mapping[str, str]) -> str:
     """Advice on a unit next to a number; `mine`: the column's own unit, `named`: columns by their units."""
-    unit = quantities.spelled(written)
+    unit = quantities.unit_in_column(written)
     if unit == mine:
         return f"write {value}, the unit stands in the column's name; "
     if unit in named:

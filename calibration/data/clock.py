@@ -9,23 +9,28 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from calibration.data import counters
 from calibration.data.columns import Column
 from calibration.data.input_errors import number
 from calibration.data.named_arrays import Raw, numbers
 
 #: Day of a cell that holds a time alone, and length of a day [s].
 _SOME_DAY, _DAY = "1970-01-01T", 86400.0
+#: Seconds since 1970 between which a clock may count from there, 1990 and 2100; and seconds of one of other units.
+EPOCH, PARTS = (6.3e8, 4.2e9), {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 #: A date as 25.11.2026.
 _WITH_POINTS = re.compile(r"(\d\d)\.(\d\d)\.(\d{4})(?=[ T])")
 
 
-def from_the_first(name: str, meaning: Column, raw: Raw, runs: Sequence[str] | None) -> tuple[Raw, str]:
-    """Returns a column of time as the time since the first row of each run, and a note where that changes it.
+def from_the_first(name: str, meaning: Column, raw: Raw, runs: Sequence[str] | None) -> tuple[Raw, tuple[str, ...]]:
+    """Returns a column of time as the time since the first row of each run, and notes on what that changes.
 
     A run begins at its first row, whatever its clock shows there: the time since a controller started, or a time of
-    day. Times of day follow ISO 8601, or have a date as 25.11.2026, or are numbers beyond the largest time (seconds
-    since 1970). Times without a date that fall back by more than half a day have passed midnight. A column with a
-    cell that is no time is returned as it is, and the reader refuses that cell.
+    day. Times of day follow ISO 8601, or have a date as 25.11.2026, or are numbers beyond the largest time. These
+    count seconds since 1970, or ms, µs or ns, as their size tells. Times without a date that fall back by more than
+    half a day have passed midnight. A counter that wraps at the end of its digits goes on. Rows that share a stamp
+    are set evenly between it and the next (`counters`). A column with a cell that is no time is returned as it is,
+    and the reader refuses that cell.
 
     Args:
         name: of the source; meaning: of the column; runs: `run_id` of each cell; None: all are of one run.
@@ -35,28 +40,59 @@ def from_the_first(name: str, meaning: Column, raw: Raw, runs: Sequence[str] | N
         np.array([_seconds(cell) for cell in raw]) if isinstance(raw, list) and ":" in raw[0] else np.full(1, np.nan)
     )
     of_day = bool(np.isfinite(clock).all())
+    names, run = (np.array([""]), None) if runs is None else np.unique(runs, return_inverse=True)
+    notes: tuple[str, ...] = ()
     if not of_day:
         low, high = (limit * factor for limit in meaning.limits())
-        clock = numbers(raw) * factor
+        count, notes = _counted(name, meaning, numbers(raw), run)
+        clock = count * factor
         of_day = bool((clock > high).all())
+        if of_day and clock[0] > EPOCH[1]:
+            unit = next((u for u, one in PARTS.items() if EPOCH[0] <= clock[0] * one <= EPOCH[1]), None)
+            if unit is None:
+                return raw, ()
+            clock = clock * PARTS[unit]
+            notes = (*notes, f"{name}: {meaning.shown} counts {unit} since 1970 by its size; read so")
         if not of_day and not ((low <= clock) & (clock <= high)).all():
-            return raw, ""
-    names, run = (np.array([""]), np.zeros(len(clock), int)) if runs is None else np.unique(runs, return_inverse=True)
+            return raw, ()
+    run = np.zeros(len(clock), int) if run is None else run
     if isinstance(raw, list):
         _past_midnight(clock, raw, run)
     first = np.full(len(names), np.inf)
-    np.minimum.at(first, run, clock)
+    if len(names) > 1:
+        np.minimum.at(first, run, clock)
+    else:  # in a tenth of the time
+        first[:] = clock.min()
     if not first.any():
-        return raw, ""
+        return (clock / factor if notes else raw), notes
     passed = np.round(clock - first[run], 9) / factor
     if of_day:
-        return passed, f"{name}: {meaning.shown} is a time of day; counted from the first of each run"
+        return passed, (*notes, f"{name}: {meaning.shown} is a time of day; counted from the first of each run")
     which = run[np.flatnonzero(first[run])[0]]
     where = f"{number(first[which] / factor)}{f' in run {names[which]}' if names[which] else ''}"
     return passed, (
+        *notes,
         f"{name}: {meaning.shown} begins at {where}; a run begins at its first row, and its time counts from there; "
-        "if it began earlier, add a row at that time without readings"
+        "if it began earlier, add a row at that time without readings",
     )
+
+
+def _counted(
+    name: str, meaning: Column, count: np.ndarray, run: np.ndarray | None
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Numbers of a clock without wraps and without stamps that rows share, and notes on these."""
+    step = np.diff(count)
+    if not len(step) or (step > 0).all() or not np.isfinite(step).all():
+        return count, ()
+    notes = []
+    recording = np.zeros(len(count), int) if run is None else run
+    count, period = counters.unwrapped(count, recording)
+    if period:
+        notes.append(f"{name}: {meaning.shown} wraps at {period:.10g}; counted on from there")
+    count, rows = counters.spread(count, recording)
+    if rows:
+        notes.append(f"{name}: {meaning.shown} repeats, {rows:.3g} rows a stamp; rows are set evenly between stamps")
+    return count, tuple(notes)
 
 
 def _past_midnight(clock: np.ndarray, cells: Sequence[str], run: np.ndarray) -> None:

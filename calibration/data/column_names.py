@@ -128,7 +128,7 @@ def _other_names(strange: list[str], column: str) -> str:
     shown = ", ".join(strange[:NAMED]) + (", ..." if len(strange) > NAMED else "")
     return (
         f"; other columns: {shown}; if one of them is it, say so in the robot's file, with the factor from its unit: "
-        f'[columns] {column} = {{column = "{guess}", factor = 1.0}}'
+        f'[columns] {column} = {{column = "{guess}", factor = 1.0}} (mmrjax inspect proposes such lines)'
     )
 
 
@@ -174,7 +174,7 @@ def check_units(arrays: NamedArrays, meanings: Sequence[Column | None]) -> None:
             continue
         named = {unit: column for column, unit in meaning.quantity.columns().items()}
         for stated, where in (
-            (quantities.at_the_end(meaning.shown, named), "in its name"),
+            (quantities.unit_at_end(meaning.shown, named), "in its name"),
             (stated_below, f"in {arrays.units_from}"),
         ):
             if stated and stated != meaning.unit:

@@ -46,7 +46,7 @@ SIDES = {c: BY_COLUMN[c] for c in ("duty_left", "duty_right")}
 #: The same in volts, which are read as those shares (`sides.of_volts`).
 VOLTS = {c: BY_COLUMN[c] for c in ("voltage_left_V", "voltage_right_V")}
 #: The same where speeds are imposed.
-SPEEDS = tuple(channels.find(f"motor_speed_{side}").column for side in channels.SIDES)
+SPEEDS = tuple(channels.find_channel(f"motor_speed_{side}").column for side in channels.SIDES)
 HEADING = {"heading_deg": BY_COLUMN["heading_deg"]}
 #: Angles of a tracked robot's levers, 0 along the wheelbase outward, positive up, 180 folded.
 LEVERS = {c: BY_COLUMN[c] for c in ("levers_front_deg", "levers_rear_deg")}
@@ -119,7 +119,7 @@ class Layout:
     configurations: tuple[str, ...] = ()
     instruments: tuple[Instrument, ...] = ()
     mapped: tuple[tuple[str, str, float], ...] = ()
-    channels: tuple[Channel, ...] = dataclasses.field(default_factory=channels.usual)
+    channels: tuple[Channel, ...] = dataclasses.field(default_factory=channels.usual_channels)
 
     @classmethod
     def of(cls, robot: Robot | None) -> Layout:
@@ -262,7 +262,7 @@ class Layout:
         none = {*stated, *self.idle, *self.deviation_columns, *WHEN, *WORDS}
         lacking = {column: quantity for column, quantity in self.quantities().items() if column not in none}
         spelled = {s: (column, unit) for column, q in lacking.items() for s, unit in q.columns().items()}
-        unit = quantities.at_the_end(name, {unit for _, unit in spelled.values()})
+        unit = quantities.unit_at_end(name, {unit for _, unit in spelled.values()})
         pool = [s for s, (column, own) in spelled.items() if own == unit or (unit is None and s == column)]
         close = difflib.get_close_matches(name.casefold(), [s.casefold() for s in pool], 1, ALIKE)
         if close:

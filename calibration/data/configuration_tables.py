@@ -10,7 +10,7 @@ from typing import Any
 import equinox as eqx
 
 from calibration.data import rig_file
-from calibration.data.input_errors import BadConfiguration, choices
+from calibration.data.input_errors import BadConfiguration, allowed_words
 from mmrjax.model import params
 from mmrjax.model.chassis import Chassis
 from mmrjax.model.contact import Friction
@@ -117,7 +117,7 @@ def resolved_likes(content: dict[str, Any], where: str) -> None:
         if "like" in table:
             like = table.pop("like")
             if like not in own:
-                raise BadConfiguration(f"{where}, {name}.like: got {like}; {choices(str(like), own)}")
+                raise BadConfiguration(f"{where}, {name}.like: got {like}; {allowed_words(str(like), own)}")
             content[name] = _over(tables[like], table)
 
 
@@ -135,7 +135,7 @@ def _kind(table: dict[str, Any], where: str) -> str:
         return "vehicle"
     load = table.pop("load")
     if load not in rig_file.LOADS:
-        raise BadConfiguration(f"{where}.load: got {load}; {choices(str(load), rig_file.LOADS)}")
+        raise BadConfiguration(f"{where}.load: got {load}; {allowed_words(str(load), rig_file.LOADS)}")
     for key in ("like", "movers"):
         if load != "vehicle" and key in table:
             raise BadConfiguration(f"{where}: states both load = {load!r} and {key}; state one of them")
@@ -177,13 +177,13 @@ def _vehicle(table: dict[str, Any], where: str, sides: float) -> tuple[Chassis, 
         inertia=0.0,
     )
     known = rig_file.vehicle_defaults(on_tracks > 0.5, table, sides)
-    missing = [p.name for p in params.walk(nothing) if p.name not in known and not _states(table, p.name)]
+    missing = [p.name for p in params.walk_parameters(nothing) if p.name not in known and not _states(table, p.name)]
     return params.replace(nothing, {name: params.as_float(value) for name, value in known.items()}), missing
 
 
 def _movers(stated: Any, where: str) -> float:
     if stated not in MOVERS:
-        raise BadConfiguration(f"{where}.movers: got {stated}; {choices(str(stated), MOVERS)}")
+        raise BadConfiguration(f"{where}.movers: got {stated}; {allowed_words(str(stated), MOVERS)}")
     return MOVERS[stated]
 
 
@@ -215,7 +215,7 @@ def _chassis(robot: Robot, name: str, table: dict[str, Any], where: str) -> Chas
         raise BadConfiguration(f"{where}: states both like and movers; state one of them")
     if like is not None:
         if like not in have.names:
-            raise BadConfiguration(f"{where}.like: got {like}; {choices(str(like), have)}")
+            raise BadConfiguration(f"{where}.like: got {like}; {allowed_words(str(like), have)}")
         return have[like]
     if movers is not None:
         return _blank(have.members[0], _movers(movers, where), table, where)

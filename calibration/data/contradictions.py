@@ -12,7 +12,7 @@ from calibration.data.table import Runs
 from mmrjax.model import params
 from mmrjax.model.channels import CURRENT, VOLTAGE
 from mmrjax.model.quantities import RPM
-from mmrjax.model.robot import Robot, cannot_turn
+from mmrjax.model.robot import Robot, turn_error
 
 #: Share of the motors' back-EMF below which no voltage turns them at an imposed speed [-], and least back-EMF that
 #: tells [V].
@@ -41,7 +41,7 @@ def check(runs: Runs, robot: Robot) -> None:
             time that goes back now and then.
     """
     _mass(runs, robot)
-    if runs.turns and (why := cannot_turn(robot, sorted({str(n) for n in runs.configurations_named(robot)}))):
+    if runs.turns and (why := turn_error(robot, sorted({str(n) for n in runs.configurations_named(robot)}))):
         raise BadData(f"{runs.source}, {', '.join((*runs.layout.sides, *HEADING))}: {why}")
     if runs.turns:
         sides.check(runs)
@@ -61,7 +61,7 @@ def cannot_stand(robot: Robot) -> str | None:
     """Why it is not known how a robot stands; None where it is."""
     if not robot.has_ground:
         return "the robot's load is a shaft, which stands on no ground"
-    if not any(robot.knows([f"running_gear.{p.name}"]) for p in params.walk(robot.running_gear)):
+    if not any(robot.knows([f"running_gear.{p.name}"]) for p in params.walk_parameters(robot.running_gear)):
         return "the robot's file states no running_gear; state its wheelbase, levers and masses there"
     return None
 

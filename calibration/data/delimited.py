@@ -10,13 +10,17 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
 from calibration.data import input_files
 from calibration.data.columns import WORDS
 from calibration.data.input_errors import BadData
-from calibration.data.named_arrays import NamedArrays, number
-from mmrjax.errors import counted
+from calibration.data.named_arrays import NamedArrays, Raw, number
+from mmrjax.errors import count_noun
 from mmrjax.model import channels, quantities
 
+#: Size of a file from which on plain tables are read as arrays at once [bytes].
+LONG = 2_000_000
 #: Separators of cells other than a comma, and a word for each.
 SEPARATORS = {";": "semicolons", "\t": "tabs"}
 #: Bytes that no text has.
@@ -36,6 +40,8 @@ def arrays(path: Path, name: str) -> NamedArrays:
         BadData: as `input_files.table`, `text` and `cells`, or a row of another length than the header.
     """
     content = input_files.table(path, name)
+    if len(content) >= LONG and (plain := _plain(name, content)) is not None:
+        return plain
     decoded, encoded = text(name, content)
     rows, notes = cells(name, below_comments([line for line in decoded.splitlines() if line.strip()]))
     header, body = (rows[0], rows[1:]) if rows else ([], [])
@@ -46,7 +52,8 @@ def arrays(path: Path, name: str) -> NamedArrays:
     for k, row in enumerate(body, 1):
         if len(row) != len(header):
             raise BadData(
-                f"{name} row {k}: got {counted(len(row), 'cell')}; the header has {counted(len(header), 'column')}"
+                f"{name} row {k}: got {count_noun(len(row), 'cell')}; "
+                f"the header has {count_noun(len(header), 'column')}"
             )
     return NamedArrays(
         name,
@@ -58,12 +65,55 @@ def arrays(path: Path, name: str) -> NamedArrays:
     )
 
 
+def _plain(name: str, content: bytes) -> NamedArrays | None:
+    """Columns of a plain table, numbers as arrays: UTF-8 with commas, without comments, quotes and units. None: it is
+    none, and `cells` reads it with all its checks."""
+    end = content.find(b"\n")
+    if content.startswith((b"#", codecs.BOM_UTF8, b"\xff\xfe", b"\xfe\xff")) or b'"' in content or end < 0:
+        return None
+    try:
+        first = content[: content.find(b"\n", end + 1)].decode().splitlines()
+    except UnicodeDecodeError:
+        return None
+    header, row = ([cell.strip() for cell in line.split(",")] for line in (*first, "", "")[:2])
+    if len(header) < 2 or not all(header) or len(header) != len(row) or row_of_units(header, row):
+        return None
+    import pyarrow as pa
+    from pyarrow import compute
+    from pyarrow import csv as reader
+
+    names = [str(k) for k in range(len(header))]
+    kinds = reader.ConvertOptions(column_types=dict.fromkeys(names, pa.string()), strings_can_be_null=False)
+    try:
+        table = reader.read_csv(
+            pa.BufferReader(pa.py_buffer(content)),
+            reader.ReadOptions(column_names=names, skip_rows=1),
+            reader.ParseOptions(quote_char=False),
+            kinds,
+        )
+    except pa.ArrowInvalid:  # a row of another length, or bytes that are not UTF-8
+        return None
+    values: list[Raw] = []
+    empty = None
+    for column in table.columns:
+        blank = compute.equal(column, "")
+        empty = blank if empty is None else compute.and_(empty, blank)
+        try:
+            found = column.cast(pa.float64()).to_numpy()
+        except pa.ArrowInvalid:  # some cell states no number
+            found = np.full(1, np.nan)
+        values.append([cell.strip() for cell in column.to_pylist()] if np.isnan(found).any() else found)
+    if empty is None or compute.any(empty).as_py():  # rows of separators alone
+        return None
+    return NamedArrays(name, tuple(header), tuple(values), digest=hashlib.sha256(content).hexdigest())
+
+
 def row_of_units(header: Sequence[str], first: Sequence[str]) -> tuple[str, ...]:
     """Returns the units that the first row below a header states, empty where it states none; () if it is a run: a
     cell of it is a number, or no cell of a column of numbers is a unit."""
     if len(first) != len(header) or any(math.isfinite(number(cell)) for cell in first):
         return ()
-    units = tuple(quantities.spelled(cell.strip("[]()")).strip("-") for cell in first)
+    units = tuple(quantities.unit_in_column(cell.strip("[]()")).strip("-") for cell in first)
     known = {unit for quantity in (*quantities.SET, *channels.EVERY) for unit in quantity.columns().values()} - {""}
     stated = any(unit in known for column, unit in zip(header, units, strict=True) if column not in WORDS)
     return units if stated else ()

@@ -20,13 +20,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from calibration.data.input_errors import BadConfiguration, choices, is_number
+from calibration.data.input_errors import BadConfiguration, allowed_words, is_number
 from mmrjax import effects
 from mmrjax.effects import Effect
 from mmrjax.effects.base import THE_SIDE
-from mmrjax.effects.contract import readable
+from mmrjax.effects.contract import readable_signals
 from mmrjax.model import channels, paper_robots, params
-from mmrjax.model.balances import BALANCES, ROUND, added, moving
+from mmrjax.model.balances import BALANCES, ROUND, effects_sum, moving_signals
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.signals import Signals, State
 
@@ -79,7 +79,8 @@ def library(paths: Sequence[Path | str] = ()) -> Library:
         others = [name for name in known if name != effect.name]
         if effect.settles_to and effect.settles_to not in others:
             raise BadConfiguration(
-                f"{_where(path, effect)}, settles_to: got {effect.settles_to}; {choices(effect.settles_to, others)}"
+                f"{_where(path, effect)}, settles_to: got {effect.settles_to}; "
+                f"{allowed_words(effect.settles_to, others)}"
             )
     return known
 
@@ -111,7 +112,7 @@ def read(path: Path) -> tuple[type[Effect], ...]:
         spec.loader.exec_module(module)
     except (Exception, SystemExit) as error:
         raise BadConfiguration(f"{path.name}: its code fails ({type(error).__name__}: {error})") from error
-    concrete = effects.defined_in(module)
+    concrete = effects.effects_of_module(module)
     if not concrete:
         own = [v for v in vars(module).values() if inspect.isclass(v) and v.__module__ == name]
         partial = [v.__name__ for v in own if issubclass(v, Effect)]
@@ -141,14 +142,14 @@ def _check(path: Path, effect: type[Effect]) -> None:
     if not effect.name.isidentifier():
         raise refuse(f", name: got {effect.name!r}; expected lower-case words joined by underscores")
     if effect.balance not in BALANCES:
-        raise refuse(f", balance: got {effect.balance}; {choices(effect.balance, BALANCES)}")
-    known = channels.names(channels.EVERY)
+        raise refuse(f", balance: got {effect.balance}; {allowed_words(effect.balance, BALANCES)}")
+    known = channels.channel_names(channels.EVERY)
     if (effect.balance == "sensor") != bool(effect.channel):
         raise refuse(f", channel: got {effect.channel!r}; expected one of {', '.join(known)} for sensor, else none")
     if effect.channel and effect.channel not in known:
-        raise refuse(f", channel: got {effect.channel}; {choices(effect.channel, known)}")
+        raise refuse(f", channel: got {effect.channel}; {allowed_words(effect.channel, known)}")
     if effect.movers and effect.movers not in _MOVERS:
-        raise refuse(f", movers: got {effect.movers}; {choices(effect.movers, _MOVERS)}, or none for both")
+        raise refuse(f", movers: got {effect.movers}; {allowed_words(effect.movers, _MOVERS)}, or none for both")
     size = effect.memory_size
     if size is not None and not (is_number(size) and size > 0):
         raise refuse(f", memory_size: got {size}; expected a positive number, or None for no memory")
@@ -161,7 +162,7 @@ def _check(path: Path, effect: type[Effect]) -> None:
     acting, stated = default.configurations, effect.configurations
     if acting != stated or not isinstance(acting, tuple) or not all(isinstance(c, str) for c in acting):
         raise refuse(f', configurations: got {stated!r}; expected a tuple of names such as ("4W2T",)')
-    declared = {p.name: p for p in params.walk(default)}
+    declared = {p.name: p for p in params.walk_parameters(default)}
     amplitudes = [name for name, p in declared.items() if p.spec.amplitude]
     if amplitudes != ["amplitude"]:
         raise refuse(
@@ -186,8 +187,8 @@ def _instants(balance: str, channel: str, configuration: int) -> tuple[Signals, 
     rest = State(zero, zero, zero, zero)
     # What is summed for the turn is summed when both sides' slip and resistance are known.
     before = "slip" if balance in ROUND else balance
-    climbs, every = readable(robot, run, climbing, before, channel), moving(robot, run, climbing)
-    still = readable(robot, run, rest, before, channel)
+    climbs, every = readable_signals(robot, run, climbing, before, channel), moving_signals(robot, run, climbing)
+    still = readable_signals(robot, run, rest, before, channel)
     return dataclasses.replace(climbs, **TURN), dataclasses.replace(every, **TURN), still
 
 
@@ -199,7 +200,7 @@ def _check_term(refuse: Callable[[str], BadConfiguration], effect: type[Effect],
         # A configuration that the nominal robot does not have is the business of the robot file.
         made = dataclasses.replace(params.replace(effect(), {"amplitude": amplitude}), configurations=())
         with_it = dataclasses.replace(robot, effects=(made,))
-        return jnp.asarray(added(with_it, signals, effect.balance, effect.channel), float)
+        return jnp.asarray(effects_sum(with_it, signals, effect.balance, effect.channel), float)
 
     for configuration in range(len(robot.configurations)):
         known, every, rest = (
@@ -221,7 +222,7 @@ def _check_term(refuse: Callable[[str], BadConfiguration], effect: type[Effect],
         if once.shape != ():
             raise refuse(f": its term has shape {once.shape}; expected a scalar for scalar signals")
         if not jnp.array_equal(once, late, equal_nan=True):
-            raise refuse(": its term reads a signal that is computed after its balance; see balances.moving")
+            raise refuse(": its term reads a signal that is computed after its balance; see balances.moving_signals")
         if float(none) != 0.0:
             raise refuse(f": its term is {float(none):g} at amplitude 0; expected 0, which is absent")
         if not math.isfinite(float(slope)):

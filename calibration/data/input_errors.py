@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from mmrjax.errors import choices as choices
-from mmrjax.errors import shortened
+from mmrjax.errors import allowed_words as allowed_words
+from mmrjax.errors import shorten
 
 
 class InputError(Exception):
@@ -14,7 +14,7 @@ class InputError(Exception):
 
     def __init__(self, message: str) -> None:
         """Keeps the message `shortened`."""
-        super().__init__(shortened(message))
+        super().__init__(shorten(message))
 
     exit_code = 2
 

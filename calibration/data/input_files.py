@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
+import math
 import re
 import stat
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from calibration.data.input_errors import BadConfiguration, BadData, InputError
-from mmrjax.errors import counted
+from mmrjax.errors import count_noun
 
-#: First bytes of formats that are no text, and what they are.
+#: First bytes of formats that are not read, and what they are (`sources.opening` has those that are).
 BINARY = {
-    b"PAR1": "a Parquet file", b"\x89HDF\r\n\x1a\n": "an HDF5 file", b"PK\x03\x04": "an Excel workbook or a zip file",
-    b"\xd0\xcf\x11\xe0": "an Excel workbook", b"\x1f\x8b": "a gzip file", b"MATLAB 5.0": "a MATLAB file",
-    b"ARROW1": "an Arrow file", b"SQLite format 3\0": "an SQLite file", b"#ROSBAG": "a ROS bag",
-    b"\x89MCAP": "an MCAP file", b"ULog\x01": "a ULog file", b"\x93NUMPY": "a NumPy file", b"%PDF": "a PDF",
+    b"PK\x03\x04": "an Excel workbook or a zip file", b"\xd0\xcf\x11\xe0": "an Excel workbook",
+    b"\x1f\x8b": "a gzip file", b"SQLite format 3\0": "an SQLite file", b"%PDF": "a PDF",
 }  # fmt: skip
 #: Beginnings of JSON and of web pages.
 TEXTS = {
@@ -40,6 +41,25 @@ def content(path: Path, where: str | Path, kind: type[InputError] = BadData, lar
     Raises:
         InputError: a folder, a pipe, a device, a file larger than `largest`, or a file that the system does not open.
     """
+    with _opened(path, where, kind, largest) as stream:
+        return stream.read()
+
+
+def beginning(path: Path, where: str | Path, kind: type[InputError] = BadData, length: int = 4096) -> bytes:
+    """Returns the first bytes of a regular file of any size.
+
+    Args:
+        where: opens the message of an error; kind: of the error.
+
+    Raises:
+        InputError: as `content`.
+    """
+    with _opened(path, where, kind) as stream:
+        return stream.read(length)
+
+
+@contextlib.contextmanager
+def _opened(path: Path, where: str | Path, kind: type[InputError], largest: float = math.inf) -> Iterator[BinaryIO]:
     try:
         found = path.stat()
         if not stat.S_ISREG(found.st_mode):
@@ -47,7 +67,8 @@ def content(path: Path, where: str | Path, kind: type[InputError] = BadData, lar
             raise kind(f"{where}: is {what}; expected a file")
         if found.st_size > largest:
             raise kind(f"{where}: has {found.st_size / 1e6:,.0f} MB; expected at most {largest / 1e6:,.0f} MB")
-        return path.read_bytes()
+        with path.open("rb") as stream:
+            yield stream
     except (OSError, ValueError) as error:  # a name with a null byte
         raise kind(f"{where}: cannot be read ({getattr(error, 'strerror', None) or error})") from error
 
@@ -63,8 +84,9 @@ def table(path: Path, where: str | Path) -> bytes:
     what = what or next((word for begin, word in TEXTS.items() if begin.match(found)), None)
     if what is not None:
         raise BadData(
-            f"{where}: is {what}; expected CSV: a header line with the columns' names, then one line for each row; "
-            "export it as CSV, from Python with pandas.DataFrame(...).to_csv(..., index=False)"
+            f"{where}: is {what}; expected CSV (a header line with the columns' names, then one line for each "
+            "row), Parquet, or another format of docs/howto/formats.md; export it as CSV, from Python with "
+            "pandas.DataFrame(...).to_csv(..., index=False)"
         )
     return found
 
@@ -109,7 +131,7 @@ def toml_content(text: str, where: str | Path, kind: type[InputError] = BadConfi
         inner = value.values() if isinstance(value, dict) else value
         keys += len(value) if isinstance(value, dict) else 0
         if keys > KEYS:
-            raise kind(f"{where}: has more than {counted(KEYS, 'key')}; is it the right file?")
+            raise kind(f"{where}: has more than {count_noun(KEYS, 'key')}; is it the right file?")
         for each in inner:
             if isinstance(each, dict | list):
                 left.append((each, depth + 1))

@@ -72,7 +72,7 @@ def infer_instruments(
     back = any((columns[c] < 0).any() for c in ("supply_voltage_V", "motor_speed_rpm", "duty") if c in columns)
     found = []
     for instrument in instruments:
-        channel = channels.find(instrument.channel)
+        channel = channels.find_channel(instrument.channel)
         shown = columns.get(channel.column, np.zeros(0))
         signed, quantum = instrument.signed, instrument.quantum
         if signed is None:

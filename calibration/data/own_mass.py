@@ -54,7 +54,9 @@ def stated_masses(robot: Robot, runs: Runs) -> dict[str, StatedMass]:
         return {}
     which = runs.configurations(robot)
     own = runs["total_mass_kg"] - runs["payload_kg"]
-    low, high = next(p for p in params.walk(robot.configurations.members[0]) if p.name == "mass").spec.bounds
+    low, high = next(
+        p for p in params.walk_parameters(robot.configurations.members[0]) if p.name == "mass"
+    ).spec.bounds
     wrong = np.flatnonzero((own < low) | (own > high))
     if wrong.size:
         row = int(wrong[0])

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calibration.data.input_errors import BadData, choices
+from calibration.data.input_errors import BadData, allowed_words
 
 if TYPE_CHECKING:
     from mmrjax.model.robot import Robot
@@ -69,11 +69,11 @@ class Posterior:
         NumPy, which compiles nothing, else traceable."""
         import jax.numpy as jnp
 
-        from calibration.inference.priors import held_within
+        from calibration.inference.priors import clip_softly
 
         xp = np if isinstance(z, np.ndarray) else jnp
         u = xp.asarray(self.location) + xp.asarray(self.spread) * z
-        u = held_within(u, self.low, self.high, self.softness * self.spread)
+        u = clip_softly(u, self.low, self.high, self.softness * self.spread)
         kinds = np.asarray(self.kinds)
         theta = xp.where(xp.asarray(kinds == LOG), xp.exp(xp.where(kinds == LOG, u, 0.0)), u)
         theta = xp.where(xp.asarray(kinds == ANGLE), xp.remainder(u + np.pi, 2 * np.pi) - np.pi, theta)
@@ -106,12 +106,13 @@ class Posterior:
         """
         from mmrjax.model import params
 
-        known = {p.name: float(p.value) for p in params.walk(robot)}
+        known = {p.name: float(p.value) for p in params.walk_parameters(robot)}
         for name in self.names:
             if name not in known:
+                alike = [n for n in known if n.rpartition(".")[2] == name.rpartition(".")[2]]
                 raise BadData(
                     f"{where}: a posterior of {name}, which this robot does not have, so it is of another robot; "
-                    f"{choices(name, [n for n in known if n.rpartition('.')[2] == name.rpartition('.')[2]] or known)}"
+                    f"{allowed_words(name, alike or known)}"
                 )
         with np.errstate(invalid="ignore"):  # of a file with NaN, refused below
             at = self.at(np.asarray(self.mean))

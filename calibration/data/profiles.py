@@ -18,8 +18,10 @@ from jaxtyping import Array
 
 from calibration.data import delimited, input_files
 from calibration.data.columns import LOAD, SUPPLY
-from calibration.data.input_errors import BadConfiguration, BadData, choices, is_number, number
-from mmrjax.errors import counted
+from calibration.data.input_errors import BadConfiguration, BadData, allowed_words, is_number, number
+from calibration.data.named_arrays import texts
+from calibration.data.sources import opening, reading
+from mmrjax.errors import count_noun
 from mmrjax.missions.mission import Start
 from mmrjax.missions.profile import (
     APART,
@@ -31,7 +33,7 @@ from mmrjax.missions.profile import (
     YAW_RATE,
     Profile,
     profile,
-    sides_refused,
+    sides_error,
 )
 from mmrjax.model import channels, quantities
 from mmrjax.model.channels import Channel
@@ -50,7 +52,7 @@ LONGEST = 1_000_000
 #: Quantities of columns, by field of `mmrjax.missions.profile.Profile`; demands become `demand`.
 QUANTITIES: dict[str, Quantity] = {
     quantity.key: quantity
-    for quantity in (quantities.named("time"), *quantities.SET, *channels.EVERY)
+    for quantity in (quantities.condition_named("time"), *quantities.SET, *channels.EVERY)
     if quantity.in_profiles
 }
 #: Columns of which a row has at most one, and the mode that each means.
@@ -196,7 +198,7 @@ def known_columns() -> dict[str, tuple[str, str]]:
 
 
 def read(source: str | Path) -> ProfileTable:
-    """Read a packaged profile by its name, or a CSV file.
+    """Returns a packaged profile, by its name, or that of a file in any format of a table.
 
     Raises:
         BadData: no such file, fewer than two rows, an unknown, misspelt or repeated column or unit, a time that does
@@ -206,19 +208,29 @@ def read(source: str | Path) -> ProfileTable:
     """
     if str(source) in PACKAGED:
         file = resources.files("calibration") / "data" / "profiles" / f"{source}.csv"
-        return _parsed(file.read_bytes(), str(source))
-    path = Path(source)
+        return _of_text(file.read_bytes(), str(source))
+    path, within = opening.split(str(source))
     if not path.exists():
-        raise BadData(f"{source}: no such file and no packaged profile; {choices(str(source), PACKAGED)}")
-    return _parsed(input_files.table(path, path.name or str(source)), path.name)
+        raise BadData(f"{source}: no such file and no packaged profile; {allowed_words(str(source), PACKAGED)}")
+    table = reading.table(path, within)
+    if table is None:
+        return _of_text(input_files.table(path, path.name or str(source)), path.name)
+    rows = [list(table.header), *map(list, zip(*map(texts, table.values), strict=True))]
+    return _parsed(table.name, _settings(table.name, []), rows, table.digest, table.notes)
 
 
-def _parsed(content: bytes, name: str) -> ProfileTable:
+def _of_text(content: bytes, name: str) -> ProfileTable:
     text, encoded = delimited.text(name, content)
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     above = next((k for k, line in enumerate(lines) if not line.startswith("#")), len(lines))
     settings = _settings(name, lines[:above])
     rows, notes = delimited.cells(name, lines[above:])
+    return _parsed(name, settings, rows, hashlib.sha256(content).hexdigest(), (*encoded, *notes))
+
+
+def _parsed(
+    name: str, settings: dict[str, Any], rows: list[list[str]], digest: str, notes: tuple[str, ...]
+) -> ProfileTable:
     if not rows:
         raise BadData(f"{name}: the file is empty; expected a header with time_s and rows")
     header, body = rows[0], rows[1:]
@@ -229,11 +241,12 @@ def _parsed(content: bytes, name: str) -> ProfileTable:
     for k, row in enumerate(body, 1):
         if len(row) != len(header):
             raise BadData(
-                f"{name} row {k}: got {counted(len(row), 'cell')}; the header has {counted(len(header), 'column')}"
+                f"{name} row {k}: got {count_noun(len(row), 'cell')}; "
+                f"the header has {count_noun(len(header), 'column')}"
             )
     cells = _Cells(name, columns, {c: [row[j] for row in body] for j, c in enumerate(header)}, settings["linear"])
     time = _time(cells)
-    if why := sides_refused(list(cells.columns), cells.has(MODES[SPEED]), cells.called):
+    if why := sides_error(list(cells.columns), cells.has(MODES[SPEED]), cells.called):
         raise BadData(f"{name}: {why}")
     modes, driven = _driven(cells)
     demand = driven.pop("demand")
@@ -242,7 +255,7 @@ def _parsed(content: bytes, name: str) -> ProfileTable:
         raise BadData(f"{name}: got {len(time)} rows times {settings['cycles']} cycles; expected at most {LONGEST}")
     return ProfileTable(
         name, time, modes, demand, values, cells.surfaces(), settings["linear"], settings["cycles"],
-        hashlib.sha256(content).hexdigest(), settings["begins"], (*encoded, *notes),
+        digest, settings["begins"], notes,
     )  # fmt: skip
 
 
@@ -259,7 +272,7 @@ def _settings(name: str, comments: list[str]) -> dict[str, Any]:
             raise BadData(f"{name}: got the line # {text}; expected TOML such as # cycles = 40 ({error})") from error
         for key, value in found.items():
             if key not in SETTINGS:
-                raise BadData(f"{name}: got the setting {key}; {choices(key, SETTINGS)}")
+                raise BadData(f"{name}: got the setting {key}; {allowed_words(key, SETTINGS)}")
             if key in stated:
                 raise BadData(f"{name}: {key} is set twice; expected once")
             stated[key] = value
@@ -317,7 +330,7 @@ def _refuse_column(name: str, column: str) -> NoReturn:
             raise BadData(
                 f"{name}, column {column}: got the unit {unit}; expected one of {', '.join(quantity.columns())}"
             )
-    raise BadData(f"{name}: unknown column {column or '(without a name)'}; {choices(column, _standard(), 3)}")
+    raise BadData(f"{name}: unknown column {column or '(without a name)'}; {allowed_words(column, _standard(), 3)}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -379,7 +392,7 @@ class _Cells:
             if not name and row == len(self) - 1 and not self.linear:
                 name = found[-1]
             if name not in SURFACES:
-                self.refuse(SURFACE, row, f"one of these; {choices(name, SURFACES)}")
+                self.refuse(SURFACE, row, f"one of these; {allowed_words(name, SURFACES)}")
             found.append(name)
         return tuple(found)
 
@@ -438,7 +451,7 @@ def _mode(cells: _Cells, row: int, before: str, filled: list[str]) -> str:
     """The mode that a row states, or that its demand means; without either voltage, if no row has a demand."""
     stated = cells.text(MODE, row)
     if stated and stated not in MODES:
-        cells.refuse(MODE, row, f"one of these; {choices(stated, MODES)}")
+        cells.refuse(MODE, row, f"one of these; {allowed_words(stated, MODES)}")
     columns = [cells.columns[field][0] for field in DEMANDS if cells.has(field)]
     mode = stated or (DEMANDS[filled[0]] if filled else "" if columns else MODES[VOLTAGE])
     if not mode and row == len(cells) - 1:

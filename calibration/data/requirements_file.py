@@ -9,7 +9,7 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-from calibration.data.input_errors import BadConfiguration, choices, stated_number
+from calibration.data.input_errors import BadConfiguration, allowed_words, stated_number
 from calibration.data.input_files import toml_content, toml_text
 from mmrjax.derived.requirements import AXES, QUANTITIES, Quantity
 from mmrjax.model.paper_tables import BENCH, SURFACES
@@ -198,7 +198,7 @@ def _unknown(name: str, known: Iterable[str]) -> str:
     head = max((s for s in stems if name.startswith(f"{s}_")), key=len, default="")
     if head:
         return f"{name}: unit {name[len(head) + 1 :]} is not read; write {stems[head]}"
-    return f"{name}: no such key; {choices(name, known)}"
+    return f"{name}: no such key; {allowed_words(name, known)}"
 
 
 def _range(value: Any, where: str, low: float, high: float, unit: str) -> Range:
@@ -225,7 +225,7 @@ def _envelope(base: Envelope, stated: Mapping[str, Any], where: str) -> Envelope
                 raise BadConfiguration(f"{place}: got {value!r}; expected true or false")
             found[key] = value
         elif key == "surface" and value not in SURFACES:
-            raise BadConfiguration(f"{place}: got {value!r}; {choices(str(value), SURFACES)}")
+            raise BadConfiguration(f"{place}: got {value!r}; {allowed_words(str(value), SURFACES)}")
         elif not isinstance(value, str):
             raise BadConfiguration(f"{place}: got {value!r}; expected the name of a configuration")
         else:
@@ -302,7 +302,7 @@ def quantity_key(quantity: Quantity) -> str:
 
 def _share(duty: Any, share: Any, where: str) -> float:
     if duty is not None and duty not in DUTIES:
-        raise BadConfiguration(f"{where}, duty: got {duty!r}; {choices(str(duty), DUTIES)}")
+        raise BadConfiguration(f"{where}, duty: got {duty!r}; {allowed_words(str(duty), DUTIES)}")
     if share is None:
         return 1.0 if duty == "driving" else 0.0
     found = stated_number(share, f"{where}, share", 0.0, 1.0, "")

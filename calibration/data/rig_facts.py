@@ -14,7 +14,7 @@ from calibration.data.courses import applied, changing, stretches
 from calibration.data.input_errors import rounded
 from calibration.data.robot_file import RobotFile
 from calibration.data.runs import Runs
-from mmrjax.errors import counted
+from mmrjax.errors import count_noun
 from mmrjax.model import params
 from mmrjax.model.channels import VOLTAGE
 from mmrjax.model.quantities import RPM
@@ -248,7 +248,7 @@ def gap(runs: Runs) -> str:
         if not (usual > 0 and long.any() and steps.max() > worst):
             continue
         k, worst = int(np.argmax(steps)), float(steps.max())
-        more = f" (and {counted(int(long.sum()) - 1, 'other row')} after a gap)" if long.sum() > 1 else ""
+        more = f" (and {count_noun(int(long.sum()) - 1, 'other row')} after a gap)" if long.sum() > 1 else ""
         told = (
             f"{runs.source} row {rows[k + 1] + 1}, time_s: {rounded(worst)} s after the row before it, where "
             f"{rounded(usual)} s is usual{more}; a fit holds what is imposed for that time; if rows are missing, "
@@ -413,7 +413,7 @@ def origins(file: RobotFile) -> list[Origin]:
     robot, stated = file.robot, file.stated
     priors = {name: sd for name, _, sd in robot.rig.priors}
     found = []
-    for p in params.walk(robot):
+    for p in params.walk_parameters(robot):
         head, _, rest = p.name.partition(".")
         mine = head in robot.configurations
         shown = p.name in stated or mine or p.name.startswith(("motor.friction", "gearbox."))

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from calibration.data.columns import Layout
-from calibration.data.input_errors import BadConfiguration, choices, is_number
+from calibration.data.input_errors import BadConfiguration, allowed_words, is_number
 from mmrjax.model import channels, params
 from mmrjax.model.paper_robots import DYNAMIC_SHARE
 from mmrjax.model.rig import BETWEEN, IMPOSED, STARTS, Instrument, Rig
@@ -119,7 +119,7 @@ def linear(table: dict[str, Any], name: str, where: str, sds: dict[str, float], 
 
 def _known_key(key: str, where: str) -> bool:
     if key not in LINEAR:
-        raise BadConfiguration(f"{where}.{key}: no such key of a linear unit; {choices(key, LINEAR)}")
+        raise BadConfiguration(f"{where}.{key}: no such key of a linear unit; {allowed_words(key, LINEAR)}")
     return True
 
 
@@ -197,19 +197,19 @@ def rig(content: dict[str, Any], where: str, loads: Sequence[str], *, travels: b
 
 def _one_of(word: Any, known: Sequence[str], where: str) -> str:
     if word not in known:
-        raise BadConfiguration(f"{where}: got {word}; {choices(str(word), known)}")
+        raise BadConfiguration(f"{where}: got {word}; {allowed_words(str(word), known)}")
     return str(word)
 
 
 def _channels(stated: Any, where: str) -> tuple[str, ...]:
-    every = channels.names(channels.EVERY)
+    every = channels.channel_names(channels.EVERY)
     if not isinstance(stated, list) or not stated or not all(isinstance(name, str) for name in stated):
         raise BadConfiguration(
             f"{where}: got {stated!r}; expected a list of channels, at least one of {', '.join(every)}"
         )
     for name in stated:
         if name not in every:
-            raise BadConfiguration(f"{where}: got {name}; {choices(name, every)}")
+            raise BadConfiguration(f"{where}: got {name}; {allowed_words(name, every)}")
         if stated.count(name) > 1:
             raise BadConfiguration(f"{where}: {name} stands twice; expected each channel once")
     return tuple(name for name in every if name in stated)
@@ -222,7 +222,7 @@ def _surfaces(stated: Any, loads: Sequence[str], where: str) -> tuple[tuple[str,
     for name, other in stated.items():
         for word in (name, other):
             if word not in loads:
-                raise BadConfiguration(f"{here}.{name}: got {word}; {choices(str(word), loads)}")
+                raise BadConfiguration(f"{here}.{name}: got {word}; {allowed_words(str(word), loads)}")
     return tuple(stated.items())
 
 
@@ -237,14 +237,16 @@ def _instruments(stated: Any, names: Sequence[str], where: str) -> tuple[Instrum
     found = []
     for name, table in stated.items():
         if name not in names:
-            raise BadConfiguration(f"{here}.{name}: the rig has no such channel; {choices(name, names)}")
+            raise BadConfiguration(f"{here}.{name}: the rig has no such channel; {allowed_words(name, names)}")
         if not isinstance(table, dict):
             raise BadConfiguration(f"{here}.{name}: got {table!r}; expected a table [instruments.{name}]")
         for key in table:
             if key not in ("signed", "quantum"):
-                raise BadConfiguration(f"{here}.{name}.{key}: no such key; {choices(key, ('signed', 'quantum'))}")
+                raise BadConfiguration(
+                    f"{here}.{name}.{key}: no such key; {allowed_words(key, ('signed', 'quantum'))}"
+                )
         signed, quantum = table.get("signed", True), table.get("quantum", 0.0)
-        channel = channels.find(name)
+        channel = channels.find_channel(name)
         if not isinstance(signed, bool) and signed != FREE:
             raise BadConfiguration(
                 f"{here}.{name}.signed: got {signed!r}; expected true, false: shows magnitude alone, or {FREE!r}: "
@@ -269,7 +271,7 @@ def _columns(stated: Any, where: str) -> tuple[tuple[str, str, float], ...]:
     known = layout.spellings()
     for mine, theirs in stated.items():
         if mine not in known:
-            listed = choices(mine, known, shown=layout.known())
+            listed = allowed_words(mine, known, shown=layout.known())
             raise BadConfiguration(f"{here}.{mine}: no such column of a table; {listed}; also in other units")
         table = {"column": theirs} if isinstance(theirs, str) else theirs
         if not isinstance(table, dict) or not isinstance(table.get("column"), str) or {*table} - {"column", "factor"}:
@@ -336,7 +338,7 @@ def with_priors(robot: Robot, sds: Mapping[str, float], where: str) -> Robot:
     Raises:
         BadConfiguration: an sd of what is no parameter.
     """
-    known = {p.name: p for p in params.walk(robot)}
+    known = {p.name: p for p in params.walk_parameters(robot)}
     for name in sds:
         if name not in known:
             raise BadConfiguration(f"{where}, {name}: a ± stands with parameters alone; state the number")
@@ -372,7 +374,7 @@ def lines(rig: Rig) -> tuple[list[str], dict[str, list[str]]]:
         tables["surfaces"] = ["# each differs from the other by its ground alone"]
         tables["surfaces"] += [f'{name} = "{other}"' for name, other in rig.surfaces]
     for instrument in rig.instruments:
-        channel = channels.find(instrument.channel)
+        channel = channels.find_channel(instrument.channel)
         size = f'"{FREE}"' if instrument.quantum is None else repr(instrument.quantum / channel.factor)
         step = [f"quantum = {size}  # [{channel.unit}] step of its readings"]
         tables[f"instruments.{channel.name}"] = [

@@ -15,14 +15,14 @@ import jax.numpy as jnp
 from calibration.data import rig_file, stated
 from calibration.data.configuration_tables import loads, resolved_likes
 from calibration.data.effect_file import Library
-from calibration.data.input_errors import BadConfiguration, choices, is_number, number
+from calibration.data.input_errors import BadConfiguration, allowed_words, is_number, number
 from calibration.data.input_files import toml_content, toml_text
 from calibration.data.writing import write_text
 from mmrjax import effects
 from mmrjax.compile.precision import in_double
 from mmrjax.effects import Effect
-from mmrjax.effects.scaled import scaled
-from mmrjax.errors import some
+from mmrjax.effects.scaled import scaled_effect
+from mmrjax.errors import list_some
 from mmrjax.model import paper_robots, params, power
 from mmrjax.model.driver import DECAYS
 from mmrjax.model.robot import Configurations, Robot
@@ -122,7 +122,7 @@ def find(name_or_path: str, library: Library = effects.BY_NAME, notes: list[str]
     if not path.is_file():
         raise BadConfiguration(
             f"--robot: got {name_or_path}, no such file and no known robot; "
-            f"{choices(name_or_path, paper_robots.ROBOTS)}"
+            f"{allowed_words(name_or_path, paper_robots.ROBOTS)}"
         )
     return parse(path, library, notes)
 
@@ -163,7 +163,7 @@ def parse(path: Path, library: Library = effects.BY_NAME, notes: list[str] | Non
     base = content.pop("base", "nominal")
     if base not in (*paper_robots.ROBOTS, rig_file.NONE):
         raise BadConfiguration(
-            f"{path.name}, base: got {base}; {choices(str(base), (*paper_robots.ROBOTS, rig_file.NONE))}"
+            f"{path.name}, base: got {base}; {allowed_words(str(base), (*paper_robots.ROBOTS, rig_file.NONE))}"
         )
     robot, sds, linear = _without_parameters(
         None if base == rig_file.NONE else paper_robots.ROBOTS[base](), content, path.name
@@ -173,7 +173,7 @@ def parse(path: Path, library: Library = effects.BY_NAME, notes: list[str] | Non
         raise BadConfiguration(f"{path.name}, effects: got {present}; expected tables such as [effects.churning]")
     for name in present:
         if name not in {**effects.BESIDE, **library}:
-            raise BadConfiguration(f"{path.name}, effects.{name}: no such effect; {choices(name, library)}")
+            raise BadConfiguration(f"{path.name}, effects.{name}: no such effect; {allowed_words(name, library)}")
     tables = {name: table for name, table in present.items() if isinstance(table, dict)}
     acting = {name: table.pop("configurations") for name, table in tables.items() if "configurations" in table}
     factors = {name: table.pop(FACTORS) for name, table in tables.items() if FACTORS in table}
@@ -201,10 +201,10 @@ def _without_parameters(
     rig = rig_file.rig(content, where, list(found.by_name), travels=found.travels, inherits=base is not None)
     if base is not None:
         return dataclasses.replace(base, configurations=Configurations(found.by_name), rig=rig), sds, found.linear
-    robot = paper_robots.blank(Configurations(found.by_name), rig=rig)
+    robot = paper_robots.blank_robot(Configurations(found.by_name), rig=rig)
     robot = params.replace(robot, {name: jnp.asarray(value) for name, (value, _) in rig_file.DEFAULTS.items()})
     given = dict(_flatten(content))
-    known = {p.name: p for p in params.walk(robot)}
+    known = {p.name: p for p in params.walk_parameters(robot)}
     resistance = given.get("motor.resistance")
     if isinstance(resistance, int | float):
         robot = params.replace(robot, {"motor.inductance": params.as_float(rig_file.WINDING * resistance)})
@@ -233,7 +233,7 @@ def _of_size(library: Library, name: str, factors: Any, where: str) -> type[effe
             f"{here}: got {factors!r}; expected three numbers more than 0, each times the library's: [sd of the "
             "amplitude, shape, limits of the amplitude]"
         )
-    return scaled(library[name], (float(factors[0]), float(factors[1]), float(factors[2])))
+    return scaled_effect(library[name], (float(factors[0]), float(factors[1]), float(factors[2])))
 
 
 def with_effects(
@@ -262,7 +262,7 @@ def with_effects(
             raise BadConfiguration(f"{here}: got {acting!r}; expected a list of {', '.join(robot.configurations)}")
         for c in acting:
             if c not in robot.configurations:
-                raise BadConfiguration(f"{here}: got {c}; {choices(c, robot.configurations)}")
+                raise BadConfiguration(f"{here}: got {c}; {allowed_words(c, robot.configurations)}")
         present.append(dataclasses.replace(effect, configurations=tuple(acting)))
     return dataclasses.replace(robot, effects=tuple(present))
 
@@ -283,13 +283,13 @@ def change(robot: Robot, values: Mapping[str, Any], where: str, notes: list[str]
         ratings.setdefault("battery.capacity_curve", stated["battery.capacity"])
     ratings |= {name: _switch(where, name, stated.pop(name)) for name in SWITCHES if name in stated}
     ratings |= {name: _choice(where, name, stated.pop(name)) for name in CHOICES if name in stated}
-    known = {p.name: p for p in params.walk(robot)}
+    known = {p.name: p for p in params.walk_parameters(robot)}
     refused: dict[str, list[str]] = {}
     for name, value in stated.items():
         if why := _refused(name, value, known):
             refused.setdefault(why, []).append(name)
     if refused:
-        sentences = [f"{some(names, 80)}: {why}" for why, names in refused.items()]
+        sentences = [f"{list_some(names, 80)}: {why}" for why, names in refused.items()]
         raise BadConfiguration(f"{where}, {'; also '.join(sentences)}")
     robot = params.replace(robot, {name: jnp.asarray(value, float) for name, value in stated.items()})
     robot = rig_file.moved_priors(robot, stated)
@@ -378,7 +378,7 @@ def _parameters(name: str, known: Collection[str]) -> str:
     heads = list(dict.fromkeys(n.partition(".")[0] for n in known))
     near = difflib.get_close_matches(name, known, n=5, cutoff=0.4)
     if head in heads:
-        return choices(name, near or [n for n in known if n.startswith(f"{head}.")])
+        return allowed_words(name, near or [n for n in known if n.startswith(f"{head}.")])
     hint = f"did you mean {near[0]}? " if near and difflib.get_close_matches(head, heads, 1, 0.6) else ""
     single = ("base", "sides", "configurations", *rig_file.KEYS)
     if not name.count(".") and (close := difflib.get_close_matches(name, single, 1, 0.75)):
@@ -392,7 +392,7 @@ def _check_pairs(robot: Robot, where: str) -> None:
             f"{where}, battery.voltage_cutoff: got {robot.battery.voltage_cutoff:g}; expected less than "
             f"voltage_charge, {robot.battery.voltage_charge:g} V"
         )
-    if refused := power.cutoff_refused(robot.battery):
+    if refused := power.cutoff_error(robot.battery):
         raise BadConfiguration(f"{where}, battery.voltage_cutoff: {refused}")
     for name, load in robot.configurations.items():
         if isinstance(load, Shaft):
@@ -404,7 +404,7 @@ def _check_pairs(robot: Robot, where: str) -> None:
                 f"expected more than speed_static, {float(friction.speed_static):g} m/s"
             )
     for effect in robot.effects:
-        ends = {p.name: float(p.value) for p in params.walk(effect)}
+        ends = {p.name: float(p.value) for p in params.walk_parameters(effect)}
         if effect.name in effects.UNNAMED and "low" in ends and not ends["low"] < ends["high"]:
             raise BadConfiguration(
                 f"{where}, effects.{effect.name}.high: got {ends['high']:g}; expected more than low, {ends['low']:g}"
@@ -458,10 +458,10 @@ def _lines_of_effect(effect: Effect) -> list[str]:
 def _lines_of_parameters(robot: Robot, nothing: Robot) -> Iterator[tuple[str, str]]:
     """Table and line of each parameter that a file has to state, or that differs from the robot it starts from."""
     whole = robot.rig.inherits
-    start = {p.name: float(p.value) for p in params.walk(nothing)}
-    needed = rig_file.needed(robot.rig, ((p.name, float(p.value)) for p in params.walk(robot)))
+    start = {p.name: float(p.value) for p in params.walk_parameters(nothing)}
+    needed = rig_file.needed(robot.rig, ((p.name, float(p.value)) for p in params.walk_parameters(robot)))
     always = (*(f"{name}." for name in robot.configurations), "effects.")
-    for parameter in params.walk(robot):
+    for parameter in params.walk_parameters(robot):
         table, _, key = parameter.name.rpartition(".")
         spec, value = parameter.spec, float(parameter.value)
         if table.startswith("rig."):  # where the runs of one table begin is not the robot's
@@ -511,7 +511,7 @@ def _start(robot: Robot) -> Robot:
     """Robot that the file of a robot starts from."""
     if robot.rig.inherits:
         return paper_robots.nominal()
-    nothing = paper_robots.blank(robot.configurations)
+    nothing = paper_robots.blank_robot(robot.configurations)
     return params.replace(nothing, {name: jnp.asarray(value) for name, (value, _) in rig_file.DEFAULTS.items()})
 
 

@@ -41,6 +41,33 @@ def complete(name: str, columns: dict[str, np.ndarray], rows: int, layout: Layou
     _check_deviations(name, columns, layout.channels)
 
 
+def without_copies(name: str, columns: dict[str, np.ndarray]) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Returns False for rows of a log that are the row before once more, shape (rows,), and a sentence on them."""
+    rows = len(next(iter(columns.values()), []))
+    kept = np.full(rows, True)
+    if not set(TIME) <= set(columns):
+        return kept, ()
+    again = np.flatnonzero(np.diff(columns["time_s"]) == 0) + 1
+    for values in columns.values():
+        if not again.size:
+            return kept, ()
+        now, before = values[again], values[again - 1]
+        same = now == before
+        if values.dtype.kind == "f":
+            same |= np.isnan(now) & np.isnan(before)
+        again = again[same]
+    kept[again] = False
+    which = (
+        f"row {again[0] + 1} is"
+        if again.size == 1
+        else f"{again.size} rows, the first row {again[0] + 1}, are"
+        if again.size
+        else ""
+    )
+    said = f"{name}: {which} the row before once more, with its time; left out, rows are counted without them"
+    return kept, (said,) if again.size else ()
+
+
 def _fill(name: str, columns: dict[str, np.ndarray], rows: int, layout: Layout) -> None:
     """Adds columns that a table of a rig may leave out: its only configuration, and conditions with a usual value."""
     if layout.complete:
@@ -286,6 +313,6 @@ def drives(name: str, columns: dict[str, np.ndarray], layout: Layout) -> Iterato
 
 def shows_magnitude(name: str, instrument: Instrument) -> str:
     return (
-        f"{name}: {channels.find(instrument.channel).column} is positive where its side is driven backward; it is "
-        "taken to show magnitude alone, and magnitudes are compared"
+        f"{name}: {channels.find_channel(instrument.channel).column} is positive where its side is driven "
+        "backward; it is taken to show magnitude alone, and magnitudes are compared"
     )

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -22,12 +22,16 @@ from calibration.data import (
     contradictions,
     delimited,
     instruments,
+    presets_file,
+    repeated_readings,
     row_checks,
     sides,
 )
 from calibration.data.columns import CONDITIONS, DUTY, SUPPLY, TIME, WHEN, Column, Layout
 from calibration.data.input_errors import BadConfiguration, BadData, number
 from calibration.data.named_arrays import NamedArrays, Raw, missing, numbers, texts
+from calibration.data.sources import opening, reading
+from calibration.data.sources.reading import Mapped
 from calibration.data.table import Runs
 from mmrjax.model.quantities import MM, RPM
 from mmrjax.model.rig import Instrument
@@ -43,31 +47,57 @@ LISTED = 8
 
 
 def read(
-    source: str | Path,
+    source: Any,
+    robot: Robot | None = None,
     *,
+    columns: str | Path | Mapping[str, Any] | None = None,
     measured: bool = True,
     battery: bool = False,
-    robot: Robot | None = None,
     of_turns: bool = False,
 ) -> Runs:
-    """Returns the runs of a packaged table, by its name, or of a CSV file.
+    """Returns the runs of a packaged table, of a file, or of a table in memory.
 
     Args:
-        source: `measured`, `simulated_by_paper`, or a path.
+        source: `measured`, `simulated_by_paper`, a path, or a table in memory. Files are CSV, Parquet, Feather,
+            Arrow, MATLAB, HDF5, NumPy, JSON, ROS bags, MCAP, ULog and MDF; a path of signals may follow `::`.
+            Tables in memory are a pandas or polars DataFrame, an Arrow table, an xarray Dataset, a dict of arrays,
+            or a list of records.
+        columns: of the source, where its names are not this program's: a packaged preset (`vesc,pole_pairs=7`), a
+            preset's file, or a dict such as `{"motor_speed_rpm": "speed"}`. They win over those of the robot's file.
         measured, battery, robot, of_turns: as for `of_arrays`.
 
     Raises:
-        BadData: no such file, a file that is no CSV, a row of another length than the header, or as `of_arrays`.
+        BadData: no such file, a format that is not read, a damaged file, a signal that is missing or of another kind,
+            or as `of_arrays`.
+        BadConfiguration: no such preset, or a preset with a mistake.
     """
-    if str(source) in PACKAGED:
+    layout, between = Layout.of(robot), "held" if robot is None else robot.rig.between_rows
+    preset = None
+    if columns is not None:
+        preset = presets_file.of_columns(columns) if isinstance(columns, Mapping) else presets_file.find(columns)
+    if isinstance(source, str | Path) and str(source) in PACKAGED:
         with resources.as_file(resources.files("calibration") / "data" / PACKAGED[str(source)]) as path:
-            arrays = delimited.arrays(path, str(source))
+            arrays, mapped = delimited.arrays(path, str(source)), layout.mapped
     else:
-        path = Path(source)
-        if not path.exists():
+        if isinstance(source, str | Path) and not opening.split(str(source))[0].exists():
             raise BadData(f"{source}: no such file and no packaged table; packaged: {', '.join(PACKAGED)}")
-        arrays = delimited.arrays(path, path.name or str(source))
-    return of_arrays(arrays, measured=measured, battery=battery, robot=robot, of_turns=of_turns)
+        found = reading.read(source, layout, preset, between)
+        arrays, mapped = found.arrays, found.mapped
+    if preset is None:
+        _refuse_a_loggers_names(arrays, layout)
+    return of_arrays(arrays, measured=measured, battery=battery, robot=robot, of_turns=of_turns, mapped=mapped)
+
+
+def _refuse_a_loggers_names(arrays: NamedArrays, layout: Layout) -> None:
+    """Refuses a source without any column of a known name whose columns are those of a preset."""
+    if any(m is not None for m in layout.meanings(arrays.name, list(dict.fromkeys(arrays.header)))):
+        return
+    if name := presets_file.recognised(arrays.header):
+        numbers_asked = "".join(f",{key}=..." for key in presets_file.asked(name))
+        raise BadData(
+            f"{arrays.name}: has no column with a name that is known, but those of {name}; add --columns "
+            f'{name}{numbers_asked}, in Python columns="{name}{numbers_asked}"'
+        )
 
 
 def of_arrays(
@@ -77,6 +107,7 @@ def of_arrays(
     battery: bool = False,
     robot: Robot | None = None,
     of_turns: bool = False,
+    mapped: Mapped | None = None,
 ) -> Runs:
     """Returns the runs that named columns of raw values state.
 
@@ -87,6 +118,7 @@ def of_arrays(
         robot: defines the columns that are needed, and the channels. None: the packaged robot, with a channel for
             each further column of one.
         of_turns: True to give a table of turns a channel for each of its columns of one side or of the yaw.
+        mapped: columns that have other names in the source, as `Layout.mapped`; None: those of the robot's file.
 
     Raises:
         BadData: no columns or rows, no channel, a missing, misspelt or repeated column, or a wrong unit; values that
@@ -95,6 +127,8 @@ def of_arrays(
     """
     inferred = robot is None
     name, layout = arrays.name, Layout.of(robot)
+    if mapped is not None:
+        layout = dataclasses.replace(layout, mapped=mapped)
     if not arrays.header:
         expected = ", ".join((*layout.required(measured=True, battery=False), *layout.measured_columns))
         raise BadData(f"{name}: the file is empty; expected a header with {expected}")
@@ -110,13 +144,17 @@ def of_arrays(
         raise BadData(f"{name}: a header and no rows; expected at least one run")
     columns, changed = _columns(arrays, meanings, layout, battery)
     notes = (*arrays.notes, *sides.of_volts(name, columns, battery))
+    kept, copied = row_checks.without_copies(name, columns)
+    columns = columns if kept.all() else {c: values[kept] for c, values in columns.items()}
+    if measured:
+        notes = (*notes, *copied, *_without_repeats(name, columns, layout))
     layout, unsigned = _with_instruments(columns, layout, measured)
-    row_checks.complete(name, columns, len(arrays), layout)
-    kept = np.full(len(arrays), True)
+    row_checks.complete(name, columns, int(kept.sum()), layout)
     if battery and layout.imposed == "voltage":
-        columns[SUPPLY] = np.full(len(arrays), np.nan)
+        columns[SUPPLY] = np.full(int(kept.sum()), np.nan)
     elif measured and not set(TIME) <= set(columns):  # a history may stop, and go on forwards against its motors
-        columns, kept, left_out = row_checks.driven_rows(name, columns, layout)
+        columns, driven, left_out = row_checks.driven_rows(name, columns, layout)
+        kept[kept] = driven
         notes = (*notes, *left_out)
     if not any(column in columns for column in WHEN):
         columns["order"] = np.arange(1.0, kept.sum() + 1)
@@ -148,8 +186,8 @@ def _columns(
             notes += more
         if meaning.column in TIME:
             runs = texts(by_name["run_id"]) if "run_id" in by_name else None
-            raw, note = clock.from_the_first(arrays.name, meaning, raw, runs)
-            notes += [note] if note else []
+            raw, more_notes = clock.from_the_first(arrays.name, meaning, raw, runs)
+            notes += more_notes
         if battery and meaning.column == SUPPLY and layout.imposed == "voltage":
             _refuse_stated(arrays, raw)
         elif meaning.column in layout.idle:
@@ -182,6 +220,21 @@ def _listed(name: str, said: Sequence[str], count: int) -> str:
         known.add(cure)
     rest = f"; and {count - LISTED} more" if count > LISTED else ""
     return f"{first}; also {'; '.join(more)}{rest}"
+
+
+def _without_repeats(name: str, columns: dict[str, np.ndarray], layout: Layout) -> Iterator[str]:
+    """Takes readings that a log repeats out of its columns, with a sentence on each channel."""
+    if not set(TIME) <= set(columns):
+        return
+    run = columns.get("run_id")
+    for channel in (c for c in layout.channels if c.column in columns and c.column != layout.imposed_column):
+        values, rows = repeated_readings.used_once(columns[channel.column], columns["time_s"], run)
+        if rows:
+            columns[channel.column] = values
+            yield (
+                f"{name}: {channel.column} repeats each reading in {rows:.3g} rows, as of a slower sensor; each is "
+                "used once, in its first row"
+            )
 
 
 def _with_instruments(

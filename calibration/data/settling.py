@@ -16,7 +16,7 @@ from calibration.data.courses import applied, differs
 from calibration.data.input_errors import BadData, number
 from calibration.data.instruments import step_of
 from calibration.data.runs import Runs
-from mmrjax.errors import counted
+from mmrjax.errors import count_noun
 from mmrjax.model import channels
 from mmrjax.model.channels import Channel
 from mmrjax.model.robot import Robot
@@ -295,7 +295,7 @@ def _in_order(runs: Runs) -> list[np.ndarray]:
             )
     if max(map(len, each)) < FEWEST:
         raise BadData(
-            f"{runs.source}: {counted(max(map(len, each)), 'sample')} in its longest run; at least {FEWEST} are "
+            f"{runs.source}: {count_noun(max(map(len, each)), 'sample')} in its longest run; at least {FEWEST} are "
             "needed"
         )
     return each
@@ -322,7 +322,7 @@ def _signals(
             for rows in each:
                 whole[rows] = np.where(off[rows], np.nan, runs[angle][rows] * factor)
                 shown[rows] = _rate(runs["time_s"][rows], whole[rows], half)
-            found.append(Signal(channels.find(rate), shown, whole, 0.0, _size(shown), off))
+            found.append(Signal(channels.find_channel(rate), shown, whole, 0.0, _size(shown), off))
     if not found:
         raise BadData(f"{runs.source}: no channel with readings that settled travel shows")
     return tuple(found)
@@ -831,18 +831,19 @@ def _check_units(found: Settled, rolling: Mapping[str, Mapping[str, float]]) -> 
             off = turns[one] / turns[other]
             unit = next((word for word, x in UNITS.items() if abs(math.log(off / x)) < NEAR), None)
             if unit is not None:
-                column = angles[one] if one in angles and not _read(runs, one) else channels.find(one).column
+                column = angles[one] if one in angles and not _read(runs, one) else channels.find_channel(one).column
                 raise BadData(
                     f"{runs.source} rows {s.rows[0] + 1} to {s.rows[-1] + 1}, {column}: {off:.4g} times as fast as "
-                    f"{channels.find(other).column} says with the ratio of the rig's file; is it {unit}? write all "
-                    f"rows in its unit, or state [columns] {column} = {{column = ..., factor = {1 / off:.3g}}} in "
+                    f"{channels.find_channel(other).column} says with the ratio of the rig's file; is it {unit}? "
+                    f"write all rows in its unit, "
+                    f"or state [columns] {column} = {{column = ..., factor = {1 / off:.3g}}} in "
                     "the rig's file"
                 )
 
 
 def _read(runs: Runs, channel: str) -> bool:
     """True if a channel is read itself, and is not the rate of an angle."""
-    return runs.has(channels.find(channel).column)
+    return runs.has(channels.find_channel(channel).column)
 
 
 def _nothing(found: Settled, loop: str) -> str:
@@ -858,7 +859,7 @@ def _nothing(found: Settled, loop: str) -> str:
         cure = "hold each level longer or state --shortest"
         if len(longest.rows) < FEWEST or found.shortest > longest.lasts >= LEAST:  # it is the samples that are few
             needed = max(FEWEST, round(found.shortest / step) if step > 0 else FEWEST)
-            held, asked = counted(len(longest.rows), "sample"), f"{needed}"
+            held, asked = count_noun(len(longest.rows), "sample"), f"{needed}"
             cure = (
                 "log faster, hold each level longer (--shortest states the time, of at least "
                 f"{FEWEST} samples), or remove time_s if each row is a settled run already"

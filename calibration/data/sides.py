@@ -76,7 +76,7 @@ def check(runs: Runs) -> None:
     """
     left, right = runs.of_sides
     for what in ("motor_speed", "motor_current"):
-        pair = [channels.find(f"{what}_{side}") for side in channels.SIDES]
+        pair = [channels.find_channel(f"{what}_{side}") for side in channels.SIDES]
         if not all(c in runs.channels and runs.has(c.column) for c in pair):
             continue
         one, other = (runs[c.column] for c in pair)
@@ -128,7 +128,7 @@ def magnitudes(columns: Mapping[str, np.ndarray], layout: Layout) -> tuple[Instr
         return ()
     found = []
     for side, drive in zip(channels.SIDES, driven(columns, layout), strict=True):
-        channel = channels.find(f"motor_current_{side}")
+        channel = channels.find_channel(f"motor_current_{side}")
         if channel.column in columns:
             shown = columns[channel.column]
             back = np.isfinite(shown) & (drive < -CLEAR * np.max(np.abs(drive)))

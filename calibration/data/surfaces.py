@@ -14,7 +14,7 @@ from typing import TypeVar
 from calibration.data.columns import Layout
 from calibration.data.surface_labels import named
 from calibration.data.table import Runs
-from mmrjax.errors import choices
+from mmrjax.errors import allowed_words
 from mmrjax.model.paper_tables import SURFACES
 from mmrjax.model.robot import Configurations, Robot
 
@@ -44,7 +44,9 @@ def refused(label: str, layout: Layout) -> str:
     if label in SURFACES:
         return ""
     alike = difflib.get_close_matches(label, SURFACES, 1, MISSPELT)
-    return f"one of these; {choices(label, SURFACES)}" if not label or alike or not layout.configurations else ""
+    return (
+        f"one of these; {allowed_words(label, SURFACES)}" if not label or alike or not layout.configurations else ""
+    )
 
 
 def with_surface_configurations(robot: Robot, runs: Runs) -> Robot:

@@ -22,7 +22,7 @@ from calibration.data.columns import (
     WHEN,
     Layout,
 )
-from calibration.data.input_errors import BadData, choices
+from calibration.data.input_errors import BadData, allowed_words
 from mmrjax.model import channels, quantities
 from mmrjax.model.channels import Channel
 from mmrjax.model.conditions import Conditions
@@ -195,7 +195,7 @@ class Runs:
     def _stacked(self, columns: tuple[str, ...]) -> np.ndarray:
         nothing = np.full(len(self), np.nan)
         found = [self.columns.get(column, nothing) for column in columns]
-        return np.stack(found, 1) * np.asarray(channels.factors(self.channels))
+        return np.stack(found, 1) * np.asarray(channels.channel_factors(self.channels))
 
     def missing(self) -> list[str]:
         """Returns a note on each channel with missing readings."""
@@ -225,7 +225,7 @@ class Runs:
                 first = int(np.flatnonzero(rows)[0]) + 1
                 raise BadData(
                     f"{self.source} row {first}, configuration: got {name}; expected one of these; "
-                    f"{choices(str(name), robot.configurations)}"
+                    f"{allowed_words(str(name), robot.configurations)}"
                 )
             which[rows] = robot.configurations.index(str(name))
         return which

@@ -10,8 +10,10 @@ import numpy as np
 
 from calibration.data import delimited, input_files, named_arrays
 from calibration.data.input_errors import BadConfiguration, BadData
+from calibration.data.named_arrays import texts
+from calibration.data.sources import reading
 from mmrjax.climbing import terrain
-from mmrjax.climbing.climb_simulation import ON_GROUND, Sequence, clearance
+from mmrjax.climbing.climb_simulation import ON_GROUND, Sequence, roller_clearance
 from mmrjax.climbing.terrain import Terrain
 from mmrjax.model.robot import Robot
 
@@ -46,9 +48,13 @@ def _read(path: Path, option: str, wanted: Rows[Rows[str]]) -> tuple[dict[str, n
     """Columns of the first of some headers that a file has."""
     if not path.exists():
         raise BadConfiguration(f"{option}: got {path}, no such file")
-    text, _ = delimited.text(path.name, input_files.table(path, path.name or str(path)))
-    lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
-    rows, _ = delimited.cells(path.name, lines)
+    table = reading.table(path)
+    if table is None:
+        text, _ = delimited.text(path.name, input_files.table(path, path.name or str(path)))
+        lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+        rows, _ = delimited.cells(path.name, lines)
+    else:
+        rows = [list(table.header), *map(list, zip(*map(texts, table.values), strict=True))]
     header = [cell.strip() for cell in rows[0]] if rows else []
     names = next((names for names in wanted if set(names) <= set(header)), None)
     if names is None:
@@ -144,7 +150,7 @@ def below(robot: Robot, angle: float) -> str:
     """Why levers cannot begin at an angle [deg] on level ground; empty where they can."""
     gear = robot.running_gear
     axle = robot.radius_pulley + gear.grouser_height
-    above = float(clearance(axle, gear, jnp.radians(angle)))
+    above = float(roller_clearance(axle, gear, jnp.radians(angle)))
     if above >= -ON_GROUND:
         return ""
     least = -float(np.degrees(np.arcsin((axle - gear.levers.roller) / gear.lever_length)))

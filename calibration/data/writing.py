@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import io
 import json
 import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
+
+from calibration.data import frames
 
 
 @contextlib.contextmanager
@@ -35,12 +38,32 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
     write_text(path, json.dumps(finite(content), indent=2, ensure_ascii=False) + "\n")
 
 
-def write_table(path: Path, columns: Mapping[str, np.ndarray]) -> None:
-    """Write a table as CSV; what is not finite becomes an empty cell."""
+def write_table(path: Path, columns: Mapping[str, np.ndarray], tables: str = "csv") -> None:
+    """Write a table as CSV; what is not finite becomes an empty cell.
+
+    Args:
+        tables: `parquet` to write the same columns into a file of that format too, with all their digits.
+    """
+    if tables == "parquet":
+        from pyarrow import parquet
+
+        with naming(path):
+            parquet.write_table(frames.to_arrow(columns), path.with_suffix(".parquet"))
     with naming(path), path.open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(columns)
-        writer.writerows(zip(*(map(cell, column) for column in columns.values()), strict=True))
+        _write_rows(stream, columns)
+
+
+def table_text(columns: Mapping[str, np.ndarray]) -> str:
+    """A table as the text of a CSV file, as `write_table` writes it."""
+    stream = io.StringIO()
+    _write_rows(stream, columns)
+    return stream.getvalue()
+
+
+def _write_rows(stream: TextIO, columns: Mapping[str, np.ndarray]) -> None:
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(zip(*(map(cell, column) for column in columns.values()), strict=True))
 
 
 def cell(value: Any) -> str:

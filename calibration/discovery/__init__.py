@@ -1,1 +1,1 @@
-"""The closed loop: what a fitted model lacks, traced to a balance and, where one fits, to an effect."""
+"""The closed loop: the model error of a fitted robot, traced to a balance and, if one fits, to an effect."""

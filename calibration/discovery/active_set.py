@@ -1,4 +1,4 @@
-"""Coordinates with room for any effects of a library, so that one compiled fit serves every candidate."""
+"""Coordinates with slots for any effects of a library, so that one compiled fit serves every candidate."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from calibration.data.effect_file import Library
 from calibration.inference.linearization import (
     ScoredEffect,
     amplitude_of,
-    scored,
+    shape_at,
     shape_of,
     shape_scales,
-    shaped,
+    with_shape_grid,
 )
 from calibration.inference.priors import Coordinates
 from calibration.inference.problem import Problem
@@ -33,14 +33,14 @@ class ActiveSet(eqx.Module):
     """Base coordinates, then the amplitudes and the shapes of the active effects.
 
     z = [base, amplitudes, shapes], all with standard normal priors: an amplitude is width · sd · z, a shape
-    its nominal value times exp(spread · z). Which effect is in a slot is data, not structure, so that fits
+    its nominal value times exp(spread · z). The effect in a slot is data, not structure, so that fits
     of many candidates are one vmapped batch; an empty slot keeps its coordinates at 0.
 
     Attributes:
         base: coordinates of the base parameters.
         active: index into `names` of the effect in each slot, -1 if it is empty; shape (slots,).
-        sd: of each effect's amplitude, the width included; scales: of each effect's shape, see `shape_scales`.
-        names, shapes: of the effects of the robot, and of their shape parameter ("" for none).
+        sd: of each effect's amplitude, including the width; scales: of each effect's shape, see `shape_scales`.
+        names, shapes: names of the robot's effects, and of their shape parameters ("" for none).
     """
 
     base: Coordinates
@@ -52,7 +52,7 @@ class ActiveSet(eqx.Module):
 
     @property
     def slots(self) -> int:
-        """How many slots there are."""
+        """Number of slots."""
         return self.active.shape[-1]
 
     def __len__(self) -> int:
@@ -64,11 +64,11 @@ class ActiveSet(eqx.Module):
         return z[..., :p], z[..., p : p + s], z[..., p + s :]
 
     def held(self) -> Float[Array, "slots effects"]:
-        """1 where a slot holds an effect."""
+        """Matrix with 1 for the effect in each slot, else 0."""
         return jnp.asarray(self.active[:, None] == jnp.arange(len(self.names)), float)
 
     def robot(self, robot: Robot, z: Float[Array, " coordinates"]) -> Robot:
-        """`robot`, which has every effect of `names`, at coordinates z."""
+        """`robot`, which has all effects of `names`, at coordinates z."""
         base, amplitudes, shapes = _parts(self, z)
         values = {f"effects.{name}.amplitude": amplitudes[k] for k, name in enumerate(self.names)}
         pairs = enumerate(zip(self.names, self.shapes, strict=True))
@@ -76,24 +76,24 @@ class ActiveSet(eqx.Module):
         return params.replace(self.base.robot(robot, base), values)
 
     def with_effects(self, active: Sequence[int] | Array) -> ActiveSet:
-        """The same with these effects in the slots."""
-        slots = active if isinstance(active, jax.Array) else np.asarray(active, int)  # else a conversion is compiled
+        """Copy with these effects in the slots."""
+        slots = active if isinstance(active, jax.Array) else np.asarray(active, int)  # avoids compiling a conversion
         return dataclasses.replace(self, active=jnp.asarray(slots, int))
 
 
 @functools.partial(compiled, options=SELDOM)
 def _parts(space: ActiveSet, z: Array) -> tuple[Array, tuple[Array, ...], tuple[Array, ...]]:
-    """Coordinates of the base, and amplitude and shape of every effect."""
+    """Coordinates of the base, and amplitude and shape of each effect."""
     base, amplitude, shape = space.parts(z)
     held = space.held()
     amplitudes = space.sd * (amplitude @ held)
-    shapes = shaped(space.scales, shape @ held)
-    return base, params.one_by_one(amplitudes), params.one_by_one(shapes)
+    shapes = shape_at(space.scales, shape @ held)
+    return base, params.split_numbers(amplitudes), params.split_numbers(shapes)
 
 
 @dataclasses.dataclass(frozen=True)
 class ScoredLibrary:
-    """The effects that are looked for, each at every point of its shape's grid (an instance).
+    """The effects of a search, each at every point of its shape's grid (an instance).
 
     Attributes:
         effects: those that the data can show and the robot does not have yet.
@@ -108,7 +108,7 @@ class ScoredLibrary:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the effects."""
+        """Names of the effects."""
         return tuple(e.name for e in self.effects)
 
     def __len__(self) -> int:
@@ -119,11 +119,11 @@ class ScoredLibrary:
 
     def indices(self, names: Sequence[str]) -> tuple[int, ...]:
         """Index of each effect, -1 for an empty slot ("")."""
-        known = {n: k for k, n in enumerate(self.names)} | {"": -1}
-        return tuple(known[n] for n in names)
+        index_of_name = {n: k for k, n in enumerate(self.names)} | {"": -1}
+        return tuple(index_of_name[n] for n in names)
 
     def largest(self, instances: np.ndarray) -> np.ndarray:
-        """The largest of a non-negative number over each effect's instances, shape (effects,)."""
+        """Maximum of a non-negative number over each effect's instances, shape (effects,)."""
         whole = np.zeros(len(self))
         np.maximum.at(whole, self.of, instances)
         return whole
@@ -135,22 +135,22 @@ class ScoredLibrary:
 
 
 def scored_library(effects: Sequence[Effect]) -> ScoredLibrary:
-    """Every effect at every point of its shape's grid."""
-    grids = tuple(scored(e) for e in effects)
+    """Library of the effects, each at every point of its shape's grid."""
+    grids = tuple(with_shape_grid(e) for e in effects)
     effect = np.repeat(np.arange(len(grids)), [len(s.at) for s in grids])
     return ScoredLibrary(tuple(effects), grids, effect, np.concatenate([s.at for s in grids]))
 
 
 @dataclasses.dataclass(frozen=True)
 class CandidateSpace:
-    """All that can be fitted: the base, and the base with any effects of a library in a few slots.
+    """Problems of a search: the base, and the base with any effects of a library in a few slots.
 
     Attributes:
-        bare: problem of the base alone; equipped: of the base and the effects in the slots, whichever these are.
+        bare: problem of the base only; equipped: of the base and the effects in the slots, whichever these are.
         library: the effects.
-        room: names of those that the program of a fit of histories has at least, see `fitted_by`.
-        near: coordinates of fits of the same histories with other sds, by their effects: from there a fit is a few
-            steps away, and none is made of effects beyond `room`.
+        room: names of effects that the program of a fit of histories always includes, see `fitted_by`.
+        near: coordinates of fits of the same histories with other sds, by their effects. Fits then start there and
+            take a few steps, and none has effects beyond `room`.
     """
 
     bare: Problem
@@ -161,32 +161,32 @@ class CandidateSpace:
 
     @property
     def coordinates(self) -> ActiveSet:
-        """Of `equipped`."""
+        """Coordinates of `equipped`."""
         return self.equipped.coordinates
 
     @property
     def free(self) -> int:
-        """How many base parameters are free."""
+        """Number of free base parameters."""
         return len(self.coordinates.base)
 
     @property
     def included(self) -> np.ndarray:
-        """Rows of which any reading counts, shape (rows,)."""
+        """True for rows with any included reading, shape (rows,)."""
         return np.asarray(self.bare.data.weight).max(1) > 0
 
     @property
     def weight(self) -> np.ndarray:
-        """Of every reading, shape (rows, channels)."""
+        """Weight of each reading, shape (rows, channels)."""
         return np.asarray(self.bare.data.weight)
 
     def without(self, rows: np.ndarray) -> CandidateSpace:
-        """The same with rows set aside (a mask or indices)."""
+        """Copy without some rows (a mask or indices)."""
         weight = self.weight.copy()
         weight[rows] = 0.0
         return self.weighted(weight)
 
     def weighted(self, weight: np.ndarray) -> CandidateSpace:
-        """The same with these weights of the readings."""
+        """Copy with these weights of the readings."""
 
         def with_weight(problem: Problem) -> Problem:
             return dataclasses.replace(problem, data=dataclasses.replace(problem.data, weight=jnp.asarray(weight)))
@@ -194,14 +194,15 @@ class CandidateSpace:
         return dataclasses.replace(self, bare=with_weight(self.bare), equipped=with_weight(self.equipped))
 
     def with_room(self, names: Sequence[str]) -> CandidateSpace:
-        """The same with these effects in the program of every fit of histories."""
+        """Copy with these effects in the program of every fit of histories."""
         return dataclasses.replace(self, room=tuple(n for n in self.library.names if n in names))
 
     def fitted_by(self, sets: Iterable[Sequence[str]]) -> tuple[Problem, list[tuple[int, ...]]]:
-        """The problem by whose program sets of effects are fitted, and indices of each set in it.
+        """Problem whose program fits sets of effects, and the indices of each set in it.
 
-        That of settled runs has the whole library, and one program serves every set. A step of a fit of histories
-        takes longer with each effect, and so does compiling it: they have those of `room` and of the sets alone.
+        For settled runs it has the whole library, and one program serves every set. A step of a fit of histories
+        takes longer with each effect, and so does its compilation. So its program has only those of `room` and of
+        the sets.
         """
         sets = [tuple(names) for names in sets]
         if not self.bare.observe.long:
@@ -225,15 +226,17 @@ class CandidateSpace:
         return problem, [tuple(index[n] for n in each) for each in sets]
 
     def fit_of(self, active: Sequence[str], z: np.ndarray) -> tuple[Problem, np.ndarray, tuple[int, ...] | None]:
-        """Problem, coordinates and indices of the effects of a fit; of one without effects those of the base alone, a
-        step of which costs a third and less."""
+        """Problem, coordinates and indices of the effects of a fit.
+
+        For a fit without effects, those of the base only: its steps cost at most a third.
+        """
         if not any(active):
             return self.bare, np.asarray(z)[: self.free], None
         problem, (indices,) = self.fitted_by([active])
         return problem, np.asarray(z), indices
 
     def problem(self, active: Sequence[str]) -> Problem:
-        """The problem with these effects in the slots."""
+        """Problem with these effects in the slots."""
         problem, (indices,) = self.fitted_by([active])
         return dataclasses.replace(problem, coordinates=problem.coordinates.with_effects(indices))
 
@@ -241,7 +244,7 @@ class CandidateSpace:
 def candidate_space(
     bare: Problem, effects: Sequence[Effect], library: Library, slots: int, width: float
 ) -> CandidateSpace:
-    """The space of the base problem and these effects of a library, with so many slots (see `Settings`)."""
+    """Space of the base problem and these effects of a library, with a number of slots (see `Settings`)."""
     shapes = [shape_of(e) for e in effects]
     scales = [shape_scales(s) for s in shapes]
     value, spread, sd, low, high = (jnp.asarray([s[k] for s in scales]) for k in range(5))
@@ -255,6 +258,6 @@ def candidate_space(
     )
     have = {e.name for e in bare.base.effects}
     more = tuple(library[e.name]() for e in effects if e.name not in have)
-    robot = params.strong(dataclasses.replace(bare.base, effects=(*bare.base.effects, *more)))
+    robot = params.without_weak_types(dataclasses.replace(bare.base, effects=(*bare.base.effects, *more)))
     data = dataclasses.replace(bare.data, centre=jnp.zeros(len(coordinates)))
     return CandidateSpace(bare, Problem(robot, coordinates, bare.observe, data), scored_library(effects))

@@ -1,4 +1,4 @@
-"""The adequacy test: whether the residuals of a fit exceed the noise."""
+"""Adequacy test: do the residuals of a fit exceed the noise?"""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from calibration.inference.linearization import Linearization
 
 @dataclasses.dataclass(frozen=True)
 class AdequacyTest:
-    """Whether a fit leaves something to explain.
+    """Test of a fit's residuals against its bootstrap.
 
     Attributes:
         found: the strongest statistics of the data; null: of the bootstrap, shape (replicates,) each.
@@ -30,21 +30,21 @@ class AdequacyTest:
         return (1 + int(np.sum(null >= float(getattr(self.found, kind))))) / (1 + len(null))
 
     def threshold(self, kind: str) -> float:
-        """What the strongest statistic of its kind has to exceed."""
+        """Critical value of the strongest statistic of a kind."""
         return float(np.quantile(getattr(self.null, kind), 1 - self.settings.shares[kind], method="higher"))
 
     @property
     def rejected(self) -> bool:
-        """Whether something is missing, at the family-wise error of the settings."""
+        """True if an effect is missing, at the family-wise error of the settings."""
         return any(self.p(kind) <= level for kind, level in self.settings.shares.items())
 
     @property
     def rejected_with_margin(self) -> bool:
-        """Whether what is left is beyond doubt, so that a fit which leaves it is not the whole story."""
+        """True if the residuals are highly significant, so that the fit is incomplete."""
         return any(map(self.beyond_doubt, self.settings.shares))
 
     def beyond_doubt(self, kind: str, found: float | None = None) -> bool:
-        """Whether a fit that leaves such a statistic of a kind, None for what is found, leaves something."""
+        """True if a statistic of a kind exceeds its threshold by the margin; None takes the one found."""
         if kind not in self.settings.shares:
             return False
         statistic = float(getattr(self.found, kind)) if found is None else found
@@ -59,10 +59,10 @@ class AdequacyTest:
 
 @dataclasses.dataclass(frozen=True)
 class Diagnosis:
-    """One look at what a fit leaves.
+    """Diagnosis of a fit's residuals.
 
     Attributes:
-        linear: the fit, linearised; scores: what effects and curves could explain; test: whether anything is left.
+        linear: the fit, linearised; scores: of effects and curves; test: of the residuals.
     """
 
     linear: Linearization

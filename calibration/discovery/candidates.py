@@ -11,25 +11,25 @@ import numpy as np
 
 from calibration.data.input_errors import BadData
 from calibration.discovery.active_set import CandidateSpace
-from calibration.discovery.dissipation import supplying
+from calibration.discovery.dissipation import supplying_effects
 from calibration.discovery.score_tests import ScoreTable
 from calibration.discovery.settings import Settings
 from calibration.inference import scans
 from calibration.inference.held_out import search_each
 from calibration.inference.linearization import amplitude_of
-from calibration.inference.optimizers import Optimum, observation
+from calibration.inference.optimizers import Optimum, observe_at
 from calibration.inference.problem import Observation
 from mmrjax.model.signals import SLIDES
 
 #: Prior sds above its mean up to which an adhesion is plausible.
 ADHESION = 2.5
-#: Fewest rows that a base can be fitted to.
+#: Fewest rows for a fit of the base.
 FEWEST = 4
-#: Difference of the objective of searches that end in one place [½σ²].
+#: Difference of the objective between searches that end in the same place [½σ²].
 ALIKE = 1e-9
-#: Steps of Gauss and Newton from one fit to another that is near.
+#: Gauss-Newton steps from one fit to another nearby.
 FEW = 6
-#: Rise of the objective beyond which a fit with more effects is worse than without [½σ²].
+#: Rise of the objective above which a fit with more effects is worse than without [½σ²].
 STUCK = 0.1
 
 
@@ -38,15 +38,15 @@ class Candidate:
     """A set of effects, fitted with the base.
 
     Attributes:
-        active: name of the effect in each slot, "" where empty.
+        active: name of the effect in each slot, "" if empty.
         z: coordinates, see `ActiveSet`; sd: their posterior sds; cost: the objective [½σ²].
-        amplitude: in prior sds of each slot's effect (0 where empty).
-        size: of each slot over the largest plausible amplitude in its direction; 0 where empty.
-        plausible: whether every amplitude is of a plausible size, off its bounds, and of a sign that physics allows.
-        nearly: whether it is plausible, but for amplitudes up to `settings.stretched` times the largest.
-        converged: whether the fit is an optimum.
-        supplying: effects whose balance would supply power with them.
-        simulated: whether the fit is of the model; else of its equations made linear at another fit (`screening`).
+        amplitude: in prior sds of each slot's effect (0 if empty).
+        size: of each slot over the largest plausible amplitude in its direction; 0 if empty.
+        plausible: True if each amplitude has a plausible size, is off its bounds, and has a sign that physics allows.
+        nearly: True if it is plausible except for amplitudes up to `settings.stretched` times the largest.
+        converged: True if the fit is an optimum.
+        supplying: effects that would make their balance supply power.
+        simulated: True for a fit of the model; False for one of its linearised equations (`screening`).
     """
 
     active: tuple[str, ...]
@@ -68,38 +68,42 @@ class Candidate:
 
     @property
     def key(self) -> frozenset[str]:
-        """What makes it the same candidate as another one."""
+        """Identity of the candidate: its set of effects."""
         return frozenset(self.effects)
 
 
-def empty(settings: Settings) -> tuple[str, ...]:
-    """No effect in any slot."""
+def empty_slots(settings: Settings) -> tuple[str, ...]:
+    """Slots without effects."""
     return ("",) * settings.slots
 
 
-def filled(effects: Sequence[str], settings: Settings) -> tuple[str, ...]:
-    """These effects in the first slots."""
+def fill_slots(effects: Sequence[str], settings: Settings) -> tuple[str, ...]:
+    """Slots with these effects first."""
     return (*effects, *("",) * (settings.slots - len(effects)))
 
 
-def candidate(space: CandidateSpace, active: tuple[str, ...], best: Optimum, settings: Settings) -> Candidate:
-    """What a fit says of the effects in its slots."""
+def candidate_of_fit(space: CandidateSpace, active: tuple[str, ...], best: Optimum, settings: Settings) -> Candidate:
+    """Candidate from a fit of the effects in its slots."""
     amplitude = settings.width * np.asarray(space.coordinates.parts(best.z)[1])
     spread = settings.width * np.asarray(space.coordinates.parts(best.sd)[1])
     amplitude = np.where([bool(name) for name in active], amplitude, 0.0)
-    size = np.array([_size(space, n, a, settings) if n else 0.0 for n, a in zip(active, amplitude, strict=True)])
-    near = np.array([_size(space, n, s, settings) if n else 0.0 for n, s in zip(active, spread, strict=True)])
+    size = np.array(
+        [_relative_amplitude(space, n, a, settings) if n else 0.0 for n, a in zip(active, amplitude, strict=True)]
+    )
+    near = np.array(
+        [_relative_amplitude(space, n, s, settings) if n else 0.0 for n, s in zip(active, spread, strict=True)]
+    )
     cost = float(best.cost) if np.isfinite(best.cost) else np.inf
     z, sd = np.asarray(best.z), np.asarray(best.sd)
-    supplies = supplying(space, active, amplitude, z) if np.isfinite(cost) else ()
-    # What lies within an sd of a bound is held by it, unless its sd is as large as all that is plausible.
+    supplies = supplying_effects(space, active, amplitude, z) if np.isfinite(cost) else ()
+    # An amplitude within an sd of a bound is held by it, unless its sd is as large as the whole plausible range.
     ok = bool(np.all(size + np.where(near < 0.25, near, 0.0) < 1.0)) and not supplies
     nearly = bool(np.all(size < settings.stretched)) and not supplies
     return Candidate(active, z, sd, cost, amplitude, size, ok, nearly, bool(best.converged), supplies)
 
 
-def _size(space: CandidateSpace, name: str, amplitude: float, settings: Settings) -> float:
-    """An amplitude [prior sds] over the largest that is plausible in its direction."""
+def _relative_amplitude(space: CandidateSpace, name: str, amplitude: float, settings: Settings) -> float:
+    """An amplitude [prior sds] over the largest plausible one in its direction."""
     spec = amplitude_of(space.library[name]).spec
     unit = spec.prior_sd(0.0)
     bound = max(spec.bounds[1] if amplitude > 0 else -spec.bounds[0], 0.0) / unit
@@ -108,11 +112,11 @@ def _size(space: CandidateSpace, name: str, amplitude: float, settings: Settings
 
 @dataclasses.dataclass(frozen=True)
 class BaseFit:
-    """The base fitted alone.
+    """The base fitted without effects.
 
     Attributes:
-        candidate: without effects; reading: what it says of every row [SI], shape (rows, channels).
-        space: with the rows kept out that it cannot reach; unusable: indices of those.
+        candidate: without effects; reading: of each row [SI], shape (rows, channels).
+        space: without the rows that it cannot reach; unusable: indices of those.
     """
 
     candidate: Candidate
@@ -122,34 +126,37 @@ class BaseFit:
 
 
 def fit_base(space: CandidateSpace, settings: Settings, where: str, near: Candidate | None = None) -> BaseFit:
-    """The base fitted alone, from the prior mean and from draws of the prior; the best that was found.
+    """Best fit of the base without effects, from the prior mean and from draws of the prior.
 
-    Rows that it cannot reach at all are kept out, and it is fitted again.
+    Rows that it cannot reach at all are excluded, and it is fitted again.
 
     Args:
-        where: opens the message.
-        near: a fit of the same runs with other weights or sds, or by regression; where runs are long it is begun
-            there and at the prior mean alone.
+        where: first words of the error message.
+        near: a fit of the same runs with other weights or sds, or by regression; for long runs, searches begin only
+            there and at the prior mean.
 
     Raises:
-        BadData: too few rows are left.
+        BadData: too few rows remain.
     """
     lost = _beyond_adhesion(space)
     unusable = tuple(map(int, np.flatnonzero(lost)))
     space = space.without(lost) if unusable else space
     while True:
-        found, seen = _base_searches(space, settings, near)
-        # The first of those that end in one place: which of them is the lowest is rounding's choice.
-        cost = np.where(np.isfinite(found.cost), found.cost, np.inf)
+        optima, seen = _base_searches(space, settings, near)
+        # The first of those that end in one place, because rounding decides which of them is the lowest.
+        cost = np.where(np.isfinite(optima.cost), optima.cost, np.inf)
         k = int(np.argmax(cost <= np.min(cost) + ALIKE))
         lost = space.bare.observe.unreachable(np.asarray(seen.status[k])) & space.included
         if not lost.any():
             slots = np.zeros(2 * settings.slots)
-            best = jax.tree.map(lambda x: x[k], found)  # noqa: B023
+            best = jax.tree.map(lambda x: x[k], optima)  # noqa: B023
             z, sd = np.concatenate([best.z[: space.free], slots]), np.concatenate([best.sd[: space.free], slots + 1])
             best = dataclasses.replace(best, z=z, sd=sd)
             return BaseFit(
-                candidate(space, empty(settings), best, settings), np.asarray(seen.reading[k]), space, unusable
+                candidate_of_fit(space, empty_slots(settings), best, settings),
+                np.asarray(seen.reading[k]),
+                space,
+                unusable,
             )
         unusable = tuple(sorted({*unusable, *map(int, np.flatnonzero(lost))}))
         space = space.without(lost)
@@ -161,18 +168,18 @@ def fit_base(space: CandidateSpace, settings: Settings, where: str, near: Candid
 def _beyond_adhesion(space: CandidateSpace) -> np.ndarray:
     """True for rows in which the robot slides at any plausible adhesion, shape (rows,).
 
-    A search would stretch the adhesion, and the whole base with it, until the robot grips in them.
+    A search would increase the adhesion, and distort the whole base, until the robot grips in them.
     """
     problem = space.bare
     if problem.observe.long:
         return np.zeros(len(space.included), bool)
     ground = [name.endswith("ground.friction.static") for name in problem.coordinates.names]
-    seen = observation(problem, jnp.where(jnp.asarray(ground), ADHESION, 0.0))
+    seen = observe_at(problem, jnp.where(jnp.asarray(ground), ADHESION, 0.0))
     return (np.asarray(seen.status) == SLIDES) & space.included
 
 
 def _base_searches(space: CandidateSpace, settings: Settings, near: Candidate | None) -> tuple[Optimum, Observation]:
-    """Where searches of the base end, from the starts that its data propose, and what it says there."""
+    """Optima of the base's searches from the starts that its data propose, and their observations."""
     observe = space.bare.observe
     few = bool(space.near)
     if near is not None and few:
@@ -180,7 +187,7 @@ def _base_searches(space: CandidateSpace, settings: Settings, near: Candidate | 
     elif near is not None and observe.long:
         starts = np.stack([near.z[: space.free], np.zeros(space.free)])
         if not near.simulated:
-            starts = scans.placed(space.bare, starts)
+            starts = scans.place_at_minimum(space.bare, starts)
     else:
         starts = observe.starts(space.bare, np.random.default_rng(settings.seed), observe.policy.searches)
     weights = np.repeat(space.weight[None], len(starts), 0)
@@ -192,7 +199,7 @@ Proposal = tuple[tuple[str, ...], np.ndarray]
 
 
 def fit_candidates(space: CandidateSpace, proposals: Sequence[Proposal], settings: Settings) -> list[Candidate]:
-    """Fit every (active effects, start); what is known with other sds in a few steps from there."""
+    """Fit each (active effects, start); those known with other sds take a few steps from there."""
     if not proposals:
         return []
     problem, active = space.fitted_by(names for names, _ in proposals)
@@ -202,26 +209,28 @@ def fit_candidates(space: CandidateSpace, proposals: Sequence[Proposal], setting
         if not mine:
             continue
         starts = [space.near.get(*proposals[k]) for k in mine]
-        found, _ = search_each(problem, starts, [space.weight] * len(mine), [active[k] for k in mine], most)
+        optima, _ = search_each(problem, starts, [space.weight] * len(mine), [active[k] for k in mine], most)
         for j, k in enumerate(mine):
-            one = jax.tree.map(lambda x: x[j], found)  # noqa: B023
-            made[k] = candidate(space, proposals[k][0], one, settings)
+            one = jax.tree.map(lambda x: x[j], optima)  # noqa: B023
+            made[k] = candidate_of_fit(space, proposals[k][0], one, settings)
     return [made[k] for k in range(len(proposals))]
 
 
-def fit_beside(
+def fit_in_addition(
     space: CandidateSpace, wanted: Sequence[tuple[tuple[str, ...], Candidate, ScoreTable]], settings: Settings
 ) -> list[Candidate]:
-    """Fit effects beside those of another fit, from where their scores say; what then explains less than that fit,
-    which has them at amplitude 0, has started beyond where a solution exists and is fitted again from there. The
-    lowest is fitted from the prior mean too: what a model lacks may have led the search without it elsewhere.
+    """Fit effects in addition to those of another fit, from the starts that their scores give.
+
+    A fit that explains less than that fit, which has the effects at amplitude 0, started where no solution exists. It
+    is repeated from the other fit. The lowest one is also fitted from the prior mean, because a model error may have
+    led the search without the effect elsewhere.
 
     Args:
-        wanted: (active effects, the other fit, scores of what that leaves); all of its effects are active.
+        wanted: (active effects, the other fit, scores of its residuals); all of its effects are active.
     """
-    found = fit_candidates(space, [(w, start(space, at, w, settings, by)) for w, at, by in wanted], settings)
+    found = fit_candidates(space, [(w, start_of_fit(space, at, w, settings, by)) for w, at, by in wanted], settings)
     stuck = [k for k, (_, at, _) in enumerate(wanted) if not found[k].cost <= at.cost + STUCK]
-    again = [(k, start(space, wanted[k][1], wanted[k][0], settings)) for k in stuck]
+    again = [(k, start_of_fit(space, wanted[k][1], wanted[k][0], settings)) for k in stuck]
     for k in sorted(range(len(found)), key=lambda k: found[k].cost)[:1]:
         again.append((k, np.where(np.arange(len(found[k].z)) < space.free, 0.0, found[k].z)))
     others = fit_candidates(space, [(wanted[k][0], z) for k, z in again], settings)
@@ -230,14 +239,14 @@ def fit_beside(
     return found
 
 
-def start(
+def start_of_fit(
     space: CandidateSpace,
     at: Candidate,
     active: tuple[str, ...],
     settings: Settings,
     scores: ScoreTable | None = None,
 ) -> np.ndarray:
-    """Where to start a fit of `active`: at another fit, new effects at what their score says."""
+    """Start of a fit of `active`: another fit, with new effects at their score's estimate."""
     p, s = space.free, settings.slots
     z = np.zeros(p + 2 * s)
     z[:p] = at.z[:p]

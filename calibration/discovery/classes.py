@@ -1,4 +1,4 @@
-"""Classes: for each effect found, the effects and stated values that the same data cannot tell from it."""
+"""Classes: for each effect found, the effects and stated values that the same data cannot separate from it."""
 
 from __future__ import annotations
 
@@ -9,30 +9,30 @@ import numpy as np
 
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import Diagnosis
-from calibration.discovery.candidates import Candidate, fit_candidates, start
+from calibration.discovery.candidates import Candidate, fit_candidates, start_of_fit
 from calibration.discovery.score_tests import ScoreTable
-from calibration.discovery.screening import ranked
+from calibration.discovery.screening import fit_by_regression
 from calibration.discovery.search import without_each
 from calibration.discovery.settings import Settings
-from calibration.discovery.stated_values import Shift, shifts
+from calibration.discovery.stated_values import Shift, find_prior_shifts
 
-#: Effects that are tried in the place of each one.
+#: Number of effects that are tried in place of each one.
 TRIED = 16
-#: Rise of χ² by regression up to which a rival is simulated [σ²], and the same as a share of what an effect explains.
+#: Rise of χ² by regression up to which a rival is simulated [σ²], and the same as a share of the effect's decrease.
 NEAR, FAR = 50.0, 0.5
-#: Share of what an effect explains that the score of a shifted prior has to promise for it to be fitted.
+#: Least predicted decrease of χ² by a shifted prior for it to be fitted, as a share of the effect's.
 SURE = 0.7
 
 
 @dataclasses.dataclass(frozen=True)
 class Classes:
-    """What cannot be told apart.
+    """Alternatives that the data cannot separate.
 
     Attributes:
-        members: of each effect of the best candidate, effects indistinguishable from it, itself first.
-        stated: of each, base parameters whose stated value may be wrong instead.
-        families: of each, the families of its members, the leader's first.
-        ladder: every candidate that was fitted, those of the search among them.
+        members: for each effect of the best candidate, the effects indistinguishable from it, itself first.
+        stated: for each, base parameters whose stated value may be wrong instead.
+        families: for each, the families of its members, the leader's first.
+        ladder: all candidates that were fitted, including those of the search.
     """
 
     members: tuple[tuple[str, ...], ...]
@@ -42,19 +42,19 @@ class Classes:
 
     @property
     def single(self) -> bool:
-        """Whether each effect has one name."""
+        """True if each effect has one name."""
         return all(len(m) + len(s) == 1 for m, s in zip(self.members, self.stated, strict=True))
 
 
-def cosines(space: CandidateSpace, scores: ScoreTable) -> np.ndarray:
-    """Largest |cos| between what a fit leaves of two effects' signatures, over their shapes; (effects, effects)."""
+def signature_cosines(space: CandidateSpace, scores: ScoreTable) -> np.ndarray:
+    """Largest |cos| between the projected signatures of two effects, over their shapes; (effects, effects)."""
     cosine, effect, count = np.abs(np.asarray(scores.cosine)), space.library.of, len(space.library)
     whole = np.zeros((count, count))
     np.maximum.at(whole, (effect[:, None], effect[None, :]), cosine)
     return whole
 
 
-def classes(
+def find_classes(
     space: CandidateSpace,
     base: Candidate,
     best: Candidate,
@@ -63,15 +63,15 @@ def classes(
     after: Diagnosis,
     settings: Settings,
 ) -> Classes:
-    """For each effect of the best fit, the effects and the stated values that explain the data as well in its place.
+    """Effects and stated values that explain the data as well in place of each effect of the best fit.
 
-    The forms of nature are not those of a library: an effect explains as well what it explains but for a share
-    `settings.form` of the sigmas, or `form_family` where it is of the same family.
+    The forms of nature are not those of a library. So an alternative may explain less than an effect, by a share
+    `settings.form` of the sigmas, or `form_family` within the same family.
 
     Args:
-        left: what the base leaves; after: what the best fit leaves.
+        left: diagnosis of the base; after: diagnosis of the best fit.
     """
-    cosine, names = cosines(space, left.scores), space.library.names
+    cosine, names = signature_cosines(space, left.scores), space.library.names
     fewer = [base] if len(best.effects) == 1 else without_each(space, best, settings, ladder)
     gains = [2 * (c.cost - best.cost) for c in fewer]
     wanted: list[tuple[int, str, tuple[str, ...]]] = []
@@ -81,25 +81,25 @@ def classes(
             if cosine[k, j] > settings.alike and names[j] not in best.effects:
                 active = tuple(names[j] if s == slot else n for s, n in enumerate(best.active))
                 wanted.append((slot, names[j], active))
-    known = {c.key: c for c in ladder if c.simulated}
-    new = [active for _, _, active in wanted if frozenset(n for n in active if n) not in known]
+    simulated = {c.key: c for c in ladder if c.simulated}
+    new = [active for _, _, active in wanted if frozenset(n for n in active if n) not in simulated]
     fitted = []
     if space.bare.observe.long:
-        fitted = ranked(space, [(w, best, after) for w in new], settings)
-        known |= {c.key: c for c in fitted}
-        # What may be of the class is simulated where the program of the fits has room for it.
+        fitted = fit_by_regression(space, [(w, best, after) for w in new], settings)
+        simulated |= {c.key: c for c in fitted}
+        # Possible members of the class are simulated if the program of the fits includes them.
         new = [c.active for c in fitted if 2 * (c.cost - best.cost) < max(NEAR, FAR * max(gains))]
         new = [active for active in new if {n for n in active if n} <= {*space.room, *best.effects}]
-    wanted_fits = [(w, start(space, best, w, settings, left.scores)) for w in new]
+    wanted_fits = [(w, start_of_fit(space, best, w, settings, left.scores)) for w in new]
     fitted += fit_candidates(space, wanted_fits, settings)
-    known |= {c.key: c for c in fitted if c.simulated}
+    simulated |= {c.key: c for c in fitted if c.simulated}
     members, stated = [], []
     for slot, (name, gain) in enumerate(zip(best.effects, gains, strict=True)):
         same = [name]
         within = {f: max(settings.same, f**2 * gain) for f in (settings.form, settings.form_family)}
         family = space.library[name].family()
         for s, other, active in wanted:
-            rival = known[frozenset(n for n in active if n)]
+            rival = simulated[frozenset(n for n in active if n)]
             parallel = cosine[names.index(name), names.index(other)] > settings.parallel
             akin = space.library[other].family() == family
             limit = within[settings.form_family if akin else settings.form]
@@ -108,14 +108,14 @@ def classes(
                 same.append(other)
         members.append(tuple(same))
         linear = left.linear if len(best.effects) == 1 else None
-        found = shifts(space, fewer[slot], SURE * gain, settings, linear)
-        stated.append(tuple(s for s in found if 2 * (s.fit.cost - best.cost) <= within[settings.form]))
-    by_regression = [c for c in (*ladder, *fitted) if not c.simulated and c.key not in known]
-    latest = {c.key: c for c in by_regression} | {k: c for k, c in known.items() if not c.simulated}
+        shifts = find_prior_shifts(space, fewer[slot], SURE * gain, settings, linear)
+        stated.append(tuple(s for s in shifts if 2 * (s.fit.cost - best.cost) <= within[settings.form]))
+    by_regression = [c for c in (*ladder, *fitted) if not c.simulated and c.key not in simulated]
+    latest = {c.key: c for c in by_regression} | {k: c for k, c in simulated.items() if not c.simulated}
     whole = (*latest.values(), *(c for c in (*ladder, *fitted) if c.simulated))
-    return Classes(tuple(members), tuple(stated), tuple(families(space, same) for same in members), whole)
+    return Classes(tuple(members), tuple(stated), tuple(families_of_members(space, same) for same in members), whole)
 
 
-def families(space: CandidateSpace, members: Sequence[str]) -> tuple[str, ...]:
+def families_of_members(space: CandidateSpace, members: Sequence[str]) -> tuple[str, ...]:
     """Families of the members of a class, the leader's first."""
     return tuple(dict.fromkeys(space.library[m].family() for m in members))

@@ -1,4 +1,4 @@
-"""Whether a model describes runs at all: before that no effect is named."""
+"""Check that a model describes the runs at all; otherwise no effect is named."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ from calibration.inference.lack_of_fit import EXPLAINED, UNDESCRIBED
 from calibration.inference.linearization import Linearization
 from calibration.inference.noise import UNSTATED, Noise
 
-#: Share of a channel's measured rms up to which a fit with effects may miss it where the refit misses more than
-#: `UNDESCRIBED`: what was found is then what the refit lacked.
+#: Largest error, as a share of a channel's measured rms, of a fit with effects that describes runs which the refit
+#: misses by more than `UNDESCRIBED`: the effects are then the missing part.
 MENDED = 0.05
 
 
-def undescribed(
+def undescribed_channels(
     space: CandidateSpace, runs: Runs, noise: Noise, refit: Linearization, found: Linearization | None = None
 ) -> tuple[Missed, ...]:
-    """Channels that the refit misses by more than `UNDESCRIBED` of their measured rms, or whose estimated noise is
-    that large; none where what was found mends it.
+    """Channels that the refit misses by more than `UNDESCRIBED` of their rms, or with estimated noise that large.
 
-    A channel whose stated noise is that large is described by residuals up to `EXPLAINED` times its sds.
+    None if the effects found bring all errors below `MENDED`. A channel with stated noise that large is described by
+    residuals up to `EXPLAINED` times its sds.
 
     Args:
-        refit, found: the fit with nothing added and with effects, linearised; None where none was found.
+        refit, found: the fits without and with effects, linearised; None without effects.
     """
     stated = np.array([source not in UNSTATED for source in noise.source])
-    share, sigma = _missed(space, runs, noise, refit)
+    share, sigma = _error_shares(space, runs, noise, refit)
     large = (share > UNDESCRIBED) & ~(stated & (sigma <= EXPLAINED))
-    if large.any() and found is not None and np.nanmax(_missed(space, runs, noise, found)[0]) < MENDED:
+    if large.any() and found is not None and np.nanmax(_error_shares(space, runs, noise, found)[0]) < MENDED:
         large[:] = False
     counts = space.weight[: len(runs)] > 0
     measured = np.where(counts, runs.measured(), np.nan)
@@ -45,9 +45,10 @@ def undescribed(
     )
 
 
-def _missed(space: CandidateSpace, runs: Runs, noise: Noise, fit: Linearization) -> tuple[np.ndarray, np.ndarray]:
-    """rms error of each channel over its measured rms [-], and in sds [σ], over the readings that count; 0 without
-    any."""
+def _error_shares(
+    space: CandidateSpace, runs: Runs, noise: Noise, fit: Linearization
+) -> tuple[np.ndarray, np.ndarray]:
+    """rms error of each channel over its measured rms [-], and in sds [σ], over included readings; 0 without any."""
     rows = len(runs)
     counts = space.weight[:rows] > 0
     off = np.where(counts, np.asarray(fit.by_row())[:rows], 0.0)
@@ -56,7 +57,7 @@ def _missed(space: CandidateSpace, runs: Runs, noise: Noise, fit: Linearization)
     return error / np.maximum(size, 1e-300), np.sqrt(np.sum(off**2, 0) / np.maximum(counts.sum(0), 1))
 
 
-def unused(runs: Runs) -> tuple[str, ...]:
-    """Columns of numbers that vary and have no role, and a torque at the output that a brake may set."""
-    torques = (f"{note.theirs} as a condition" for note in unused_room.no_load_gives(runs))
+def unused_inputs(runs: Runs) -> tuple[str, ...]:
+    """Columns of numbers that vary and have no role, and an output torque that a brake may impose."""
+    torques = (f"{note.theirs} as a condition" for note in unused_room.unexplained_torque_notes(runs))
     return (*unused_room.unused_columns(runs), *torques)

@@ -1,6 +1,6 @@
-"""The closed loop: fit, outliers, score tests, adequacy, search, classes, discrepancy, next experiment, in turn.
+"""The closed loop: fit, outliers, score tests, adequacy, search, classes, discrepancy, next experiment, in order.
 
-Each stage is a function of what the stages before it found; none changes anything.
+Each stage is a pure function of the results of the stages before it.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from calibration.described import described, in_words
 from calibration.discovery import findings, kept, menu, prediction, preference, scales
 from calibration.discovery.active_set import CandidateSpace, candidate_space
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
-from calibration.discovery.candidates import BaseFit, Candidate, filled, fit_base, fit_candidates, start
-from calibration.discovery.classes import Classes, classes, cosines
-from calibration.discovery.description import undescribed, unused
-from calibration.discovery.discrepancy import CurveBeside, Discrepancy, locate
-from calibration.discovery.experiments import Proposal, denser, no_menu, separating
-from calibration.discovery.hidden import hidden
+from calibration.discovery.candidates import BaseFit, Candidate, fill_slots, fit_base, fit_candidates, start_of_fit
+from calibration.discovery.classes import Classes, find_classes, signature_cosines
+from calibration.discovery.description import undescribed_channels, unused_inputs
+from calibration.discovery.discrepancy import CurveBeside, Discrepancy, locate_discrepancy
+from calibration.discovery.experiments import Proposal, propose_denser_runs, propose_nothing, propose_separating
+from calibration.discovery.hidden import find_hidden_effects
 from calibration.discovery.kept import Keep
 from calibration.discovery.location import DiscrepancyLocation, varied_by_duty
 from calibration.discovery.loop_notes import (
@@ -57,9 +57,15 @@ from calibration.discovery.loop_notes import (
     TooFewReplicates,
     Unwritten,
 )
-from calibration.discovery.loop_posterior import of_curve, of_fit
-from calibration.discovery.mechanism import mechanism
-from calibration.discovery.outliers import Screening, ahead, same_rows, screen, screen_beside
+from calibration.discovery.loop_posterior import posterior_of_curve, posterior_of_fit
+from calibration.discovery.mechanism import find_mechanism
+from calibration.discovery.outliers import (
+    Screening,
+    compile_ahead,
+    screen_known_rows,
+    screen_outliers,
+    screen_with_effects,
+)
 from calibration.discovery.prediction import Predicted
 from calibration.discovery.result import (
     Alternative,
@@ -74,10 +80,10 @@ from calibration.discovery.result import (
     UnnamedDiscrepancy,
 )
 from calibration.discovery.score_tests import Statistics, bootstrap
-from calibration.discovery.screening import beforehand, with_room
-from calibration.discovery.search import Search, diagnose, path, search
+from calibration.discovery.screening import screen_by_weak_form, with_program_room
+from calibration.discovery.search import Search, best_of_each_size, diagnose_candidate, search_effects
 from calibration.discovery.settings import FIT, HELD_OUT, WITHOUT_NAME, Settings, settings_for
-from calibration.discovery.standing import standing
+from calibration.discovery.standing import judge_names
 from calibration.inference import bases as bases_room
 from calibration.inference import blocks as blocks_room
 from calibration.inference import noise as noise_room
@@ -94,7 +100,7 @@ from calibration.inference.fit_notes import (
     OnlyTogether,
     Step,
 )
-from calibration.inference.fit_posterior import undetermined
+from calibration.inference.fit_posterior import undetermined_names
 from calibration.inference.lack_of_fit import Residuals
 from calibration.inference.linearization import Linearization
 from calibration.inference.noise import Noise
@@ -103,29 +109,30 @@ from calibration.inference.residual_clusters import residual_clusters
 from mmrjax import effects
 from mmrjax.compile.precision import SINGLE, Threads, in_double, is_double
 from mmrjax.effects import Effect
-from mmrjax.errors import counted
+from mmrjax.errors import count_noun
 from mmrjax.model import channels
 from mmrjax.model.robot import Robot
 
-#: Factors on a noise that nobody states at which the verdict is looked at too: on what is assumed, and on what the
-#: table shows.
+#: Factors on unstated noise for which the verdict is repeated: on an assumed noise, and on one estimated from the
+#: table.
 FACTORS = {"assumed": (0.5, 2.0), "estimated": (0.7, 1.4)}
-#: Times that rows are looked through for such as stand alone, with what was found.
+#: Number of times that rows are screened for isolated outliers, with the effects found.
 SCREENINGS = 4
-#: Share of the largest speed or voltage that is no noise about rest [-].
+#: Share of the largest speed or voltage above which a value is not noise about rest [-].
 EITHER_WAY = 0.05
-#: Sds of a delay from zero from which on it is one.
+#: Size of a delay in its sds from which a note reports it.
 LATE = 4.0
-#: Share of rows set aside beyond which that is said first.
+#: Share of excluded rows above which the summary begins with it.
 MANY = 0.03
-#: Share of the range of a series by which levels differ that are not the same one as measured [-].
+#: Relative difference of two levels of a series, by its range, above which they are distinct [-].
 LEVEL = 0.02
-#: Error of a refit over that of the robot as stated above which it is said [-].
+#: Ratio of the error of a refit to that of the robot as stated above which a note reports it [-].
 WORSE = 1.1
-#: Root of a score from which on it is likely that something is missing, before the bootstrap tells [σ].
+#: Root of a score from which an effect is probably missing, before the bootstrap's result [σ].
 LIKELY = 4.0
-#: Prior sds beyond which a base parameter is worth a look.
+#: Distance from the prior above which a note reports a base parameter [prior sd].
 FAR = 3.0
+#: Callback for progress notes.
 #: Is told what the loop does next.
 Tell = Callable[[Note | str], None]
 
@@ -144,45 +151,45 @@ def discover(
     forbidden: Sequence[str] = (),
     rows: int = ROWS,
     progress: Callable[[str], None] = lambda text: None,
-    keep: Keep = kept.nothing,
+    keep: Keep = kept.keep_nothing,
     left: Callable[[], float | None] = lambda: None,
 ) -> DiscoveryResult:
-    """Find what a robot's model lacks against measured runs.
+    """Find the model error of a robot against measured runs, and trace it to a balance or an effect.
 
     Args:
         runs: settled runs, or time histories from rest.
-        robot: its values are the prior means; a mass that the table states takes the place of its own.
-        noise: sds as `noise.parse`; None takes the file's columns, else what series of conditions show,
-            or where there are none a usual one, halved and doubled.
-        stated: parameter → (mean, sd) [SI], priors in place of the fields'.
-        library: effects to look for.
+        robot: its values are the prior means; a mass in the table replaces its own.
+        noise: sds as `noise.parse_noise`; None takes the file's columns, else an estimate from series of conditions,
+            or without series a usual one, halved and doubled.
+        stated: parameter → (mean, sd) [SI], priors that replace the fields'.
+        library: effects to test.
         replicates: of the bootstrap; seed: random seed.
-        prefer: by what the leader of a class is chosen, `fit` or `held-out`.
-        forbidden: kinds of experiments (`menu.KINDS`) and configurations that are not to be proposed.
-        rows: of a log over time from which on readings are used of fewer, evenly in time, which its notes say.
-        progress: called with a sentence as the work goes on; keep: by which stages are kept as they end.
-        left: time that is left once there is a verdict [s], for which verdicts at other noises are waited; None: all.
+        prefer: criterion for the leader of a class, `fit` or `held-out`.
+        forbidden: kinds of experiments (`menu.KINDS`) and configurations that are not proposed.
+        rows: number of rows of a log over time above which readings are thinned evenly in time; a note reports it.
+        progress: callback for progress messages; keep: function that stores each stage when it ends.
+        left: remaining time after the verdict [s], for which verdicts at other noises are awaited; None: no limit.
 
     Raises:
-        BadData, BadConfiguration: data that contradict themselves or are too few, priors that cannot be, experiments
-            that are not known; or a call inside `jax.jit` where JAX is single.
+        BadData, BadConfiguration: data that contradict themselves or are too few, invalid priors, unknown
+            experiments; or a call inside `jax.jit` while JAX uses single precision.
     """
     if not is_double():
         raise BadConfiguration(f"discover: {SINGLE}")
     tell = in_words(progress)
-    ready = prepared(
+    ready = prepare_loop(
         runs, robot, noise=noise, stated=stated, library=library, replicates=replicates, seed=seed, prefer=prefer,
         forbidden=forbidden, rows=rows,
     )  # fmt: skip
     distinct, known = ready.runs, ready.noise
     for note in ready.at_first:
         tell(note)
-    space = pose(distinct, ready.robot, known.sd, ready.settings, ready.stated, ready.library)
-    with ahead(space, functools.partial(bases_at, distinct), ready.settings) as later:
+    space = pose_candidates(distinct, ready.robot, known.sd, ready.settings, ready.stated, ready.library)
+    with compile_ahead(space, functools.partial(bases_at_fit, distinct), ready.settings) as later:
         traced, notes = keep("verdict", lambda: ready.trace(progress=tell, later=later, keep=keep)), ready.notes
-    silent = channels.names(known.silent)
+    silent = channels.channel_names(known.silent)
     factors = FACTORS.get(known.word, ())
-    # Verdicts at other noises run the programs of the first one: beside what follows it, on other cores.
+    # Verdicts at other noises use the programs of the first one, so they run in parallel on other cores.
     others = Threads(2, kept.BESIDE)
     sensitivity, outstanding = list[Sensitivity](), list[float]()
     try:
@@ -202,16 +209,16 @@ def discover(
             tell(Step("others"))
         for f, verdict in verdicts.items():
             try:
-                sensitivity.append(in_short(f, verdict.result(left()), ready.numbers))
+                sensitivity.append(brief_verdict(f, verdict.result(left()), ready.numbers))
             except concurrent.futures.TimeoutError:
                 outstanding.append(f)
-    finally:  # one that is interrupted, or out of time, waits for none
+    finally:  # an interruption or the time limit waits for none of them
         others.shutdown(wait=False, cancel_futures=True)
     if outstanding:
         notes = (Outstanding(tuple(outstanding), known.word), *notes)
     assumed = [c for c in known.silent if c not in {s.channel for s in known.along_series}]
     if assumed:
-        notes = (*notes, AssumedNoise(channels.names(assumed), noise_room.default(assumed)))
+        notes = (*notes, AssumedNoise(channels.channel_names(assumed), noise_room.default_noise(assumed)))
     if known.along_series:
         notes = (*notes, NoiseFromSeries(known.along_series))
     return dataclasses.replace(found, remarks=(*notes, *found.remarks), sensitivity=tuple(sensitivity))
@@ -219,13 +226,13 @@ def discover(
 
 @dataclasses.dataclass(frozen=True)
 class LoopInput:
-    """What the stages of the loop are given: a table, its robot, and how to look.
+    """Input of the loop's stages: a table, its robot, and the settings.
 
     Attributes:
-        runs: without copies; numbers: of the rows, as messages call them.
-        robot: as `preparation.prepare` leaves it; noise: of the readings; stated: priors (mean, sd) [SI].
-        settings: statistical; library: effects to look for.
-        notes: what to say of all that; at_first: those that are said before the first fit.
+        runs: without copies; numbers: of the rows, as in messages.
+        robot: as `preparation.prepare` returns it; noise: of the readings; stated: priors (mean, sd) [SI].
+        settings: statistical; library: effects to test.
+        notes: on all of these; at_first: those to report before the first fit.
     """
 
     runs: Runs
@@ -244,16 +251,16 @@ class LoopInput:
         progress: Tell = lambda note: None,
         known: LoopStages | None = None,
         later: Callable[[BaseFit], None] = lambda base: None,
-        keep: Keep = kept.nothing,
+        keep: Keep = kept.keep_nothing,
     ) -> LoopStages:
-        """The stages up to a verdict, with this noise or another; the others as of the function `trace`."""
+        """Stages up to a verdict, with this noise or another; other arguments as in the function `trace`."""
         sds = self.noise if noise is None else noise
         return trace(
             self.runs, self.robot, sds, self.settings, self.stated, self.library, progress, known, later, keep
         )
 
 
-def prepared(
+def prepare_loop(
     runs: Runs,
     robot: Robot,
     *,
@@ -266,19 +273,19 @@ def prepared(
     forbidden: Sequence[str] = (),
     rows: int = ROWS,
 ) -> LoopInput:
-    """What `discover` does before its first fit; arguments and errors as of `discover`.
+    """Input of the stages from the arguments of `discover`; arguments and errors as there.
 
-    A campaign that wants verdicts alone goes on with `LoopInput.trace`, so that it takes the way that users take.
+    A campaign that needs only verdicts continues with `LoopInput.trace`, and so follows the same path as users.
     """
     menu.check_forbidden(forbidden, robot)
     if not robot.rig.inherits:
-        scales.nominal_ahead()
+        scales.precompute_nominal()
     runs = thinned(runs.of(robot), rows)
     distinct, numbers, notes = without_copies(runs)
-    kind = observers.kind(distinct)
+    kind = observers.observer_kind(distinct)
     if len(distinct) < kind.fewest:
         raise BadData(
-            f"{runs.source}: {counted(len(distinct), kind.word)} cannot show what a model lacks; at least "
+            f"{runs.source}: {count_noun(len(distinct), kind.word)} cannot show what a model lacks; at least "
             f"{kind.fewest} are needed"
         )
     ready = preparation.prepare(distinct, robot, noise, stated)
@@ -287,21 +294,21 @@ def prepared(
             raise BadData(described(note))
     at_first = (*ready.foreign, *ready.doubted)
     said: Notes = (*notes, *ready.checked, *ready.begins, *ready.weighed, *at_first)
-    turned = scales.turned_in(distinct, ready.robot)
+    turned = scales.output_rotation(distinct, ready.robot)
     own = {name: e for name, e in effects.OF_CHANNELS.items() if e.channel in ready.robot.rig.channels}
     library = {**library, **kind.library, **own}
-    library = scales.library_for(ready.robot, distinct.conditions(ready.robot), library, turned)
+    library = scales.library_of_size(ready.robot, distinct.conditions(ready.robot), library, turned)
     settings = dataclasses.replace(settings_for(kind, replicates, seed, prefer), forbidden=tuple(forbidden))
     return LoopInput(distinct, numbers, ready.robot, ready.noise, ready.stated, settings, library, said, at_first)
 
 
 @dataclasses.dataclass(frozen=True)
 class Sds:
-    """The noise that a verdict is with.
+    """Noise of a verdict.
 
     Attributes:
-        noise: of the readings; factors: of the sds as given by which each channel's were changed, empty for none.
-        remarks: what to say of that.
+        noise: of the readings; factors: changes of the given sds by channel, empty for none.
+        remarks: notes on the noise.
     """
 
     noise: Noise
@@ -311,19 +318,19 @@ class Sds:
 
 @dataclasses.dataclass(frozen=True)
 class LoopStages:
-    """What the stages up to a verdict found.
+    """Results of the stages up to a verdict.
 
     Attributes:
         verdict: `none`, `named`, `class`, `mechanism`, `place` or `undescribed`.
-        screened: the base fit, rows that stand alone set aside; left: what it leaves.
-        sds: the noise that the verdict is with.
-        searched: what was tried; alike: what cannot be told apart, where a name is given.
-        where: something is missing, or remains.
-        standing: why names that were looked at do not stand, or what was put beside them.
-        held_out: the alternatives compared by data held out, where these chose the leader.
-        beside: the curve of what the base leaves, where something is missing.
-        predicted: what fits predict of data held out, as of `prediction.smallest`.
-        mechanism: where no name stands, established or not.
+        screened: the base fit without outliers; left: its diagnosis.
+        sds: noise of the verdict.
+        searched: the search; alike: effects that cannot be separated, if a name is given.
+        where: location of the discrepancy, or of the remaining one.
+        standing: tests of the names.
+        held_out: alternatives by hold-out errors, if these chose the leader.
+        beside: the curve of the base's discrepancy, if there is one.
+        predicted: hold-out predictions of fits, as from `prediction.smallest_predictive_set`.
+        mechanism: if no name is established; it may not be established either.
         missed: channels that the model does not describe; unused: columns that vary and have no role.
     """
 
@@ -344,7 +351,7 @@ class LoopStages:
 
     @property
     def members(self) -> tuple[tuple[str, ...], ...]:
-        """Of each effect that is established, those that these data cannot tell from it, itself first."""
+        """For each established effect, those that these data cannot separate from it, itself first."""
         return tuple(m for m, name in zip(self._classes, self._named, strict=True) if name)
 
     @property
@@ -357,12 +364,12 @@ class LoopStages:
 
     @property
     def noise_factor(self) -> float | None:
-        """By what factor sds are off, the mean of the channels; None where they are right."""
+        """Factor of the sds, the geometric mean of the channels; None if they are unchanged."""
         return float(np.exp(np.mean(np.log(list(self.sds.factors.values()))))) if self.sds.factors else None
 
     @property
     def families(self) -> tuple[str, ...]:
-        """Families of what is established: of the members of each class, or where something without a name is."""
+        """Families of the members of each established class, or of the location of an unnamed discrepancy."""
         if self.alike is not None and self.verdict not in WITHOUT_NAME:
             return tuple(f for each, name in zip(self.alike.families, self._named, strict=True) if name for f in each)
         if self.verdict == "mechanism" and self.mechanism is not None:
@@ -371,17 +378,17 @@ class LoopStages:
 
     @property
     def events(self) -> tuple[dict[str, Any], ...]:
-        """Where something happens for a while: axis and window, and numbers of the rows in it."""
+        """Temporary changes: axis and window, and numbers of the rows in it."""
         return () if self.where is None else self._happening(self.where.variable)
 
     @property
     def events_alike(self) -> tuple[dict[str, Any], ...]:
-        """The same of what it cannot be told from."""
+        """Temporary changes that cannot be separated from `events`, in the same form."""
         alike = () if self.where is None else self.where.variables_alike
         return tuple(event for variable in alike for event in self._happening(variable))
 
     def _happening(self, variable: str) -> tuple[dict[str, Any], ...]:
-        happens = bases_room.window(variable)
+        happens = bases_room.window_from_name(variable)
         if happens is None or self.where is None:
             return ()
         linear = self.left.linear
@@ -392,20 +399,20 @@ class LoopStages:
 
     @property
     def simulated(self) -> dict[tuple[str, ...], np.ndarray]:
-        """Coordinates of every fit by simulation, by its effects."""
+        """Coordinates of each simulated fit, by its effects."""
         every = (self.screened.base.candidate, *(() if self.searched is None else self.searched.ladder))
         return {c.active: c.z for c in reversed(every) if c.simulated and np.isfinite(c.cost)}
 
     @property
     def best(self) -> Candidate:
-        """The candidate that is proposed: the base, where no effect is named."""
+        """The proposed candidate: the base if no effect is named."""
         if self.alike is None or self.searched is None or self.searched.best is None:
             return self.screened.base.candidate
         return self.searched.best
 
     @property
     def ends(self) -> Diagnosis:
-        """What that candidate leaves."""
+        """Diagnosis of that candidate."""
         if self.alike is None or self.searched is None or self.searched.diagnosis is None:
             return self.left
         return self.searched.diagnosis
@@ -421,34 +428,35 @@ def trace(
     progress: Tell = lambda note: None,
     known: LoopStages | None = None,
     later: Callable[[BaseFit], None] = lambda base: None,
-    keep: Keep = kept.nothing,
+    keep: Keep = kept.keep_nothing,
 ) -> LoopStages:
-    """The stages of the loop up to a verdict, in order; the noise is known. `later` is told the base
-    fit as soon as something is likely to be missing. What is kept of a stage holds what those before it found, which
-    is one whole.
+    """Stages of the loop up to a verdict, in order, with known noise.
 
-    What replicates of a bootstrap show in units of their own sds hardly depends on these: where the stages of the
-    same table with other sds are `known`, and the same rows count, their replicates serve. Fits of histories then
-    take a few steps of Gauss and Newton from those. Sets for which their program has no room are not simulated, and
-    no row is set aside anew.
+    `later` is called with the base fit as soon as an effect is probably missing. A stored stage contains the results
+    of the stages before it.
 
-    Where residuals are without structure and everywhere as many times the sds, it is the sds that are wrong: the
-    stages go through again with such as the residuals show.
+    The bootstrap's statistics, in units of their sds, depend only weakly on the sds. If the stages of the same table
+    with other sds are `known`, with the same included rows, their replicates are reused. Fits of histories then take
+    a few Gauss-Newton steps from those. Sets of effects outside their program are not simulated, and no further
+    row is excluded.
+
+    If the residuals have no structure and exceed the sds by the same factor everywhere, the sds are wrong. The
+    stages are then repeated with sds from the residuals.
     """
     task = _Task(runs, robot, noise, settings, stated, library, progress, known, later, keep)
     ranked = list[Ranking]()
-    screened, sds = keep("base", functools.partial(_base, task, ranked))
-    screened, left, searched = _searched(task, screened, sds, ranked)
+    screened, sds = keep("base", functools.partial(_fit_base_and_noise, task, ranked))
+    screened, left, searched = _search_until_clean(task, screened, sds, ranked)
     if searched is None:
-        missed = undescribed(screened.base.space, runs, sds.noise, left.linear)
+        missed = undescribed_channels(screened.base.space, runs, sds.noise, left.linear)
         word = "undescribed" if missed else "none"
-        return LoopStages(word, screened, left, sds, missed=missed, unused=unused(runs))
+        return LoopStages(word, screened, left, sds, missed=missed, unused=unused_inputs(runs))
     return _verdict(task, screened, left, sds, searched)
 
 
 @dataclasses.dataclass(frozen=True)
 class _Task:
-    """The arguments of `trace`, which its stages share."""
+    """Arguments of `trace`, shared by its stages."""
 
     runs: Runs
     robot: Robot
@@ -463,31 +471,31 @@ class _Task:
 
     def screen(self, noise: Noise, near: Candidate | None, ranked: list[Ranking]) -> Screening:
         """The base fit with this noise, from `near` if given, and its outliers; see `windows`."""
-        space = pose(self.runs, self.robot, noise.sd, self.settings, self.stated, self.library)
-        known, at = self.known, functools.partial(bases_at, self.runs)
-        if known is not None and space.bare.observe.long:  # whose rows count here too
+        space = pose_candidates(self.runs, self.robot, noise.sd, self.settings, self.stated, self.library)
+        known, at = self.known, functools.partial(bases_at_fit, self.runs)
+        if known is not None and space.bare.observe.long:  # the same rows are included here
             space = dataclasses.replace(space.without(np.array(known.screened.outliers, int)), near=known.simulated)
             self.progress(Step("base"))
             base = fit_base(space, self.settings, self.runs.source, near)
-            return same_rows(base, at, known.screened, self.settings)
+            return screen_known_rows(base, at, known.screened, self.settings)
         if near is None:
             near = self.windows(space, ranked)
         self.progress(Step("base"))
-        return screen(fit_base(space, self.settings, self.runs.source, near), at, self.runs, self.settings)
+        return screen_outliers(fit_base(space, self.settings, self.runs.source, near), at, self.runs, self.settings)
 
     def windows(self, space: CandidateSpace, ranked: list[Ranking]) -> Candidate | None:
-        """Where the base fit begins by the equations of a log in weak form; their ranking of the library is appended
-        to `ranked`."""
-        found = beforehand(space, self.settings)
+        """Start of the base fit from a log's equations in weak form; their ranking of the library is appended to
+        `ranked`."""
+        found = screen_by_weak_form(space, self.settings)
         if found is None:
             return None
-        make = functools.partial(findings.ranking_beforehand, space, found, self.settings)
+        make = functools.partial(findings.rank_by_weak_form, space, found, self.settings)
         ranked.append(self.keep("ranking", make))
         return found.base
 
 
-def _base(task: _Task, ranked: list[Ranking]) -> tuple[Screening, Sds]:
-    """The base fit and the noise, which is scaled where residuals without structure exceed it by one factor."""
+def _fit_base_and_noise(task: _Task, ranked: list[Ranking]) -> tuple[Screening, Sds]:
+    """The base fit and the noise, rescaled if residuals without structure exceed it by one factor."""
     known, noise = task.known, task.noise
     screened = task.screen(noise, None if known is None else known.screened.base.candidate, ranked)
     residuals = residuals_of(screened, task.runs)
@@ -500,47 +508,49 @@ def _base(task: _Task, ranked: list[Ranking]) -> tuple[Screening, Sds]:
     return screened, sds
 
 
-def _tested(task: _Task, sds: Sds, screened: Screening) -> tuple[Screening, Diagnosis]:
-    """A base fit with room for the sets of effects that are simulated, and the bootstrap of what it leaves."""
+def _test_base(task: _Task, sds: Sds, screened: Screening) -> tuple[Screening, Diagnosis]:
+    """A base fit with the sets of effects to be simulated in its program, and the bootstrap of its residuals."""
     known, weight = task.known, screened.base.space.weight
     null = None if known is None or np.any(known.screened.base.space.weight != weight) else known.left.test.null
     room = () if known is None else known.screened.base.space.room
     base, (linear, scores, _) = screened.base, screened.diagnosed
     space = base.space.with_room(room)
     if not room:
-        space = with_room(base.space, base.candidate, linear, scores, task.settings)
+        space = with_program_room(base.space, base.candidate, linear, scores, task.settings)
     screened = dataclasses.replace(screened, base=dataclasses.replace(base, space=space))
     if np.max(np.abs(np.asarray(scores.single))) > LIKELY:
         task.later(screened.base)
     return screened, diagnosis_of_base(screened, task.settings, sds.noise.freedom, null)
 
 
-def _tried(task: _Task, screened: Screening, left: Diagnosis) -> tuple[Screening, Diagnosis, Search]:
-    """The search for effects that explain what the base leaves."""
+def _search_effects(task: _Task, screened: Screening, left: Diagnosis) -> tuple[Screening, Diagnosis, Search]:
+    """Search for effects that explain the residuals of the base."""
     base = screened.base
-    found = search(base.space, base.candidate, left, screened.bases, task.settings, task.progress)
+    found = search_effects(base.space, base.candidate, left, screened.bases, task.settings, task.progress)
     base = dataclasses.replace(base, space=base.space.with_room(found.room))
     return dataclasses.replace(screened, base=base), left, found
 
 
-def _searched(
+def _search_until_clean(
     task: _Task, screened: Screening, sds: Sds, ranked: list[Ranking]
 ) -> tuple[Screening, Diagnosis, Search | None]:
-    """The search, repeated while it leaves outliers; None where the base leaves nothing."""
+    """Search, repeated while it leaves outliers; None if the base leaves no discrepancy."""
     settings, keep, progress = task.settings, task.keep, task.progress
     for k in range(SCREENINGS):
         progress(Step("bootstrap", (settings.replicates,)))
-        screened, left = keep(f"bootstrap {k}", functools.partial(_tested, task, sds, screened))
+        screened, left = keep(f"bootstrap {k}", functools.partial(_test_base, task, sds, screened))
         if k == 0 and not ranked:
-            keep("ranking", functools.partial(findings.ranking, screened.base.space, left, settings))
+            keep("ranking", functools.partial(findings.rank_library, screened.base.space, left, settings))
         if not left.test.rejected and screened.cluster is None:
             return screened, left, None
         progress(Step("effects"))
-        screened, left, searched = keep(f"search {k}", functools.partial(_tried, task, screened, left))
+        screened, left, searched = keep(f"search {k}", functools.partial(_search_effects, task, screened, left))
         after = searched.diagnosis
         if after is None or not after.test.rejected_with_margin or screened.base.space.near:
             break
-        more = screen_beside(screened, after.scores, lambda base: bases_at(task.runs, base), task.runs, settings)
+        more = screen_with_effects(
+            screened, after.scores, lambda base: bases_at_fit(task.runs, base), task.runs, settings
+        )
         if more is None:
             break
         progress(Step("alone"))
@@ -549,22 +559,22 @@ def _searched(
 
 
 def _verdict(task: _Task, screened: Screening, left: Diagnosis, sds: Sds, searched: Search) -> LoopStages:
-    """The verdict where the base leaves something: names, classes, a mechanism or a place."""
+    """Verdict on a base with a discrepancy: names, classes, a mechanism or a place."""
     runs, settings, progress = task.runs, task.settings, task.progress
     base, space, bases = screened.base.candidate, screened.base.space, screened.bases
     beside, predicted = CurveBeside(space, base, left, bases), Predicted()
     where = dataclasses.replace(beside.where, by_duty=varied_by_duty(runs))
-    model, searched, stood = choose(runs, screened, left, searched, settings, progress, beside, predicted)
+    model, searched, stood = choose_effects(runs, screened, left, searched, settings, progress, beside, predicted)
     stages = functools.partial(LoopStages, beside=beside, predicted=predicted)
-    missed = undescribed(space, runs, sds.noise, left.linear, None if model is None else model[1].linear)
+    missed = undescribed_channels(space, runs, sds.noise, left.linear, None if model is None else model[1].linear)
     if missed:
-        return stages("undescribed", screened, left, sds, searched, missed=missed, unused=unused(runs))
+        return stages("undescribed", screened, left, sds, searched, missed=missed, unused=unused_inputs(runs))
     named = [] if model is None else [stood.established(e) for e in model[0].effects]
     level, found = "", None
     if not any(named):
         progress(Step("mechanism"))
         ladder = [c for c in (*searched.ladder, *([] if model is None else model[:1]))]
-        found = mechanism(space, runs, base, left, ladder, bases, beside, predicted, settings)
+        found = find_mechanism(space, runs, base, left, ladder, bases, beside, predicted, settings)
         level = "place" if found is None or found.fails else "mechanism"
     if model is None:
         return stages(level, screened, left, sds, searched, where=where, standing=stood, mechanism=found)
@@ -572,7 +582,7 @@ def _verdict(task: _Task, screened: Screening, left: Diagnosis, sds: Sds, search
     searched = dataclasses.replace(searched, best=model[0], diagnosis=model[1])
     best, after = model
     progress(Step("alike", (best.effects,)))
-    alike = classes(space, base, best, searched.ladder, left, after, settings)
+    alike = find_classes(space, base, best, searched.ladder, left, after, settings)
     if not any(named):
         return stages(level, screened, left, sds, searched, alike, where, standing=stood, mechanism=found)
     compared: tuple[HeldOutAlternative, ...] = ()
@@ -583,11 +593,11 @@ def _verdict(task: _Task, screened: Screening, left: Diagnosis, sds: Sds, search
         stood = stood.renamed(dict(zip(best.active, (searched.best or best).active, strict=True)))
     alone = [len(m) + len(v) == 1 for m, v in zip(alike.members, alike.stated, strict=True)]
     verdict = "named" if all(one for one, name in zip(alone, named, strict=True) if name) else "class"
-    remains = locate(after, bases, space.included) if after.test.rejected_with_margin else None
+    remains = locate_discrepancy(after, bases, space.included) if after.test.rejected_with_margin else None
     return stages(verdict, screened, left, sds, searched, alike, remains, standing=stood, held_out=compared)
 
 
-def choose(
+def choose_effects(
     runs: Runs,
     screened: Screening,
     left: Diagnosis,
@@ -597,34 +607,37 @@ def choose(
     beside: CurveBeside,
     predicted: Predicted,
 ) -> tuple[tuple[Candidate, Diagnosis] | None, Search, NameSupport]:
-    """The effects that belong in the model: those whose names stand by themselves, and those of the smallest set that
-    predicts as well as any, but what only stands in for a curve; None for none. With what was searched, and which
-    names stand.
+    """Effects that belong in the model, the updated search, and the tests of their names.
 
-    Where the largest set leaves nothing its effects are judged, else those of the set that predicts.
+    They are those with an established name, and those of the smallest set that predicts as well as any, except
+    stand-ins for a curve; None for no effects. If the largest set leaves no discrepancy, its effects are judged, else
+    those of the set that predicts.
 
     Args:
-        left: what the base leaves; beside: its curve.
-        predicted: takes what fits predict of data held out.
+        left: diagnosis of the base; beside: its curve.
+        predicted: collects hold-out predictions of fits.
     """
     base, space, bases = screened.base.candidate, screened.base.space, screened.bases
     best, after, long = searched.best, searched.diagnosis, space.bare.observe.long
     if best is None or after is None:
-        return None, searched, standing(space, base, searched, left, bases, settings)
+        return None, searched, judge_names(space, base, searched, left, bases, settings)
     adequate = not after.test.rejected_with_margin
-    kinds = blocks_room.predictable(runs, space.bare)
+    kinds = blocks_room.predictable_blocks(runs, space.bare)
     blocks = [mask for by in kinds.values() for mask in by.values()]
-    asked = functools.partial(standing, space, base, searched, left, bases, settings, blocks=blocks, beside=beside)
+    asked = functools.partial(judge_names, space, base, searched, left, bases, settings, blocks=blocks, beside=beside)
     stood = asked() if adequate or long else None
     if stood is not None and all(stood.established(e) for e in best.effects):
         return (best, after), searched, stood
     few = None
     if not (long and stood is not None and stood.stands):  # refits of histories take long
         progress(Step("held out"))
-        few = prediction.smallest(space, runs, base, path(searched), predicted)
+        few = prediction.smallest_predictive_set(space, runs, base, best_of_each_size(searched), predicted)
     if stood is None:
         judged = best if few is None else few
-        proposed = judged, after if judged is best else diagnose(space, judged, bases, left.test.null, settings)
+        proposed = (
+            judged,
+            after if judged is best else diagnose_candidate(space, judged, bases, left.test.null, settings),
+        )
         stood = asked(proposed=proposed)
     else:
         proposed = best, after
@@ -636,18 +649,18 @@ def choose(
     every = (proposed[0], best, *(c for c in searched.ladder if c.simulated))
     known = [c for c in every if c.key == frozenset(names)]
     if not known:
-        active = filled(names, settings)
-        begins = start(space, proposed[0], active, settings, left.scores)
+        active = fill_slots(names, settings)
+        begins = start_of_fit(space, proposed[0], active, settings, left.scores)
         known = fit_candidates(space, [(active, begins)], settings)
         searched = dataclasses.replace(searched, ladder=(*searched.ladder, *known))
     seen = next((d for c, d in (proposed, (best, after)) if c is known[0]), None)
-    return (known[0], seen or diagnose(space, known[0], bases, left.test.null, settings)), searched, stood
+    return (known[0], seen or diagnose_candidate(space, known[0], bases, left.test.null, settings)), searched, stood
 
 
-# --- the stages that are no room of their own -----------------------------------------------------------
+# --- stages without a module of their own ---------------------------------------------------------------
 
 
-def pose(
+def pose_candidates(
     runs: Runs,
     robot: Robot,
     sd: np.ndarray,
@@ -655,34 +668,34 @@ def pose(
     stated: Mapping[str, tuple[float, float]] | None = None,
     library: Library = effects.BY_NAME,
 ) -> CandidateSpace:
-    """The base problem of a table, and room for the effects that its data can show.
+    """Base problem of a table, with slots for the effects that its data can show.
 
-    Rows are padded to one of a few sizes, so that tables of about one size share what is compiled; what is padded
-    counts for nothing. A mass that the table states takes the place of the robot's own, and the ground may be any
-    surface whose friction is not stated: its own prior, of another surface, would pull on what depends on slip.
+    Rows are padded to one of a few sizes, so that tables of similar size share compiled programs; padding has weight
+    0. A mass in the table replaces the robot's own. Ground friction without a stated prior has that of any surface,
+    because the prior of another surface would bias parameters that depend on slip.
     """
     robot = own_mass.with_table_mass(robot, runs)
-    kind = observers.kind(runs)
-    index, real = padded(len(runs), kind.sizes_padded)
+    kind = observers.observer_kind(runs)
+    index, real = padded_rows(len(runs), kind.sizes_padded)
     names = priors.free_names(robot, runs.configurations_named(robot), *kind.free())
-    coordinates = priors.coordinates(robot, names, dict(stated or {}), any_surface=True)
-    bare = observers.pose(runs.where(index), robot, coordinates, sd[index])
-    shown = visible(library, robot, kind, both_ways(runs), pulsed(runs))
+    coordinates = priors.parameter_coordinates(robot, names, dict(stated or {}), any_surface=True)
+    bare = observers.pose_problem(runs.where(index), robot, coordinates, sd[index])
+    shown = visible_effects(library, robot, kind, goes_both_ways(runs), has_pulses(runs))
     space = candidate_space(bare, shown, library, settings.slots, settings.width)
     return space.without(~real)
 
 
-def visible(
+def visible_effects(
     library: Library,
     robot: Robot,
     kind: type[observers.Observer],
     either_way: bool = True,
     at_duties: bool = False,
 ) -> tuple[Effect, ...]:
-    """The effects of a library that such data can show and the robot does not have yet.
+    """Effects of a library that such data can show and the robot does not have yet.
 
     Args:
-        either_way: whether the runs go both ways, see `both_ways`; at_duties: see `pulsed`.
+        either_way: True if the runs go both ways, see `goes_both_ways`; at_duties: see `has_pulses`.
     """
     have = {e.name for e in robot.effects}
     return tuple(
@@ -690,38 +703,38 @@ def visible(
         for name, effect in library.items()
         if name not in have
         and kind.shows(effect)
-        and scales.present(effect, robot)
+        and scales.effect_applies(effect, robot)
         and (either_way or not effect.needs_reverse)
         and (at_duties or not effect.needs_duty)
     )
 
 
-def pulsed(runs: Runs) -> bool:
+def has_pulses(runs: Runs) -> bool:
     """True if some runs have a duty below 1."""
     duties = [runs[name] for name in ("duty", *SIDES) if runs.has(name)]
     return any((np.abs(x) < 1).any() for x in duties)
 
 
-def both_ways(runs: Runs) -> bool:
-    """Whether runs go forward as well as backward, by any speed that they state or by what drives them."""
+def goes_both_ways(runs: Runs) -> bool:
+    """True if runs go both forward and backward, by any speed that they state or by their drive."""
     moved = [c.column for c in channels.EVERY if c.zero_at_rest and c.directed]
     columns = [runs[name] for name in (*moved, runs.layout.imposed_column, "duty") if runs.has(name)]
     found = [x[np.isfinite(x)] for x in columns]
     return any(min(x.max(), -x.min()) > EITHER_WAY * np.abs(x).max() for x in found if x.size)
 
 
-def padded(rows: int, sizes: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Rows with repeats of the first behind them, to the next of `sizes` or a multiple of the last, and which of them
-    are real."""
+def padded_rows(rows: int, sizes: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Row indices padded by repeats of the first to the next of `sizes` (or a multiple of the last), and True for
+    the real rows."""
     size = next((s for s in sizes if s >= rows), rows + (-rows % sizes[-1] if sizes else 0))
     index = np.concatenate([np.arange(rows), np.zeros(size - rows, int)])
     return index, np.arange(len(index)) < rows
 
 
-def bases_at(runs: Runs, base: BaseFit) -> Bases:
-    """Bases of curves over the readings of a fit: over measured ones they would share their noise."""
+def bases_at_fit(runs: Runs, base: BaseFit) -> Bases:
+    """Bases of curves over the fitted readings, because curves over measured ones would share their noise."""
     problem = base.space.bare
-    index, _ = padded(len(runs), problem.observe.sizes_padded)
+    index, _ = padded_rows(len(runs), problem.observe.sizes_padded)
     columns = dict(runs.where(index).columns)
     reading = np.where(np.isfinite(base.reading), base.reading, np.asarray(problem.data.measured))
     columns |= {c.column: reading[:, k] for k, c in enumerate(problem.channels)}
@@ -733,10 +746,10 @@ def bases_at(runs: Runs, base: BaseFit) -> Bases:
 def diagnosis_of_base(
     screened: Screening, settings: Settings, freedom: np.ndarray | None = None, null: Statistics | None = None
 ) -> Diagnosis:
-    """What the base leaves, tested against the bootstrap of itself.
+    """Diagnosis of the base by its own bootstrap.
 
     Args:
-        freedom: degrees of freedom of the sd of each channel; null: replicates where they are known.
+        freedom: degrees of freedom of the sd of each channel; null: replicates, if known.
     """
     space, base = screened.base.space, screened.base.candidate
     linear, scores, found = screened.diagnosed
@@ -748,19 +761,19 @@ def diagnosis_of_base(
     return Diagnosis(linear, scores, AdequacyTest(found, null, settings))
 
 
-def _once(columns: Sequence[np.ndarray]) -> int:
-    """Number of rows after which a table begins anew, row for row."""
+def _rows_until_repeat(columns: Sequence[np.ndarray]) -> int:
+    """Number of rows after which a table repeats itself exactly."""
     rows = list(zip(*(column.astype(str).tolist() for column in columns), strict=True))
     return next(n for n in range(1, len(rows) + 1) if len(rows) % n == 0 and rows[:-n] == rows[n:])
 
 
 def without_copies(runs: Runs) -> tuple[Runs, np.ndarray, list[Note]]:
-    """The runs without exact copies of one another, their row numbers, and what to say of that.
+    """Runs without exact copies of each other, their row numbers, and notes on the copies.
 
-    Rows that a file tells apart by no name, order or time are repeats, even if a coarse display shows them the same.
-    They are copies where the whole table is: the same rows in the same sequence, several times.
+    Equal rows that a file does not distinguish by name, order or time are repeats, perhaps read from a coarse
+    display. They are copies only if the whole table repeats: the same rows in the same sequence, several times.
     """
-    columns = [*(runs[c] for c in observers.kind(runs).identity(runs)), *runs.extras.values()]
+    columns = [*(runs[c] for c in observers.observer_kind(runs).identity(runs)), *runs.extras.values()]
     seen: set[tuple[str, ...]] = set()
     keep: list[int] = []
     copies: list[int] = []
@@ -770,22 +783,22 @@ def without_copies(runs: Runs) -> tuple[Runs, np.ndarray, list[Note]]:
             (copies if row in seen else keep).append(k)
             seen.add(row)
     else:
-        once = _once(columns)
+        once = _rows_until_repeat(columns)
         keep, copies = list(range(once)), list(range(once, len(runs)))
     if not copies:
         return runs, np.arange(1, len(runs) + 1), []
     return runs.where(np.asarray(keep)), np.asarray(keep) + 1, [Copies(tuple(k + 1 for k in copies))]
 
 
-def in_short(factor: float, traced: LoopStages, numbers: np.ndarray) -> Sensitivity:
-    """What the loop says with another noise."""
+def brief_verdict(factor: float, traced: LoopStages, numbers: np.ndarray) -> Sensitivity:
+    """Verdict and summary for another noise."""
     adequate = not traced.ends.test.rejected_with_margin
     near = bool(traced.screened.base.space.near)
-    return Sensitivity(factor, traced.verdict, summary(traced, numbers), traced.members, adequate, near)
+    return Sensitivity(factor, traced.verdict, verdict_summary(traced, numbers), traced.members, adequate, near)
 
 
-def summary(traced: LoopStages, numbers: np.ndarray) -> Summary:
-    """The verdict of these stages, with what else its statement says; `numbers` as of `assemble_result`."""
+def verdict_summary(traced: LoopStages, numbers: np.ndarray) -> Summary:
+    """Summary of a verdict, as data of its statement; `numbers` as in `assemble_result`."""
     space, alike = traced.screened.base.space, traced.alike
     support = None if traced.standing is None else traced.standing.numbered(numbers)
     best = None if traced.searched is None else traced.searched.best
@@ -796,7 +809,7 @@ def summary(traced: LoopStages, numbers: np.ndarray) -> Summary:
         traced.verdict,
         traced.left.test.p_value,
         traced.where,
-        missing=() if alike is None else missing(space, alike, support),
+        missing=() if alike is None else missing_effects(space, alike, support),
         nearest=best.effects if traced.verdict in WITHOUT_NAME and best is not None else (),
         support=support,
         aside=aside if many else 0,
@@ -810,8 +823,8 @@ def summary(traced: LoopStages, numbers: np.ndarray) -> Summary:
     )
 
 
-def missing(space: CandidateSpace, alike: Classes, support: NameSupport | None) -> tuple[Missing, ...]:
-    """Each effect in the model, with what it cannot be told from and whether it is established."""
+def missing_effects(space: CandidateSpace, alike: Classes, support: NameSupport | None) -> tuple[Missing, ...]:
+    """Effects in the model, each with its alternatives and whether it is established."""
     c, p = space.coordinates.base, space.free
     return tuple(
         Missing(
@@ -831,13 +844,13 @@ def missing(space: CandidateSpace, alike: Classes, support: NameSupport | None) 
 
 
 @dataclasses.dataclass(frozen=True)
-class _Written:
-    """The fit that a result is about: with the named effects, or with the curve where no name is given.
+class _FitOfVerdict:
+    """Fit of a result: with the named effects, or with the curve if no name is given.
 
     Attributes:
-        before, after: the fits of the base and of what is proposed, None where that is the base.
+        before, after: fits of the base and of the proposal, None if that is the base.
         robot: of the fit, with its coordinates z, their sds, its cost, and whether it converged.
-        ends: what it leaves; curve, beside: the curve and what remains beside it, where no name is given.
+        ends: its diagnosis; curve, beside: the curve and the diagnosis with it, if no name is given.
     """
 
     before: findings.Fitted
@@ -852,18 +865,18 @@ class _Written:
     curve: Discrepancy | None = None
     beside: Diagnosis | None = None
 
-    def or_refit(self, traced: LoopStages, kept: bool) -> _Written:
-        """The same where it is `kept`, else with the robot and the posterior of the refit."""
+    def or_refit(self, traced: LoopStages, kept: bool) -> _FitOfVerdict:
+        """Copy that is unchanged if `kept`, else has the robot and the posterior of the refit."""
         if kept:
             return self
         space, base = traced.screened.base.space, traced.screened.base.candidate
-        posterior = of_fit(space, base.active, base.z, traced.left.linear)
+        posterior = posterior_of_fit(space, base.active, base.z, traced.left.linear)
         robot = findings.proposed_robot(space, base)
         return dataclasses.replace(self, robot=robot, converged=base.converged, posterior=posterior)
 
 
-def _written(traced: LoopStages, progress: Tell) -> _Written:
-    """The fit that the result of a verdict is about."""
+def _fit_of_verdict(traced: LoopStages, progress: Tell) -> _FitOfVerdict:
+    """Fit of a verdict's result."""
     space, base, best, ends = traced.screened.base.space, traced.screened.base.candidate, traced.best, traced.ends
     curve = beside = None
     if traced.verdict in WITHOUT_NAME and traced.beside is not None:
@@ -871,21 +884,23 @@ def _written(traced: LoopStages, progress: Tell) -> _Written:
         curve, beside = traced.beside.curve, traced.beside.diagnosis
     before = findings.Fitted(*space.fit_of(base.active, base.z))
     if best is base and curve is not None and beside is not None:
-        return _Written(
+        return _FitOfVerdict(
             before, findings.Fitted(curve.problem, curve.z, None), curve.robot, curve.z,
             np.sqrt(np.diag(curve.covariance)), curve.chi2[1] / 2, curve.converged,
-            of_curve(space, best.active, curve), beside, curve, beside,
+            posterior_of_curve(space, best.active, curve), beside, curve, beside,
         )  # fmt: skip
     after = None if best is base else findings.Fitted(*space.fit_of(best.active, best.z))
-    posterior = of_fit(space, best.active, best.z, ends.linear)
+    posterior = posterior_of_fit(space, best.active, best.z, ends.linear)
     robot = findings.proposed_robot(space, best)
-    return _Written(before, after, robot, best.z, best.sd, best.cost, best.converged, posterior, ends, curve, beside)
+    return _FitOfVerdict(
+        before, after, robot, best.z, best.sd, best.cost, best.converged, posterior, ends, curve, beside
+    )
 
 
-def _keeps(traced: LoopStages, written: _Written, gain: prediction.Gain | None) -> bool:
-    """True if what is found predicts well enough to be written in place of the refit.
+def _predicts_well(traced: LoopStages, written: _FitOfVerdict, gain: prediction.Gain | None) -> bool:
+    """True if the proposal predicts well enough to be written instead of the refit.
 
-    What is written never predicts worse than the refit; a curve, which claims no cause, has to predict better.
+    A written fit never predicts worse than the refit; a curve, which claims no cause, has to predict better.
     """
     refit = traced.best is traced.screened.base.candidate
     if gain is None or (written.curve is None and refit):
@@ -896,7 +911,7 @@ def _keeps(traced: LoopStages, written: _Written, gain: prediction.Gain | None) 
 def _claims(
     traced: LoopStages, settings: Settings
 ) -> tuple[tuple[FoundEffect, ...], DiscrepancyLocation | None, tuple[HiddenEffect, ...]]:
-    """Effects that a verdict names, the place where something remains, and effects that they may conceal."""
+    """Effects that a verdict names, location of the remaining discrepancy, and effects that they may conceal."""
     screened, left, alike = traced.screened, traced.left, traced.alike
     space, base, best = screened.base.space, screened.base.candidate, traced.best
     if alike is None:
@@ -905,7 +920,9 @@ def _claims(
     if traced.verdict in WITHOUT_NAME:
         return found, None, ()
     ask = space.bare.observe.menu and not space.bare.observe.long
-    concealed = findings.hidden_effects(space, hidden(space, best, alike, left, traced.ends, settings, ask=ask))
+    concealed = findings.hidden_effects(
+        space, find_hidden_effects(space, best, alike, left, traced.ends, settings, ask=ask)
+    )
     return found, traced.where, concealed
 
 
@@ -917,44 +934,46 @@ def assemble_result(
     library: Library,
     progress: Tell,
 ) -> DiscoveryResult:
-    """The result of a verdict, with what only now is worth its time: errors held out, and the next experiment."""
+    """Result of a verdict, with the final computations: hold-out errors, and the next experiment."""
     screened, noise = traced.screened, traced.sds.noise
     space, base, best = screened.base.space, screened.base.candidate, traced.best
     included = space.included[: len(runs)]
     numbers = np.arange(1, len(runs) + 1) if numbers is None else numbers
-    written = _written(traced, progress)
+    written = _fit_of_verdict(traced, progress)
     progress(Step("errors"))
-    known = [traced.predicted.get(prediction.key(c)) for c in (base, best)]
-    seen = findings.readings(
+    known = [traced.predicted.get(prediction.candidate_key(c)) for c in (base, best)]
+    seen = findings.readings_of_rows(
         runs, noise.sd, written.before, written.after, known[0], None if best is base else known[1]
     )
     compared = traced.held_out
     nameless = traced.verdict in WITHOUT_NAME
     if traced.alike is not None and not nameless and not compared and not space.bare.observe.long:
-        compared = preference.compared(space, runs, best, traced.alike)
+        compared = preference.compare_alternatives(space, runs, best, traced.alike)
     gain = _gain(space, runs, seen)
-    kept = _keeps(traced, written, gain)
+    kept = _predicts_well(traced, written, gain)
     written = written.or_refit(traced, kept)
     progress(Step("next"))
     remaining = _residuals(space, runs, written.ends.linear, seen.after, written.z)
-    found = _Found(traced, written, seen, compared, gain, kept, remaining)
+    found = _ResultInput(traced, written, seen, compared, gain, kept, remaining)
     result = _result(found, runs, numbers, settings, library)
-    # What happens for a while is not everywhere alike.
-    of_noise = of_sds(traced.sds, remaining) if traced.sds.factors or not traced.events else ()
-    return dataclasses.replace(result, remarks=(*of_noise, *refit_worse(seen, noise, included), *remarks(result)))
+    # A temporary change is not uniform.
+    of_noise = noise_remarks_before_verdict(traced.sds, remaining) if traced.sds.factors or not traced.events else ()
+    return dataclasses.replace(
+        result, remarks=(*of_noise, *refit_worse(seen, noise, included), *loop_remarks(result))
+    )
 
 
 @dataclasses.dataclass(frozen=True)
-class _Found:
-    """Verdict, fit and predictions of which a result is made.
+class _ResultInput:
+    """Verdict, fit and predictions as input of a result.
 
     Attributes:
-        seen: readings of every row; compared: alternatives by data held out; remaining: residuals of the fit.
-        gain: by how much the fit predicts better than the refit; kept: True if it is written.
+        seen: readings of each row; compared: alternatives by hold-out errors; remaining: residuals of the fit.
+        gain: of the fit's predictions over the refit's; kept: True if the fit is written.
     """
 
     traced: LoopStages
-    written: _Written
+    written: _FitOfVerdict
     seen: ReadingsOfRows
     compared: tuple[HeldOutAlternative, ...]
     gain: prediction.Gain | None
@@ -962,34 +981,38 @@ class _Found:
     remaining: Residuals
 
 
-def _alternatives(found: _Found, settings: Settings) -> tuple[tuple[Alternative, ...], tuple[Alternative, ...]]:
+def _alternatives(found: _ResultInput, settings: Settings) -> tuple[tuple[Alternative, ...], tuple[Alternative, ...]]:
     """Sets of effects that explain nearly as much, and those of implausible size."""
     traced = found.traced
     ladder = traced.searched.ladder if traced.searched is not None else ()
     ladder = traced.alike.ladder if traced.alike is not None else ladder
-    return findings.alternatives(traced.screened.base.space, traced.best, found.written.cost, ladder, settings)
+    return findings.listed_alternatives(traced.screened.base.space, traced.best, found.written.cost, ladder, settings)
 
 
-def _unnamed(found: _Found, rows: int) -> UnnamedDiscrepancy | None:
-    """The discrepancy that a curve describes, where no name is given."""
+def _unnamed(found: _ResultInput, rows: int) -> UnnamedDiscrepancy | None:
+    """Discrepancy described by a curve, if no name is given."""
     written, where = found.written, found.traced.where
     if written.curve is None or where is None or written.beside is None:
         return None
-    return findings.unnamed(written.curve, where, found.traced.left.test.p_value, written.beside.linear, rows)
+    return findings.unnamed_discrepancy(
+        written.curve, where, found.traced.left.test.p_value, written.beside.linear, rows
+    )
 
 
-def _result(about: _Found, runs: Runs, numbers: np.ndarray, settings: Settings, library: Library) -> DiscoveryResult:
-    """The result without its remarks."""
+def _result(
+    about: _ResultInput, runs: Runs, numbers: np.ndarray, settings: Settings, library: Library
+) -> DiscoveryResult:
+    """Result without its remarks."""
     traced, written, seen = about.traced, about.written, about.seen
     screened, left, ends = traced.screened, traced.left, written.ends
     space, base = screened.base.space, screened.base.candidate
     observe, included = space.bare.observe, space.included[: len(runs)]
-    error = lambda simulated: findings.errors(space.bare, simulated, seen.measured, seen.sd, included)  # noqa: E731
+    error = lambda simulated: findings.errors_of_readings(space.bare, simulated, seen.measured, seen.sd, included)  # noqa: E731
     near, too_large = _alternatives(about, settings)
     found, remains, concealed = _claims(traced, settings)
     listed = findings.effect_scores(space, left.scores, settings)
     shown = space.library.indices([s.name for s in listed])
-    said = summary(traced, numbers)
+    said = verdict_summary(traced, numbers)
     return DiscoveryResult(
         verdict=traced.verdict,
         summary=said,
@@ -1008,7 +1031,7 @@ def _result(about: _Found, runs: Runs, numbers: np.ndarray, settings: Settings, 
         unnamed=_unnamed(about, len(runs)),
         remains=remains,
         next_experiment=findings.next_experiment(_proposal(space, traced, settings)),
-        cannot_see=findings.invisible(space, left.scores, settings),
+        cannot_see=findings.invisible_effects(space, left.scores, settings),
         needs_histories=_needs_histories(library, type(observe)),
         needs_reverse=_needs_reverse(library, runs),
         alternatives=near,
@@ -1017,20 +1040,20 @@ def _result(about: _Found, runs: Runs, numbers: np.ndarray, settings: Settings, 
         support=said.support,
         cluster=screened.cluster,
         residual_clusters=residual_clusters(about.remaining, settings.seed),
-        before=findings.evidence(left.test, adequate=not left.test.rejected),
-        after=findings.evidence(ends.test, adequate=not ends.test.rejected_with_margin),
+        before=findings.evidence_of_test(left.test, adequate=not left.test.rejected),
+        after=findings.evidence_of_test(ends.test, adequate=not ends.test.rejected_with_margin),
         chi2=(2 * base.cost, 2 * written.cost),
         readings=int(np.sum(space.weight > 0)),
         base_shift=findings.base_shift(space, base.z, written.z, written.sd),
         scores=listed,
-        cosine=cosines(space, left.scores)[np.ix_(shown, shown)],
+        cosine=signature_cosines(space, left.scores)[np.ix_(shown, shown)],
         detail=observe.detail(screened.bases, included, left, ends),
         readings_of_rows=seen,
         errors_as_stated=error(seen.as_stated),
         errors=on_same_rows(seen.before, seen.after, error),
         errors_held_out={k: on_same_rows(*both, error) for k, both in seen.held_out.items()},
-        held_out_unpredictable=blocks_room.unpredictable(runs, space.bare),
-        held_out_worse=preference.worse(seen.held_out, error),
+        held_out_unpredictable=blocks_room.unpredictable_kinds(runs, space.bare),
+        held_out_worse=preference.worse_predictions(seen.held_out, error),
         alternatives_held_out=about.compared,
         noise=_noise(runs, traced.sds.noise, type(observe)),
         settings=settings,
@@ -1039,11 +1062,12 @@ def _result(about: _Found, runs: Runs, numbers: np.ndarray, settings: Settings, 
 
 
 def refit_worse(seen: ReadingsOfRows, noise: Noise, included: np.ndarray) -> list[RefitWorse]:
-    """Channels whose sds nobody states and that the refit misses by more than the robot as stated does, beyond their
-    noise: the estimate gives some readings too large a weight.
+    """Channels with unstated sds and a refit that is worse than the robot as stated, beyond their noise.
+
+    The estimated sds then give some readings too much weight.
 
     Args:
-        included: True for rows that count, shape (rows,).
+        included: True for included rows, shape (rows,).
     """
     found = []
     for k, channel in enumerate(noise.channels):
@@ -1067,9 +1091,9 @@ def on_same_rows(
     return error(np.where(both, before, np.nan)), error(np.where(both, after, np.nan))
 
 
-def of_sds(sds: Sds, remaining: Residuals) -> tuple[NoiseOff, ...]:
-    """What to say of sds of which something is said before the answer: by what the answer leaves; that they were
-    changed, where it leaves what they now say."""
+def noise_remarks_before_verdict(sds: Sds, remaining: Residuals) -> tuple[NoiseOff, ...]:
+    """Remarks on sds that are reported before the verdict: from the residuals of the final fit, or that the sds were
+    changed if those residuals agree with them."""
     off = tuple(noise_remarks(remaining, sds.noise.word)) if sds.remarks else ()
     if sds.factors:
         return () if off else sds.remarks
@@ -1077,19 +1101,21 @@ def of_sds(sds: Sds, remaining: Residuals) -> tuple[NoiseOff, ...]:
 
 
 def _gain(space: CandidateSpace, runs: Runs, seen: ReadingsOfRows) -> prediction.Gain | None:
-    """By how much what was found predicts better than the refit; None where nothing can be held out."""
+    """Gain of the proposal's predictions over the refit's; None if no block can be held out."""
     if not seen.held_out:
         return None
-    counts, kinds = space.weight[: len(runs)] > 0, blocks_room.predictable(runs, space.bare)
+    counts, kinds = space.weight[: len(runs)] > 0, blocks_room.predictable_blocks(runs, space.bare)
     before, after = (
-        prediction.scored({k: x[when] for k, x in seen.held_out.items()}, seen.measured, seen.sd, counts, kinds)
+        prediction.score_readings(
+            {k: x[when] for k, x in seen.held_out.items()}, seen.measured, seen.sd, counts, kinds
+        )
         for when in (0, 1)
     )
     return after.gain(before)
 
 
 def residuals_of(screened: Screening, runs: Runs) -> Residuals:
-    """What the base fit leaves of every reading."""
+    """Residuals of the base fit, by reading."""
     base, free = screened.base, screened.base.space.free
     return _residuals(base.space, runs, screened.diagnosed[0], base.reading, base.candidate.z[:free])
 
@@ -1097,10 +1123,10 @@ def residuals_of(screened: Screening, runs: Runs) -> Residuals:
 def _residuals(
     space: CandidateSpace, runs: Runs, linear: Linearization, reading: np.ndarray, z: np.ndarray
 ) -> Residuals:
-    """What a fit leaves of every reading.
+    """Residuals of a fit, by reading.
 
     Args:
-        linear: the fit at z, linearised; reading: what it says of every row [SI], shape (rows or more, channels).
+        linear: the fit at z, linearised; reading: of each row [SI], shape (rows or more, channels).
     """
     rows, count = len(runs), len(runs.channels)
     counts = (space.weight[:rows] > 0) & np.isfinite(reading[:rows])
@@ -1112,46 +1138,46 @@ def _residuals(
 
 
 def _proposal(space: CandidateSpace, traced: LoopStages, settings: Settings) -> Proposal | None:
-    """What to do next; None where nothing is left to tell apart, or the model does not describe the runs."""
+    """Next experiment; None if there are no alternatives to separate, or if the model does not describe the runs."""
     if traced.verdict == "undescribed":
         return None
     if not space.bare.observe.menu:
-        return no_menu(space) if traced.verdict != "none" else None
+        return propose_nothing(space) if traced.verdict != "none" else None
     if traced.verdict in WITHOUT_NAME and traced.where is not None:
-        return denser(space, traced.where, settings)
-    return None if traced.alike is None else separating(space, traced.best, traced.alike, settings)
+        return propose_denser_runs(space, traced.where, settings)
+    return None if traced.alike is None else propose_separating(space, traced.best, traced.alike, settings)
 
 
 def _needs_histories(library: Library, kind: type[observers.Observer]) -> tuple[str, ...]:
-    """Effects of the library that data of this kind cannot show at all, and a history could."""
+    """Effects of the library that data of this kind cannot show, but histories could."""
     return tuple(sorted(name for name, e in library.items() if e.transient and not kind.shows(e)))
 
 
 def _needs_reverse(library: Library, runs: Runs) -> tuple[str, ...]:
-    """Effects of the library that these runs cannot show since they all go one way."""
-    return tuple(sorted(name for name, e in library.items() if e.needs_reverse and not both_ways(runs)))
+    """Effects of the library that these runs cannot show because they all go in one direction."""
+    return tuple(sorted(name for name, e in library.items() if e.needs_reverse and not goes_both_ways(runs)))
 
 
 def _noise(runs: Runs, noise: Noise, kind: type[observers.Observer]) -> dict[str, dict[str, object]]:
-    """Channel → where its sd comes from, and its median share of the reading [%]."""
+    """Channel → source of its sd, and its median share of the reading [%]."""
     with np.errstate(invalid="ignore"):
         share = 100 * noise.sd / np.maximum(kind.sizes(runs), 1e-12)
     return {
         name: {"source": noise.source[k], "median_percent": float(np.nanmedian(share[:, k]))}
-        for k, name in enumerate(channels.names(noise.channels))
+        for k, name in enumerate(channels.channel_names(noise.channels))
         if noise.source[k] != "no readings"
     }
 
 
-def remarks(found: DiscoveryResult) -> Notes:
-    """What a careful engineer would say of this result."""
+def loop_remarks(found: DiscoveryResult) -> Notes:
+    """Remarks of a careful engineer on a result."""
     said: list[Note] = []
     for rows, why in ((found.unusable, "unusable"), (found.outliers, "outliers")):
         if rows:
             said.append(KeptOut(rows, why))
     far = {name: abs(p.shift_after) for name, p in found.base_shift.items() if abs(p.shift_after) > FAR}
     said += [FarFromPrior(name, x, "loop") for name, x in far.items()]
-    held = tuple(name for name in undetermined(found.held_by_prior, found.together) if name not in far)
+    held = tuple(name for name in undetermined_names(found.held_by_prior, found.together) if name not in far)
     said += [HeldByPrior(held)] * bool(held)
     said += [OnlyTogether(found.together)] * bool(found.together)
     said += [NotPredictable(found.held_out_unpredictable)] * bool(found.held_out_unpredictable)
@@ -1170,7 +1196,7 @@ def remarks(found: DiscoveryResult) -> Notes:
             said.append(_rests_on(found, t))
     if not found.written and found.gain is not None:
         said.append(Unwritten(not found.effects, found.gain.mean, found.gain.se))
-    said += preference.remarks(found.alternatives_held_out, found.settings.prefer)
+    said += preference.leader_remarks(found.alternatives_held_out, found.settings.prefer)
     settled, asked = found.replicates, found.settings.replicates
     if settled < 0.9 * asked:
         said.append(LostReplicates(settled, asked))
@@ -1180,8 +1206,8 @@ def remarks(found: DiscoveryResult) -> Notes:
 
 
 def _rests_on(found: DiscoveryResult, test: NameTest) -> RestsOn:
-    """What would tell whether a run that an effect rests on is right: it again, and half steps on either side of it
-    along a series that it is in."""
+    """Experiment to test the run that an effect depends on: a repeat, and half steps to either side along a series
+    of that run."""
     runs = found.runs
     if test.what == "run":
         return RestsOn(test)
@@ -1189,20 +1215,21 @@ def _rests_on(found: DiscoveryResult, test: NameTest) -> RestsOn:
     columns = [c for c in ("configuration", *runs.axes) if runs.has(c)]
     at = {c: str(runs[c][row]) if runs[c].dtype.kind == "U" else float(runs[c][row]) for c in columns}
     for axis in sorted(runs.axes, key=lambda axis: axis != series_noise.FIRST):
-        series = next((rows for rows in series_noise.series_of(runs, axis) if row in rows), None)
+        series = next((rows for rows in series_noise.series_along(runs, axis) if row in rows), None)
         x, here = runs[axis][row if series is None else series], float(runs[axis][row])
-        beside = levels_beside(np.asarray(x, float), here)
+        beside = neighbouring_levels(np.asarray(x, float), here)
         if beside:
             return RestsOn(test, at, axis, beside)
     return RestsOn(test, at)
 
 
-def levels_beside(x: np.ndarray, here: float) -> tuple[float, ...]:
-    """Levels half a step below and above one of a series, rounded to what a person sets; none where the others do
-    not differ from it by `LEVEL` of their range.
+def neighbouring_levels(x: np.ndarray, here: float) -> tuple[float, ...]:
+    """Levels half a step below and above one of a series, rounded to practical values.
+
+    Empty if all other levels are within `LEVEL` of its range.
 
     Args:
-        x: levels of the series; here: that of the row.
+        x: levels of the series; here: level of the row.
     """
     apart = np.abs(x - here)
     others = apart[apart > LEVEL * np.ptp(x)]

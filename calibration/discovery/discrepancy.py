@@ -1,7 +1,7 @@
-"""A discrepancy without a name: where it is, its shape as a smooth curve fitted with the base, a formula for it.
+"""Discrepancy without a name: its location, its shape as a smooth curve fitted with the base, and a formula.
 
-Defects and formulas are linear algebra at the fit that leaves it, every column projected against the free
-parameters; the curve itself is fitted with the base anew.
+Defects and formulas are linear algebra at a fit, with every column projected against the free parameters; the curve
+itself is fitted together with the base.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from jaxtyping import Array, Float
 from calibration.discovery.active_set import ActiveSet, CandidateSpace
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import Candidate
-from calibration.discovery.formula import Proposal, propose
+from calibration.discovery.formula import Proposal, propose_formula
 from calibration.discovery.location import DiscrepancyLocation
-from calibration.discovery.projection import Defect, Projection, defect
-from calibration.discovery.score_tests import diagnosed
-from calibration.discovery.smooth import Smooth, smooth
+from calibration.discovery.projection import Defect, Projection, defect_by_row
+from calibration.discovery.score_tests import diagnose_fit
+from calibration.discovery.smooth import Smooth, smooth_curve
 from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
 from calibration.inference.held_out import search_each
@@ -37,96 +37,100 @@ from mmrjax.effects.curve import PLACES
 from mmrjax.model import params
 from mmrjax.model.robot import Robot
 
-#: Starts of the curve's fit, from what the linear analysis says to none.
+#: Number of starts of the curve's fit, from the linear estimate to zero.
 STARTS = 8
-#: Points of a curve that are shown.
+#: Number of plotted points of a curve.
 POINTS = 61
-#: Evidence by which a curve over the supply's voltage, which acts by way of currents and speeds, has to be the better
-#: one [σ²].
+#: Extra evidence required of a curve over the supply's voltage, which acts only through currents and speeds [σ²].
 INDIRECT = 6.0
+#: Largest number of instants among which the ends of a window are chosen.
 #: Most instants between which the ends of a window are looked for.
 INSTANTS = 200
-#: How much less improbable a balance's best curve may be for it to act alike [normal deviate].
+#: Difference of the scores of two balances' best curves up to which they cannot be separated [normal deviate].
 ALIKE = 1.0
 
 
-# --- where it is ----------------------------------------------------------------------------------------
+# --- location -------------------------------------------------------------------------------------------
 
 
-def locate(left: Diagnosis, bases: Bases, included: np.ndarray) -> DiscrepancyLocation:
-    """Place of the curve whose score is the most improbable, the variable over which a curve there has the greatest
-    evidence, and the places in which one is as improbable.
+def locate_discrepancy(left: Diagnosis, bases: Bases, included: np.ndarray) -> DiscrepancyLocation:
+    """Location of a discrepancy: place, variable, and the places that are indistinguishable.
+
+    The place is that of the most significant curve. The variable is that of the curve with most evidence there.
 
     Args:
-        left: what a fit leaves; included: whether a row counts, shape (rows,).
+        left: diagnosis of a fit; included: True for included rows, shape (rows,).
     """
-    names = bases_room.names(bases)
+    names = bases_room.family_names(bases)
     deviate, explained = np.asarray(left.scores.curve), np.asarray(left.scores.explained)
-    happens = np.array([bases_room.window(n[1]) is not None for n in names])
-    # A smooth curve shows something of what happens for a while, and the other way round.
+    happens = np.array([bases_room.window_from_name(n[1]) is not None for n in names])
+    # A smooth curve responds to a temporary change too, and a window to a smooth curve.
     for_a_while = bool(np.max(deviate[happens], initial=-np.inf) > np.max(deviate[~happens]) + ALIKE)
     those = [j for j in range(len(names)) if happens[j] == for_a_while]
     k = max(those, key=lambda j: deviate[j])
-    # What a balance does as well is not put down to an instrument; it is listed beside it.
-    lacks = [j for j in those if not bases_room.in_readings(names[j][0]) and deviate[j] > deviate[k] - ALIKE]
+    # A balance takes precedence over an instrument with a similar score, which is listed as an alternative.
+    lacks = [j for j in those if not bases_room.is_channel_place(names[j][0]) and deviate[j] > deviate[k] - ALIKE]
     k = max(lacks, key=lambda j: deviate[j]) if lacks else k
     place = names[k][0]
     over = [j for j in those if names[j][0] == place and names[j][1] != bases_room.CONDITIONS]
     j = k if for_a_while else max(over, key=lambda j: deviate[j])
     if names[j][1] in bases_room.VARIABLES:
-        smoothly = [i for i in over if bases_room.window(names[i][1]) is None]
-        evidence = {i: smooth(left.linear, *names[i], included).evidence for i in smoothly}
+        smoothly = [i for i in over if bases_room.window_from_name(names[i][1]) is None]
+        evidence = {i: smooth_curve(left.linear, *names[i], included).evidence for i in smoothly}
         j = max(smoothly, key=lambda i: evidence[i] - INDIRECT * (names[i][1] == "voltage"))
     every = dict.fromkeys(names[i][0] for i in those)
     best = {b: max(deviate[i] for i in those if names[i][0] == b) for b in every}
     alike = [(b, *bases_room.STANDS_FOR.get(b, ())) for b, d in best.items() if d > deviate[k] - ALIKE]
     variable, strength = names[j][1], float(explained[j])
-    happening = bases_room.window(variable)
+    happening = bases_room.window_from_name(variable)
     if happening is not None and happening.axis in bases_room.AXES:
-        happening, strength = refined(left.linear, place, happening.axis, included)
+        happening, strength = refine_window(left.linear, place, happening.axis, included)
         variable = str(happening)
     strongest = max(strength, float(explained[k]))
-    also = alike_variables(names, deviate, place, variable)
+    also = similar_variables(names, deviate, place, variable)
     return DiscrepancyLocation(place, variable, tuple(itertools.chain(*alike)), also, strength, strongest)
 
 
-def alike_variables(
+def similar_variables(
     names: Sequence[tuple[str, str]], deviate: np.ndarray, place: str, variable: str
 ) -> tuple[str, ...]:
-    """Over what else a curve in a place is as improbable, the most improbable first."""
+    """Other variables with curves of similar significance in a place, the most significant first."""
     by_variable = {names[j][1]: deviate[j] for j in np.argsort(-deviate) if names[j][0] == place}
     by_variable.pop(bases_room.CONDITIONS, None)
-    found: dict[str, str] = {_axis(variable): variable}
+    variable_of_axis: dict[str, str] = {_axis(variable): variable}
     for other, d in by_variable.items():
         if d > max(by_variable.values()) - ALIKE:
-            found.setdefault(_axis(other), other)
-    return tuple(other for other in found.values() if other != variable)
+            variable_of_axis.setdefault(_axis(other), other)
+    return tuple(other for other in variable_of_axis.values() if other != variable)
 
 
 def _axis(variable: str) -> str:
-    """What is the same for all windows along an axis, and for a smooth curve over nothing else."""
-    happens = bases_room.window(variable)
+    """Key shared by all windows along an axis; a smooth curve has a key of its own."""
+    happens = bases_room.window_from_name(variable)
     return variable if happens is None else f"{happens.axis} for a while"
 
 
-def refined(linear: Linearization, place: str, axis: str, included: np.ndarray) -> tuple[bases_room.Window, float]:
-    """The window of an axis, of all that begin and end at its instants and hold at most half of the rows, that
-    explains most, and how much [σ²]; those that are tried for evidence are coarse.
+def refine_window(
+    linear: Linearization, place: str, axis: str, included: np.ndarray
+) -> tuple[bases_room.Window, float]:
+    """Window of an axis that explains most, and its decrease of χ² [σ²].
+
+    Windows begin and end at the axis's instants and hold at most half of the rows; those of the tests are coarser.
 
     Args:
-        included: whether a row counts, shape (rows,).
+        included: True for included rows, shape (rows,).
     """
     (x, way), included = linear.in_travel(place, axis), linear.at_points(included)
-    at, counts = np.unique(x[included], return_counts=True)
-    merged = -(-len(at) // INSTANTS)
-    edges = at[::merged]
+    levels, counts = np.unique(x[included], return_counts=True)
+    merged = -(-len(levels) // INSTANTS)
+    edges = levels[::merged]
     index = np.searchsorted(edges, x, side="right") - 1
     shapes = (index[:, None] == np.arange(len(edges))) & included[:, None]
-    a, b = Projection(linear)(bases_room.signature(linear, place, way[:, None] * shapes))
+    a, b = Projection(linear)(bases_room.place_signature(linear, place, way[:, None] * shapes))
     sums = np.zeros((len(edges) + 1,) * 2)
     sums[1:, 1:] = a.cumsum(0).cumsum(1)
     pull = np.append(0.0, b.cumsum())
-    rows = np.append(0, np.add.reduceat(counts, np.arange(0, len(at), merged)).cumsum())
+    rows = np.append(0, np.add.reduceat(counts, np.arange(0, len(levels), merged)).cumsum())
     first, last = np.triu_indices(len(edges) + 1, 1)
     norm2 = sums[last, last] - 2 * sums[first, last] + sums[first, first]
     held = rows[last] - rows[first]
@@ -145,7 +149,7 @@ class Shaped(eqx.Module):
 
     Attributes:
         base: of the base; root: L, shape (ordinates, ordinates); names: dotted, of the ordinates.
-        fitted_once: whether few fits are made with such coordinates.
+        fitted_once: True, because few fits use such coordinates.
     """
 
     fitted_once: ClassVar[bool] = True
@@ -171,21 +175,20 @@ def _ordinates(shaped: Shaped, z: Array) -> tuple[Array, tuple[Array, ...]]:
 
 @dataclasses.dataclass(frozen=True)
 class Discrepancy:
-    """A discrepancy that was located, as a smooth curve fitted together with the base.
+    """A located discrepancy, as a smooth curve fitted together with the base.
 
     Attributes:
-        balance, variable, unit: where it is, over what, and the unit of the balance.
-        effect: name of the curve among the effects of `robot`, the fitted robot that has it.
-        defect: of the balance, by row, at the fit that leaves it; None where single rows do not show it.
+        balance, variable, unit: its place and variable, and the unit of the balance.
+        effect: name of the curve among the effects of `robot`, the fitted robot with the curve.
+        defect: of the balance, by row, at the fit without the curve; None if single rows do not show it.
         grid: of the variable [SI]; curve, sd: there [unit], shape (points,); the 95 % band is ±1.96 sd. The
-            band holds what these data and the priors leave open, so it is wide where base parameters can
-            take the place of the curve.
+            band includes the uncertainty of the base, so it is wide if base parameters can replace the curve.
         chi2: twice the objective before and after [σ²], priors included.
         z, covariance: posterior of the coordinates of `problem`, the ordinates last.
-        problem: in which it was fitted.
-        reading: what the robot says of every row [SI], shape (rows, channels).
-        converged: whether the fit is an optimum.
-        proposal: a formula for it.
+        problem: of the fit.
+        reading: of each row [SI], shape (rows, channels).
+        converged: True if the fit is an optimum.
+        proposal: a formula for the curve.
     """
 
     balance: str
@@ -209,24 +212,24 @@ class Discrepancy:
 def fit_discrepancy(
     space: CandidateSpace, base: Candidate, linear: Linearization, balance: str, variable: str
 ) -> Discrepancy:
-    """The discrepancy of a balance over a variable: its defects, its curve, a formula.
+    """Discrepancy of a balance over a variable: its defects, its curve, a formula.
 
     Args:
-        base: the fit that leaves it; linear: the same, linearised.
+        base: the fit without the curve; linear: the same, linearised.
         balance: one of `bases.BALANCES`, or a channel.
         variable: one of `bases.VARIABLES`, of `bases.ORDERS`, or a window.
     """
     included = space.included
-    at_base = smooth(linear, balance, variable, included)
+    at_base = smooth_curve(linear, balance, variable, included)
     problem = _with_curve(space, base, at_base)
     inner = len(problem.coordinates.base)
     starts = np.zeros((STARTS, len(problem.coordinates)))
     starts[:, :inner] = base.z[:inner]
     starts[:, inner:] = np.linspace(1.0, 0.0, STARTS)[:, None] * at_base.start
-    found, seen = search_each(problem, list(starts), [space.weight] * STARTS)
-    k = int(np.argmin(np.where(np.isfinite(found.cost), found.cost, np.inf)))
-    z = np.asarray(found.z[k])
-    covariance = np.asarray(found.covariance[k])
+    optima, seen = search_each(problem, list(starts), [space.weight] * STARTS)
+    k = int(np.argmin(np.where(np.isfinite(optima.cost), optima.cost, np.inf)))
+    z = np.asarray(optima.z[k])
+    covariance = np.asarray(optima.covariance[k])
     grid = np.linspace(at_base.low, at_base.high, POINTS)
     shape = at_base.scale * at_base.basis(grid) @ at_base.root
     ordinates = covariance[inner:, inner:]
@@ -236,34 +239,35 @@ def fit_discrepancy(
         unit=PLACES[balance][0],
         effect=at_base.effect,
         robot=_present(problem.robot(jnp.asarray(z)), space, base, at_base.effect),
-        defect=defect(linear, balance) if space.bare.observe.rows_tell else None,
+        defect=defect_by_row(linear, balance) if space.bare.observe.rows_tell else None,
         grid=grid,
         curve=shape @ z[inner:],
         sd=np.sqrt(np.einsum("ij,jk,ik->i", shape, ordinates, shape)),
-        chi2=(2 * base.cost, 2 * float(found.cost[k])),
+        chi2=(2 * base.cost, 2 * float(optima.cost[k])),
         z=z,
         covariance=covariance,
         problem=problem,
         reading=np.asarray(seen.reading[k]),
-        converged=bool(found.converged[k]),
-        proposal=propose(linear, balance, included, at_base, voltage=space.bare.base.rig.shows_voltage),
+        converged=bool(optima.converged[k]),
+        proposal=propose_formula(linear, balance, included, at_base, voltage=space.bare.base.rig.shows_voltage),
     )
 
 
-def diagnosis_beside(space: CandidateSpace, found: Discrepancy, bases: Bases, left: Diagnosis) -> Diagnosis:
-    """A look at the fit with a curve, against the thresholds of the base, which `left` has."""
+def diagnose_with_curve(space: CandidateSpace, found: Discrepancy, bases: Bases, left: Diagnosis) -> Diagnosis:
+    """Diagnosis of the fit with a curve, with the thresholds of the base, which `left` has."""
     z, effects = jnp.asarray(found.z), space.library.scored
-    linear, scores, strongest = diagnosed(found.problem, z, effects, bases, near=left.linear)
+    linear, scores, strongest = diagnose_fit(found.problem, z, effects, bases, near=left.linear)
     return Diagnosis(linear, scores, AdequacyTest(strongest, left.test.null, left.test.settings))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class CurveBeside:
-    """Where the base leaves something, the smooth curve there and what it leaves, each found when it is first asked
-    for: both the verdict and its result may ask.
+    """Smooth curve of the base's discrepancy and its diagnosis, each computed once when it is first needed.
+
+    Both the verdict and its result may need them.
 
     Attributes:
-        space, base, left, bases: as of `fit_discrepancy` and `diagnosis_beside`.
+        space, base, left, bases: as in `fit_discrepancy` and `diagnose_with_curve`.
     """
 
     space: CandidateSpace
@@ -273,8 +277,8 @@ class CurveBeside:
 
     @functools.cached_property
     def where(self) -> DiscrepancyLocation:
-        """The place, as `locate` has it."""
-        return locate(self.left, self.bases, self.space.included)
+        """Location, as from `locate_discrepancy`."""
+        return locate_discrepancy(self.left, self.bases, self.space.included)
 
     @functools.cached_property
     def curve(self) -> Discrepancy:
@@ -283,14 +287,14 @@ class CurveBeside:
 
     @functools.cached_property
     def diagnosis(self) -> Diagnosis:
-        """What the fit with the curve leaves."""
-        return diagnosis_beside(self.space, self.curve, self.bases, self.left)
+        """Diagnosis of the fit with the curve."""
+        return diagnose_with_curve(self.space, self.curve, self.bases, self.left)
 
 
 def _with_curve(space: CandidateSpace, base: Candidate, curve: Smooth) -> Problem:
-    """The problem of the base and a curve; the coordinates of the curve's ordinates come last."""
+    """Problem of the base and a curve; the coordinates of the curve's ordinates come last."""
     problem = space.problem(base.active) if base.effects else space.bare
-    # A robot that has this curve from an earlier round keeps one of them: the names are its parameters'.
+    # A curve of this name from an earlier round is replaced, because its parameters have the same names.
     kept = tuple(e for e in problem.base.effects if e.name != curve.effect)
     added = params.replace(UNNAMED[curve.effect](), {n: jnp.asarray(v) for n, v in curve.values.items()})
     robot = dataclasses.replace(problem.base, effects=(*kept, added))
@@ -301,6 +305,6 @@ def _with_curve(space: CandidateSpace, base: Candidate, curve: Smooth) -> Proble
 
 
 def _present(robot: Robot, space: CandidateSpace, base: Candidate, curve: str) -> Robot:
-    """The robot with the effects that are in it: its own, those of the fit, the curve."""
+    """Robot with only the effects that are present: its own, those of the fit, and the curve."""
     names = {e.name for e in space.bare.base.effects} | set(base.effects) | {curve}
     return dataclasses.replace(robot, effects=tuple(e for e in robot.effects if e.name in names))

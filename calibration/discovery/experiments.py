@@ -1,13 +1,14 @@
-"""The next experiment: of a menu, the one that best tells apart what a finished loop could not.
+"""The next experiment: the one of a menu that best separates the alternatives of a finished loop.
 
-Alternatives are hypotheses that explain the same table equally well. Each foresees every reading y of the menu,
-with the covariance S = diag(sd²) + J C Jᵀ: of the instruments, and to first order of its fitted coordinates,
-C = (JᵀJ)⁻¹ over readings and priors of the table (Chaloner and Verdinelli, Bayesian experimental design,
-Statistical Science 10 (1995)). Two alternatives A, B are √(dᵀ S⁻¹ d) apart, d = y_A - y_B, with the S of the
-two that leaves less (Hunter and Reiner, Designs for discriminating between two rival models, Technometrics 7
-(1965)). If one of them is true, the χ² of the other is larger by σ² ± 2σ, σ being that distance, so that the
-chance that the false one is refuted is Φ((σ² - refuted) / 2σ). What is proposed is what is expected to tell the
-most of all pairs apart; where one experiment does not do, two.
+Alternatives are hypotheses that explain the same table equally well. Each predicts every reading y of the menu
+with the covariance S = diag(sd²) + J C Jᵀ. The first term is the variance of the instruments. The second is, to first
+order, the covariance of the fitted coordinates, with C = (JᵀJ)⁻¹ over readings and priors of the table (Chaloner
+and Verdinelli, Bayesian experimental design, Statistical Science 10 (1995)). The separation of two alternatives
+A, B is √(dᵀ S⁻¹ d), d = y_A - y_B. It takes the S with the smaller result (Hunter and Reiner, Designs for
+discriminating between two rival models, Technometrics 7 (1965)). If one of them is true, the χ² of the other is
+larger by σ² ± 2σ, where σ is their separation. So the probability that the false one is refuted is
+Φ((σ² - refuted) / 2σ). The proposal is expected to separate most of all pairs; if one experiment is not enough, two
+are proposed.
 """
 
 from __future__ import annotations
@@ -38,35 +39,35 @@ from calibration.discovery.instructions import (
     TooWeak,
 )
 from calibration.discovery.location import DiscrepancyLocation
-from calibration.discovery.reach import Reach, reach_of
+from calibration.discovery.reach import Reach, reach_of_space
 from calibration.discovery.settings import Settings
 from calibration.inference import bases, priors
-from calibration.inference.optimizers import informing
+from calibration.inference.optimizers import informative_residuals
 from calibration.inference.problem import Problem
 from mmrjax.compile.compiling import SELDOM, compiled
 from mmrjax.fidelities.steady import IMPLICIT
 from mmrjax.model import channels
 from mmrjax.model.robot import Robot
-from mmrjax.numerics.linear_equations import half_solved
+from mmrjax.numerics.linear_equations import solve_lower
 from mmrjax.numerics.newton import implicit_slopes
 
-#: Alternatives are foreseen in batches of a multiple of this, so that most classes share what is compiled.
+#: Alternatives are predicted in batches of a multiple of this, so that most classes share compiled programs.
 PAD = 4
 NONE = "none on this menu"
 
 
 @dataclasses.dataclass(frozen=True)
 class PredictedReadings:
-    """What every alternative foresees of every reading of the menu.
+    """Predictions of every reading of the menu, by alternative.
 
     Attributes:
         names: of the alternatives, the best fit first.
         experiments: the menu.
         value: readings [SI], shape (alternatives, readings); sd: of the instruments [SI], shape (readings,).
-        half: J C^½, so that the covariance that the fit leaves is half halfᵀ; shape
+        half: J C^½, so that the covariance due to the fit is half halfᵀ; shape
             (alternatives, readings, coordinates).
-        exists: which readings do for every alternative, shape (readings,).
-        settings: from which separation an experiment counts.
+        exists: True for readings that every alternative has, shape (readings,).
+        settings: thresholds of the separation.
     """
 
     names: tuple[str, ...]
@@ -79,11 +80,11 @@ class PredictedReadings:
 
     def apart(self, a: int, b: int, *experiments: str) -> float:
         """Expected separation of two alternatives by experiments, all carried out [σ]."""
-        where = predicted.spans(self.experiments)
+        where = predicted.reading_spans(self.experiments)
         spans = [where[e] for e in experiments]
-        at = np.concatenate([np.flatnonzero(self.exists[k]) + k.start for k in spans])
-        d = self.value[a, at] - self.value[b, at]
-        squares = [d @ np.linalg.solve(_covariance(self.half[x, at], self.sd[at]), d) for x in (a, b)]
+        columns = np.concatenate([np.flatnonzero(self.exists[k]) + k.start for k in spans])
+        d = self.value[a, columns] - self.value[b, columns]
+        squares = [d @ np.linalg.solve(_covariance(self.half[x, columns], self.sd[columns]), d) for x in (a, b)]
         return float(np.sqrt(max(min(squares), 0.0)))
 
 
@@ -96,10 +97,10 @@ class Ranked:
     """One experiment of the menu, or several carried out together.
 
     Attributes:
-        experiments: their names; sigma: between every two alternatives, the pairs of the best fit first, as
-            `itertools.combinations` has them [σ].
-        separates: alternatives that they tell from the best fit, at `Settings.apart`.
-        settings: from which separation an experiment counts.
+        experiments: their names; sigma: separation of every two alternatives, in the order of
+            `itertools.combinations`, so with the pairs of the best fit first [σ].
+        separates: alternatives that they separate from the best fit, at `Settings.apart`.
+        settings: thresholds of the separation.
     """
 
     experiments: tuple[str, ...]
@@ -109,31 +110,31 @@ class Ranked:
 
     @property
     def smallest(self) -> float:
-        """Separation of the pair that is told apart worst [σ]."""
+        """Separation of the pair that is separated worst [σ]."""
         return min(self.sigma, default=0.0)
 
     @property
     def told(self) -> tuple[float, ...]:
-        """Separations that are worth while."""
+        """Separations that are worth an experiment."""
         return tuple(s for s in self.sigma if s >= self.settings.worth)
 
     @property
     def chances(self) -> np.ndarray:
-        """For each pair, that the false one is refuted if either is true."""
+        """Probability for each pair that the false one is refuted if either is true."""
         sigma = np.maximum(self.sigma, 1e-9)
         return ndtr((sigma**2 - self.settings.refuted) / (2 * sigma))
 
 
 @dataclasses.dataclass(frozen=True)
 class Proposal:
-    """The next experiment, or two where one does not do.
+    """The next experiment, or two if one is not enough.
 
     Attributes:
-        experiments: names of what to carry out; `NONE` alone where the menu holds nothing.
-        instruction: what to do and what to read.
-        separates: alternatives that it tells from the best fit.
-        expected_sigma: the smallest separation of a pair that it is worth doing for; 0 for none.
-        settles: whether it tells every two alternatives apart, at `Settings.apart`.
+        experiments: names of the experiments; only `NONE` if no experiment helps.
+        instruction: instruction for the experimenter.
+        separates: alternatives that it separates from the best fit.
+        expected_sigma: smallest separation of a pair that is worth an experiment; 0 for none.
+        settles: True if it separates every two alternatives, at `Settings.apart`.
         table: the whole menu, the most useful experiment first.
     """
 
@@ -146,18 +147,18 @@ class Proposal:
 
     @property
     def name(self) -> str:
-        """Of all of it."""
+        """Name of the proposal, with all its experiments."""
         return " and ".join(self.experiments)
 
 
 # --- alternatives -----------------------------------------------------------------------------------
 
 
-def alternatives(best: Candidate, found: Classes, *, stated: bool = True) -> dict[str, Candidate]:
-    """The candidates that a table leaves, by the names of their effects; the best fit first.
+def alternatives_of_class(best: Candidate, found: Classes, *, stated: bool = True) -> dict[str, Candidate]:
+    """Candidates that the table cannot separate, by the names of their effects; the best fit first.
 
     Args:
-        stated: whether values that may be wrong in the place of an effect are among them, by their names.
+        stated: True to include stated values that may be wrong instead of an effect, by their names.
     """
     fitted = {c.key: c for c in sorted(found.ladder, key=lambda c: -c.cost)}
     kept = {best.active: best}
@@ -172,7 +173,7 @@ def alternatives(best: Candidate, found: Classes, *, stated: bool = True) -> dic
     return named
 
 
-# --- what they foresee ------------------------------------------------------------------------------
+# --- predictions ------------------------------------------------------------------------------------
 
 
 @functools.partial(compiled, options=SELDOM)
@@ -184,10 +185,10 @@ def _predicted(
     z: Array,
     informed: Array,
 ) -> tuple[predicted.Predicted, Array]:
-    """Readings of the menu, and ½ of what the fit leaves of their covariance, by alternative.
+    """Readings of the menu, and the square root of their covariance due to the fit, by alternative.
 
-    `other` are coordinates of what the table does not show at all, known by their priors alone; `informed` the
-    Jacobian of what informs each fit.
+    `other` are coordinates that the table does not show at all, known only by their priors; `informed` is the
+    Jacobian of the readings and priors of each fit.
     """
 
     def one(w: Array, z: Float[Array, " coordinates"], informed: Array) -> tuple[predicted.Predicted, Array]:
@@ -198,16 +199,16 @@ def _predicted(
             return here.robot(base, x[: z.size])
 
         wide = jnp.concatenate([z, jnp.zeros(0 if other is None else len(other))])
-        unknowns, solved = predicted.of_runs(IMPLICIT.solve, robot(wide), batch)
+        unknowns, solved = predicted.map_over_runs(IMPLICIT.solve, robot(wide), batch)
 
         def readings(x: Array) -> tuple[Any, predicted.Predicted]:
-            return predicted.readings(robot(x[: wide.size]), batch, unknowns + x[wide.size :], solved)
+            return predicted.predict_readings(robot(x[: wide.size]), batch, unknowns + x[wide.size :], solved)
 
         (acts, every, left), found = jax.jacfwd(readings, has_aux=True)(
             jnp.concatenate([wide, jnp.zeros(unknowns.shape[1])])
         )
-        slopes = predicted.arranged(batch, [a[:, : wide.size] for a in acts], implicit_slopes(every, left))
-        half = jnp.concatenate([half_solved(informed.T @ informed, slopes[:, : z.size].T).T, slopes[:, z.size :]], 1)
+        slopes = predicted.arrange_readings(batch, [a[:, : wide.size] for a in acts], implicit_slopes(every, left))
+        half = jnp.concatenate([solve_lower(informed.T @ informed, slopes[:, : z.size].T).T, slopes[:, z.size :]], 1)
         exists = found.exists & jnp.all(jnp.isfinite(half), 1) & jnp.isfinite(found.value)
         return dataclasses.replace(found, exists=exists), half
 
@@ -215,32 +216,34 @@ def _predicted(
 
 
 def _informed(problem: Problem, at: Candidate, active: tuple[int, ...]) -> Array:
-    return problem.observe.at(problem, at.z, active)[1][informing(problem.data)]
+    return problem.observe.at(problem, at.z, active)[1][informative_residuals(problem.data)]
 
 
-def predict(space: CandidateSpace, candidates: Mapping[str, Candidate], settings: Settings) -> PredictedReadings:
-    """What these alternatives foresee of the menu, with instruments as good as those of the table.
+def predict_menu(space: CandidateSpace, candidates: Mapping[str, Candidate], settings: Settings) -> PredictedReadings:
+    """Predictions of the menu by these alternatives, with instruments as good as those of the table.
 
-    The menu holds what is within reach of the table, what the robots of all alternatives manage, and what is not
-    forbidden.
+    The menu has the experiments within reach of the table that the robots of all alternatives can do and that
+    are not forbidden.
     """
     names, those = list(candidates), list(candidates.values())
     those += [those[0]] * (-len(those) % PAD)
     robot = space.bare.base
     whole = priors.free_names(robot, robot.configurations.names)
     more = [n for n in whole if n not in space.coordinates.base.names]
-    other = priors.coordinates(robot, more) if more else None
+    other = priors.parameter_coordinates(robot, more) if more else None
     equipped, indices = space.fitted_by(c.active for c in those)
     active = jnp.asarray(indices)
     z = jnp.asarray(np.stack([c.z for c in those]))
     informed = jnp.stack([_informed(equipped, c, mine) for c, mine in zip(those, indices, strict=True)])
-    within = reach_of(space, space.bare.robot(jnp.asarray(those[0].z[: space.free])))
-    everything, shown = menu.menu(within), channels.names(space.bare.channels)
-    found, half = jax.device_get(_predicted(equipped, other, predicted.batch(everything, shown), active, z, informed))
+    within = reach_of_space(space, space.bare.robot(jnp.asarray(those[0].z[: space.free])))
+    everything, shown = menu.experiment_menu(within), channels.channel_names(space.bare.channels)
+    found, half = jax.device_get(
+        _predicted(equipped, other, predicted.batch_experiments(everything, shown), active, z, informed)
+    )
     found, half = jax.tree.map(lambda x: np.asarray(x)[: len(names)], (found, half))
     experiments, kept = _possible(everything, found, within, settings)
     medians = np.median(np.asarray(space.equipped.data.sd), 0)
-    sd = predicted.sds(experiments, dict(zip(shown, medians, strict=True)))
+    sd = predicted.reading_sds(experiments, dict(zip(shown, medians, strict=True)))
     value, half = np.nan_to_num(found.value[:, kept]), np.nan_to_num(half[:, kept])
     return PredictedReadings(tuple(names), experiments, value, half, sd, np.all(found.exists, 0)[kept], settings)
 
@@ -248,24 +251,24 @@ def predict(space: CandidateSpace, candidates: Mapping[str, Candidate], settings
 def _possible(
     experiments: Sequence[menu.Experiment], found: predicted.Predicted, within: Reach, settings: Settings
 ) -> tuple[tuple[menu.Experiment, ...], np.ndarray]:
-    """What of a menu is possible and not forbidden, and whether each reading of the whole menu is of that.
+    """Possible and allowed experiments of a menu, and True for their readings among those of the whole menu.
 
     Args:
-        found: of every alternative, the best fit first.
+        found: of each alternative, the best fit first.
     """
     runs = [e for e in experiments if isinstance(e, menu.Run)]
     ends = dict(zip((r.name for r in runs), np.cumsum([len(r.voltage) for r in runs]).tolist(), strict=True))
     left: list[menu.Experiment] = []
     kept: list[np.ndarray] = []
     for e in experiments:
-        rows = np.ones(predicted.size(e), bool)
+        rows = np.ones(predicted.reading_count(e), bool)
         if isinstance(e, menu.Run):
-            at = slice(ends[e.name] - len(e.voltage), ends[e.name])
-            grips = np.abs(found.grip[:, at]) < np.where(np.asarray(e.slope) > e.beyond, menu.GRIP, np.inf)
-            done = menu.possible(e, np.all(found.does[:, at] & grips, 0))
+            span = slice(ends[e.name] - len(e.voltage), ends[e.name])
+            grips = np.abs(found.grip[:, span]) < np.where(np.asarray(e.slope) > e.beyond, menu.GRIP, np.inf)
+            done = menu.possible_runs(e, np.all(found.does[:, span] & grips, 0))
             if done.any():
-                hot, fast = np.asarray(found.temperature)[0, at], np.asarray(found.speed)[0, at]
-                e = menu.carried_out(e, done, hot, fast, within)
+                hot, fast = np.asarray(found.temperature)[0, span], np.asarray(found.speed)[0, span]
+                e = menu.restrict_run(e, done, hot, fast, within)
             rows = np.repeat(done, len(e.channels))
         if set(e.kinds) & set(settings.forbidden):
             rows = np.zeros(len(rows), bool)
@@ -278,34 +281,34 @@ def _possible(
 # --- the choice -------------------------------------------------------------------------------------
 
 
-def _ranked(seen: PredictedReadings, *experiments: str) -> Ranked:
+def _rank_experiment(seen: PredictedReadings, *experiments: str) -> Ranked:
     pairs = itertools.combinations(range(len(seen.names)), 2)
     sigma = tuple(seen.apart(a, b, *experiments) for a, b in pairs)
     others = zip(seen.names[1:], sigma, strict=False)  # the pairs of the best fit come first
     return Ranked(experiments, sigma, tuple(n for n, s in others if s >= seen.settings.apart), seen.settings)
 
 
-def _use(r: Ranked) -> tuple[bool, float]:
-    """Whether it is worth while for any pair, and how many pairs it is expected to tell apart."""
+def _usefulness(r: Ranked) -> tuple[bool, float]:
+    """True if it is worth an experiment for any pair, and the expected number of separated pairs."""
     return bool(r.told), float(np.sum(np.minimum(r.chances, r.settings.enough)))
 
 
-def ranked(seen: PredictedReadings) -> tuple[Ranked, ...]:
-    """The whole menu by the number of pairs that an experiment is expected to tell apart; of those that tell as many
-    by `Settings.enough`, in the menu's order, the least effort first."""
-    return tuple(sorted((_ranked(seen, e.name) for e in seen.experiments), key=_use, reverse=True))
+def rank_experiments(seen: PredictedReadings) -> tuple[Ranked, ...]:
+    """The whole menu by the expected number of separated pairs; ties, within `Settings.enough`, keep the menu's
+    order, the least effort first."""
+    return tuple(sorted((_rank_experiment(seen, e.name) for e in seen.experiments), key=_usefulness, reverse=True))
 
 
-def choose(seen: PredictedReadings) -> Proposal:
-    """The experiment of the menu that tells most apart, with the best one beside it where that adds enough."""
-    table = ranked(seen)
+def choose_experiment(seen: PredictedReadings) -> Proposal:
+    """The experiment of the menu that separates most pairs, with a second one if that adds enough."""
+    table = rank_experiments(seen)
     if not table:
         return Proposal((NONE,), NothingPossible(), (), 0.0, False, ())
     plan = table[0]
     (first,) = plan.experiments
-    both = (_ranked(seen, first, e.name) for e in seen.experiments if e.name != first)
-    more = max(both, key=_use, default=plan)
-    if more.told and (not plan.told or _use(more)[1] > _use(plan)[1] + seen.settings.gain):
+    both = (_rank_experiment(seen, first, e.name) for e in seen.experiments if e.name != first)
+    more = max(both, key=_usefulness, default=plan)
+    if more.told and (not plan.told or _usefulness(more)[1] > _usefulness(plan)[1] + seen.settings.gain):
         plan = more
     if not plan.told:
         return Proposal((NONE,), NothingTells(seen.names, seen.settings.worth), (), 0.0, False, table)
@@ -316,12 +319,12 @@ def choose(seen: PredictedReadings) -> Proposal:
     )
 
 
-#: Runs of a series that covers the variable of a curve more densely, and repeats of each that are averaged.
+#: Number of runs in a series that covers the variable of a curve more densely, and of repeats that are averaged.
 SERIES, REPEATS = 15, 3
 
 
-def more_runs(place: str, variable: str, within: Reach, by_duty: bool = False) -> MoreRuns:
-    """How the variable of a curve is covered more densely, within reach of the table."""
+def denser_runs_instruction(place: str, variable: str, within: Reach, by_duty: bool = False) -> MoreRuns:
+    """Instruction to cover the variable of a curve more densely, within reach of the table."""
     volts = within.voltages
     low, high = (volts[0], volts[-1]) if volts[-1] > volts[0] else (menu.round_significant(0.5 * volts[0]), volts[0])
     slope = max(u.steepest for u in within.used)
@@ -335,29 +338,30 @@ def more_runs(place: str, variable: str, within: Reach, by_duty: bool = False) -
     return MoreRuns(place, variable, SERIES, low, high, volts[-1], slope, payload, steps, within, by_duty)
 
 
-def denser(space: CandidateSpace, where: DiscrepancyLocation, settings: Settings) -> Proposal:
-    """More runs along the variable of a discrepancy without a name.
+def propose_denser_runs(space: CandidateSpace, where: DiscrepancyLocation, settings: Settings) -> Proposal:
+    """Proposal of more runs along the variable of an unnamed discrepancy.
 
-    Its expected separation from nothing is that of the table [σ], whose curve explains so much a run, over the
-    runs of the series.
+    Its expected separation from no discrepancy is the table's χ² per run, times the runs of the series [σ].
     """
-    variable, within = where.variable, reach_of(space)
+    variable, within = where.variable, reach_of_space(space)
     runs = space.bare.observe.runs_counting(space.included)
     sigma = float(np.sqrt(max(where.strongest, 0.0) * SERIES * REPEATS / max(runs, 1)))
     if sigma < settings.worth:
         return Proposal((NONE,), TooWeak(variable, sigma), (), 0.0, False, ())
     name = f"steady speeds for {variable}" if variable in bases.ORDERS else f"finer steps in {variable}"
-    name = name if bases.window(variable) is None else "the same runs again"
-    curve = f"curve of the {bases.in_words(where.place)} over {variable}"
-    return Proposal((name,), more_runs(where.place, variable, within, where.by_duty), (curve,), sigma, False, ())
+    name = name if bases.window_from_name(variable) is None else "the same runs again"
+    curve = f"curve of the {bases.place_in_words(where.place)} over {variable}"
+    return Proposal(
+        (name,), denser_runs_instruction(where.place, variable, within, where.by_duty), (curve,), sigma, False, ()
+    )
 
 
-def no_menu(space: CandidateSpace) -> Proposal:
-    """Nothing: the menu holds no runs of the kind that the table does."""
+def propose_nothing(space: CandidateSpace) -> Proposal:
+    """Empty proposal, because the menu has no runs of the table's kind."""
     return Proposal((NONE,), NoMenu(space.bare.observe.word), (), 0.0, False, ())
 
 
-def separating(space: CandidateSpace, best: Candidate, found: Classes, settings: Settings) -> Proposal | None:
-    """What tells the alternatives of a class apart; None where each effect has one name."""
-    left = alternatives(best, found)
-    return choose(predict(space, left, settings)) if len(left) > 1 else None
+def propose_separating(space: CandidateSpace, best: Candidate, found: Classes, settings: Settings) -> Proposal | None:
+    """Experiment that separates the alternatives of a class; None if each effect has one name."""
+    left = alternatives_of_class(best, found)
+    return choose_experiment(predict_menu(space, left, settings)) if len(left) > 1 else None

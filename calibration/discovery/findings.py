@@ -1,4 +1,4 @@
-"""From the loop's stages to its result: effects, evidence, shifts, errors, each by name and in its unit."""
+"""Parts of the loop's result from its stages: effects, evidence, shifts and errors, by name and in their units."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from calibration.discovery.hidden import Hidden
 from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.loop_notes import RuledOut
 from calibration.discovery.mechanism import excess_misfit, share_of_excess
-from calibration.discovery.projection import Defect, defect
+from calibration.discovery.projection import Defect, defect_by_row
 from calibration.discovery.result import (
     Alternative,
     BaseShift,
@@ -44,13 +44,13 @@ from calibration.discovery.result import (
 )
 from calibration.discovery.score_tests import ScoreTable
 from calibration.discovery.screening import Beforehand
-from calibration.discovery.search import own_p, without_each
+from calibration.discovery.search import single_p_value, without_each
 from calibration.discovery.settings import Settings
 from calibration.discovery.stated_values import Shift
 from calibration.inference import bases, blocks, priors
-from calibration.inference.held_out import unseen
+from calibration.inference.held_out import predict_unseen
 from calibration.inference.identifiability import held_by_prior
-from calibration.inference.linearization import Linearization, amplitude_of, shape_of, shape_scales, shaped
+from calibration.inference.linearization import Linearization, amplitude_of, shape_at, shape_of, shape_scales
 from calibration.inference.problem import Observation, Problem
 from calibration.inference.simulation_errors import channel_errors
 from mmrjax.effects import Effect
@@ -58,12 +58,12 @@ from mmrjax.model.balances import BALANCES
 from mmrjax.model.robot import Robot
 
 
-def size_of(effect: Effect) -> float:
+def amplitude_unit(effect: Effect) -> float:
     """One prior sd of an effect's amplitude [its unit]."""
     return amplitude_of(effect).spec.prior_sd(0.0)
 
 
-def equation(effect: Effect) -> tuple[str, str]:
+def equation_and_source(effect: Effect) -> tuple[str, str]:
     """Equation and source of an effect, from its docstring."""
     head, _, source = (inspect.getdoc(type(effect)) or "").partition("Source:")
     return " ".join(head.split()), " ".join(source.split())
@@ -78,14 +78,14 @@ def found_effects(
     """Each effect of the best candidate, with its class, amplitude and evidence.
 
     Args:
-        test: of the base fit, whose bootstrap gives the p-values.
+        test: of the base fit; its bootstrap gives the p-values.
     """
     gains = _without_each(space, base, best, found.ladder, settings)
     null, excess = np.asarray(test.null.single), excess_misfit(space, base)
     listed = []
     for slot, members in enumerate(found.members):
         effect = space.library[members[0]]
-        words, source = equation(effect)
+        words, source = equation_and_source(effect)
         listed.append(
             FoundEffect(
                 name=effect.name,
@@ -97,7 +97,7 @@ def found_effects(
                 equation=words,
                 source=source,
                 parameters=_parameters(space, best, slot, settings),
-                p_value=own_p(gains[slot], null),
+                p_value=single_p_value(gains[slot], null),
                 score=float(gains[slot]),
                 share=share_of_excess(excess, float(gains[slot])),
             )
@@ -107,7 +107,7 @@ def found_effects(
 
 def _parameters(space: CandidateSpace, best: Candidate, slot: int, settings: Settings) -> dict[str, Estimate]:
     effect, p = space.library[best.active[slot]], space.free
-    amplitude, unit = amplitude_of(effect), size_of(effect)
+    amplitude, unit = amplitude_of(effect), amplitude_unit(effect)
     sd = settings.width * best.sd[p + slot] * unit
     held = held_by_prior(best.sd)
     values = {
@@ -123,16 +123,16 @@ def _parameters(space: CandidateSpace, best: Candidate, slot: int, settings: Set
     return values
 
 
-_shaped = jax.jit(jax.value_and_grad(shaped, argnums=1))
+_shaped = jax.jit(jax.value_and_grad(shape_at, argnums=1))
 
 
 def _member(space: CandidateSpace, best: Candidate, found: Classes, slot: int, name: str) -> Member:
-    """An effect of a class in the leader's place."""
+    """An effect of a class in place of the leader."""
     wanted = frozenset(name if s == slot else n for s, n in enumerate(best.active)) - {""}
     other = next(c for c in (best, *found.ladder) if c.key == wanted)
-    at = other.active.index(name)
-    amplitude = other.amplitude[at] * size_of(space.library[name])
-    return Member(float(amplitude), float(other.size[at]), float(2 * (other.cost - best.cost)))
+    position = other.active.index(name)
+    amplitude = other.amplitude[position] * amplitude_unit(space.library[name])
+    return Member(float(amplitude), float(other.size[position]), float(2 * (other.cost - best.cost)))
 
 
 def _stated(space: CandidateSpace, best: Candidate, shift: Shift) -> StatedValue:
@@ -145,24 +145,24 @@ def _stated(space: CandidateSpace, best: Candidate, shift: Shift) -> StatedValue
 def _without_each(
     space: CandidateSpace, base: Candidate, best: Candidate, ladder: Sequence[Candidate], settings: Settings
 ) -> list[float]:
-    """What each effect explains that the others cannot: the rise of χ² when it is taken away and all is refitted."""
+    """Unique contribution of each effect: the rise of χ² if it is removed and everything is refitted."""
     if len(best.effects) == 1:
         return [2 * (base.cost - best.cost)]
     return [2 * (c.cost - best.cost) for c in without_each(space, best, settings, ladder)]
 
 
-def unnamed(
+def unnamed_discrepancy(
     found: Discrepancy, where: DiscrepancyLocation, p_value: float, linear: Linearization, rows: int
 ) -> UnnamedDiscrepancy:
-    """The discrepancy of an `unnamed` verdict, over the rows of the table; curve and rows are of one fit.
+    """Discrepancy of an `unnamed_discrepancy` verdict, over the rows of the table; curve and rows are of one fit.
 
     Args:
         linear: the fit with the curve, linearised.
     """
-    f, lacks, happens = found.proposal, None, bases.window(where.variable)
+    f, lacks, happens = found.proposal, None, bases.window_from_name(where.variable)
     x, way = linear.in_travel(found.balance, where.variable if happens is None else happens.axis)
     if found.defect is not None:
-        lacks = defect(linear, found.balance)
+        lacks = defect_by_row(linear, found.balance)
         turn = 2 * np.pi if where.variable in bases.ORDERS else None
         lacks = Defect(np.interp(x, found.grid, found.curve, period=turn) + way * lacks.value, lacks.sd)
     return UnnamedDiscrepancy(
@@ -184,17 +184,16 @@ def unnamed(
     )
 
 
-def alternatives(
+def listed_alternatives(
     space: CandidateSpace, best: Candidate, cost: float, ladder: Sequence[Candidate], settings: Settings
 ) -> tuple[tuple[Alternative, ...], tuple[Alternative, ...]]:
-    """Simulated candidates that explain the data nearly as well as what is proposed; and those that would but for
-    their size.
+    """Simulated candidates that explain the data nearly as well as the proposal; and those of implausible size.
 
-    One that only adds effects to what is proposed, or to another one of these, is left out where these explain next
-    to nothing.
+    A candidate that only adds effects to the proposal, or to another candidate of the list, is omitted if they
+    explain little.
 
     Args:
-        cost: of what is proposed [½σ²]; best: the same, where it is a candidate.
+        cost: of the proposal [½σ²]; best: the proposal, if it is a candidate.
     """
     near: tuple[list[Alternative], list[Alternative]] = ([], [])
     simpler = {best.key: cost} if best.key else {}
@@ -215,7 +214,7 @@ def hidden_effects(space: CandidateSpace, found: Sequence[Hidden]) -> tuple[Hidd
     return tuple(
         HiddenEffect(
             h.name,
-            h.amplitude * size_of(space.library[h.name]),
+            h.amplitude * amplitude_unit(space.library[h.name]),
             amplitude_of(space.library[h.name]).spec.unit,
             h.sigmas,
             h.experiment,
@@ -239,12 +238,12 @@ def _alternative(space: CandidateSpace, c: Candidate, rise: float, settings: Set
             why.append(RuledOut(name, "size", float(size), tuple(check)))
         elif not c.plausible and size * (1 + sd / max(abs(float(amplitude)), 1e-12)) >= 1:
             why.append(RuledOut(name, "edge"))
-    amplitudes = {name: a * size_of(space.library[name]) for name, a in sds.items()}
+    amplitudes = {name: a * amplitude_unit(space.library[name]) for name, a in sds.items()}
     return Alternative(amplitudes, sds, sizes, float(rise), tuple(why))
 
 
 def proposed_robot(space: CandidateSpace, best: Candidate) -> Robot:
-    """The base fitted, with what was found and no other effect."""
+    """Fitted base with the effects of the proposal and no other."""
     whole = space.problem(best.active).robot(jnp.asarray(best.z))
     keep = set(best.effects) | {e.name for e in space.bare.base.effects}
     return dataclasses.replace(whole, effects=tuple(e for e in whole.effects if e.name in keep))
@@ -267,8 +266,8 @@ def next_experiment(proposal: Proposal | None) -> NextExperiment | None:
 # --- the base and the library ---------------------------------------------------------------------------
 
 
-def evidence(test: AdequacyTest, adequate: bool) -> Evidence:
-    """The strongest statistic of each kind, what it has to exceed, and its share among bootstrap tables."""
+def evidence_of_test(test: AdequacyTest, adequate: bool) -> Evidence:
+    """Strongest statistic of each kind, its critical value, and its p-value among bootstrap tables."""
     kinds = {
         kind: KindOfEvidence(
             float(getattr(test.found, kind)), test.threshold(kind), test.p(kind), np.asarray(getattr(test.null, kind))
@@ -282,13 +281,13 @@ def base_shift(space: CandidateSpace, before: np.ndarray, after: np.ndarray, sd:
     """Every base parameter before and after, in its unit and in prior sds.
 
     Args:
-        before, after: coordinates, those of the base first; sd: of the latter.
+        before, after: coordinates, the base's first; sd: of `after`.
     """
     coordinates, p = space.coordinates.base, space.free
     z = [np.asarray(x[:p]) for x in (before, after)]
     value = [coordinates.value(np.asarray(x)) for x in (np.zeros(p), *z)]
     slope = np.asarray(coordinates.slope(jnp.asarray(z[1])))
-    fields, held = priors.known(space.bare.base), held_by_prior(sd)
+    fields, held = priors.parameters_by_name(space.bare.base), held_by_prior(sd)
     return {
         name: BaseShift(
             prior=float(value[0][k]),
@@ -306,7 +305,7 @@ def base_shift(space: CandidateSpace, before: np.ndarray, after: np.ndarray, sd:
 
 
 def effect_scores(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> tuple[EffectScore, ...]:
-    """Every effect at its best shape and plausible size, strongest first; by name where equal to rounding."""
+    """Every effect at its best shape and plausible size, strongest first; equal scores are sorted by name."""
     listed = []
     for effect in space.library.effects:
         amplitude, explained = _plausible_score(space, effect, scores, settings)
@@ -316,36 +315,37 @@ def effect_scores(space: CandidateSpace, scores: ScoreTable, settings: Settings)
                 name=effect.name,
                 balance=effect.balance,
                 score=max(explained, 0.0),
-                amplitude=amplitude * size_of(effect),
+                amplitude=amplitude * amplitude_unit(effect),
                 sigmas_per_prior_sd=float(scores.left[m]),
             )
         )
     return tuple(sorted(listed, key=lambda s: (-round(s.score, 9), s.name)))
 
 
-def ranking(space: CandidateSpace, left: Diagnosis, settings: Settings) -> Ranking:
-    """The library by what each effect alone would explain of what the base leaves."""
+def rank_library(space: CandidateSpace, left: Diagnosis, settings: Settings) -> Ranking:
+    """Ranking of the library by the share of the base's residuals that each single effect would explain."""
     test = left.test
     listed = _ranked(space, left.scores, settings)
     return Ranking(test.rejected, test.p_value, test.threshold("single") ** 2, listed)
 
 
-def ranking_beforehand(space: CandidateSpace, known: Beforehand, settings: Settings) -> Ranking:
-    """The same by the equations of the log in weak form, before anything is simulated."""
-    p = own_p(float(np.max(known.scores.single**2)), known.null)
+def rank_by_weak_form(space: CandidateSpace, known: Beforehand, settings: Settings) -> Ranking:
+    """Ranking by the equations of the log in weak form, before any simulation."""
+    p = single_p_value(float(np.max(known.scores.single**2)), known.null)
     chance = float(np.quantile(known.null, 1 - settings.family_wise_error, method="higher")) ** 2
     listed = _ranked(space, known.scores, settings)
     return Ranking(p <= settings.family_wise_error, p, chance, listed, known.windows)
 
 
 def _ranked(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> tuple[Ranked, ...]:
-    """The library by its scores, those last that would supply power."""
+    """Library sorted by score, with effects that would supply power last."""
     listed = []
     for s in effect_scores(space, scores, settings):
         effect = space.library[s.name]
-        sd = size_of(effect) / max(s.sigmas_per_prior_sd, 1e-300)
+        sd = amplitude_unit(effect) / max(s.sigmas_per_prior_sd, 1e-300)
         unit = amplitude_of(effect).spec.unit
-        supplies = space.bare.observe.long and effect.dissipative and s.amplitude < 0  # as of `dissipation.supplying`
+        # as in `dissipation.supplying_effects`
+        supplies = space.bare.observe.long and effect.dissipative and s.amplitude < 0
         listed.append(Ranked(s.name, effect.family(), unit, s.score, s.amplitude, sd, supplies))
     return tuple(sorted(listed, key=lambda e: e.supplies))
 
@@ -353,16 +353,16 @@ def _ranked(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> tu
 def _plausible_score(
     space: CandidateSpace, effect: Effect, scores: ScoreTable, settings: Settings
 ) -> tuple[float, float]:
-    """Amplitude [prior sds] and what it explains [σ²], no larger than plausible."""
+    """Plausible amplitude [prior sds] and the decrease of χ² that it explains [σ²]."""
     m = space.library.best_instance(effect.name, np.asarray(scores.single))
     wanted, left = float(scores.amplitude[m]), float(scores.left[m])
-    low = max(-settings.plausible, amplitude_of(effect).spec.bounds[0] / size_of(effect))
+    low = max(-settings.plausible, amplitude_of(effect).spec.bounds[0] / amplitude_unit(effect))
     amplitude = min(max(wanted, low), settings.plausible)
     return amplitude, float(scores.single[m] ** 2 - ((wanted - amplitude) * left) ** 2)
 
 
-def invisible(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> tuple[str, ...]:
-    """Effects of which the largest plausible amplitude leaves too few sigmas, and that explain no more than that."""
+def invisible_effects(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> tuple[str, ...]:
+    """Effects that the data cannot show: even the largest plausible amplitude changes the readings too little."""
     left = space.library.largest(np.asarray(scores.left))
     return tuple(
         e.name
@@ -377,22 +377,22 @@ def invisible(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> 
 
 @dataclasses.dataclass(frozen=True)
 class Fitted:
-    """A fit whose readings are shown: its problem, coordinates and active effects (None without slots)."""
+    """A fit with its problem, coordinates and active effects (None without slots)."""
 
     problem: Problem
     z: np.ndarray
     active: tuple[int, ...] | None
 
     def observation(self) -> Observation:
-        """What it says of every row."""
+        """Observation of the fit."""
         return self.problem.observe.observed(self.problem, self.z, self.active)
 
 
-#: Kind of block → what a fit predicts of each row that it has not seen, shape (rows, channels).
+#: Kind of block → hold-out predictions of each row, shape (rows, channels).
 HeldOutReadings = dict[str, np.ndarray]
 
 
-def readings(
+def readings_of_rows(
     runs: Runs,
     sd: np.ndarray,
     before: Fitted,
@@ -403,20 +403,20 @@ def readings(
     """Fitted and held-out readings, for every kind of block; `after` None is the same as before.
 
     Args:
-        known_before, known_after: what of it is known.
+        known_before, known_after: hold-out readings, if they are already known.
     """
     rows = len(runs)
 
     def seen(fitted: Fitted) -> np.ndarray:
-        found = fitted.observation()
-        lost = fitted.problem.observe.unreachable(np.asarray(found.status))[:rows, None]
-        return np.where(lost, np.nan, np.asarray(found.reading)[:rows])
+        observation = fitted.observation()
+        lost = fitted.problem.observe.unreachable(np.asarray(observation.status))[:rows, None]
+        return np.where(lost, np.nan, np.asarray(observation.reading)[:rows])
 
     def left_out(fitted: Fitted, masks: list[np.ndarray]) -> np.ndarray:
-        return unseen(fitted.problem, fitted.z, masks, fitted.active).reading
+        return predict_unseen(fitted.problem, fitted.z, masks, fitted.active).reading
 
     held, labels = {}, {}
-    for kind, by in blocks.predictable(runs, before.problem).items():
+    for kind, by in blocks.predictable_blocks(runs, before.problem).items():
         masks = list(by.values())
         first = left_out(before, masks) if known_before is None else known_before[kind]
         later = first
@@ -428,9 +428,9 @@ def readings(
     return ReadingsOfRows(runs.measured(), sd[:rows], stated, fitted, later, held, labels)
 
 
-def errors(
+def errors_of_readings(
     problem: Problem, simulated: np.ndarray, measured: np.ndarray, sd: np.ndarray, included: np.ndarray
 ) -> Errors:
-    """Errors of every channel [%, and in σ] over the rows that count and have a simulated value."""
+    """Errors of each channel [%, and in σ] over the included rows with a simulated value."""
     simulated = np.where(included[:, None], simulated, np.nan)
     return channel_errors(problem.channels, simulated, measured, sd)

@@ -1,4 +1,4 @@
-"""A formula proposed for a discrepancy: one term of a dictionary of dimensionless monomials."""
+"""A formula for a discrepancy: one term of a dictionary of dimensionless monomials."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ import numpy as np
 
 from calibration.discovery.projection import Projection
 from calibration.discovery.smooth import Smooth
-from calibration.inference.bases import ORDERS, signature
+from calibration.inference.bases import ORDERS, place_signature
 from calibration.inference.linearization import Linearization
 from mmrjax.effects.curve import EVERY_VARIABLE, PLACES, READINGS
 from mmrjax.model import channels
 
-#: What a formula is called, in the symbols of the paper.
+#: Left side of a formula, in the symbols of the paper.
 SYMBOL = {"electrical": "ΔU", "track": "ΔM_t", "ground": "ΔF_f", "slip": "ΔV", "yaw": "ΔM_ψ"} | {
     c.name: f"Δ({c.label})" for c in channels.EVERY if c.name in READINGS
 }
-#: Variables over which things fade: symbol, and unit of its constant.
+#: Variables of decays: symbol, and unit of the time constant.
 FADING = {"time": ("t", " s"), "order": ("k", "")}
-#: Exponents of a factor alone, and in a product of two.
+#: Exponents of a single factor, and in a product of two.
 POWERS, POWERS_PRODUCT = (-1.0, 0.5, 1.0, 2.0, 3.0), (-1.0, 0.5, 1.0, 2.0)
-#: Share of what the curve explains that a single term has to explain to be proposed [-].
+#: Least share of the curve that a single term has to explain [-].
 MOST = 0.9
 #: Signals that settled travel ties to a ratio of the dictionary.
 SAME_AS = {"speed": "speed_motor"}
@@ -30,7 +30,7 @@ SAME_AS = {"speed": "speed_motor"}
 SAFE = 0.1
 #: A simpler formula is preferred up to this rise of the BIC: no evidence worth a mention (Kass and Raftery 1995).
 NO_EVIDENCE = 2.0
-#: How every formula is marked.
+#: Label of each formula.
 MARK = "a proposal, not a finding"
 
 
@@ -45,12 +45,12 @@ class Ratio:
 
     @property
     def value(self) -> str:
-        """What the signal is divided by, with its unit."""
+        """Divisor of the signal, with its unit."""
         return f"{self.over:g} {self.unit}".rstrip()
 
     def scaled(self, x: np.ndarray) -> Ratio:
-        """The same over the largest of these ratios, rounded to one digit, so that factors are of the size of what
-        they are of."""
+        """Ratio over the largest of these values, rounded to one digit, so that coefficients have the size of the
+        term."""
         most = float(np.max(np.abs(x), initial=0.0)) * self.over
         return dataclasses.replace(self, over=float(f"{most:.0e}")) if most > 0 else self
 
@@ -65,7 +65,7 @@ RATIOS = tuple(
     for name, variable in {name: EVERY_VARIABLE[name] for name in ("speed_motor", "current", *EVERY_VARIABLE)}.items()
     if variable.symbol
 )
-#: Rise of the BIC for each variable but the one that the curve is over: one of so many is looked for.
+#: Rise of the BIC for each variable other than the curve's, because it is one of several tested.
 FOREIGN = 2 * float(np.log(len(RATIOS)))
 
 
@@ -78,12 +78,12 @@ class Monomial:
 
     @property
     def complexity(self) -> float:
-        """What makes it harder to believe: factors, and exponents other than one."""
+        """Penalty for factors, and for exponents other than one."""
         return sum(1 + 0.1 * abs(p - 1) for _, p in self.factors)
 
     @property
     def variables(self) -> tuple[str, ...]:
-        """Signals that it depends on."""
+        """Signals of the monomial."""
         return tuple(self.ratios[k].of for k, _ in self.factors)
 
     def __str__(self) -> str:
@@ -91,11 +91,11 @@ class Monomial:
         return " ".join(f"({r.symbol}/{r.value})" + (f"^{p:g}" if p != 1 else "") for r, p in over)
 
 
-def dictionary(ratios: np.ndarray, kinds: tuple[Ratio, ...] = RATIOS) -> dict[Monomial, np.ndarray]:
-    """Monomials that can be written down for these ratios, with their values by row.
+def monomial_dictionary(ratios: np.ndarray, kinds: tuple[Ratio, ...] = RATIOS) -> dict[Monomial, np.ndarray]:
+    """Monomials that are defined for these ratios, with their values by row.
 
-    A root needs ratios that are never negative, an inverse ones that stay off zero; a ratio that does not vary
-    is left out, as is all but the first of monomials that are proportional to each other here.
+    A root needs ratios that are never negative, an inverse needs ratios away from zero. A ratio that does not vary
+    is omitted, and so are all but the first of several proportional monomials.
 
     Args:
         ratios: values, shape (rows, ratios); kinds: signal and scale of each.
@@ -115,15 +115,15 @@ def dictionary(ratios: np.ndarray, kinds: tuple[Ratio, ...] = RATIOS) -> dict[Mo
         for p, q in itertools.product(POWERS_PRODUCT, repeat=2)
         if safe(j, p) and safe(k, q)
     ]
-    found: dict[Monomial, np.ndarray] = {}
+    monomials: dict[Monomial, np.ndarray] = {}
     directions: list[np.ndarray] = []
     for factors in sorted(single + double, key=lambda f: Monomial(f).complexity):
         value = np.prod([ratios[:, k] ** p for k, p in factors], 0)
         norm = np.linalg.norm(value)
         if norm > 0 and not any(abs(value @ d) > (1 - 1e-9) * norm for d in directions):
-            found[Monomial(factors, kinds)] = value
+            monomials[Monomial(factors, kinds)] = value
             directions.append(value / norm)
-    return found
+    return monomials
 
 
 @dataclasses.dataclass(frozen=True)
@@ -131,13 +131,12 @@ class Proposal:
     """A formula for a discrepancy: one term of a dictionary of dimensionless monomials.
 
     Attributes:
-        formula: e.g. `ΔU = 0.42 V (I/2 A)^2`, "" where no single term shows `MOST` of the curve; mark: that it is a
-            proposal.
+        formula: e.g. `ΔU = 0.42 V (I/2 A)^2`, "" if no single term explains `MOST` of the curve; mark: its label.
         terms: its monomials; coefficients, sds: of each [unit of the balance].
-        variables: signals that it depends on, without repeats.
-        explained: fall of χ² at the base fit.
-        gain: BIC of the smooth curve less that of the formula; positive speaks for the formula.
-        tried: size of the dictionary: the more, the less a formula that stands out means.
+        variables: signals of the terms, without repeats.
+        explained: decrease of χ² at the base fit.
+        gain: BIC of the smooth curve less that of the formula; positive favours the formula.
+        tried: size of the dictionary: a larger one makes a good formula less significant.
     """
 
     formula: str
@@ -151,39 +150,39 @@ class Proposal:
     mark: str = MARK
 
 
-def propose(
+def propose_formula(
     linear: Linearization, balance: str, counts: np.ndarray, curve: Smooth, *, voltage: bool = True
 ) -> Proposal:
-    """The term with the least BIC that explains `MOST` of the curve; a simpler one where that costs no evidence. None
-    is proposed where no single term does: the curve is then described by its values.
+    """Term with the least BIC that explains `MOST` of the curve, or a simpler one without loss of evidence.
 
-    A variable other than the curve's has to earn its place.
+    The formula is empty if no single term does; the curve is then described by its values. Variables other than
+    the curve's add a penalty.
 
     Args:
-        counts: whether a row counts, shape (rows,); curve: what the formula is weighed against.
-        voltage: True for a rig on which a voltage is set or read.
+        counts: True for included rows, shape (rows,); curve: for comparison with the formula.
+        voltage: True for a rig with an imposed or measured voltage.
     """
     if curve.wave:
-        return _harmonic(balance, curve)
+        return _wave_formula(balance, curve)
     if curve.happening:
-        return _while(balance, curve)
+        return _temporary_formula(balance, curve)
     if curve.variable in FADING:
-        return _decay(linear, balance, counts, curve)
+        return _decay_formula(linear, balance, counts, curve)
     counts = linear.at_points(counts)
     known_of = [r for r in RATIOS if voltage or r.of != "voltage"]
     scaled = tuple(r.scaled(r(linear, balance)[counts]) for r in known_of)
     ratios = np.stack([r(linear, balance) for r in scaled], 1)
-    known = dictionary(ratios[counts], scaled)
-    terms = list(known)
-    if not terms:  # all runs alike
+    dictionary = monomial_dictionary(ratios[counts], scaled)
+    terms = list(dictionary)
+    if not terms:  # all runs have the same conditions
         return Proposal("", (), (), (), (), 0.0, 0.0, 0)
     shapes = np.zeros((linear.points, len(terms)))
     _, way = linear.in_travel(balance, curve.variable)
-    for k, value in enumerate(known.values()):
+    for k, value in enumerate(dictionary.values()):
         shapes[counts, k] = way[counts] * value
-    a, b = Projection(linear)(signature(linear, balance, shapes))
+    a, b = Projection(linear)(place_signature(linear, balance, shapes))
     scale = np.sqrt(np.maximum(np.diag(a), 0))
-    visible = scale > 1e-3 * np.linalg.norm(signature(linear, balance, shapes), axis=0)
+    visible = scale > 1e-3 * np.linalg.norm(place_signature(linear, balance, shapes), axis=0)
     scale = np.where(visible, scale, 1.0)
     b = np.where(visible, b / scale, 0.0)
     cost = np.log(3 * counts.sum())
@@ -208,8 +207,8 @@ def propose(
     )
 
 
-def _harmonic(balance: str, curve: Smooth) -> Proposal:
-    """A wave is its own formula."""
+def _wave_formula(balance: str, curve: Smooth) -> Proposal:
+    """Formula of a wave."""
     sine, cosine = curve.scale * curve.root @ curve.start
     size, phase = float(np.hypot(sine, cosine)), float(np.arctan2(cosine, sine))
     order, unit = ORDERS[curve.variable][0], PLACES[balance][0]
@@ -219,24 +218,26 @@ def _harmonic(balance: str, curve: Smooth) -> Proposal:
     return Proposal(formula, (), (size,), (float("nan"),), ("angle of the driving shaft",), curve.explained, 0.0, 1)
 
 
-def _while(balance: str, curve: Smooth) -> Proposal:
-    """What happens for a while: its mean over that."""
+def _temporary_formula(balance: str, curve: Smooth) -> Proposal:
+    """Formula of a temporary change: its mean."""
     level = float(np.mean((curve.scale * curve.root @ curve.start)[1:-1]))
     formula = f"{SYMBOL[balance]} = {level:.2g} {PLACES[balance][0]} while {curve.variable}"
     axis = curve.variable.split()[0]
     return Proposal(formula, (), (level,), (float("nan"),), (axis,), curve.explained, 0.0, 1)
 
 
-def _decay(linear: Linearization, balance: str, counts: np.ndarray, curve: Smooth) -> Proposal:
-    """What fades with the time since the start or from run to run: an exponential, its constant from a grid over the
-    length of the runs or of the table. A level beside it is left to the base."""
+def _decay_formula(linear: Linearization, balance: str, counts: np.ndarray, curve: Smooth) -> Proposal:
+    """Formula of a decay with time or from run to run: an exponential without offset.
+
+    Its constant is from a grid over the length of the runs or of the table. The base takes up a constant level.
+    """
     (t, way), counts = linear.in_travel(balance, curve.variable), linear.at_points(counts)
     symbol, unit = FADING[curve.variable]
     constants = np.geomspace(0.02, 2.0, 40) * max(float(t[counts].max()), 1e-9)
     best: tuple[float, tuple] = (np.inf, ())
     project, cost = Projection(linear), np.log(3 * counts.sum())
     for tau in constants:
-        a, b = project(signature(linear, balance, (way * np.exp(-t / tau) * counts)[:, None]))
+        a, b = project(place_signature(linear, balance, (way * np.exp(-t / tau) * counts)[:, None]))
         if a[0, 0] > 0 and 2 * cost - b[0] ** 2 / a[0, 0] < best[0]:
             best = 2 * cost - b[0] ** 2 / a[0, 0], (tau, b[0] / a[0, 0], a[0, 0] ** -0.5)
     if not best[1]:

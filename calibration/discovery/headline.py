@@ -1,4 +1,4 @@
-"""The claim that comes first: established at every noise that was tried."""
+"""The main claim of a verdict: established at every noise that was tried."""
 
 from __future__ import annotations
 
@@ -9,60 +9,67 @@ from calibration.discovery.settings import WITHOUT_NAME
 
 
 def headline(said: Summary, others: Sequence[tuple[float, Summary]] = ()) -> Headline:
-    """The deepest claims that hold in a verdict and in those at other noises.
+    """Deepest claims that hold in a verdict and in those at other noises.
 
     Args:
         others: factor on the noise and verdict, of each.
     """
     every = [said, *(summary for _, summary in others)]
     factors = tuple(sorted([1.0, *(factor for factor, _ in others)]))
-    if len({_silent(s) for s in every}) > 1:
+    if len({_verdict_without_claim(s) for s in every}) > 1:
         return Headline("open", (), factors)
-    if _silent(said):
+    if _verdict_without_claim(said):
         return Headline(said.verdict, (), factors)
-    laws, _ = _common([[m.names for m in s.missing if m.established] for s in every])
+    laws, _ = _shared_claims([[m.names for m in s.missing if m.established] for s in every])
     if laws:
         alone = all(len(names) == 1 for names in laws) and not any(m.values for s in every for m in s.missing)
         return Headline("named" if alone else "class", laws, factors)
-    mechanisms, shared = _common([_mechanisms(s) for s in every])
+    mechanisms, shared = _shared_claims([_mechanisms(s) for s in every])
     if mechanisms:
         return Headline("mechanism", mechanisms, factors, shared)
-    places, shared = _common([_places(s) for s in every])
+    places, shared = _shared_claims([_places(s) for s in every])
     return Headline("place", places, factors, shared)
 
 
-def _silent(said: Summary) -> str:
-    """The verdict of a table in which nothing is said to be missing; empty for others."""
+def _verdict_without_claim(said: Summary) -> str:
+    """Verdict of a table without a claim of a missing effect; empty for other verdicts."""
     return said.verdict if said.verdict in ("none", "undescribed") else ""
 
 
 def _mechanisms(said: Summary) -> list[tuple[str, ...]]:
-    """Families of each thing that is established as a law or a mechanism."""
-    found = [m.families for m in said.missing if m.established]
-    return [*found, said.mechanism.families] if said.verdict == "mechanism" and said.mechanism is not None else found
+    """Families of each established law or mechanism."""
+    families = [m.families for m in said.missing if m.established]
+    return (
+        [*families, said.mechanism.families]
+        if said.verdict == "mechanism" and said.mechanism is not None
+        else families
+    )
 
 
 def _places(said: Summary) -> list[tuple[str, ...]]:
-    """Equations that lack something, in words: a family without what drives it."""
+    """Equations with a discrepancy, in words: families without their driver."""
     families = _mechanisms(said)
     if said.verdict in WITHOUT_NAME and said.where is not None:
         families.append((said.where.family,))
     return [tuple(dict.fromkeys(f.partition(" that ")[0] for f in those)) for those in families]
 
 
-def _common(claims: Sequence[Sequence[tuple[str, ...]]]) -> tuple[tuple[tuple[str, ...], ...], tuple[int, ...]]:
-    """Claims of the first verdict that share a member with one of each other verdict, and how many members all list.
+def _shared_claims(
+    claims: Sequence[Sequence[tuple[str, ...]]],
+) -> tuple[tuple[tuple[str, ...], ...], tuple[int, ...]]:
+    """Claims of the first verdict that share a member with a claim of each other verdict, and their shared members.
 
-    These come first in a claim, then what some noises do not tell from them. A claim within another is left out.
+    Members in all verdicts come first, then any that some noises cannot separate from them. A claim within another
+    is omitted. The second result is the number of shared members of each claim.
     """
-    found: dict[tuple[str, ...], int] = {}
+    counts: dict[tuple[str, ...], int] = {}
     for claim in claims[0]:
         alike = [[other for other in those if set(other) & set(claim)] for those in claims[1:]]
         if all(alike):
             every = dict.fromkeys([*claim, *(n for those in alike for other in those for n in other)])
             shared = [n for n in claim if all(any(n in o for o in those) for those in alike)]
             whole = (*shared, *(n for n in every if n not in shared))
-            if not any(set(whole) <= set(other) for other in found):
-                found[whole] = len(shared)
-    kept = {c: n for c, n in found.items() if not any(set(c) < set(other) for other in found)}
+            if not any(set(whole) <= set(other) for other in counts):
+                counts[whole] = len(shared)
+    kept = {c: n for c, n in counts.items() if not any(set(c) < set(other) for other in counts)}
     return tuple(kept), tuple(kept.values())

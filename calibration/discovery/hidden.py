@@ -1,8 +1,8 @@
-"""What a name could hide: effects that may be there beside it, as large as would be seen without it.
+"""Effects that a name could hide: they may be present in addition, as large as would be visible without it.
 
-At the fit with a name, an effect beside it may have any amplitude whose objective rises by no more than `same` [σ²]:
-b̂ ± √same sd. Where the largest plausible one of these would by itself, without the name, leave `needed` sigmas, the
-name hides it: the two trade against each other.
+At the fit with a name, a further effect may have any amplitude that raises the objective by no more than `same` [σ²]:
+b̂ ± √same sd. The name hides the effect if the largest plausible such amplitude, without the name, would change the
+readings by `needed` sigmas. The two are then strongly correlated.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ import numpy as np
 from calibration.discovery import experiments
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import Diagnosis
-from calibration.discovery.candidates import Candidate, fit_candidates, start
+from calibration.discovery.candidates import Candidate, fit_candidates, start_of_fit
 from calibration.discovery.classes import Classes
 from calibration.discovery.settings import Settings
-from calibration.inference.optimizers import informing, linearised
+from calibration.inference.optimizers import informative_residuals, linearise
 
-#: Rise of the objective up to which a joint fit is as good [σ²]; effects that are told of; of which an experiment is
-#: looked for.
+#: Rise of the objective up to which a joint fit is as good [σ²]; largest number of reported effects; number of them
+#: with an experiment.
 SAME, MOST, ASKED = 4.0, 6, 2
 
 
@@ -30,9 +30,9 @@ class Hidden:
     """An effect that the names of a fit could hide.
 
     Attributes:
-        name: of it; amplitude: the largest that could be there [prior sds].
-        sigmas: what it would leave by itself [σ].
-        experiment: of the menu, the one that would show it, with its expected separation [σ]; "" and 0 for none.
+        name: of the effect; amplitude: the largest possible one [prior sds].
+        sigmas: change of the readings by it, without the name [σ].
+        experiment: of the menu, that would show it, with the expected separation [σ]; "" and 0 for none.
     """
 
     name: str
@@ -42,7 +42,7 @@ class Hidden:
     separation: float = 0.0
 
 
-def hidden(
+def find_hidden_effects(
     space: CandidateSpace,
     best: Candidate,
     alike: Classes,
@@ -55,8 +55,8 @@ def hidden(
     """Effects that the names of the best candidate could hide, the largest first.
 
     Args:
-        alike: its classes, whose members are listed there; left: what the base leaves; after: what that fit leaves.
-        ask: whether experiments that would show them are looked for.
+        alike: its classes, which list their members; left: diagnosis of the base; after: diagnosis of that fit.
+        ask: True to look for experiments that would show the effects.
     """
     found, named = [], {n for members in alike.members for n in members}
     for effect in space.library.effects:
@@ -76,28 +76,30 @@ def hidden(
     found = sorted(found, key=lambda h: -h.sigmas)[:MOST]
     if not ask or len(best.effects) >= settings.slots:
         return tuple(found)
-    return tuple(_shown(space, best, h, after, settings) if k < ASKED else h for k, h in enumerate(found))
+    return tuple(_with_experiment(space, best, h, after, settings) if k < ASKED else h for k, h in enumerate(found))
 
 
-def _shown(space: CandidateSpace, best: Candidate, what: Hidden, after: Diagnosis, settings: Settings) -> Hidden:
-    """With the experiment that tells the fit with it at its largest from the fit without it."""
+def _with_experiment(
+    space: CandidateSpace, best: Candidate, what: Hidden, after: Diagnosis, settings: Settings
+) -> Hidden:
+    """Hidden effect with the experiment that separates the fit with its largest amplitude from the fit without it."""
     slot = best.active.index("")
     active = tuple(what.name if s == slot else n for s, n in enumerate(best.active))
-    (joint,) = fit_candidates(space, [(active, start(space, best, active, settings, after.scores))], settings)
+    (joint,) = fit_candidates(space, [(active, start_of_fit(space, best, active, settings, after.scores))], settings)
     if not np.isfinite(joint.cost):
         return what
     problem = space.problem(active)
-    _, jacobian, _ = linearised(problem, jnp.asarray(joint.z), problem.data)
-    informed = np.asarray(jacobian)[informing(problem.data)]
+    _, jacobian, _ = linearise(problem, jnp.asarray(joint.z), problem.data)
+    informed = np.asarray(jacobian)[informative_residuals(problem.data)]
     covariance = np.linalg.inv(informed.T @ informed)
     k = space.free + slot
     move = what.amplitude / settings.width - joint.z[k]
     z = joint.z + covariance[:, k] / covariance[k, k] * move
     moved = dataclasses.replace(joint, z=z, cost=joint.cost + 0.5 * move**2 / covariance[k, k])
-    seen = experiments.predict(space, {"without": best, "with": moved}, settings)
+    seen = experiments.predict_menu(space, {"without": best, "with": moved}, settings)
     if not seen.experiments:
         return what
-    first = experiments.ranked(seen)[0]
+    first = experiments.rank_experiments(seen)[0]
     if first.smallest < settings.worth:
         return what
     return dataclasses.replace(what, experiment=first.experiments[0], separation=float(first.smallest))

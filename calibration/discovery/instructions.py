@@ -15,14 +15,14 @@ class NothingPossible:
 
 @dataclasses.dataclass(frozen=True)
 class NoMenu:
-    """The menu holds no runs of the kind of the table's; what its rows are."""
+    """The menu has no runs of the table's kind; `word` is the name of its rows."""
 
     word: str
 
 
 @dataclasses.dataclass(frozen=True)
 class NothingTells:
-    """No experiment of the menu tells alternatives apart by so much [σ]."""
+    """No experiment of the menu separates the alternatives by at least `sigma` [σ]."""
 
     names: tuple[str, ...]
     sigma: float
@@ -30,7 +30,7 @@ class NothingTells:
 
 @dataclasses.dataclass(frozen=True)
 class CarryOut:
-    """Experiments of the menu, all of them."""
+    """Experiments of the menu, all to be carried out."""
 
     experiments: tuple[Experiment, ...]
 
@@ -40,10 +40,10 @@ class MoreRuns:
     """More runs along the variable of a discrepancy in a place.
 
     Attributes:
-        runs: of the series.
-        low, high: voltages that it goes between, top: the highest that the table used [V].
-        slope [deg], payload [kg]: up to which it may go; steps: of voltage, slope and payload.
-        within: reach of the table; by_duty: whether it varied the duty at one supply voltage.
+        runs: number of runs in the series.
+        low, high: range of its voltages, top: the highest voltage of the table [V].
+        slope [deg], payload [kg]: largest values; steps: of voltage, slope and payload.
+        within: reach of the table; by_duty: True if the table varied the duty at one supply voltage.
     """
 
     place: str
@@ -61,7 +61,7 @@ class MoreRuns:
 
 @dataclasses.dataclass(frozen=True)
 class TooWeak:
-    """A series in a variable that would show what is missing by too little [σ]."""
+    """A series in a variable with a separation that is too small [σ]."""
 
     variable: str
     sigma: float

@@ -1,4 +1,4 @@
-"""Stages of the loop that are kept as they end, so that an interrupted one goes on; and its budget of time."""
+"""Storage of the loop's finished stages, so that an interrupted loop can resume; and its time budget."""
 
 from __future__ import annotations
 
@@ -6,20 +6,20 @@ from collections.abc import Callable
 from typing import Protocol, TypeVar
 
 T = TypeVar("T")
-#: Name of threads that look at other noises: work that nobody has to wait for.
+#: Name of the threads for other noises, whose results are optional.
 BESIDE = "loop-beside"
 
 
 class Keep(Protocol):
-    """What gives the result of a stage by its name: as it was kept, or made now and kept."""
+    """Function that returns the stored result of a stage by name, or else computes and stores it."""
 
     def __call__(self, name: str, make: Callable[[], T]) -> T: ...
 
 
-def nothing(name: str, make: Callable[[], T]) -> T:
-    """Keeps nothing."""
+def keep_nothing(name: str, make: Callable[[], T]) -> T:
+    """Computes the result of a stage without storing it."""
     return make()
 
 
 class OutOfTime(KeyboardInterrupt):
-    """The loop's budget of time is spent before there is a verdict: it ends as if interrupted, by itself."""
+    """The loop's time budget is spent before a verdict; it ends as if interrupted."""

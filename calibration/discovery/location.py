@@ -1,4 +1,4 @@
-"""Where something is missing: the balance or the channel, and over what it shows."""
+"""Location of a discrepancy: the balance or the channel, and the variable."""
 
 from __future__ import annotations
 
@@ -13,15 +13,14 @@ from calibration.inference import bases
 from mmrjax.effects.base import EQUATION
 from mmrjax.effects.curve import EVERY_VARIABLE
 
-#: Balances in which the current stands for the load that the motors carry.
+#: Balances in which the current is a measure of the motors' load.
 OF_LOAD = ("motor", "gearbox", "track", "ground", "slip", "yaw")
-#: Spread of the supply voltage over that of the duty, each over its largest, below which the duty alone is set [-].
+#: Range of the supply voltage over that of the duty, each over its largest, below which only the duty is varied [-].
 SAGS = 0.3
 
 
 def varied_by_duty(runs: Runs) -> bool:
-    """True if the motors' voltage varies in a table by the duty, at about one supply voltage: one that is measured
-    sags a little."""
+    """True if a table varies the motors' voltage by the duty, at nearly constant supply voltage (which may sag)."""
     if not (runs.has("duty") and runs.has(SUPPLY)):
         return False
     duty, supply = (float(np.ptp(x) / max(np.max(x), 1e-300)) for x in map(np.abs, (runs["duty"], runs[SUPPLY])))
@@ -30,17 +29,16 @@ def varied_by_duty(runs: Runs) -> bool:
 
 @dataclasses.dataclass(frozen=True)
 class DiscrepancyLocation:
-    """Where something is missing.
+    """Location of a discrepancy.
 
     Attributes:
-        place: balance in which a curve explains most, or channel whose readings it shifts; variable: over which it
-            does.
-        alike: places in which one explains as much, or would if it had curves of its own.
-        variables_alike: over which a curve there is as improbable, beside `variable`: the most improbable first, of
-            what happens for a while one along each axis.
-        explained: what the curves of that balance and variable explain [σ²]; strongest: what the most improbable
-            family does.
-        by_duty: whether the motors' voltage varied with the duty alone.
+        place: balance with the curve that explains most, or channel with shifted readings; variable: of the curve.
+        alike: places with curves that explain as much, or that represent balances without curves of their own.
+        variables_alike: other variables with curves of similar significance there, the most significant first; of
+            temporary changes one along each axis.
+        explained: decrease of χ² by the curves of that balance and variable [σ²]; strongest: by the most significant
+            family.
+        by_duty: True if the motors' voltage varied only with the duty.
     """
 
     place: str
@@ -59,7 +57,7 @@ class DiscrepancyLocation:
     @property
     def channel(self) -> str:
         """The channel whose readings are off, empty for none."""
-        return self.place if bases.in_readings(self.place) else ""
+        return self.place if bases.is_channel_place(self.place) else ""
 
     @property
     def balances_alike(self) -> tuple[str, ...]:
@@ -69,9 +67,9 @@ class DiscrepancyLocation:
     @property
     def family(self) -> str:
         """Its equation and what drives it, in the words of `Effect.family`."""
-        happens = bases.window(self.variable)
+        happens = bases.window_from_name(self.variable)
         variable = self.variable if happens is None else happens.axis
-        what = bases.in_words(self.place) if self.channel else EQUATION[self.balance]
+        what = bases.place_in_words(self.place) if self.channel else EQUATION[self.balance]
         drivers = {name: v.driver for name, v in EVERY_VARIABLE.items() if v.driver}
         drivers |= {"current": "load" if self.balance in OF_LOAD else "current"}
         drivers |= {"payload": "load", "slope": "demand" if self.balance == "slip" else "slope"}
@@ -79,7 +77,7 @@ class DiscrepancyLocation:
         return f"{what} that changes with {drivers.get(variable, variable)}"
 
     def to_json(self) -> dict[str, Any]:
-        """As in result.json."""
+        """Entries of result.json."""
         return {
             "balance": self.balance,
             "channel": self.channel,

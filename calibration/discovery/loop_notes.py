@@ -24,36 +24,36 @@ class CurveOver(NamedTuple):
     variables: tuple[str, ...]
 
 
-#: Evidence by which a smooth curve of an effect's own equation has to be the better explanation [σ²]
+#: Advantage in evidence of a smooth curve of an effect's own equation that refutes its name [σ²]
 #: (docs/lab/findings.md, "The price of a name").
 BETTER = 5.0
-#: Share of its root that an effect has to keep without any one run: without a row of a table, whose readings may be
-#: wrong by themselves; without a run of a history, hundreds of samples, chance is asked alone.
+#: Least share of its root that an effect keeps without any one run. A row of a table may have a wrong reading; a run
+#: of a history has hundreds of samples, so that only significance is tested.
 KEPT = {"row": 1 / math.sqrt(3), "run": 0.0}
-#: Share of itself by which an amplitude may change over a variable without costing a law its name.
+#: Largest relative change of an amplitude over a variable for an established law.
 FORM = 0.3
-#: Share of the blocks left out, of those that leave half of what is known of an effect, in which it has to be chosen
-#: again.
+#: Least share of the informative hold-out blocks in which an effect is chosen again. Informative are those that leave
+#: half of the information on it.
 AGAIN = 0.8
 
 
 @dataclasses.dataclass(frozen=True)
 class NameTest:
-    """An effect of a candidate, tested by itself at the fit of all the others.
+    """Test of one effect of a candidate, at the fit of all the others.
 
     Attributes:
-        effect: its name; root: of what it would explain there beside curves of other equations [σ]; needed: by chance
-            the strongest effect reaches that [σ]; curves: those beside.
-        evidence: twice the log of that for it over a smooth curve of its own equation, the best one [σ²].
-        row: number of the run without which the root is smallest, None where none was left out; root_without: then.
-            A settled run is a row of its table, see `what`; of histories as if the others told as much.
+        effect: its name; root: of its score in addition to curves of other equations [σ]; needed: critical value for
+            the strongest effect [σ]; curves: those of other equations.
+        evidence: twice the log evidence of the effect over the best smooth curve of its own equation [σ²].
+        row: number of the run with the smallest root when left out, None if none was; root_without: that root.
+            A settled run is a row of its table, see `what`; for histories it is scaled to the remaining runs.
         again: share of the informative blocks without which an effect of its family is still the strongest.
         larger: effects of a set without it that is the better explanation, but not of a plausible size.
-        remains: whether the largest set that was searched for leaves something in its equation.
-        what: a run is called, `row` or `run`.
-        varies: root of what an amplitude that changes with a variable explains beside the largest set [σ]; over: that
-            variable; by_chance: what chance leaves to as many variables, whatever the library has.
-        spread: by how much of itself the amplitude changes at either end of that variable [-].
+        remains: True if the largest set of the search leaves a discrepancy in its equation.
+        what: name of a run, `row` or `run`.
+        varies: root of the score of an amplitude that changes with a variable, in addition to the largest set [σ];
+            over: that variable; by_chance: critical value for as many variables, independent of the library.
+        spread: relative change of the amplitude to either end of that variable [-].
     """
 
     effect: str
@@ -74,12 +74,12 @@ class NameTest:
 
     @property
     def stands(self) -> bool:
-        """Whether it explains more than chance, and as much as any curve in its place."""
+        """True if it is significant, and explains as much as any curve in its place."""
         return self.root >= self.needed and self.evidence >= -BETTER
 
     @property
     def rests_on(self) -> int | None:
-        """Number of the row without which it would not stand; None where it needs none, or does not stand with it."""
+        """Number of the row without which it would fail; None if it needs no single row, or fails anyway."""
         if self.root < self.needed:
             return None
         return self.row if self.root_without < max(self.needed, KEPT[self.what] * self.root) else None
@@ -100,18 +100,18 @@ class NameTest:
 
     @property
     def shows_form(self) -> bool:
-        """Whether a change of its amplitude over a variable is more than chance."""
+        """True if a change of its amplitude over a variable is significant."""
         return self.varies > max(self.needed, self.by_chance)
 
     @property
     def established(self) -> bool:
-        """Whether nothing speaks against it."""
+        """True if it fails no test."""
         return not self.fails
 
 
 @dataclasses.dataclass(frozen=True)
 class NameSupport:
-    """Whether the names of a candidate stand.
+    """Tests of a candidate's names.
 
     Attributes:
         stands: whether one at least does.
@@ -126,35 +126,37 @@ class NameSupport:
     tests: tuple[NameTest, ...] = ()
 
     def test_of(self, effect: str) -> NameTest | None:
-        """That of an effect; None where it was not tested."""
+        """Test of an effect; None if it was not tested."""
         return next((t for t in self.tests if t.effect == effect), None)
 
     def stands_in(self, effect: str) -> bool:
-        """Whether it stands in for a curve, which claims no cause: beside curves of other equations it explains
-        nothing, and one of its own explains more."""
+        """True if an effect is a stand-in for a curve, which claims no cause.
+
+        It explains nothing in addition to curves of other equations, and a curve of its own equation explains more.
+        """
         test = self.test_of(effect)
         return test is not None and {"chance", "curve"} <= set(test.fails)
 
     def established(self, effect: str) -> bool:
-        """Whether the name of an effect stands, by itself where it was tested so."""
+        """True if the name of an effect is established, by a test of its own if it had one."""
         test = self.test_of(effect)
         return self.stands and (not self.tests if test is None else test.established)
 
     def rests_on(self, effect: str) -> int | None:
-        """Number of the row that an effect rests on; None where it needs none, or was not tested."""
+        """Number of the row that an effect depends on; None if it depends on none, or was not tested."""
         test = self.test_of(effect)
         return None if test is None else test.rests_on
 
     def renamed(self, names: Mapping[str, str]) -> NameSupport:
-        """With others of their classes in the place of effects: what stands is a class, whoever leads it."""
+        """Copy with other leaders of the effects' classes, because a test is one of the class."""
         tests = tuple(dataclasses.replace(t, effect=names.get(t.effect, t.effect)) for t in self.tests)
         return dataclasses.replace(self, tests=tests)
 
     def numbered(self, numbers: np.ndarray) -> NameSupport:
-        """With rows called as messages call them.
+        """Copy with row numbers as in messages.
 
         Args:
-            numbers: of the rows in turn.
+            numbers: of the rows, in order.
         """
         named = (
             t if t.row is None or t.what == "run" else dataclasses.replace(t, row=int(numbers[t.row - 1]))
@@ -173,8 +175,12 @@ class FreedValue(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Missing:
-    """An effect that was found: names that these data cannot tell apart, stated values that may be wrong instead, the
-    families of the names, whether it is established, and its test by itself, None where there was none."""
+    """An effect that was found.
+
+    Attributes:
+        names: that these data cannot separate; values: stated values that may be wrong instead.
+        families: of the names; established: True if it is; test: of its own, None without one.
+    """
 
     names: tuple[str, ...]
     values: tuple[FreedValue, ...]
@@ -183,21 +189,21 @@ class Missing:
     test: NameTest | None = None
 
 
-#: What a mechanism needs: share of the excess misfit, standard errors of its gain on data held out.
+#: Requirements of a mechanism: share of the excess misfit, and standard errors of its hold-out gain.
 HALF, SURE = 0.5, 2.0
-#: Drivers that data may not tell apart for a mechanism to be stated.
+#: Largest number of drivers that the data cannot separate for a mechanism to be stated.
 FEW = 3
 
 
 @dataclasses.dataclass(frozen=True)
 class Mechanism:
-    """Which equation lacks something and what drives it, by the effects or the smooth curve that explain most of it.
+    """An equation with a discrepancy and its driver, from the effects or the smooth curve that explain most of it.
 
     Attributes:
         families: equation and driver in words, the best first, then those that explain as much.
         effects: of the library in its place, () for a curve.
         share: of the excess misfit, χ² less its expectation, that it explains [-].
-        gain, se: on data held out, over the readings that it changes [nat a reading].
+        gain, se: hold-out gain, over the readings that it changes [nat a reading].
         again: share of the informative blocks of runs without which it is found again [-].
         errors: standard error of the gain by kind of block [nat a reading].
     """
@@ -212,7 +218,7 @@ class Mechanism:
 
     @property
     def drivers(self) -> tuple[str, ...]:
-        """What may drive it: the families differ in this, or in the equation alone."""
+        """Possible drivers; the families differ in these, or only in the equation."""
         return tuple(dict.fromkeys(f.partition(" that ")[2] for f in self.families))
 
     @property
@@ -228,7 +234,7 @@ class Mechanism:
 
 
 class Missed(NamedTuple):
-    """A channel that a refit misses: rms error and estimated noise over its measured rms [-]."""
+    """A channel with a bad refit: rms error and estimated noise over its measured rms [-]."""
 
     channel: str
     error: float
@@ -237,16 +243,16 @@ class Missed(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Summary:
-    """A verdict with all that its statement says.
+    """A verdict and all data of its statement.
 
     Attributes:
         verdict: `none`, `named`, `class`, `mechanism`, `place` or `undescribed`; p: family-wise.
-        where: something is missing, or remains.
-        missing: the effects found, established or tentative; without names none is established.
-        nearest: effects that come nearest where none may be named; support: whether names stand.
-        aside, of: rows that lie off alone where these are many, of how many; 0 else.
-        noise: sds that are off, where that is all; cluster: what rows that lie off have in common.
-        mechanism: where no name stands, established or not.
+        where: location of the discrepancy, or of the remaining one.
+        missing: the effects found, established or tentative; only tentative ones without names.
+        nearest: effects that fit best if none may be named; support: tests of the names.
+        aside, of: number of isolated outliers if they are many (else 0), and of all rows.
+        noise: wrong sds, if they are the only finding; cluster: common property of outliers.
+        mechanism: if no name is established; it may not be established either.
         missed: channels that the model does not describe; unused: columns of numbers that vary and are not used;
             far: base parameters beyond three prior sds.
     """
@@ -269,14 +275,14 @@ class Summary:
 
 @dataclasses.dataclass(frozen=True)
 class Headline:
-    """What holds at every noise that was tried.
+    """Claims that hold at every noise that was tried.
 
     Attributes:
-        level: of the claims, a verdict; `open` where it depends on the noise whether anything is missing.
-        claims: laws, mechanisms or places, each with those that data cannot tell from it.
+        level: of the claims, a verdict; `open` if the noise decides whether an effect is missing.
+        claims: laws, mechanisms or places, each with those that the data cannot separate from it.
         factors: on the noise.
-        shared: of each mechanism or place, how many of its members come first that hold at every noise; the others
-            cannot be told from these at some.
+        shared: number of the first members of each mechanism or place that hold at every noise; at some noises the
+            others cannot be separated from these.
     """
 
     level: str
@@ -287,11 +293,11 @@ class Headline:
 
 @dataclasses.dataclass(frozen=True)
 class RuledOut:
-    """Why an effect is not plausible.
+    """Reason why an effect is not plausible.
 
     Attributes:
-        name: its; why: its balance would supply `power`, its `size`, or an sd would take it to the `edge`.
-        size: over the largest plausible one; check: what that rests on.
+        name: of the effect; why: its balance would supply `power`, its `size`, or it is within an sd of the `edge`.
+        size: over the largest plausible one; check: values that this depends on.
     """
 
     name: str
@@ -302,8 +308,12 @@ class RuledOut:
 
 @dataclasses.dataclass(frozen=True)
 class Asked:
-    """What the track model is asked about: something `missing` in a balance over a variable, effects that are `found`
-    there, or such as explain the readings nearly as well (`near`)."""
+    """Reason for a question to the track model.
+
+    Attributes:
+        why: a discrepancy is `missing` an effect, effects are `found`, or some explain nearly as much (`near`).
+        balance, variable: of the discrepancy; effects: their names.
+    """
 
     why: str
     balance: str = ""
@@ -311,7 +321,7 @@ class Asked:
     effects: tuple[str, ...] = ()
 
 
-#: Where data held out decide nothing between alternatives.
+#: Hold-out errors that do not decide between alternatives.
 DRAW = "draw"
 
 
@@ -319,21 +329,21 @@ DRAW = "draw"
 
 
 class AssumedNoise(Note):
-    """Channels whose sds nobody states, and what is usual, as an option states it."""
+    """Channels with unstated sds, and the usual values, in the form of the option."""
 
     channels: tuple[str, ...]
     usual: str
 
 
 class NoiseFromSeries(Note):
-    """Channels whose sds nobody states, as the scatter along series shows them."""
+    """Channels with unstated sds, and estimates from the scatter along series."""
 
     noise: tuple[SeriesNoise, ...]
 
 
 class RefitWorse(Note):
-    """A channel that the refit misses by more than the robot as stated does: errors over its measured rms [-], and
-    whether its noise is `assumed` or `estimated`."""
+    """A channel with a refit that is worse than the robot as stated: errors over its measured rms [-], and `assumed`
+    or `estimated` for its noise."""
 
     channel: str
     stated: float
@@ -342,47 +352,48 @@ class RefitWorse(Note):
 
 
 class Copies(Note):
-    """Numbers of rows that copy earlier ones."""
+    """Numbers of rows that duplicate earlier ones."""
 
     rows: tuple[int, ...]
 
 
 class KeptOut(Note):
-    """Numbers of rows that do not count: `unusable` ones, or `outliers`."""
+    """Numbers of excluded rows: `unusable` ones, or `outliers`."""
 
     rows: tuple[int, ...]
     why: str
 
 
 class PhasesDiffer(Note):
-    """A wave with another phase in each run: what it explains with a phase of its own in each, and with one [σ²]."""
+    """A wave with a different phase in each run: decrease of χ² with a phase for each run, and with one [σ²]."""
 
     free: float
     held: float
 
 
 class StillLacks(Note):
-    """A place that lacks something over a variable, beside what was found."""
+    """A place with a remaining discrepancy over a variable."""
 
     place: str
     variable: str
 
 
 class Late(Note):
-    """A delay of what is imposed that the rig's file does not state, with its sd [s]."""
+    """A delay of an imposed quantity that the rig's file does not state, with its sd [s]."""
 
     delay: float
     sd: float
 
 
 class Led(Note):
-    """By what the leader of a class was chosen.
+    """Choice of the leader of a class.
 
     Attributes:
-        names, rms_sigma: of the alternatives, and their errors held out [σ].
-        leader: which one leads; closest: to all rows; best: on data held out, where it is adequate.
-        by: `settings.PREFERENCES`, or `DRAW`; prefer: what was asked for.
-        told: share of itself by which an error has to differ to be told apart [-].
+        names, rms_sigma: of the alternatives, and their hold-out errors [σ].
+        leader: index of the leader; closest: of the best fit to all rows; best: of the best hold-out error among
+            adequate ones.
+        by: `settings.PREFERENCES`, or `DRAW`; prefer: the requested criterion.
+        told: least relative difference of errors that counts [-].
         rise_chi2: of the leader above the closest [σ²].
     """
 
@@ -398,27 +409,27 @@ class Led(Note):
 
 
 class NotPredictable(Note):
-    """Kinds of blocks that the others cannot predict, as parameters are determined by one block alone."""
+    """Kinds of blocks that the others cannot predict, because single blocks determine some parameters."""
 
     kinds: tuple[str, ...]
 
 
 class LostReplicates(Note):
-    """Bootstrap tables that could be fitted again, of those that were asked for."""
+    """Number of bootstrap tables with successful refits, and of all."""
 
     settled: int
     asked: int
 
 
 class Outstanding(Note):
-    """Verdicts at other noises that the time did not do for: factors of the sds, and `assumed` or `estimated`."""
+    """Verdicts at other noises that were not finished in time: factors of the sds, and `assumed` or `estimated`."""
 
     factors: tuple[float, ...]
     word: str
 
 
 class TooFewReplicates(Note):
-    """Bootstrap tables that do not do for every kind of evidence."""
+    """Too few bootstrap tables for every kind of evidence."""
 
     settled: int
 
@@ -431,8 +442,8 @@ class Heat:
     """A winding that gets hot.
 
     Attributes:
-        how: where it does: in a motor that is `held` or `braked`, or in a `run`.
-        temperature: after long running, infinite where none settles; allowed: None where nobody has stated it [°C].
+        how: it happens in a motor that is `held` or `braked`, or in a `run`.
+        temperature: after long running, infinite if none settles; allowed: None if unknown [°C].
         current: of a motor that is held [A], else 0.
     """
 
@@ -444,7 +455,7 @@ class Heat:
 
 @dataclasses.dataclass(frozen=True)
 class Overspeed:
-    """Motors without load that turn about as fast as they may: speed and its limit [rad/s], at a voltage [V]."""
+    """Unloaded motors near their speed limit: speed and its limit [rad/s], at a voltage [V]."""
 
     speed: float
     limit: float
@@ -453,7 +464,7 @@ class Overspeed:
 
 @dataclasses.dataclass(frozen=True)
 class Overvoltage:
-    """A supply beyond what the table used [V]."""
+    """A supply voltage above the table's largest [V]."""
 
     voltage: float
     used: float
@@ -463,12 +474,12 @@ Watch = Heat | Overspeed | Overvoltage
 
 
 class RestsOn(Note):
-    """An effect that stands by one run alone, which would have to be made again, and others beside it.
+    """An effect that depends on a single run, which should be repeated together with neighbouring ones.
 
     Attributes:
-        test: of it.
-        conditions: column → what the run was at; axis: column along which others were made at the same conditions
-            otherwise, "" for none; beside: where along that others would tell most.
+        test: of the effect.
+        conditions: column → value of that run; axis: column along which other runs share its other conditions,
+            "" for none; beside: values along it that would be most informative.
     """
 
     test: NameTest
@@ -478,8 +489,13 @@ class RestsOn(Note):
 
 
 class Unwritten(Note):
-    """What was found predicts data held out worse than the refit does, or no better, and is not in the robot that is
-    written: a `curve`, or effects; by how much, and the standard error [nat a reading]."""
+    """A proposal that is not written to the robot, because its hold-out predictions are worse than the refit's.
+
+    A curve is also omitted if they are no better.
+
+    Attributes:
+        curve: True for a curve, False for effects; gain, se: of its predictions [nat a reading].
+    """
 
     curve: bool
     gain: float

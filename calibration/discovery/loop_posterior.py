@@ -1,4 +1,4 @@
-"""The posterior of what the loop found: base parameters, effects' amplitudes and shapes, curves' ordinates."""
+"""Posterior of the loop's result: base parameters, effects' amplitudes and shapes, curves' ordinates."""
 
 from __future__ import annotations
 
@@ -10,38 +10,42 @@ import numpy as np
 from calibration.data.posterior_file import ANGLE, LOG, NORMAL, Posterior, joined
 from calibration.discovery.active_set import ActiveSet, CandidateSpace
 from calibration.discovery.discrepancy import Discrepancy, Shaped
-from calibration.inference.fit_posterior import of_coordinates
+from calibration.inference.fit_posterior import posterior_of_coordinates
 from calibration.inference.linearization import Linearization, amplitude_of, shape_of, shape_scales
-from calibration.inference.optimizers import informing
+from calibration.inference.optimizers import informative_residuals
 from calibration.inference.priors import Coordinates
 from mmrjax.model import params
 from mmrjax.model.params import Spec
 
 
-def of_fit(space: CandidateSpace, active: tuple[str, ...], z: np.ndarray, linear: Linearization) -> Posterior:
-    """The posterior of a fit of the base with the active effects, from its linearization.
+def posterior_of_fit(
+    space: CandidateSpace, active: tuple[str, ...], z: np.ndarray, linear: Linearization
+) -> Posterior:
+    """Posterior of a fit of the base with the active effects, from its linearization.
 
     Args:
-        active: effect in each slot, "" where empty; z: its coordinates, those of the base alone or of all.
+        active: effect in each slot, "" if empty; z: its coordinates, those of the base only or of all.
         linear: of that fit.
     """
     jacobian = np.asarray(linear.jacobian)
     size = jacobian.shape[1]
     problem = space.bare if size == space.free else space.equipped
-    informed = jacobian[informing(problem.data)]
+    informed = jacobian[informative_residuals(problem.data)]
     covariance = np.linalg.inv(informed.T @ informed)
     return _of(problem.coordinates, space, active, np.asarray(z)[:size], covariance)
 
 
-def of_curve(space: CandidateSpace, active: tuple[str, ...], curve: Discrepancy) -> Posterior:
-    """The posterior of a fit with a curve: the ordinates, which are linear in their coordinates, come last."""
+def posterior_of_curve(space: CandidateSpace, active: tuple[str, ...], curve: Discrepancy) -> Posterior:
+    """Posterior of a fit with a curve; the ordinates, linear in their coordinates, come last."""
     shaped: Shaped = curve.problem.coordinates
     inner = len(shaped.base)
     turn = np.eye(len(shaped))
     turn[inner:, inner:] = np.asarray(shaped.root)
     base, kept = _parts(shaped.base, space, active, curve.z[:inner])
-    spec = {p.name: p.spec for p in params.walk(curve.problem.base)}
-    ordinates = _cut(shaped.names, [spec[n] for n in shaped.names], np.asarray(shaped.root) @ curve.z[inner:])
+    spec = {p.name: p.spec for p in params.walk_parameters(curve.problem.base)}
+    ordinates = _clipped_parameters(
+        shaped.names, [spec[n] for n in shaped.names], np.asarray(shaped.root) @ curve.z[inner:]
+    )
     places = [*kept, *range(inner, len(shaped))]
     covariance = (turn @ curve.covariance @ turn.T)[np.ix_(places, places)]
     return joined([*base, ordinates], covariance)
@@ -61,18 +65,20 @@ def _of(
 def _parts(
     coordinates: Coordinates | ActiveSet, space: CandidateSpace, active: tuple[str, ...], z: np.ndarray
 ) -> tuple[list[Posterior], list[int]]:
-    """Sets of coordinates of a fit, and where in z they are; empty slots and effects without shape have none."""
+    """Posteriors of a fit's groups of coordinates, and their indices in z, without empty slots and missing shapes."""
     if not isinstance(coordinates, ActiveSet):
-        return [of_coordinates(coordinates, z, np.eye(len(z)))], list(range(len(z)))
+        return [posterior_of_coordinates(coordinates, z, np.eye(len(z)))], list(range(len(z)))
     p, slots = len(coordinates.base), coordinates.slots
-    parts, kept = [of_coordinates(coordinates.base, z[:p], np.eye(p))], list(range(p))
+    parts, kept = [posterior_of_coordinates(coordinates.base, z[:p], np.eye(p))], list(range(p))
     for slot, name in enumerate(active):
         if not name:
             continue
         effect = space.library[name]
         amplitude = amplitude_of(effect)
         sd = float(coordinates.sd[coordinates.names.index(name)])
-        of_amplitude = _cut((f"effects.{name}.amplitude",), [amplitude.spec], np.array([sd * z[p + slot]]))
+        of_amplitude = _clipped_parameters(
+            (f"effects.{name}.amplitude",), [amplitude.spec], np.array([sd * z[p + slot]])
+        )
         parts.append(dataclasses.replace(of_amplitude, mean=z[p + slot, None], spread=np.array([sd])))
         kept.append(p + slot)
         shape = shape_of(effect)
@@ -80,7 +86,7 @@ def _parts(
             continue
         value, spread, turned, low, high = shape_scales(shape)
         log = spread > 0
-        of_shape = _cut((f"effects.{name}.{shape.name}",), [shape.spec], np.zeros(1))
+        of_shape = _clipped_parameters((f"effects.{name}.{shape.name}",), [shape.spec], np.zeros(1))
         bounds = (math.log(low) if low > 0 else -math.inf, math.log(high)) if log else (-math.inf, math.inf)
         parts.append(
             dataclasses.replace(
@@ -93,8 +99,8 @@ def _parts(
     return parts, kept
 
 
-def _cut(names: tuple[str, ...], specs: list[Spec], mean: np.ndarray) -> Posterior:
-    """Parameters that are their own coordinates, cut at their bounds."""
+def _clipped_parameters(names: tuple[str, ...], specs: list[Spec], mean: np.ndarray) -> Posterior:
+    """Posterior of parameters that are their own coordinates, clipped at their bounds."""
     size = len(names)
     return Posterior(
         coordinates=names, units=tuple(s.unit for s in specs), mean=mean, covariance=np.eye(size),

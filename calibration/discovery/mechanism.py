@@ -1,7 +1,7 @@
-"""Mechanisms: which equation lacks something and what drives it, where no exact law stands.
+"""Mechanisms: the equation with a discrepancy and its driver, if no exact law is established.
 
-No law is exactly true of a machine, so with precise data every name fails a test of its form. What a mechanism
-explains, what it predicts and whether it is found again without parts of the data do not depend on that.
+No law is exactly true of a machine, so with precise data every name fails a test of its form. The share that a
+mechanism explains, its predictions, and its repetition without parts of the data do not depend on the exact form.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from calibration.discovery.standing import chosen_again
 from calibration.inference import bases as bases_room
 from calibration.inference import blocks as blocks_room
 from calibration.inference.bases import Bases
-from calibration.inference.held_out import unseen
+from calibration.inference.held_out import predict_unseen
 
-#: Share of the largest rms change of a channel by a mechanism from which on it changes a reading [σ over σ].
+#: Least change of a reading by a mechanism, over the largest rms change of a channel, for it to count [σ over σ].
 CHANGED = 0.5
-#: Blocks of a kind from which on their scatter tells the error of a gain.
+#: Fewest blocks of a kind for an error of a gain from their scatter.
 BLOCKS = 3
-#: Parameters that a curve takes, each of which lowers χ² by one where nothing is missing [σ²].
+#: Number of parameters of a curve, each of which lowers χ² by one without a discrepancy [σ²].
 OF_CURVE = 5.0
 
 
-def mechanism(
+def find_mechanism(
     space: CandidateSpace,
     runs: Runs,
     base: Candidate,
@@ -47,16 +47,18 @@ def mechanism(
     predicted: Predicted,
     settings: Settings,
 ) -> Mechanism | None:
-    """The mechanism that explains most of what the base leaves: that of effects of one family of the library, or that
-    of a smooth curve where none of them explains as much; None of histories where a curve alone does.
+    """Mechanism that explains most of the base's discrepancy.
+
+    It is that of effects of one family of the library, or that of a smooth curve if none of them explains as
+    much; None for histories if only a curve does.
 
     Args:
-        left: what the base leaves; ladder: candidates that were fitted; beside: the curve of what the base leaves.
-        predicted: what fits predict of data held out, where it is known.
+        left: diagnosis of the base; ladder: candidates that were fitted; beside: the curve of the discrepancy.
+        predicted: known hold-out predictions of fits.
     """
-    ladder = first_simulated(space, base, ladder, settings)
+    ladder = simulate_leading_families(space, base, ladder, settings)
     best, own = _of_one_family(space, ladder), _families_of(beside.where)
-    if space.bare.observe.long:  # whose curves take long to fit
+    if space.bare.observe.long:  # fits of curves take long
         by_curve = beside.where.explained - OF_CURVE
     else:
         by_curve = beside.curve.chi2[0] - beside.curve.chi2[1] - OF_CURVE
@@ -66,11 +68,11 @@ def mechanism(
     most = max(explained.values())
     within = max(settings.same, settings.form**2 * most)
     alike = sorted((f for f in explained if explained[f] >= most - within), key=lambda f: -explained[f])
-    # What the best curve is as improbable over, it cannot be told from: an effect that goes by it may predict better.
+    # Families that the curve cannot separate from its own may predict better by an effect.
     over = [f for f in own if f not in alike and explained[alike[0]] == by_curve]
     by_name = [f for f in (*alike, *over) if f in best and (space.bare.observe.long or by_effects[f] >= HALF * most)]
-    blocks = [mask for by in blocks_room.predictable(runs, space.bare).values() for mask in by.values()]
-    found: list[Mechanism] = []
+    blocks = [mask for by in blocks_room.predictable_blocks(runs, space.bare).values() for mask in by.values()]
+    mechanisms: list[Mechanism] = []
     excess = excess_misfit(space, base)
     curve = () if space.bare.observe.long or own[0] in by_name or own[0] not in alike else own[:1]
     for leader in (*by_name[:1], *curve, *by_name[1:]):
@@ -84,32 +86,32 @@ def mechanism(
             pair, gain = max(gains.items(), key=lambda one: one[1].mean / max(one[1].se, 1e-12))
             effects = tuple(n for n in pair.having.effects if space.library[n].family() == leader)
             again = chosen_again(space, base, best[leader], left, families, bases, blocks, settings)
-            if again < AGAIN:  # several effects together may be found by their sum alone
+            if again < AGAIN:  # several effects together may be found again only by their sum
                 again = max(again, _curve_again(space, left, bases, families, blocks, settings))
         else:
             gain, effects = _gain_of_curve(space, runs, base, beside, predicted), ()
             again = _curve_again(space, left, bases, families, blocks, settings)
         share = share_of_excess(excess, explained.get(leader, 0.0))
-        found.append(Mechanism(families, effects, share, gain.mean, gain.se, again, gain.errors))
-        if not found[-1].fails:
-            return found[-1]
-    return found[0] if found else None
+        mechanisms.append(Mechanism(families, effects, share, gain.mean, gain.se, again, gain.errors))
+        if not mechanisms[-1].fails:
+            return mechanisms[-1]
+    return mechanisms[0] if mechanisms else None
 
 
-def first_simulated(
+def simulate_leading_families(
     space: CandidateSpace, base: Candidate, ladder: Sequence[Candidate], settings: Settings
 ) -> list[Candidate]:
-    """The candidates, where of each family that may explain most the best one is a simulation and no regression."""
-    found = list(ladder)
+    """Candidates in which the best one of each family that may explain most is simulated, not a regression."""
+    candidates = list(ladder)
     while True:
-        best = _of_one_family(space, found).values()
+        best = _of_one_family(space, candidates).values()
         lowest = min((c.cost for c in best), default=0.0)
         within = max(settings.same, settings.form**2 * 2 * (base.cost - lowest))
         near = [c for c in best if not c.simulated and 2 * (c.cost - lowest) <= within]
         if not near:
-            return found
+            return candidates
         made = fit_candidates(space, [(c.active, c.z) for c in near], settings)
-        found = [*(c for c in found if not any(c is x for x in near)), *made]
+        candidates = [*(c for c in candidates if not any(c is x for x in near)), *made]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -121,12 +123,12 @@ class Pair:
 
     @property
     def explained(self) -> float:
-        """Fall of χ² [σ²]."""
+        """Decrease of χ² [σ²]."""
         return 2 * (self.without.cost - self.having.cost)
 
 
 def _few_and_best(space: CandidateSpace, ladder: Sequence[Candidate], best: Candidate) -> list[Candidate]:
-    """The best candidate of a family, and where it has several effects the best of one, which may predict better."""
+    """Best candidate of a family, and if it has several effects the best single one, which may predict better."""
     family = space.library[best.effects[0]].family()
     single = [c for c in ladder if len(c.effects) == 1 and space.library[c.effects[0]].family() == family]
     sound = [c for c in single if c.plausible and np.isfinite(c.cost)]
@@ -136,49 +138,51 @@ def _few_and_best(space: CandidateSpace, ladder: Sequence[Candidate], best: Cand
 def _explained(
     space: CandidateSpace, base: Candidate, ladder: Sequence[Candidate], best: dict[str, Candidate]
 ) -> dict[str, Pair]:
-    """Of each family the fits with and without its effects that differ most: alone, or next to those of others."""
-    known = {c.key: c for c in (base, *ladder) if np.isfinite(c.cost) and not c.supplying}
-    found = {family: Pair(alone, base) for family, alone in best.items()}
-    for effects, having in known.items():
-        for family in {space.library[name].family() for name in effects} & set(found):
+    """For each family the fits with and without its effects that differ most: alone, or with those of others."""
+    simulated = {c.key: c for c in (base, *ladder) if np.isfinite(c.cost) and not c.supplying}
+    pairs = {family: Pair(alone, base) for family, alone in best.items()}
+    for effects, having in simulated.items():
+        for family in {space.library[name].family() for name in effects} & set(pairs):
             others = frozenset(n for n in effects if space.library[n].family() != family)
-            if others in known:
-                found[family] = max(found[family], Pair(having, known[others]), key=lambda pair: pair.explained)
-    return found
+            if others in simulated:
+                pairs[family] = max(pairs[family], Pair(having, simulated[others]), key=lambda pair: pair.explained)
+    return pairs
 
 
 def excess_misfit(space: CandidateSpace, base: Candidate) -> float:
-    """χ² of the base, priors included, less what noise leaves (`Observer.noise_misfit`) [σ²]."""
+    """χ² of the base, priors included, less its expectation from noise (`Observer.noise_misfit`) [σ²]."""
     counts = np.asarray(space.weight > 0)
     return 2 * base.cost - space.bare.observe.noise_misfit(lambda: _whitened(space, base), counts)
 
 
 def share_of_excess(excess: float, explained: float) -> float:
-    """Share of the excess misfit that so much is [-]; no more than all: with noise that is stated too large there is
-    less excess than that.
+    """Share of the excess misfit that is explained [-], at most 1: if the stated noise is too large, the excess is
+    smaller than the decrease of χ².
 
     Args:
-        excess: see `excess_misfit`; explained: fall of χ² [σ²].
+        excess: see `excess_misfit`; explained: decrease of χ² [σ²].
     """
     return float(explained / max(excess, explained, 1e-300))
 
 
 def _of_one_family(space: CandidateSpace, ladder: Sequence[Candidate]) -> dict[str, Candidate]:
-    """The best candidate of each family that has the effects of that family alone, of a plausible size where there is
-    one: the size of a mechanism is not claimed."""
-    found: dict[str, Candidate] = {}
+    """Best candidate of each family among those with effects of one family, of plausible size if there is one.
+
+    The size of a mechanism is not claimed.
+    """
+    best: dict[str, Candidate] = {}
     for c in ladder:
         families = {space.library[name].family() for name in c.effects}
         once = len(set(c.effects)) == len(c.effects)
         if len(families) == 1 and once and np.isfinite(c.cost) and not c.supplying:
             (family,) = families
-            found[family] = min(found.get(family, c), c, key=lambda x: (not x.plausible, x.cost))
-    return found
+            best[family] = min(best.get(family, c), c, key=lambda x: (not x.plausible, x.cost))
+    return best
 
 
 def _in_equations_alike(family: str, where: DiscrepancyLocation) -> tuple[str, ...]:
-    """The family with the same driver in each equation that these data cannot tell from its own."""
-    places = [p for p in where.alike if not bases_room.in_readings(p)]  # an instrument is not put beside a cause
+    """Family with the same driver in each equation that these data cannot separate from its own."""
+    places = [p for p in where.alike if not bases_room.is_channel_place(p)]  # instruments are excluded
     equations = [dataclasses.replace(where, place=p).family.partition(" that ") for p in places]
     what, joint, driver = family.partition(" that ")
     alike = dict.fromkeys(equation for equation, *_ in equations)
@@ -186,26 +190,26 @@ def _in_equations_alike(family: str, where: DiscrepancyLocation) -> tuple[str, .
 
 
 def _families_of(where: DiscrepancyLocation) -> tuple[str, ...]:
-    """The family of a curve, and those of the places and variables over which one is as improbable."""
+    """Family of a curve, and those of the places and variables with curves of similar significance."""
     places = [dataclasses.replace(where, place=p) for p in where.alike]
     others = [dataclasses.replace(where, variable=v) for v in where.variables_alike]
     return tuple(dict.fromkeys(x.family for x in (where, *places, *others)))
 
 
-# --- data held out --------------------------------------------------------------------------------------
+# --- hold-out errors ------------------------------------------------------------------------------------
 
 
 def _gain_of(space: CandidateSpace, runs: Runs, pair: Pair, predicted: Predicted) -> Gain:
-    """By how much a fit predicts better with the effects of a mechanism, over the readings that these change."""
+    """Hold-out gain by the effects of a mechanism, over the readings that they change."""
     seen, before = (_held_out(space, runs, c, predicted) for c in (pair.having, pair.without))
-    changed = _changed(space, runs, _reading(space, pair.without), _reading(space, pair.having))
-    return _gain(seen, before, changed)
+    changed = _changed_readings(space, runs, _reading(space, pair.without), _reading(space, pair.having))
+    return _gain_over_changed(seen, before, changed)
 
 
-def _gain(score: HeldOutScore, over: HeldOutScore, changed: np.ndarray) -> Gain:
-    """How much better a score is, over the readings that a mechanism changes.
+def _gain_over_changed(score: HeldOutScore, over: HeldOutScore, changed: np.ndarray) -> Gain:
+    """Gain of a score, over the readings that a mechanism changes.
 
-    Each kind of block leaves out the same readings, so errors of kinds do not average out: the standard error is the
+    Each kind of block omits the same readings, so errors of kinds do not average out. The standard error is the
     mean of theirs, weighted by readings.
     """
     kinds = score.by_kind
@@ -223,20 +227,22 @@ def _gain(score: HeldOutScore, over: HeldOutScore, changed: np.ndarray) -> Gain:
 def _gain_of_curve(
     space: CandidateSpace, runs: Runs, base: Candidate, beside: CurveBeside, predicted: Predicted
 ) -> Gain:
-    """The same of the curve of what the base leaves, over the range of its variable that its fit has seen: a curve
-    says nothing beyond."""
-    curve, kinds = beside.curve, blocks_room.predictable(runs, space.bare)
-    told = {kind: unseen(curve.problem, curve.z, list(by.values())).reading for kind, by in kinds.items()}
-    changed = _changed(space, runs, _reading(space, base), curve.reading)
+    """Hold-out gain by the curve of the base's discrepancy, within the range of its variable in each fit.
+
+    A curve does not extrapolate.
+    """
+    curve, kinds = beside.curve, blocks_room.predictable_blocks(runs, space.bare)
+    told = {kind: predict_unseen(curve.problem, curve.z, list(by.values())).reading for kind, by in kinds.items()}
+    changed = _changed_readings(space, runs, _reading(space, base), curve.reading)
     score = _scored(space, runs, told)
-    seen = {kind: _seen(space, beside, list(by.values())) for kind, by in kinds.items()}
+    seen = {kind: _within_seen_range(space, beside, list(by.values())) for kind, by in kinds.items()}
     inside = {kind: np.where(seen[kind][:, None], x, np.nan) for kind, x in score.by_kind.items()}
     score = dataclasses.replace(score, by_kind=inside)
-    return _gain(score, _held_out(space, runs, base, predicted), changed)
+    return _gain_over_changed(score, _held_out(space, runs, base, predicted), changed)
 
 
-def _seen(space: CandidateSpace, beside: CurveBeside, masks: Sequence[np.ndarray]) -> np.ndarray:
-    """Rows at which a curve's variable is within the range of the rows outside their block, shape (rows,).
+def _within_seen_range(space: CandidateSpace, beside: CurveBeside, masks: Sequence[np.ndarray]) -> np.ndarray:
+    """True for rows with a curve's variable within the range of the rows outside their block, shape (rows,).
 
     Args:
         masks: of the rows of each block.
@@ -246,7 +252,7 @@ def _seen(space: CandidateSpace, beside: CurveBeside, masks: Sequence[np.ndarray
     if where.variable not in bases_room.VARIABLES:
         return seen
     x = np.asarray(linear.in_travel(where.place, where.variable)[0], float)
-    if len(x) != len(space.included):  # of turns, whose sides differ
+    if len(x) != len(space.included):  # turns, with different sides
         return seen
     for mask in masks:
         others = x[:rows][space.included[:rows] & ~mask]
@@ -256,18 +262,18 @@ def _seen(space: CandidateSpace, beside: CurveBeside, masks: Sequence[np.ndarray
 
 
 def _held_out(space: CandidateSpace, runs: Runs, candidate: Candidate, predicted: Predicted) -> HeldOutScore:
-    known = predicted.get(prediction.key(candidate))
-    if known is not None:
-        return _scored(space, runs, known)
-    score = prediction.score_of(space, runs, candidate)
-    predicted[prediction.key(candidate)] = score.reading
+    prediction_before = predicted.get(prediction.candidate_key(candidate))
+    if prediction_before is not None:
+        return _scored(space, runs, prediction_before)
+    score = prediction.score_candidate(space, runs, candidate)
+    predicted[prediction.candidate_key(candidate)] = score.reading
     return score
 
 
 def _scored(space: CandidateSpace, runs: Runs, reading: dict[str, np.ndarray]) -> HeldOutScore:
     data, rows = space.equipped.data, len(runs)
     measured, sd, counts = (np.asarray(x)[:rows] for x in (data.measured, data.sd, space.weight > 0))
-    return prediction.scored(reading, measured, sd, counts, blocks_room.predictable(runs, space.bare))
+    return prediction.score_readings(reading, measured, sd, counts, blocks_room.predictable_blocks(runs, space.bare))
 
 
 def _reading(space: CandidateSpace, candidate: Candidate) -> np.ndarray:
@@ -276,15 +282,15 @@ def _reading(space: CandidateSpace, candidate: Candidate) -> np.ndarray:
 
 
 def _whitened(space: CandidateSpace, candidate: Candidate) -> np.ndarray:
-    """Residuals of a candidate in sds, 0 for readings that do not count; shape (rows, channels)."""
+    """Residuals of a candidate in sds, 0 for excluded readings; shape (rows, channels)."""
     data = space.equipped.data
     off = (_reading(space, candidate) - np.asarray(data.measured)) / np.asarray(data.sd)
     return np.where(np.asarray(space.weight) > 0, np.nan_to_num(off), 0.0)
 
 
-def _changed(space: CandidateSpace, runs: Runs, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Readings that a mechanism changes by at least `CHANGED` of the rms of the channel that it changes most, in sds:
-    in the others its gain would be diluted; shape (rows, channels)."""
+def _changed_readings(space: CandidateSpace, runs: Runs, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """True for readings that a mechanism changes by at least `CHANGED` of the rms of the most changed channel, in
+    sds; others would dilute its gain; shape (rows, channels)."""
     rows = len(runs)
     sd, counts = np.asarray(space.bare.data.sd)[:rows], space.weight[:rows] > 0
     moved = np.where(counts, np.abs(after[:rows] - before[:rows]) / sd, 0.0)
@@ -293,7 +299,7 @@ def _changed(space: CandidateSpace, runs: Runs, before: np.ndarray, after: np.nd
     return np.asarray(counts & (moved >= CHANGED * most))
 
 
-# --- blocks left out ------------------------------------------------------------------------------------
+# --- hold-out blocks ------------------------------------------------------------------------------------
 
 
 def _curve_again(
@@ -304,9 +310,11 @@ def _curve_again(
     blocks: Sequence[np.ndarray],
     settings: Settings,
 ) -> float:
-    """Share of the informative blocks without which a smooth curve of these families explains as much as any other; 1
-    where there are none. An informative block leaves half of what is known of the curve."""
-    linear, names = left.linear, bases_room.names(bases)
+    """Share of the informative blocks without which a smooth curve of these families explains as much as any.
+
+    1 without such blocks. An informative block leaves half of the information on the curve.
+    """
+    linear, names = left.linear, bases_room.family_names(bases)
     smooth = [k for k, (_, v) in enumerate(names) if v in bases_room.VARIABLES]
     here = DiscrepancyLocation("", "", (), (), 0.0, 0.0)
     akin = [dataclasses.replace(here, place=names[k][0], variable=names[k][1]).family in families for k in smooth]
@@ -329,7 +337,7 @@ def _curve_again(
 
 
 def _explained_by(jacobian: np.ndarray, residual: np.ndarray) -> Callable[[np.ndarray], tuple[float, float]]:
-    """Of columns over the readings: what they explain together [σ²], and what the fit leaves of them [σ²]."""
+    """Function of columns over the readings: decrease of χ² and remaining sensitivity of all columns [σ²]."""
     half = np.linalg.solve(np.linalg.cholesky(jacobian.T @ jacobian), jacobian.T)
     left = residual - half.T @ (half @ residual)
 

@@ -1,4 +1,4 @@
-"""The menu of experiments: what can be done with a robot within reach of its table, what to read, what to watch."""
+"""Menu of experiments: possible ones within reach of a table, with channels to read and risks to watch."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from calibration.data.input_errors import BadConfiguration, choices
+from calibration.data.input_errors import BadConfiguration, allowed_words
 from calibration.discovery import setups
 from calibration.discovery.loop_notes import Heat, Overspeed, Overvoltage, Watch
 from calibration.discovery.reach import SLOPE, Reach, Used
@@ -23,18 +23,21 @@ from mmrjax.model.quantities import RPM
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Signals, State
 
-#: What a user may forbid, beside configurations: every experiment is of one or more of these kinds.
+#: Kinds of experiments that a user may forbid, in addition to configurations; an experiment may have several kinds.
 KINDS = (
     "weigh", "zero current", "zero reading", "shunt", "strobe", "timing", "bare motor", "stall", "one motor",
     "braked motor", "reverse", "downhill", "lifted", "payload", "other voltages", "steepest slope", "crawl",
     "other torques",
 )  # fmt: skip
-#: Share of the adhesion that a slope steeper than the table's may take by the fitted robot [-].
+#: Largest share of the adhesion for the fitted robot on a slope steeper than the table's [-].
 GRIP = 0.95
-#: Temperature of a winding from which nobody has stated a limit [°C].
+#: Temperature of a winding from which its limit is unknown [°C].
 UNLIMITED = 1e6
-#: How near to what is allowed something has to come to be watched: of a winding [K], of a speed [-].
+#: Distance from a limit at which a quantity is watched: of a winding [K], of a speed [-].
 WARM, FAST = 25.0, 0.85
+
+
+# --- experiments ------------------------------------------------------------------------------------
 
 
 # --- what is done -----------------------------------------------------------------------------------
@@ -42,15 +45,15 @@ WARM, FAST = 25.0, 0.85
 
 @dataclasses.dataclass(frozen=True)
 class Act:
-    """A calibration act: something is read that does not depend on the run.
+    """A calibration act: a reading that does not depend on a run.
 
     Attributes:
         name: of it; kinds: of `KINDS`.
-        reading: of a robot and of what is set [SI], shape (readings,).
-        at: what is set, one tuple a reading [SI]; of `weigh`, the configuration's index and the payload.
+        reading: function of a robot and of the settings [SI], shape (readings,).
+        at: settings, one tuple a reading [SI]; of `weigh`, the configuration's index and the payload.
         sd: of a single reading [SI]; None: that of the table's readings of `channel`.
-        repeats: readings that are averaged.
-        channel: whose instrument is read where nothing is to be shown, "" for another act.
+        repeats: number of readings that are averaged.
+        channel: channel of the instrument for a reading of zero, "" for another act.
     """
 
     name: str
@@ -64,23 +67,23 @@ class Act:
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """Settled runs under conditions that the table does not hold.
+    """Settled runs under conditions that the table does not have.
 
     Attributes:
         name: of them; kinds: of `KINDS`, and the configuration where there is one.
         doing: a row of `experiment_words.DOING`; where: the configuration's name, "" for none; motors: of the robot.
         setup: how the robot is set up.
         voltage [V], slope [deg], payload [kg]: conditions of each run, shape (runs,).
-        channels: names of what is read.
+        channels: names of the channels to read.
         configuration: index of the robot's.
-        sides: motors that are switched on; None: all.
+        sides: number of motors that are on; None: all.
         brake: torque on each motor shaft [N·m].
         beyond: angle above which a slope is steeper than any of the table [deg].
-        steepest: whether only the steepest slope that the robot climbs is worth while.
-        repeats: readings that are averaged.
-        watch: what can be damaged, and what shows that it will be.
-        imposed: what is in the place of the voltage, see `Rig`; `motor_speed`: [rad/s]; `motor_current`: [A].
-        torque: of a brake on the output, against forward rotation [N·m]; empty: there is no brake.
+        steepest: True if only the steepest slope that the robot climbs is informative.
+        repeats: number of readings that are averaged.
+        watch: risks of damage, with their indications.
+        imposed: quantity instead of the voltage, see `Rig`; `motor_speed`: [rad/s]; `motor_current`: [A].
+        torque: of a brake on the output, against forward rotation [N·m]; empty without a brake.
     """
 
     name: str
@@ -104,7 +107,7 @@ class Run:
     torque: tuple[float, ...] = ()
 
     def read(self, shown: tuple[str, ...]) -> tuple[int, ...]:
-        """Positions of the channels that are read, among all that are shown."""
+        """Positions of the channels to read among all channels."""
         return tuple(shown.index(c) for c in self.channels)
 
 
@@ -112,18 +115,18 @@ Experiment = Act | Run
 
 
 def round_significant(value: float, digits: int = 2) -> float:
-    """A number with so many digits, as a person sets it."""
+    """A number with so many significant digits, as a person sets it."""
     return float(f"{value:.{digits - 1}e}")
 
 
-#: Steps in which people set a quantity, times powers of ten.
+#: Usual steps of settings, times powers of ten.
 STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)
-#: By how much a setting may exceed the largest that the table used, as its readings scatter [-].
+#: Tolerance of a setting above the table's largest, because readings scatter [-].
 ABOUT = 0.01
 
 
 def step_of_settings(span: float, count: int) -> float:
-    """The step of `STEPS` nearest, in proportion, to that of so many even steps over a span; 0 for no span."""
+    """The step of `STEPS` nearest in ratio to that of `count` even steps over a span; 0 for no span."""
     if span <= 0:
         return 0.0
     step = span / count
@@ -132,20 +135,20 @@ def step_of_settings(span: float, count: int) -> float:
 
 
 def last_setting(most: float, step: float) -> float:
-    """The largest multiple of a step that does not exceed about a number; the number itself without a step."""
+    """Largest multiple of a step up to a number, within the tolerance `ABOUT`; the number itself without a step."""
     if step == 0:
         return most
     return float(f"{step * math.floor(most * (1 + ABOUT) / step + 1e-9):.6g}")
 
 
 def floor_significant(value: float) -> float:
-    """The largest number of two digits that does not exceed a positive one."""
+    """Largest number of two digits up to a positive one."""
     step = 10.0 ** (math.floor(math.log10(value)) - 1)
     return round_significant(math.floor(value / step + 1e-9) * step)
 
 
 def spaced_settings(least: float, most: float, count: int) -> tuple[float, ...]:
-    """Evenly from one to the other, of two digits each and never more than the latter."""
+    """Evenly spaced settings of two digits, none above `most`."""
     top = floor_significant(most)
     return tuple(sorted({min(round_significant(v), top) for v in np.linspace(least, top, count).tolist() if v > 0}))
 
@@ -154,15 +157,17 @@ def spaced_settings(least: float, most: float, count: int) -> tuple[float, ...]:
 
 
 def _weighed(robot: Robot, at: Array) -> Array:
-    """Mass beyond the stated one, so that it does not matter how that was come by."""
+    """Mass in addition to the stated one, so that its origin does not matter."""
     still = State(*(jnp.zeros(()),) * 4)
     stated = setups.without(robot, "mass")
     loads = [Conditions(configuration=k.astype(int), payload=m) for k, m in at]
-    return jnp.stack([balances.begin(robot, c, still).mass - balances.begin(stated, c, still).mass for c in loads])
+    return jnp.stack(
+        [balances.begin_signals(robot, c, still).mass - balances.begin_signals(stated, c, still).mass for c in loads]
+    )
 
 
 def _show(robot: Robot, channel: str, signals: Sequence[Signals]) -> Array:
-    """What the instrument of a channel shows of signals that are known otherwise."""
+    """Readings of a channel's instrument for known signals."""
     return jnp.stack([jnp.asarray(balances.sensor(robot, s)[channel]) for s in signals])
 
 
@@ -180,7 +185,7 @@ def _timed(robot: Robot, at: Array) -> Array:
 
 @dataclasses.dataclass(frozen=True)
 class _Zero:
-    """What the instrument of a channel shows of a robot at rest whose motors are off."""
+    """Reading of a channel's instrument for a robot at rest with its motors off."""
 
     channel: str
 
@@ -188,8 +193,8 @@ class _Zero:
         return _show(robot, self.channel, [Signals(current=0.0, voltage=0.0, torque_output=0.0)])
 
 
-def acts(reach: Reach) -> tuple[Act, ...]:
-    """The calibration acts, the least effort first; none of an instrument that the table's bench lacks."""
+def calibration_acts(reach: Reach) -> tuple[Act, ...]:
+    """Calibration acts, the least effort first, without those of instruments that the table's bench lacks."""
     payload = round_significant(max(u.payloads[-1] for u in reach.used))
     loads = (0.0, payload) if payload > 0 else (0.0,)
     total = reach.current * reach.motors
@@ -200,28 +205,28 @@ def acts(reach: Reach) -> tuple[Act, ...]:
     weighing = Act("weigh", ("weigh",), _weighed, at, 0.02, repeats=1)
     ammeter = [
         Act("zero current", ("zero current",), _shunted, ((0.0,),), 0.02),
-        Act("shunt", ("shunt",), _shunted, _each(amperes), 0.02),
+        Act("shunt", ("shunt",), _shunted, _one_tuple_each(amperes), 0.02),
     ]
-    strobe = Act("strobe", ("strobe",), _strobed, _each(turning), 5 * RPM)
-    timing = Act("timing", ("timing",), _timed, _each(paces), 3e-3)
-    found = [weighing] * reach.has_ground
-    found += ammeter * ("total_current" in reach.measured)
-    meters = [c for c in channels.rows(reach.measured) if c.misses_zero]
-    found += [
+    strobe = Act("strobe", ("strobe",), _strobed, _one_tuple_each(turning), 5 * RPM)
+    timing = Act("timing", ("timing",), _timed, _one_tuple_each(paces), 3e-3)
+    acts = [weighing] * reach.has_ground
+    acts += ammeter * ("total_current" in reach.measured)
+    meters = [c for c in channels.channels_named(reach.measured) if c.misses_zero]
+    acts += [
         Act(f"zero of {c.label}", ("zero reading",), _Zero(c.name), ((0.0,),), None, channel=c.name) for c in meters
     ]
-    found += [strobe] * ("motor_speed" in reach.measured)
-    found += [timing] * ("speed" in reach.measured)
-    return tuple(found)
+    acts += [strobe] * ("motor_speed" in reach.measured)
+    acts += [timing] * ("speed" in reach.measured)
+    return tuple(acts)
 
 
-def _each(values: Sequence[float]) -> tuple[tuple[float, ...], ...]:
+def _one_tuple_each(values: Sequence[float]) -> tuple[tuple[float, ...], ...]:
     return tuple((v,) for v in values)
 
 
 # --- runs -------------------------------------------------------------------------------------------
 
-#: What is read where nothing travels, and where nothing turns.
+#: Channels to read if nothing travels, and if nothing turns.
 TURNING, STANDING = ("total_current", "motor_speed"), ("total_current",)
 
 
@@ -242,7 +247,7 @@ def _runs(
     steepest: bool = False,
     torques: Sequence[float] = (0.0,),
 ) -> Run:
-    """Runs under every combination of slopes, voltages and torques of a brake, where there is one."""
+    """Runs under every combination of slopes, voltages and, with a brake, its torques."""
     each = list(itertools.product(dict.fromkeys(slopes), dict.fromkeys(voltages), dict.fromkeys(torques)))
     slope, voltage, torque = (tuple(x) for x in zip(*each, strict=True))
     own = (at.configuration,) if at is not None else ()
@@ -255,31 +260,31 @@ def _runs(
 
 
 def other_voltages(reach: Reach, used: tuple[float, ...]) -> tuple[float, ...]:
-    """Four voltages that a table lacks: below its lowest, in its widest gaps, above if the motors are rated so."""
-    found = [round_significant(0.55 * used[0])]
+    """Four voltages missing in a table: below its lowest, in its widest gaps, above if the motors allow it."""
+    voltages = [round_significant(0.55 * used[0])]
     if reach.voltage > used[-1]:
-        found.append(floor_significant(reach.voltage))
+        voltages.append(floor_significant(reach.voltage))
     levels = [0.55 * used[0], *used] if len(used) == 1 else list(used)
-    while len(found) < 4:
+    while len(voltages) < 4:
         low, high = max(itertools.pairwise(levels), key=lambda gap: gap[1] - gap[0])
         levels = sorted([*levels, 0.5 * (low + high)])
-        found.append(round_significant(0.5 * (low + high)))
-    return tuple(sorted(set(found)))
+        voltages.append(round_significant(0.5 * (low + high)))
+    return tuple(sorted(set(voltages)))
 
 
 def other_torques(used: Sequence[float]) -> tuple[float, ...]:
-    """Three torques of a brake that a table lacks, in its widest gaps from none on, and the largest that it used."""
+    """Three brake torques missing in a table, in its widest gaps from zero, and the largest that it used."""
     levels = sorted({0.0, *used})
-    found: list[float] = []
-    while len(found) < 3 and levels[-1] > 0:
+    torques: list[float] = []
+    while len(torques) < 3 and levels[-1] > 0:
         low, high = max(itertools.pairwise(levels), key=lambda gap: round_significant(gap[1] - gap[0], 6))
         levels = sorted([*levels, 0.5 * (low + high)])
-        found.append(round_significant(0.5 * (low + high)))
-    return tuple(sorted({*found, floor_significant(levels[-1]) if levels[-1] > 0 else 0.0}))
+        torques.append(round_significant(0.5 * (low + high)))
+    return tuple(sorted({*torques, floor_significant(levels[-1]) if levels[-1] > 0 else 0.0}))
 
 
-def _travels(reach: Reach, used: Used) -> tuple[Run, ...]:
-    """Runs that are done with one configuration."""
+def _travel_runs(reach: Reach, used: Used) -> tuple[Run, ...]:
+    """Runs with one configuration."""
 
     volts = used.voltages
     ends, three = (volts[0], volts[-1]), (volts[0], volts[len(volts) // 2], volts[-1])
@@ -287,7 +292,7 @@ def _travels(reach: Reach, used: Used) -> tuple[Run, ...]:
     some, more, most = inclines[(len(inclines) - 1) // 2], inclines[max(len(inclines) - 2, 0)], inclines[-1]
     air, payload = spaced_settings(0.2 * reach.geared, reach.geared, 5), round_significant(used.payload)
     runs = functools.partial(_runs, reach, at=used)
-    found = [
+    experiments = [
         runs("reverse", "backwards", setups.reversed_, voltages=ends, slopes=(0.0, -some)),
         runs("downhill", "about", voltages=ends, slopes=(-inclines[0], -some)),
         runs("lifted", "lifted", setups.lifted, voltages=air, read=TURNING),
@@ -303,17 +308,17 @@ def _travels(reach: Reach, used: Used) -> tuple[Run, ...]:
     lacks = {
         "downhill": most == 0, "steepest slope": most == 0, "payload": payload == 0, "one motor": reach.motors == 1,
     }  # fmt: skip
-    return tuple(r for r in found if not lacks.get(r.kinds[0], False))
+    return tuple(r for r in experiments if not lacks.get(r.kinds[0], False))
 
 
-def _alone(reach: Reach) -> tuple[Run, ...]:
+def _motor_runs(reach: Reach) -> tuple[Run, ...]:
     """Runs of the motors without the robot."""
     volts = spaced_settings(0.2 * reach.alone, reach.alone, 5)
     stalling = spaced_settings(
         0.5 * reach.current * reach.resistance, min(reach.current * reach.resistance, reach.voltage), 2
     )
     brake = round_significant(0.6 * reach.torque_constant * reach.current, 1)
-    found = [
+    experiments = [
         _runs(reach, "bare motor", "alone", setups.bare, voltages=volts, read=TURNING),
         _runs(reach, "stall", "held", setups.blocked, voltages=stalling, read=STANDING),
         _runs(reach, "stall, one motor", "one held", setups.blocked, kinds=("stall", "one motor"), voltages=stalling,
@@ -321,24 +326,23 @@ def _alone(reach: Reach) -> tuple[Run, ...]:
         _runs(reach, "braked motor", "braked", setups.braked,
               voltages=spaced_settings(0.4 * reach.alone, reach.alone, 3), read=TURNING, brake=brake),
     ]  # fmt: skip
-    return tuple(r for r in found if reach.motors > 1 or r.sides is None)
+    return tuple(r for r in experiments if reach.motors > 1 or r.sides is None)
 
 
-def menu(reach: Reach) -> tuple[Experiment, ...]:
-    """What can be done within reach, in the order of the effort, the least first.
+def experiment_menu(reach: Reach) -> tuple[Experiment, ...]:
+    """Experiments within reach, in the order of their effort, the least first.
 
-    What the robot cannot do (climb that slope, move at that voltage) only its readings show: see `possible`.
+    Limits of the robot (steep slopes, low voltages) show only in its predicted readings: see `possible_runs`.
     """
     if reach.imposed != "voltage" or not reach.has_ground:
-        runs: tuple[Run, ...] = tuple(r for used in reach.used for r in _turns(reach, used))
+        runs: tuple[Run, ...] = tuple(r for used in reach.used for r in _shaft_runs(reach, used))
     else:
-        runs = (*_alone(reach), *(r for used in reach.used for r in _travels(reach, used)))
-    return (*acts(reach), *(r for r in runs if r.channels))
+        runs = (*_motor_runs(reach), *(r for used in reach.used for r in _travel_runs(reach, used)))
+    return (*calibration_acts(reach), *(r for r in runs if r.channels))
 
 
-def _turns(reach: Reach, used: Used) -> tuple[Run, ...]:
-    """Runs of a load on a shaft, or of motors whose speed or current is imposed: at other levels, and the other way
-    round."""
+def _shaft_runs(reach: Reach, used: Used) -> tuple[Run, ...]:
+    """Runs of a load on a shaft, or with imposed speed or current: at other levels, and in the other direction."""
     others_of = {"voltage": "other voltages", "motor_speed": "other speeds", "motor_current": "other currents"}
     levels = used.voltages if reach.imposed == "voltage" else reach.levels
     sizes = tuple(sorted({round_significant(abs(x)) for x in levels if x})) or (1.0,)
@@ -353,8 +357,8 @@ def _turns(reach: Reach, used: Used) -> tuple[Run, ...]:
     )
     both = any(x < 0 for x in levels) and any(x > 0 for x in levels)
     torques = other_torques(reach.torques)
-    way = -1.0 if levels[-1] > 0 else 1.0  # of a brake too, which is against the rotation
-    found = [
+    way = -1.0 if levels[-1] > 0 else 1.0  # also of a brake, which acts against the rotation
+    experiments = [
         _runs(reach, others_of[reach.imposed], "run", kinds=("other voltages",), at=used,
               voltages=others),
         *([] if both else [
@@ -366,7 +370,7 @@ def _turns(reach: Reach, used: Used) -> tuple[Run, ...]:
                   torques=[-way * x for x in torques])
         ] if max(reach.torques, default=0.0) > 0 else []),
     ]  # fmt: skip
-    return tuple(dataclasses.replace(r, imposed=reach.imposed) for r in found)
+    return tuple(dataclasses.replace(r, imposed=reach.imposed) for r in experiments)
 
 
 def check_forbidden(forbidden: Sequence[str], robot: Robot) -> None:
@@ -375,20 +379,22 @@ def check_forbidden(forbidden: Sequence[str], robot: Robot) -> None:
     Raises:
         BadConfiguration: such a name, with the choices.
     """
-    known = (*KINDS, *robot.configurations)
+    allowed = (*KINDS, *robot.configurations)
     for name in forbidden:
-        if name not in known:
-            raise BadConfiguration(f"--forbid {name}: no such experiment or configuration; {choices(name, known)}")
+        if name not in allowed:
+            raise BadConfiguration(
+                f"--forbid {name}: no such experiment or configuration; {allowed_words(name, allowed)}"
+            )
 
 
-# --- what of it is possible ---------------------------------------------------------------------------
+# --- possible experiments -----------------------------------------------------------------------------
 
 
-def possible(run: Run, does: np.ndarray) -> np.ndarray:
-    """Which runs to carry out: of the slopes, voltages and payloads only those that the robot manages all of.
+def possible_runs(run: Run, does: np.ndarray) -> np.ndarray:
+    """True for runs to carry out: only slopes, voltages and payloads in all combinations that the robot can do.
 
     Args:
-        does: whether the robot manages each run, shape (runs,).
+        does: True for runs that the robot can do, shape (runs,).
     """
     kept = np.ones(len(does), bool)
     axes = [np.asarray(x) for x in (run.slope, run.voltage, run.payload, run.torque) if len(x)]
@@ -401,12 +407,12 @@ def possible(run: Run, does: np.ndarray) -> np.ndarray:
     return kept
 
 
-def carried_out(run: Run, kept: np.ndarray, temperature: np.ndarray, speed: np.ndarray, reach: Reach) -> Run:
-    """A run of what is possible, with what to watch.
+def restrict_run(run: Run, kept: np.ndarray, temperature: np.ndarray, speed: np.ndarray, reach: Reach) -> Run:
+    """A run with only its possible conditions, and with the risks to watch.
 
     Args:
-        kept: by `possible`; temperature: of a winding after long running [°C]; speed: of the motor shaft [rad/s]; as
-            foreseen, shape (runs,).
+        kept: by `possible_runs`; temperature: of a winding after long running [°C]; speed: of the motor shaft
+            [rad/s]; both predicted, shape (runs,).
     """
     voltage, slope, payload, torque = (
         tuple(v for v, k in zip(x, kept, strict=True) if k) if x else ()

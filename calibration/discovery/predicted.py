@@ -1,4 +1,4 @@
-"""What any robot would show in the experiments of a menu, all in one batch."""
+"""Predictions of a menu's experiments for any robot, in one batch."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ from mmrjax.fidelities.steady import IMPLICIT
 from mmrjax.model import channels
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.robot import Robot
-from mmrjax.model.signals import STALLED, done
+from mmrjax.model.signals import STALLED, is_done
 
 T = TypeVar("T")
-#: Mass of a robot whose weight is carried by stands [kg]: none, but for the sake of ratios to its load.
+#: Mass of a robot on stands [kg]: nearly zero, but its ratio to the load is defined.
 UNLOADED = 1e-9
 
 
 class Batch(eqx.Module):
-    """Experiments as one batch: what is compiled depends on their kinds and sizes, not on their conditions.
+    """Experiments as one batch; the compiled program depends on their kinds and sizes, not on their conditions.
 
     Attributes:
-        acts: reading of each; at: what each sets, see `Act`.
-        conditions: of every run, of all experiments in turn, shape (runs,).
-        brake: torque of the brake, of every run [N·m].
-        set_up: how the robot is set up and how many motors are on, each pair once; which: of every run.
-        read: positions of the channels that are read of each experiment, and how many runs it has.
-        order: position of each experiment among the acts, or behind them among the runs.
+        acts: reading function of each; at: settings of each, see `Act`.
+        conditions: of the runs of all experiments, in order, shape (runs,).
+        brake: torque of the brake in each run [N·m].
+        set_up: distinct pairs of the robot's setup and the number of motors that are on; which: pair of each run.
+        read: positions of the channels to read in each experiment, and its number of runs.
+        order: position of each experiment among the acts followed by the runs.
     """
 
     acts: tuple[Callable[[Robot, Array], Array], ...] = eqx.field(static=True)
@@ -50,13 +50,13 @@ class Batch(eqx.Module):
 
 
 class Predicted(eqx.Module):
-    """What a robot shows in a batch.
+    """Predicted readings of a batch.
 
     Attributes:
-        value: of every reading [SI]; exists: whether the robot shows it: one that slides or stands still where it
-            should travel shows nothing; shape (readings,).
-        does: the same of every run; grip: share of the adhesion that it uses [-]; temperature: of a winding after
-            long running [°C]; speed: of the motor shaft [rad/s]; shape (runs,).
+        value: of each reading [SI]; exists: True if the robot has it: not if it slides, or stands still instead of
+            travelling; shape (readings,).
+        does: the same for each run; grip: used share of the adhesion [-]; temperature: of a winding after long
+            running [°C]; speed: of the motor shaft [rad/s]; shape (runs,).
     """
 
     value: Float[Array, " readings"]
@@ -67,8 +67,8 @@ class Predicted(eqx.Module):
     speed: Float[Array, " runs"]
 
 
-def batch(experiments: Sequence[Experiment], shown: tuple[str, ...]) -> Batch:
-    """These experiments as one batch, of a robot with these channels."""
+def batch_experiments(experiments: Sequence[Experiment], shown: tuple[str, ...]) -> Batch:
+    """These experiments as one batch, for a robot with these channels."""
     acts = [e for e in experiments if isinstance(e, Act)]
     runs = [e for e in experiments if isinstance(e, Run)]
     set_up = list(dict.fromkeys((r.setup, r.sides) for r in runs))
@@ -87,7 +87,7 @@ def batch(experiments: Sequence[Experiment], shown: tuple[str, ...]) -> Batch:
 
 
 def _conditions(run: Run) -> Conditions:
-    # None would take the robot's own mass, which a batch with the others cannot.
+    # None would mean the robot's own mass, which cannot be in a batch with other masses.
     mass = UNLOADED if run.setup in setups.WEIGHTLESS else math.nan
     torque = run.torque or None
     if run.imposed != "voltage":
@@ -98,9 +98,9 @@ def _conditions(run: Run) -> Conditions:
     return Conditions(run.configuration, run.voltage, run.slope, run.payload, total_mass=mass, load_torque=torque)
 
 
-def of_runs(function: Callable[..., T], robot: Robot, experiments: Batch, *own: Array) -> T:
-    """`function` of the robot as it is set up for every run, under what conditions, and of what each run has of its
-    own; a leading axis of runs."""
+def map_over_runs(function: Callable[..., T], robot: Robot, experiments: Batch, *own: Array) -> T:
+    """`function` of the robot as set up for each run, its conditions, and further values of each run; the leading
+    axis is the runs."""
     conditions = experiments.conditions
     mass = jax.vmap(lambda k: robot.chassis(k).mass)(conditions.configuration) + conditions.payload
     stated = jnp.asarray(conditions.total_mass)
@@ -112,7 +112,7 @@ def of_runs(function: Callable[..., T], robot: Robot, experiments: Batch, *own: 
     ]
     which = np.asarray(experiments.which)
 
-    def same(*x: Any) -> bool:  # whatever the setup
+    def same(*x: Any) -> bool:  # in all setups
         return all(v is x[0] for v in x)
 
     robots = jax.tree.map(lambda *x: x[0] if same(*x) else jnp.stack([jnp.asarray(v) for v in x])[which], *each)
@@ -120,29 +120,29 @@ def of_runs(function: Callable[..., T], robot: Robot, experiments: Batch, *own: 
     return jax.vmap(function, in_axes=(axes, 0, *[0] * len(own)))(robots, conditions, *own)
 
 
-def readings(
+def predict_readings(
     robot: Robot, experiments: Batch, unknowns: Float[Array, "runs unknowns"], found: Bool[Array, " runs"]
 ) -> tuple[tuple[tuple[Array, ...], Array, Array], Predicted]:
-    """What the robot shows in every act, what in every run at some unknowns, shape (runs, channels), and what its
-    equations leave there, (runs, unknowns); and all that it shows."""
+    """Readings of each act, readings of each run at some unknowns, shape (runs, channels), residuals of its equations
+    there, (runs, unknowns); and all predictions."""
     acts = tuple(act(robot, at) for act, at in zip(experiments.acts, experiments.at, strict=True))
-    result, _, left = of_runs(IMPLICIT.shown, robot, experiments, unknowns, found)
-    every = jnp.stack([result.reading[c] for c in channels.names(robot.channels)], -1)
+    result, _, left = map_over_runs(IMPLICIT.shown, robot, experiments, unknowns, found)
+    every = jnp.stack([result.reading[c] for c in channels.channel_names(robot.channels)], -1)
     held = np.array([experiments.set_up[k][0] is setups.blocked for k in experiments.which])
-    does = jnp.where(jnp.asarray(held), result.status == STALLED, done(result.status))
-    exists = arranged(
+    does = jnp.where(jnp.asarray(held), result.status == STALLED, is_done(result.status))
+    exists = arrange_readings(
         experiments, [jnp.ones(a.shape, bool) for a in acts], jnp.broadcast_to(does[:, None], every.shape)
     )
     speed = jnp.where(jnp.asarray(held), 0.0, result.reading["motor_speed"])
     shown = Predicted(
-        arranged(experiments, acts, every), exists, does, jnp.asarray(result.adhesion_used),
+        arrange_readings(experiments, acts, every), exists, does, jnp.asarray(result.adhesion_used),
         jnp.asarray(result.winding_settled), speed,
     )  # fmt: skip
     return (acts, every, left), shown
 
 
-def arranged(experiments: Batch, acts: Sequence[Array], every: Float[Array, "runs channels ..."]) -> Array:
-    """What is known of the readings of every act, and of every run by channel, in the order of the readings."""
+def arrange_readings(experiments: Batch, acts: Sequence[Array], every: Float[Array, "runs channels ..."]) -> Array:
+    """Values of each act, and of each run by channel, in the order of the readings."""
     parts, first = list(acts), 0
     for read, runs in experiments.read:
         of_run = every[first : (first := first + runs)][:, list(read)]
@@ -150,34 +150,34 @@ def arranged(experiments: Batch, acts: Sequence[Array], every: Float[Array, "run
     return jnp.concatenate([parts[k] for k in experiments.order])
 
 
-# --- where they stand -------------------------------------------------------------------------------
+# --- positions --------------------------------------------------------------------------------------
 
 
-def size(experiment: Experiment) -> int:
-    """How many readings an experiment has, repeats averaged."""
+def reading_count(experiment: Experiment) -> int:
+    """Number of readings of an experiment, with repeats averaged."""
     if isinstance(experiment, Act):
         return len(experiment.at)
     return len(experiment.voltage) * len(experiment.channels)
 
 
-def spans(experiments: Sequence[Experiment]) -> dict[str, slice]:
-    """Where the readings of each experiment stand in those of all."""
-    ends = np.cumsum([size(e) for e in experiments]).tolist()
-    return {e.name: slice(end - size(e), end) for e, end in zip(experiments, ends, strict=True)}
+def reading_spans(experiments: Sequence[Experiment]) -> dict[str, slice]:
+    """Slice of each experiment's readings among all readings."""
+    ends = np.cumsum([reading_count(e) for e in experiments]).tolist()
+    return {e.name: slice(end - reading_count(e), end) for e, end in zip(experiments, ends, strict=True)}
 
 
-def sds(experiments: Sequence[Experiment], of_channels: Mapping[str, float]) -> np.ndarray:
-    """Sd of every reading [SI], repeats averaged; runs, and zeros, are read with the instruments of the table.
+def reading_sds(experiments: Sequence[Experiment], of_channels: Mapping[str, float]) -> np.ndarray:
+    """Sd of each reading [SI], with repeats averaged; runs, and zeros, are read with the instruments of the table.
 
     Args:
         of_channels: sds of its channels [SI], by name.
     """
-    found = [np.zeros(0)]
+    sds = [np.zeros(0)]
     for e in experiments:
         one = (
             [of_channels[e.channel] if e.sd is None else e.sd] * len(e.at)
             if isinstance(e, Act)
             else np.tile([of_channels[c] for c in e.channels], len(e.voltage))
         )
-        found.append(np.asarray(one, float) / math.sqrt(e.repeats))
-    return np.concatenate(found)
+        sds.append(np.asarray(one, float) / math.sqrt(e.repeats))
+    return np.concatenate(sds)

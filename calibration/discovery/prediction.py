@@ -1,6 +1,6 @@
-"""What sets of effects predict of data that their fits have not seen, and which of them is proposed by that.
+"""Hold-out predictions of sets of effects, and the choice of a set by them.
 
-One score serves all: the log density of every reading of every kind of block, by a fit without its block.
+One score serves all: the log density of each reading for each kind of block, by a fit without its block.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from calibration.data.runs import Runs
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.candidates import Candidate
 from calibration.inference import blocks as blocks_room
-from calibration.inference.held_out import unseen
+from calibration.inference.held_out import predict_unseen
 
-#: Degrees of freedom of Student's t that a reading is scored by: one that is far off does not decide alone.
+#: Degrees of freedom of Student's t for the score of a reading, so that a single outlier does not decide.
 FREEDOM = 4.0
-#: As how far off a reading counts that a fit does not predict, its robot sliding or failing there [σ].
+#: Error assigned to a reading without a prediction, because its robot slides or fails there [σ].
 UNREACHED = 12.0
-#: By how much what is written may predict worse than the refit [nat a reading].
+#: Largest loss of a written fit's predictions compared with the refit's [nat a reading].
 WORSE = 0.05
 
 Readings = Float[np.ndarray, "rows channels"]
@@ -30,12 +30,12 @@ Readings = Float[np.ndarray, "rows channels"]
 
 @dataclasses.dataclass(frozen=True)
 class HeldOutScore:
-    """Scores of a fit.
+    """Hold-out scores of a fit.
 
     Attributes:
-        by_kind: kind of block → log density of each reading, NaN where none counts; shape (rows, channels).
+        by_kind: kind of block → log density of each reading, NaN for excluded ones; shape (rows, channels).
         blocks: kind of block → index of each row's block, -1 for none.
-        reading: kind of block → what was scored.
+        reading: kind of block → the scored predictions.
     """
 
     by_kind: dict[str, Readings]
@@ -43,17 +43,17 @@ class HeldOutScore:
     reading: dict[str, Readings] = dataclasses.field(default_factory=dict)
 
     def only(self, kind: str) -> HeldOutScore:
-        """Scores of one kind of block alone."""
+        """Scores of one kind of block."""
         return HeldOutScore({kind: self.by_kind[kind]}, {kind: self.blocks[kind]})
 
     def gain(
         self, over: HeldOutScore, where: Bool[np.ndarray, "rows channels"] | None = None, fewest: int = 2
     ) -> Gain:
-        """How much better it is than another's, over the readings of both.
+        """Gain over another score, over the readings of both.
 
         Args:
-            where: readings that count; None: all.
-            fewest: blocks of a kind from which on their scatter counts: that of two has one degree of freedom.
+            where: True for included readings; None: all.
+            fewest: fewest blocks of a kind whose scatter counts: that of two has one degree of freedom.
         """
         if not self.by_kind:
             return Gain(0.0, np.inf)
@@ -66,19 +66,19 @@ class HeldOutScore:
         if not total:
             return Gain(0.0, np.inf)
         mean = float(np.nansum(each) / total)
-        # Of rows, and of the blocks of each kind, whose readings share what was not seen.
+        # Errors by row, and by block of each kind, because readings of a block share the rows that were left out.
         off = np.nansum(each, (0, 2)) - mean * counts
         several = [by for by in self.blocks.values() if len(np.unique(by[by >= 0])) >= fewest]
         groups = [np.arange(len(rows)), *several]
-        return Gain(mean, max(_error(off[rows], by[rows]) for by in groups) / total)
+        return Gain(mean, max(_clustered_standard_error(off[rows], by[rows]) for by in groups) / total)
 
 
 @dataclasses.dataclass(frozen=True)
 class Gain:
-    """A difference of two scores and its standard error [nat a reading].
+    """Difference of two scores and its standard error [nat a reading].
 
     Attributes:
-        errors: standard error by kind of block, where `se` is their mean; else empty.
+        errors: standard error by kind of block, if `se` is their mean; else empty.
     """
 
     mean: float
@@ -86,26 +86,26 @@ class Gain:
     errors: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
 
-def _error(off: np.ndarray, groups: np.ndarray) -> float:
-    """Standard error of a sum whose terms belong together in groups."""
+def _clustered_standard_error(off: np.ndarray, groups: np.ndarray) -> float:
+    """Standard error of a sum with terms correlated within groups."""
     _, which = np.unique(groups, return_inverse=True)
     count = which.max() + 1
     sums = np.bincount(which, off)
     return float(np.sqrt(np.sum(sums**2) * count / (count - 1))) if count > 1 else 0.0
 
 
-def scored(
+def score_readings(
     reading: dict[str, Readings],
     measured: Readings,
     sd: Readings,
     counts: Bool[np.ndarray, "rows channels"],
     kinds: Mapping[str, Mapping[str, np.ndarray]],
 ) -> HeldOutScore:
-    """Scores of readings held out.
+    """Scores of hold-out predictions.
 
     Args:
-        reading: kind of block → of each row, by a fit that has not seen its block; NaN where it predicts none.
-        counts: whether a reading does; kinds: of blocks, label → mask of its rows each.
+        reading: kind of block → predictions of each row by a fit without its block; NaN for none.
+        counts: True for included readings; kinds: of blocks, label → mask of its rows each.
     """
     by_kind, blocks = {}, {}
     norm = math.lgamma((FREEDOM + 1) / 2) - math.lgamma(FREEDOM / 2) - 0.5 * math.log(FREEDOM * math.pi)
@@ -121,44 +121,46 @@ def scored(
     return HeldOutScore(by_kind, blocks)
 
 
-#: `key` of a candidate → kind of block → what it predicts of each row, by a fit that has not seen its block.
+#: `candidate_key` of a candidate → kind of block → hold-out predictions of each row.
 Predicted = dict[tuple[tuple[str, ...], bytes], dict[str, Readings]]
 
 
-def key(candidate: Candidate) -> tuple[tuple[str, ...], bytes]:
-    """By which a fit finds again what it predicts of data held out."""
+def candidate_key(candidate: Candidate) -> tuple[tuple[str, ...], bytes]:
+    """Key of a candidate's hold-out predictions."""
     return candidate.active, np.asarray(candidate.z).tobytes()
 
 
-def score_of(space: CandidateSpace, runs: Runs, candidate: Candidate) -> HeldOutScore:
-    """Scores of a candidate, fitted anew without each block of every kind."""
-    data, rows, kinds = space.equipped.data, len(runs), blocks_room.predictable(runs, space.bare)
+def score_candidate(space: CandidateSpace, runs: Runs, candidate: Candidate) -> HeldOutScore:
+    """Scores of a candidate, refitted without each block of each kind."""
+    data, rows, kinds = space.equipped.data, len(runs), blocks_room.predictable_blocks(runs, space.bare)
     measured, sd, counts = (np.asarray(x)[:rows] for x in (data.measured, data.sd, space.weight > 0))
     problem, z, active = space.fit_of(candidate.active, candidate.z)
-    reading = {kind: unseen(problem, z, list(by.values()), active).reading for kind, by in kinds.items()}
-    return dataclasses.replace(scored(reading, measured, sd, counts, kinds), reading=reading)
+    reading = {kind: predict_unseen(problem, z, list(by.values()), active).reading for kind, by in kinds.items()}
+    return dataclasses.replace(score_readings(reading, measured, sd, counts, kinds), reading=reading)
 
 
-def smallest(
+def smallest_predictive_set(
     space: CandidateSpace,
     runs: Runs,
     base: Candidate,
     path: Sequence[Candidate],
     predicted: Predicted | None = None,
 ) -> Candidate | None:
-    """The smallest set of effects that predicts as well as the best one, to one standard error (the rule of Breiman,
-    Friedman, Olshen and Stone 1984, sec. 3.4.3); None where that is the base, or nothing can be held out.
+    """Smallest set of effects that predicts as well as the best one, within one standard error.
+
+    The rule is that of Breiman, Friedman, Olshen and Stone 1984, sec. 3.4.3. None if it is the base, or if no block
+    can be held out.
 
     Args:
         path: candidates by the number of their effects.
-        predicted: takes what each of them predicts of data held out.
+        predicted: collects the hold-out predictions of each.
     """
-    if not blocks_room.predictable(runs, space.bare):
+    if not blocks_room.predictable_blocks(runs, space.bare):
         return None
     candidates = [base, *path]
-    scores = [score_of(space, runs, c) for c in candidates]
+    scores = [score_candidate(space, runs, c) for c in candidates]
     if predicted is not None:
-        predicted |= {key(c): score.reading for c, score in zip(candidates, scores, strict=True)}
+        predicted |= {candidate_key(c): score.reading for c, score in zip(candidates, scores, strict=True)}
     best = scores[max(range(len(scores)), key=lambda k: scores[k].gain(scores[0]).mean)]
     for candidate, score in zip(candidates, scores, strict=True):
         behind = best.gain(score)

@@ -1,4 +1,4 @@
-"""What data held out say: which errors rise with what was found, and which alternative of a class predicts best."""
+"""Use of hold-out errors: errors that rise with the effects found, and the choice of a class's leader."""
 
 from __future__ import annotations
 
@@ -10,61 +10,63 @@ import numpy as np
 from calibration.data.runs import Runs
 from calibration.discovery import experiments
 from calibration.discovery.active_set import CandidateSpace
-from calibration.discovery.candidates import Candidate, fit_candidates, start
-from calibration.discovery.classes import Classes, families
+from calibration.discovery.candidates import Candidate, fit_candidates, start_of_fit
+from calibration.discovery.classes import Classes, families_of_members
 from calibration.discovery.loop_notes import DRAW, Led
 from calibration.discovery.result import Errors, HeldOutAlternative, Worse
-from calibration.discovery.search import Search, diagnose
+from calibration.discovery.search import Search, diagnose_candidate
 from calibration.discovery.settings import HELD_OUT, Settings
 from calibration.inference import blocks as blocks_room
 from calibration.inference.bases import Bases
-from calibration.inference.held_out import unseen
+from calibration.inference.held_out import predict_unseen
 
-#: Share of itself by which held-out errors have to differ to be told apart; less is not seen in two digits.
+#: Least relative difference of hold-out errors that counts; less is invisible in two digits.
 TOLD = 0.01
 
 
 # --- before and after -----------------------------------------------------------------------------------
 
 
-def worse(
+def worse_predictions(
     readings: Mapping[str, tuple[np.ndarray, np.ndarray]], errors: Callable[[np.ndarray], Errors]
 ) -> tuple[Worse, ...]:
-    """Every kind of block and channel in which the error of data held out rises, over the rows that both predict.
+    """Kinds of block and channels with a hold-out error that rises, over the rows that both fits predict.
 
     Args:
-        readings: kind of block → readings before and after [SI], NaN where a fit predicts none.
-        errors: of readings, by channel.
+        readings: kind of block → readings before and after [SI], NaN if a fit predicts none.
+        errors: function of readings to their errors, by channel.
     """
-    found = []
+    worse = []
     for kind, (before, after) in readings.items():
         both = np.isfinite(before) & np.isfinite(after)
         was, now = (errors(np.where(both, x, np.nan)) for x in (before, after))
         for channel, e in now.items():
             old, new = float(was[channel]["rms_percent"]), float(e["rms_percent"])
             if new > (1 + TOLD) * old:
-                found.append(Worse(kind, channel, int(e["rows"]), old, new))
-    return tuple(found)
+                worse.append(Worse(kind, channel, int(e["rows"]), old, new))
+    return tuple(worse)
 
 
 # --- among alternatives ---------------------------------------------------------------------------------
 
 
-def compared(space: CandidateSpace, runs: Runs, best: Candidate, alike: Classes) -> tuple[HeldOutAlternative, ...]:
-    """Held-out errors of a fit and of those with one effect replaced by a member of its class, that fit first.
+def compare_alternatives(
+    space: CandidateSpace, runs: Runs, best: Candidate, alike: Classes
+) -> tuple[HeldOutAlternative, ...]:
+    """Hold-out errors of a fit and of those with one effect replaced by a member of its class, that fit first.
 
-    Those that are not quite plausible cannot lead, and are left out. Empty where there is but one, or no block.
+    Members that are not plausible cannot lead, and are omitted. Empty for a single one, or without blocks.
     """
-    others = [c for c in experiments.alternatives(best, alike, stated=False).values() if c.plausible]
+    others = [c for c in experiments.alternatives_of_class(best, alike, stated=False).values() if c.plausible]
     data, rows = space.equipped.data, len(runs)
     measured, sd, counts = (np.asarray(x)[:rows] for x in (data.measured, data.sd, space.weight > 0))
-    kinds = blocks_room.predictable(runs, space.bare)
+    kinds = blocks_room.predictable_blocks(runs, space.bare)
     if len(others) < 2 or not kinds:
         return ()
 
     def sigma(c: Candidate, masks: list[np.ndarray]) -> np.ndarray:
         problem, z, active = space.fit_of(c.active, c.z)
-        reading = unseen(problem, z, masks, active).reading
+        reading = predict_unseen(problem, z, masks, active).reading
         return np.where(counts, (reading - measured) / sd, np.nan)
 
     errors = [{kind: sigma(c, list(by.values())) for kind, by in kinds.items()} for c in others]
@@ -89,85 +91,87 @@ def compared(space: CandidateSpace, runs: Runs, best: Candidate, alike: Classes)
 
 
 def _order(table: Sequence[HeldOutAlternative]) -> list[int]:
-    """Alternatives that predict no fewer readings than the best fit, which is the first, by their held-out error.
+    """Alternatives that predict no fewer readings than the best fit, which is the first, by their hold-out error.
 
-    Of those within `TOLD` of the smallest the best fit comes first: between these held-out data decide nothing.
+    The best fit precedes others within `TOLD` of the smallest error, because hold-out errors do not decide there.
     """
-    able = _able(table)
+    able = _full_predictors(table)
     least = min((table[k] for k in able), key=lambda a: a.rms_sigma)
-    return sorted(able, key=lambda k: (k != 0 or not _draw(table[0], least), table[k].rms_sigma))
+    return sorted(able, key=lambda k: (k != 0 or not _is_draw(table[0], least), table[k].rms_sigma))
 
 
-def _able(table: Sequence[HeldOutAlternative]) -> list[int]:
-    """Those that predict no fewer readings than the first."""
+def _full_predictors(table: Sequence[HeldOutAlternative]) -> list[int]:
+    """Indices of alternatives that predict no fewer readings than the first."""
     return [k for k, a in enumerate(table) if a.lost <= table[0].lost]
 
 
-def _draw(a: HeldOutAlternative, b: HeldOutAlternative) -> bool:
-    """Whether held-out data decide nothing between two."""
+def _is_draw(a: HeldOutAlternative, b: HeldOutAlternative) -> bool:
+    """True if hold-out errors do not decide between two."""
     return not a.rms_sigma > (1 + TOLD) * b.rms_sigma
 
 
 def prefer_by_held_out(
     space: CandidateSpace, runs: Runs, searched: Search, alike: Classes, bases: Bases, settings: Settings
 ) -> tuple[Search, Classes, tuple[HeldOutAlternative, ...]]:
-    """The search and its classes, led by the alternative that predicts data held out best, see `_order`.
+    """The search and its classes, led by the alternative with the best hold-out errors, see `_order`.
 
-    One that is not adequate where the best fit is does not lead.
+    An inadequate alternative does not lead if the best fit is adequate.
     """
     best, before = searched.best, searched.diagnosis
     if best is None or before is None:
         return searched, alike, ()
-    table = compared(space, runs, best, alike)
+    table = compare_alternatives(space, runs, best, alike)
     if not table:
         return searched, alike, ()
-    fitted = {c.key: c for c in experiments.alternatives(best, alike, stated=False).values()}
+    fitted = {c.key: c for c in experiments.alternatives_of_class(best, alike, stated=False).values()}
     for k in _order(table):
         leader = fitted[frozenset(table[k].effects)]
         if leader is best:
             break
         if not leader.simulated:
             (leader,) = fit_candidates(space, [(leader.active, leader.z)], settings)
-        diagnosis = diagnose(space, leader, bases, before.test.null, settings)
+        diagnosis = diagnose_candidate(space, leader, bases, before.test.null, settings)
         sound = before.test.rejected_with_margin or not diagnosis.test.rejected_with_margin
         if sound:
             led = tuple(dataclasses.replace(a, leads=j == k) for j, a in enumerate(table))
             searched = dataclasses.replace(searched, best=leader, diagnosis=diagnosis)
-            return searched, _led(space, best, leader, alike, settings), led
+            return searched, _classes_of_leader(space, best, leader, alike, settings), led
     return searched, alike, table
 
 
-def _led(space: CandidateSpace, best: Candidate, leader: Candidate, alike: Classes, settings: Settings) -> Classes:
-    """The classes of another leader: its effect comes first in its class; what is missing of them is fitted."""
+def _classes_of_leader(
+    space: CandidateSpace, best: Candidate, leader: Candidate, alike: Classes, settings: Settings
+) -> Classes:
+    """Classes of another leader, with its effect first in its class; missing members are fitted."""
     members = dict(zip(best.effects, alike.members, strict=True))
     (new,), (old,) = leader.key - best.key, best.key - leader.key
     members[new] = (new, *(n for n in members.pop(old) if n != new))
     stated = dict(zip(best.effects, alike.stated, strict=True))
     stated[new] = stated.pop(old)
-    known = {best.key, *(c.key for c in alike.ladder)}
+    keys = {best.key, *(c.key for c in alike.ladder)}
     wanted = [
         tuple(other if n == name else n for n in leader.active)
         for name in leader.effects
         for other in members[name][1:]
     ]
-    missing = [w for w in wanted if frozenset(n for n in w if n) not in known]
-    fitted = fit_candidates(space, [(w, start(space, leader, w, settings)) for w in missing], settings)
+    missing = [w for w in wanted if frozenset(n for n in w if n) not in keys]
+    fitted = fit_candidates(space, [(w, start_of_fit(space, leader, w, settings)) for w in missing], settings)
     return Classes(
         tuple(members[name] for name in leader.effects),
         tuple(stated[name] for name in leader.effects),
-        tuple(families(space, members[name]) for name in leader.effects),
+        tuple(families_of_members(space, members[name]) for name in leader.effects),
         (best, *alike.ladder, *fitted),
     )
 
 
-def remarks(table: Sequence[HeldOutAlternative], prefer: str) -> list[Led]:
-    """By what the leader was chosen among the alternatives, and whether the other way would have chosen another."""
+def leader_remarks(table: Sequence[HeldOutAlternative], prefer: str) -> list[Led]:
+    """Notes on the choice of the leader, and whether the other criterion would have chosen another."""
     if not table:
         return []
     shared = set.intersection(*(set(a.effects) for a in table))
     leader = next(k for k, a in enumerate(table) if a.leads)
     wins = _order(table)[0]
-    alike = any(_draw(table[k], table[0]) for k in _able(table)[1:])
+    alike = any(_is_draw(table[k], table[0]) for k in _full_predictors(table)[1:])
     return [
         Led(
             tuple(" and ".join(n for n in a.effects if n not in shared) for a in table),

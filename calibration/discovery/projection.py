@@ -1,4 +1,4 @@
-"""Linear algebra at one fit: columns projected against the free parameters, and the defect of a balance by row."""
+"""Linear algebra at a fit: columns projected against the free parameters, and the defect of a balance by row."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import dataclasses
 
 import numpy as np
 
-from calibration.inference.bases import signature
+from calibration.inference.bases import place_signature
 from calibration.inference.linearization import Linearization
 
 
 class Projection:
-    """What is left of any columns after the free parameters have been fitted again.
+    """Projection of columns on the complement of the free parameters, as if these were fitted again.
 
     Args:
         linear: at the base fit of settled rows; its prior rows are those of the free parameters.
@@ -36,26 +36,26 @@ class Projection:
 
 @dataclasses.dataclass(frozen=True)
 class Defect:
-    """What a place lacks in each row by itself, after what the free parameters absorb.
+    """Defect of a place in each row, after the free parameters have absorbed their part.
 
     Attributes:
-        value, sd: [unit of the place], shape (rows,); NaN where the readings do not show it.
+        value, sd: [unit of the place], shape (rows,); NaN if the readings do not show it.
     """
 
     value: np.ndarray
     sd: np.ndarray
 
 
-def defect(linear: Linearization, place: str) -> Defect:
-    """The defect of a place in each row: least squares of the row's residual along its sensitivity.
+def defect_by_row(linear: Linearization, place: str) -> Defect:
+    """Defect of a place in each row: least squares of the row's residual along its sensitivity.
 
     δ_i = -(r_i·e) / ‖r_i‖², sd 1/‖r_i‖, r_i = (I - P) g_i, g_i the change of all readings by a defect of row i
-    (of histories: at that instant, falling to zero at the knots beside it; NaN between knots).
+    (of histories: at that instant, falling to zero at the neighbouring knots; NaN between knots).
     """
     places = linear.places()
     shapes = np.zeros((linear.rows, len(places)))
     shapes[places, np.arange(len(places))] = 1.0
-    columns = signature(linear, place, shapes)
+    columns = place_signature(linear, place, shapes)
     a, b = Projection(linear)(columns)
     norm2, whole = np.diag(a), np.sum(columns**2, 0)
     seen = norm2 > 1e-6 * np.maximum(whole, 1e-300)

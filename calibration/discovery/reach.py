@@ -1,4 +1,4 @@
-"""What is within reach of whoever measured a table: the ranges that it used, and what the robot's makers allow."""
+"""Reach of whoever measured a table: the ranges that it used, and limits of the robot's makers."""
 
 from __future__ import annotations
 
@@ -12,17 +12,16 @@ from mmrjax.model import channels
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.robot import Robot
 
-#: How much more than the table's a payload and a slope may be: as factors, and of the payload also as a share of the
-#: largest total mass [-]. Voltages are never more, unless the robot states what its motors are good for.
+#: Largest payload and slope compared with the table's: as factors, and for the payload also as a share of the
+#: largest total mass [-]. Voltages are not increased, unless the robot states its motors' limit.
 PAYLOAD, MASS, SLOPE = 1.5, 0.2, 1.15
-#: A motor whose table holds no steady travel is taken to run at these shares of its stall current and of its speed
-#: without load [-].
+#: Assumed shares of stall current and of no-load speed for a motor with a table without steady travel [-].
 LOADED, RUNNING = 0.3, 0.8
 
 
 @dataclasses.dataclass(frozen=True)
 class Used:
-    """What a table used of one configuration, each increasing and without repeats.
+    """Ranges that a table used of one configuration, each increasing and without repeats.
 
     Attributes:
         configuration: its name; index: in the robot.
@@ -39,36 +38,36 @@ class Used:
 
     @property
     def steepest(self) -> float:
-        """Largest angle of the slope, whichever way the robot went [deg]."""
+        """Largest angle of the slope, in either direction [deg]."""
         return max(abs(s) for s in self.slopes)
 
     @property
     def payload(self) -> float:
-        """The largest that the robot may be given [kg]: 0 where the table holds none."""
+        """Largest payload that the robot may carry [kg]: 0 if the table has none."""
         most = self.payloads[-1]
         return min(PAYLOAD * most, most + MASS * self.mass)
 
 
 @dataclasses.dataclass(frozen=True)
 class Reach:
-    """What experiments with a robot may use.
+    """Limits of experiments with a robot.
 
     Attributes:
-        used: of each configuration that the table holds.
-        measured: names of the channels that it holds.
-        voltage: highest of runs under load [V]; geared, alone: of motors that turn their gearboxes alone, or nothing.
-        current: largest of one motor in steady travel [A], and what it bears for long.
+        used: of each configuration in the table.
+        measured: names of the channels in the table.
+        voltage: highest of runs under load [V]; geared, alone: of motors with only their gearboxes, or with nothing.
+        current: largest of one motor in steady travel [A], within its continuous limit.
         motor_speed [rad/s], speed [m/s]: largest in steady travel.
-        limit_geared, limit_alone: speeds of the motor shaft that its gearbox and itself are good for, or which the
-            table went to [rad/s].
-        motors: how many are driven alike.
+        limit_geared, limit_alone: speed limits of the motor shaft with its gearbox and alone, or the table's largest
+            speed [rad/s].
+        motors: number of motors driven in the same way.
         resistance [ohm], torque_constant [N·m/A]: of one.
-        hot: temperature of a winding that is too hot [°C].
-        imposed: on the motors, see `Rig`; levels: of speed [rad/s] or current [A] that the table
-            used, where these are imposed.
-        has_ground: whether a ground carries it.
-        duties: sizes of the driver's duty that the table used [-].
-        torques: sizes of a brake's torque that it used [N·m]; empty where it states none, so that there is no brake.
+        hot: temperature limit of a winding [°C].
+        imposed: quantity on the motors, see `Rig`; levels: of speed [rad/s] or current [A] that the table
+            used, if these are imposed.
+        has_ground: True if it is carried by a ground.
+        duties: magnitudes of the driver's duty that the table used [-].
+        torques: magnitudes of a brake's torque that it used [N·m]; empty without a brake.
     """
 
     used: tuple[Used, ...]
@@ -93,7 +92,7 @@ class Reach:
 
     @property
     def voltages(self) -> tuple[float, ...]:
-        """All that the table used [V]."""
+        """All voltages that the table used [V]."""
         return tuple(sorted({v for u in self.used for v in u.voltages}))
 
 
@@ -101,24 +100,24 @@ def _levels(x: np.ndarray) -> tuple[float, ...]:
     return tuple(np.unique(np.round(x, 6)).tolist())
 
 
-def reach(robot: Robot, conditions: Conditions, measured: tuple[str, ...]) -> Reach:
-    """What a table's robot may be asked for next.
+def reach_of_table(robot: Robot, conditions: Conditions, measured: tuple[str, ...]) -> Reach:
+    """Limits of the next experiments with a table's robot.
 
     Args:
-        robot: as its file states it, or fitted; conditions: of the table's runs, shape (runs,).
-        measured: names of the channels that the table holds.
+        robot: as in its file, or fitted; conditions: of the table's runs, shape (runs,).
+        measured: names of the channels in the table.
     """
     which, volts, slope, payload = (
         np.asarray(x)
         for x in (conditions.configuration, conditions.voltage, conditions.slope_deg, conditions.payload)
     )
-    own = np.asarray([float(c.mass) for c in robot.configurations.members])
+    masses = np.asarray([float(c.mass) for c in robot.configurations.members])
     stated = conditions.total_mass
-    mass = own[which] + payload if stated is None else np.asarray(stated)
+    mass = masses[which] + payload if stated is None else np.asarray(stated)
     used = tuple(
-        Used(name, k, _levels(volts[at]), _levels(slope[at]), _levels(payload[at]), float(mass[at].max()))
+        Used(name, k, _levels(volts[rows]), _levels(slope[rows]), _levels(payload[rows]), float(mass[rows].max()))
         for k, name in enumerate(robot.configurations)
-        if (at := which == k).any()
+        if (rows := which == k).any()
     )
     motor, highest = robot.motor, float(volts.max())
     constant, resistance = float(motor.torque_constant), float(motor.resistance)
@@ -142,8 +141,8 @@ def reach(robot: Robot, conditions: Conditions, measured: tuple[str, ...]) -> Re
     )  # fmt: skip
 
 
-def reach_of(space: CandidateSpace, robot: Robot | None = None) -> Reach:
-    """What the robot of a space may be asked for next; the robot fitted where it is given."""
+def reach_of_space(space: CandidateSpace, robot: Robot | None = None) -> Reach:
+    """Limits of the next experiments with the robot of a space, or with a fitted one if given."""
     weight = space.weight
-    measured = tuple(c for k, c in enumerate(channels.names(space.bare.channels)) if weight[:, k].any())
-    return reach(space.bare.base if robot is None else robot, space.bare.observe.driven, measured)
+    measured = tuple(c for k, c in enumerate(channels.channel_names(space.bare.channels)) if weight[:, k].any())
+    return reach_of_table(space.bare.base if robot is None else robot, space.bare.observe.driven, measured)

@@ -1,6 +1,6 @@
-"""What remains in slip, track or ground, asked of the resolved running gear: would one within its priors leave it?
+"""Test whether a resolved running gear within its priors explains a discrepancy in slip, track or ground.
 
-The lumped laws are fed by smooth contacts; the track model has grousers and guides, and shakes. Friction is fitted
+The lumped laws assume smooth contacts; the track model has grousers and guides, and vibrates. Friction is fitted
 through it twice to the rows on tracks, once with the running gear as stated and once with its constants free.
 """
 
@@ -27,17 +27,17 @@ from mmrjax.effects import UNNAMED
 from mmrjax.model import channels
 from mmrjax.model.robot import Robot
 
-#: Balances that the resolved running gear has a say in.
+#: Balances that the resolved running gear affects.
 BALANCES = ("slip", "track", "ground")
-#: Constants of the running gear that are freed, and friction of each configuration on tracks that is freed beside.
+#: Free constants of the running gear, and free friction of each configuration on tracks.
 GEAR = ("guide_recess", "guide_gap", "contact_stiffness", "contact_damping", "centre_offset", "payload_height")
 FRICTION = ("ground.friction.static", "ground.friction.dynamic", "ground.friction.speed_static")
-#: Members of a generation, and generations at most.
+#: Members of a generation, and most generations.
 POPULATION, GENERATIONS = 128, 20
 
 
-def asked(found: DiscoveryResult) -> Asked | None:
-    """What of a verdict the running gear could leave; None for nothing."""
+def question_of_verdict(found: DiscoveryResult) -> Asked | None:
+    """Part of a verdict that the running gear could explain; None for none."""
     places = [w for w in (found.unnamed, found.remains) if w is not None]
     for place in places:
         for balance in (place.balance, *place.balances_alike):
@@ -46,25 +46,25 @@ def asked(found: DiscoveryResult) -> Asked | None:
     named = [e.name for e in found.effects if e.balance in BALANCES]
     if named:
         return Asked("found", effects=tuple(named))
-    weighed = [a for a in found.alternatives if any(found_in(name, found) for name in a.effects)]
+    weighed = [a for a in found.alternatives if any(enters_gear_balance(name, found) for name in a.effects)]
     if weighed:
-        return Asked("near", effects=tuple(n for n in weighed[0].effects if found_in(n, found)))
+        return Asked("near", effects=tuple(n for n in weighed[0].effects if enters_gear_balance(n, found)))
     return None
 
 
-def found_in(name: str, found: DiscoveryResult) -> bool:
-    """Whether an effect of the library enters one of `BALANCES`."""
+def enters_gear_balance(name: str, found: DiscoveryResult) -> bool:
+    """True if an effect of the library enters one of `BALANCES`."""
     return any(s.name == name and s.balance in BALANCES for s in found.scores)
 
 
 def check_resolvable(runs: Runs, members: Path | None = None) -> None:
-    """Refuse what `resolve` cannot be asked about, before the loop that it follows.
+    """Refuse unsuitable input of `resolve` before the loop that precedes it.
 
     Raises:
         BadConfiguration: the data are histories, or the file of members cannot be read.
     """
-    if not observers.kind(runs).rows_tell:
-        raise BadConfiguration("--resolve: the track model is asked about settled rows; these are histories")
+    if not observers.observer_kind(runs).rows_tell:
+        raise BadConfiguration("--resolve: the track model needs settled rows; got time histories")
     if members is not None and members.exists():
         saved_members(members)
 
@@ -79,21 +79,21 @@ def resolve(
     seed: int = 0,
     tell: Callable[[Note | str], None] = lambda note: None,
 ) -> Resolved | None:
-    """Ask the track model about a verdict.
+    """Fit the track model to the rows of a verdict.
 
     Args:
-        found: by the loop, from settled rows; noise: as the loop was given it.
+        found: by the loop, from settled rows; noise: as given to the loop.
         population, generations, members, seed: of the search, see `calibrate`.
-        tell: receives a note, or a sentence of `calibrate`, as the work goes on.
+        tell: callback for a progress note, or for a sentence of `calibrate`.
 
     Returns:
-        None where nothing is to be asked: nothing remains in slip, track or ground, or no row is on tracks.
+        None if it does not apply: no discrepancy in slip, track or ground, or no row on tracks.
 
     Raises:
         BadConfiguration: the data are histories.
     """
     check_resolvable(found.runs)
-    reason, robot = asked(found), found.robot
+    reason, robot = question_of_verdict(found), found.robot
     tracked = [name for name, chassis in robot.configurations.items() if float(chassis.on_tracks) > 0.5]
     rows = found.runs.where(found.included & np.isin(found.runs["configuration"], tracked))
     if reason is None or not len(rows):
@@ -142,13 +142,16 @@ def resolve(
 
 
 def _noise(found: DiscoveryResult, stated: str | None) -> str | None:
-    """What the loop took sds to be, in words for `calibrate`."""
+    """Option `noise` of `calibrate` for the loop's sds."""
     assumed = [name for name, about in found.noise.items() if about["source"] == "assumed"]
-    return ",".join(part for part in (stated, noise_room.default(channels.rows(assumed))) if part) or None
+    return (
+        ",".join(part for part in (stated, noise_room.default_noise(channels.channels_named(assumed))) if part)
+        or None
+    )
 
 
 def _slip_rms(fitted: CalibrationResult, robot: Robot) -> float:
-    """Rms difference of the slip 1 - V / (r_k ω_k) [percentage points], of rows that read both speeds."""
+    """Rms difference of the slip 1 - V / (r_k ω_k) [percentage points], over rows with both speeds."""
     motor = fitted.readings["motor_speed"]
     speed = fitted.readings["speed"]
     ratio = float(robot.gearbox.ratio) / float(robot.radius_pulley)

@@ -1,4 +1,4 @@
-"""What the closed loop found: typed, by name, self-contained. Nothing here computes; JSON and tables are read off."""
+"""Result of the closed loop: typed, by name, self-contained. JSON and tables are made from it without computation."""
 
 from __future__ import annotations
 
@@ -31,19 +31,19 @@ from mmrjax.model.channels import Channel
 from mmrjax.model.robot import Robot
 
 SCHEMA = "mmrjax.loop/3"
-#: The robot whose running gear the track model found.
+#: The robot with the running gear fitted by the track model.
 TRACK_FILE = "robot_track.toml"
 #: The robot fitted with nothing added.
 REFIT_FILE = "fitted.toml"
-#: Error at which a running gear is said to leave what remains.
+#: Significance at which a running gear explains the discrepancy.
 RESOLVED_ERROR = 0.01
-#: Prior sds beyond which a constant of the running gear is not plausible.
+#: Prior sds above which a constant of the running gear is implausible.
 PLAUSIBLE = 3.0
 
 
 @dataclasses.dataclass(frozen=True)
 class Estimate:
-    """A parameter with its standard deviation, both in `unit`, and whether it is held by its prior."""
+    """A parameter with its standard deviation, both in `unit`, and True if it is held by its prior."""
 
     value: float
     sd: float
@@ -53,8 +53,11 @@ class Estimate:
 
 @dataclasses.dataclass(frozen=True)
 class Member:
-    """An effect of a class in the leader's place: its amplitude; the same over the largest plausible one; what the
-    data say against it [σ²]."""
+    """An effect of a class in place of the leader.
+
+    Attributes:
+        amplitude: its own [unit]; size: over the largest plausible one; rise_chi2: compared with the leader [σ²].
+    """
 
     amplitude: float
     size: float
@@ -63,11 +66,11 @@ class Member:
 
 @dataclasses.dataclass(frozen=True)
 class StatedValue:
-    """A base parameter whose stated value may be wrong in the place of an effect.
+    """A base parameter with a stated value that may be wrong, instead of an effect.
 
     Attributes:
         value: that explains as much; stated: its prior mean; both in `unit`.
-        prior_sds: how far from its prior that is; rise_chi2: what the data say against it [σ²].
+        prior_sds: distance from its prior; rise_chi2: compared with the effect [σ²].
     """
 
     value: float
@@ -82,13 +85,13 @@ class FoundEffect:
     """An effect of the verdict.
 
     Attributes:
-        name: of the leader of its class; members: effects that these data cannot tell from it, itself first.
+        name: of the leader of its class; members: effects that these data cannot separate from it, itself first.
         stated: base parameters that may be wrong instead, by name.
-        families: of the members, the leader's first: one family says what is missing even where no name is sure.
-        balance, unit: that it enters; equation, source: from its docstring.
-        parameters: its amplitude and shape; p_value: its own, against the strongest of all effects in each bootstrap
-            table; score: rise of χ² without it, all else fitted again [σ²].
-        share: of the excess misfit, χ² less its expectation, that this is [-].
+        families: of the members, the leader's first; a single family identifies the equation and its driver.
+        balance, unit: of the balance that it enters; equation, source: from its docstring.
+        parameters: its amplitude and shape; p_value: compared with the strongest of all effects in each bootstrap
+            table; score: rise of χ² without it after a refit [σ²].
+        share: of the excess misfit, χ² less its expectation, that it explains [-].
     """
 
     name: str
@@ -107,7 +110,7 @@ class FoundEffect:
 
 @dataclasses.dataclass(frozen=True)
 class Formula:
-    """A formula proposed for a curve; see `formula.Proposal`."""
+    """A formula for a curve; see `formula.Proposal`."""
 
     expression: str
     mark: str
@@ -122,7 +125,7 @@ class Formula:
         return described(self)
 
     def to_json(self) -> dict[str, Any]:
-        """As in result.json."""
+        """Entry of result.json."""
         return {
             n: getattr(self, n) for n in ("formula", "mark", "coefficients", "sds", "bic_gain_over_curve", "tried")
         }
@@ -134,14 +137,14 @@ class UnnamedDiscrepancy(DiscrepancyLocation):
 
     Attributes:
         unit: of the balance.
-        families: what is missing, in words, as of `FoundEffect`.
-        window: axis, first and last place of what happens for a while; None for other discrepancies.
+        families: equation and driver, in words, as in `FoundEffect`.
+        window: axis, first and last place of a temporary change; None for other discrepancies.
         effect: name of the smooth curve in the proposed robot.
-        p_value: family-wise; score: fall of χ² by the curve [σ²]; score_free_in_each_run: by a wave with a phase
-            of its own in each run, None for other curves.
+        p_value: family-wise; score: decrease of χ² by the curve [σ²]; score_free_in_each_run: by a wave with a phase
+            for each run, None for other curves.
         at: of the variable [SI]; value, sd: of the curve there [unit].
-        over, defect, defect_sd: in each row the variable of the fit [SI] and what the balance lacks [unit], the curve
-            there and what its fit leaves of the row, both along the travel; None where single rows do not show it.
+        over, defect, defect_sd: for each row the fitted variable [SI] and the defect of the balance [unit]: the curve
+            there plus the row's residual, along the travel; None if single rows do not show it.
         proposal: a formula.
     """
 
@@ -163,8 +166,12 @@ class UnnamedDiscrepancy(DiscrepancyLocation):
 
 @dataclasses.dataclass(frozen=True)
 class HiddenEffect:
-    """An effect that what was found could hide: its largest amplitude in `unit`, the sigmas that it would leave by
-    itself [σ], and the experiment that would show it with its expected separation [σ] ("" and 0 for none)."""
+    """An effect that the effects found could hide.
+
+    Attributes:
+        amplitude: the largest possible one in `unit`; sigmas: its change of the readings without them [σ].
+        experiment: that would show it; separation: expected of it [σ]; "" and 0 for none.
+    """
 
     name: str
     amplitude: float
@@ -180,8 +187,8 @@ class Alternative:
 
     Attributes:
         effects: amplitudes; prior_sds: the same in prior sds; sizes: over the largest plausible ones.
-        rise_chi2: over the proposed fit [σ²], negative where they explain more.
-        reasons: why they are not plausible.
+        rise_chi2: over the proposed fit [σ²], negative if they explain more.
+        reasons: for their implausibility.
     """
 
     effects: dict[str, float]
@@ -196,7 +203,7 @@ class Alternative:
         return described(self)
 
     def to_json(self) -> dict[str, Any]:
-        """As in result.json."""
+        """Entry of result.json."""
         return {name: getattr(self, name) for name in ("effects", "prior_sds", "sizes", "rise_chi2", "why")}
 
 
@@ -205,7 +212,7 @@ class BaseShift:
     """A base parameter before and after, in its unit, and as shifts from its prior [prior sds].
 
     Attributes:
-        held_by_prior: whether it is so after, see `identifiability.held_by_prior`.
+        held_by_prior: True if it is after, see `identifiability.held_by_prior`.
     """
 
     prior: float
@@ -221,7 +228,7 @@ class BaseShift:
 
 @dataclasses.dataclass(frozen=True)
 class EffectScore:
-    """An effect of the library at its best shape: score [σ²], amplitude [its unit], sigmas that a prior sd leaves."""
+    """An effect of the library at its best shape: score [σ²], amplitude [its unit], sigmas per prior sd."""
 
     name: str
     balance: str
@@ -232,12 +239,12 @@ class EffectScore:
 
 @dataclasses.dataclass(frozen=True)
 class Ranked:
-    """An effect by regression alone: all else is fitted again on the equations of the base fit made linear.
+    """An effect by regression: all other parameters are refitted on the linearised equations of the base fit.
 
     Attributes:
-        name: of the effect; family: what it is of, in words; unit: of its amplitude.
-        score: what it alone would explain, no larger than plausible [σ²]; amplitude, sd: then [its unit].
-        supplies: whether it would supply power with such a sign, and so explains nothing.
+        name: of the effect; family: equation and driver in words; unit: of its amplitude.
+        score: that it alone would explain at plausible size [σ²]; amplitude, sd: then [its unit].
+        supplies: True if that sign would supply power, so that it explains nothing.
     """
 
     name: str
@@ -251,13 +258,13 @@ class Ranked:
 
 @dataclasses.dataclass(frozen=True)
 class Ranking:
-    """What regression says of the library before any set of effects is fitted: nothing of it is confirmed.
+    """Ranking of the library by regression before any set of effects is fitted, unconfirmed.
 
     Attributes:
-        missing: whether anything is missing; p_value: of that test, family-wise.
-        chance: score that the strongest effect reaches by chance alone [σ²].
-        effects: the strongest first, after them those that would supply power.
-        windows: equations of the log in weak form that it is from; 0: it is from signatures along the base fit.
+        missing: True if an effect is missing; p_value: of that test, family-wise.
+        chance: critical score of the strongest effect [σ²].
+        effects: the strongest first, then those that would supply power.
+        windows: number of equations of the log in weak form; 0 for a ranking by signatures along the base fit.
     """
 
     missing: bool
@@ -269,7 +276,7 @@ class Ranking:
 
 @dataclasses.dataclass(frozen=True)
 class KindOfEvidence:
-    """The strongest statistic of one kind, what it has to exceed, its share among bootstrap tables, and those."""
+    """Strongest statistic of one kind, its critical value, its p-value, and those of the bootstrap tables."""
 
     found: float
     threshold: float
@@ -279,7 +286,7 @@ class KindOfEvidence:
 
 @dataclasses.dataclass(frozen=True)
 class Evidence:
-    """Of one fit: by kind, and family-wise; adequate: whether nothing is left that counts."""
+    """Evidence in one fit's residuals, by kind and family-wise; adequate: True without a significant discrepancy."""
 
     kinds: dict[str, KindOfEvidence]
     p_value: float
@@ -288,7 +295,7 @@ class Evidence:
 
 @dataclasses.dataclass(frozen=True)
 class RankedExperiment:
-    """An experiment of the menu: separations [σ], and chances that the false one of two is refuted."""
+    """An experiment of the menu: separations [σ], and probabilities that the false one of two is refuted."""
 
     name: str
     smallest_sigma: float
@@ -299,7 +306,7 @@ class RankedExperiment:
 
 @dataclasses.dataclass(frozen=True)
 class NextExperiment:
-    """What to do next, with the whole menu; see `experiments.Proposal`."""
+    """The next experiment, with the whole menu; see `experiments.Proposal`."""
 
     name: str
     experiments: tuple[str, ...]
@@ -315,19 +322,19 @@ class NextExperiment:
         return described(self.instruction)
 
     def to_json(self) -> dict[str, Any]:
-        """As in result.json."""
+        """Entry of result.json."""
         kept = ("name", "experiments", "description", "separates", "expected_sigma", "settles")
         return {**{n: getattr(self, n) for n in kept}, "menu": [dataclasses.asdict(e) for e in self.menu]}
 
 
 @dataclasses.dataclass(frozen=True)
 class ReadingsOfRows:
-    """Readings of every row [SI], shape (rows, channels), NaN where there is none.
+    """Readings of all rows [SI], shape (rows, channels), NaN if missing.
 
     Attributes:
-        measured, sd: of the table; as_stated: by the robot before any fit, at the means of its priors.
+        measured, sd: of the table; as_stated: by the robot before any fit, at its prior means.
         before, after: by the base and by the proposed robot, fitted to all rows.
-        held_out: kind of block → (before, after), each row by fits that have not seen its block.
+        held_out: kind of block → (before, after), each row by fits without its block.
         blocks: kind of block → labels.
     """
 
@@ -345,11 +352,11 @@ Errors = dict[str, dict[str, float | int]]
 
 @dataclasses.dataclass(frozen=True)
 class Worse:
-    """A channel that is predicted worse with what was found than without it.
+    """A channel with larger hold-out errors of the proposal than of the refit.
 
     Attributes:
         kind: of the blocks held out; channel: its name.
-        rows: that both fits predict; before, after: rms error over these [%].
+        rows: number that both fits predict; before, after: rms error over these [%].
     """
 
     kind: str
@@ -361,13 +368,13 @@ class Worse:
 
 @dataclasses.dataclass(frozen=True)
 class HeldOutAlternative:
-    """An alternative of a class, fitted anew without each block.
+    """An alternative of a class, refitted without each block.
 
     Attributes:
-        effects: its names; leads: whether it is the one proposed.
+        effects: its names; leads: True if it is the one proposed.
         rise_chi2: of the fit to all rows, above the best one [σ²].
         rms_sigma: over the readings of all kinds of blocks that every alternative predicts [σ]; by_kind: of each.
-        lost: readings of blocks that it does not predict, because its robot slides or fails there.
+        lost: number of held-out readings without a prediction, because its robot slides or fails there.
     """
 
     effects: tuple[str, ...]
@@ -380,19 +387,19 @@ class HeldOutAlternative:
 
 @dataclasses.dataclass(frozen=True)
 class Resolved:
-    """What the track model says.
+    """Result of the track model's fits.
 
     Attributes:
-        asked: why it was asked: where something remains, or what was found there.
-        rows: on tracks that were fitted.
+        asked: the discrepancy, or the effects found, that it may explain.
+        rows: number of fitted rows on tracks.
         robot: for `--model track`, with the running gear that fits best.
         constants: of the running gear and the friction, by name.
-        alike: pairs of constants that trade against one another, with their correlation.
-        outside: constants further than `PLAUSIBLE` prior sds from their priors; settled: whether both searches ended.
-        fall: of twice the objective by the running gear, priors counted [σ²]; p: of as large a fall by chance.
-        chi2: of the readings with the gear as stated and with the best one [σ²]; readings: that count.
+        alike: strongly correlated pairs of constants, with their correlation.
+        outside: constants further than `PLAUSIBLE` prior sds from their priors; settled: True if both searches ended.
+        fall: decrease of twice the objective by the running gear, priors included [σ²]; p: its p-value.
+        chi2: of the readings with the gear as stated and with the best one [σ²]; readings: number included.
         rms_percent: by channel, with the gear as stated and with the best one [%].
-        slip_rms: the same of the slip [percentage points].
+        slip_rms: the same for the slip [percentage points].
         remarks: of the search.
     """
 
@@ -413,12 +420,12 @@ class Resolved:
 
     @property
     def known_from_rows(self) -> tuple[str, ...]:
-        """Constants that are not held by their priors."""
+        """Constants not held by their priors."""
         return tuple(name for name, e in self.constants.items() if not e.held_by_prior)
 
     @property
     def explains(self) -> bool:
-        """Whether a running gear within its priors leaves what remains, more than chance would."""
+        """True if a running gear within its priors explains the discrepancy significantly."""
         return self.p < RESOLVED_ERROR and not self.outside
 
     @property
@@ -428,11 +435,11 @@ class Resolved:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Of the search, in sentences."""
+        """Remarks of the search, as sentences."""
         return sentences(self.remarks)
 
     def to_json(self) -> dict[str, Any]:
-        """As in result.json."""
+        """Entry of result.json."""
         return {
             "asked": described(self.asked),
             "statement": self.statement,
@@ -454,43 +461,43 @@ class Resolved:
 
 @dataclasses.dataclass(frozen=True)
 class DiscoveryResult:
-    """All that the loop found.
+    """Result of the closed loop.
 
     Attributes:
         verdict: `none`, `named`, `class`, `mechanism`, `place` or `undescribed`.
-        summary: the verdict with all that its statement says.
-        robot: the one that is written; refit: with nothing added; written: whether what was found is in it.
-        gain: of what was found over the refit, on data held out; None where nothing can be.
-        converged: whether the fit of that robot is an optimum; posterior: of all that was fitted.
-        runs: the table; numbers: of its rows, as messages call them.
-        included: whether a row counts; outliers, unusable: numbers of rows set aside.
-        effects: in the model, established or tentative; unnamed: the discrepancy of that verdict; remains: what the
-            effects leave.
-        next_experiment: what would tell more; None where nothing is left to tell apart.
+        summary: the verdict with all data of its statement.
+        robot: as written; refit: with nothing added; written: True if the robot has the proposal.
+        gain: hold-out gain of the proposal over the refit; None if no block can be held out.
+        converged: True if the fit of that robot is an optimum; posterior: of all fitted parameters.
+        runs: the table; numbers: of its rows, as in messages.
+        included: True for included rows; outliers, unusable: numbers of excluded rows.
+        effects: in the model, established or tentative; unnamed: the discrepancy of that verdict; remains: the
+            discrepancy that the effects leave.
+        next_experiment: the most informative one; None if there are no alternatives to separate.
         cannot_see: effects that the data cannot show; needs_histories: that only histories can; needs_reverse: that
-            only runs both ways can.
-        alternatives, implausible: candidates nearly as good; such that would be but for their size or sign.
-        hidden: effects that what was found could hide, the largest first.
-        support: why names do not stand, or beside what they do; None where none was looked at.
-        cluster: what rows that lie off have in common, so that they were not set aside; None for nothing.
-        residual_clusters: columns without a role by which what the proposed robot leaves clusters.
-        before, after: evidence in what base and proposed robot leave.
-        chi2: twice the objective before and after [σ²]; readings: that count.
+            only runs in both directions can.
+        alternatives, implausible: candidates nearly as good; those of implausible size or sign.
+        hidden: effects that the effects found could hide, the largest first.
+        support: tests of the names; None if none was tested.
+        cluster: common property of outliers, which were then not excluded; None for none.
+        residual_clusters: clusters of the proposed robot's residuals by columns without a role.
+        before, after: evidence in the residuals of base and proposed robot.
+        chi2: twice the objective before and after [σ²]; readings: number included.
         base_shift: of every base parameter; scores: of the library at the base fit, strongest first.
-        cosine: |cos| between what the base leaves of two effects' signatures; shape (scores, scores), their order.
-        detail: what this kind of data tells beside: equations run by run, or memory, orders and drift.
+        cosine: |cos| between the projected signatures of two effects; shape (scores, scores), their order.
+        detail: further findings for the kind of data: defects of equations by run, or memory, orders and drift.
         readings_of_rows: measured and simulated.
         errors_as_stated: rms by channel, of the robot before any fit.
         errors, errors_held_out: rms by channel, before and after, over the rows that both predict; by kind of block.
-        held_out_unpredictable: kinds of blocks of which the others cannot predict some or all.
-        held_out_worse: where the latter rise.
-        alternatives_held_out: of a class, compared by data held out; empty where there is one, or where that takes
-            long and was not asked for.
+        held_out_unpredictable: kinds with at least one block that the others cannot predict.
+        held_out_worse: rises of hold-out errors.
+        alternatives_held_out: of a class, by hold-out errors; empty for a single one, or for histories unless
+            requested.
         noise: channel → source and median sd [%].
-        settings: the statistical constants; replicates: of the bootstrap, that settled.
-        remarks: what is worth saying.
-        sensitivity: what is said with other assumed noise.
-        resolved: what the track model says of what remains; None where it was not asked, or has no say.
+        settings: the statistical constants; replicates: number of bootstrap tables with successful refits.
+        remarks: notes on the result.
+        sensitivity: verdicts with other assumed noise.
+        resolved: result of the track model; None if it was not run, or does not apply.
     """
 
     verdict: str
@@ -553,7 +560,7 @@ class DiscoveryResult:
 
     @property
     def refit_alone(self) -> bool:
-        """True where nothing is proposed next to the refit."""
+        """True if nothing is proposed in addition to the refit."""
         return self.verdict in ("none", "undescribed")
 
     @property
@@ -568,13 +575,15 @@ class DiscoveryResult:
 
     @property
     def channels(self) -> tuple[Channel, ...]:
-        """That its readings are of, in order."""
+        """Channels of the readings, in order."""
         return self.runs.channels
 
     @property
     def chi2_of_readings(self) -> tuple[float, float]:
-        """Sum of the squares that the fits leave of the readings that count, before and after [σ²]; `chi2` has what
-        parameters moved from their priors, and penalties, too."""
+        """Sum of squared residuals of the included readings, before and after [σ²].
+
+        `chi2` also contains the parameters' distances from their priors, and penalties.
+        """
         seen = self.readings_of_rows
         before, after = (
             float(np.nansum(np.where(self.included[:, None], (simulated - seen.measured) / seen.sd, np.nan) ** 2))
@@ -584,7 +593,7 @@ class DiscoveryResult:
 
     @property
     def predicted(self) -> dict[str, tuple[int, int]]:
-        """Kind of block → rows that fits without their block predict, before and after."""
+        """Kind of block → number of rows with hold-out predictions, before and after."""
 
         def rows(reading: np.ndarray) -> int:
             return int(np.sum(np.isfinite(reading).any(1) & self.included))
@@ -593,8 +602,7 @@ class DiscoveryResult:
 
     @property
     def rms(self) -> dict[str, dict[str, float]]:
-        """rms errors by fit and channel with readings [unit of the channel], over the rows that errors in percent are
-        over."""
+        """rms errors by fit and channel with readings [unit of the channel], over the rows of the percent errors."""
         fits = dict(zip(("before", "after"), self.errors, strict=True))
         main = next(iter(self.errors_held_out.values()), ())
         fits |= dict(zip(("held_out_before", "held_out_after"), main, strict=False))
@@ -602,14 +610,14 @@ class DiscoveryResult:
 
     @property
     def held_by_prior(self) -> tuple[str, ...]:
-        """Names of the parameters of the proposed robot that were fitted and are held by their priors."""
+        """Names of the fitted parameters of the proposed robot that are held by their priors."""
         base = [name for name, p in self.base_shift.items() if p.held_by_prior]
         each = [(f"effects.{e.name}.{name}", p) for e in self.effects for name, p in e.parameters.items()]
         return (*base, *(name for name, p in each if p.held_by_prior))
 
     @property
     def together(self) -> tuple[Pair, ...]:
-        """Pairs of base parameters and of effects' own of which these data determine a combination alone."""
+        """Pairs of base parameters and effects' parameters that the data determine only in combination."""
         own = {*self.base_shift, *(f"effects.{e.name}.{name}" for e in self.effects for name in e.parameters)}
         pairs = determined_together(self.posterior, self.held_by_prior)
         return tuple(pair for pair in pairs if own >= {pair.one, pair.other})
@@ -694,7 +702,7 @@ class DiscoveryResult:
         }
 
     def rows_table(self) -> dict[str, np.ndarray]:
-        """Conditions, measured, simulated before and after and held out, and defects where rows show them, by row."""
+        """Table by row: conditions, readings measured, simulated before and after and held out, defects if known."""
         seen = self.readings_of_rows
         known = ("run_id", *WHEN, "configuration", *self.runs.axes, *DRIVING)
         table = {"row": self.numbers, **{k: self.runs[k] for k in known if self.runs.has(k)}}
@@ -717,14 +725,20 @@ class DiscoveryResult:
         table["use"] = use
         return table
 
-    def save(self, folder: Path | str, robot_name: str = "") -> None:
-        """Write `result.json`, `rows.csv`, `posterior.nc`, `robot.toml` and `fitted.toml` (with nothing added) into a
-        folder, and `robot_track.toml` too where the track model was asked; `robot_name` is that of the robot that the
-        loop began with."""
+    def save(self, folder: Path | str, robot_name: str = "", tables: str = "csv") -> None:
+        """Write `result.json`, `rows.csv`, `posterior.nc`, `robot.toml` and `fitted.toml` (with nothing added).
+
+        `robot_track.toml` is also written if the track model was run.
+
+        Args:
+            folder: created if missing.
+            robot_name: name of the initial robot.
+            tables: as for `write_table`.
+        """
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         write_json(folder / "result.json", self.to_json())
-        write_table(folder / "rows.csv", self.rows_table())
+        write_table(folder / "rows.csv", self.rows_table(), tables)
         held = [described(HeldByPrior(self.held_by_prior))] if self.held_by_prior else []
         note = "\n".join([described(self, "header", robot_name), *held])
         robot_file.write(self.robot, folder / "robot.toml", note=note)
@@ -736,8 +750,12 @@ class DiscoveryResult:
 
 @dataclasses.dataclass(frozen=True)
 class Sensitivity:
-    """What the loop says with another noise, in short; `factor` times the assumed one; `near`: whether its fits are a
-    few steps of Gauss and Newton from those with the assumed one, of sets that were simulated there."""
+    """Verdict with another noise.
+
+    Attributes:
+        factor: on the assumed noise.
+        near: True if its fits are a few Gauss-Newton steps from those with the assumed noise, for the same sets.
+    """
 
     factor: float
     verdict: str
@@ -752,7 +770,7 @@ class Sensitivity:
         return described(self.summary)
 
     def to_json(self) -> dict[str, Any]:
-        """As in result.json."""
+        """Entry of result.json."""
         found = {n: getattr(self, n) for n in ("factor", "verdict", "statement", "classes", "adequate_after")}
         return found | ({"near": True} if self.near else {})
 

@@ -1,11 +1,11 @@
-"""How large effects may be on a rig: the library's priors are those of the nominal robot, brought to the rig's size.
+"""Sizes of effects on a rig: the library's priors are for the nominal robot and are scaled to the rig's size.
 
-A loss of 0.7 mN·m is a fifth of the friction of a motor of 60 W and nothing beside that of one of 1 kW. What carries
-over from rig to rig is how much of its balance a term is. So the prior sd of an amplitude is scaled until a term of
-one sd is the same share of its balance at the rig's operating points as at those of the nominal robot over Table 8;
-and a shape parameter that is a speed or a current is scaled with those of the rig. The limits of an amplitude are met
-up to what the motors are good for: a saturation of the torque constant that a table shows at a tenth of the rated
-current would leave nothing of it at the rated one.
+A loss of 0.7 mN·m is a fifth of the friction of a motor of 60 W and negligible in one of 1 kW. The share of a term in
+its balance carries over from rig to rig. So the prior sd of an amplitude is scaled: a term of one sd has the same
+share of its balance at the rig's operating points as on the nominal robot over Table 8. A shape parameter
+that is a speed or a current is scaled with those of the rig. The limits of an amplitude hold up to the motors' rated
+values. Otherwise a saturation visible at a tenth of the rated current would leave no torque constant at the rated
+one.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from calibration.discovery.reach import LOADED, RUNNING
 from mmrjax.compile.compiling import OVER_TIME, compiled
 from mmrjax.compile.precision import in_double
 from mmrjax.effects import Effect
-from mmrjax.effects.scaled import amplitude_of, scaled, shape_of
-from mmrjax.fidelities.steady import operating_signals, shown_batch
+from mmrjax.effects.scaled import amplitude_of, scaled_effect, shape_of
+from mmrjax.fidelities.steady import operating_signals, results_of_rows
 from mmrjax.model import channels, paper_robots, params
-from mmrjax.model.balances import BALANCES, absent, added
+from mmrjax.model.balances import BALANCES, absent_balances, effects_sum
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Signals
 
-#: What the terms of a balance are a share of.
+#: Reference quantity of each balance; terms are shares of it.
 WHOLE: dict[str, Callable[[Robot, Signals], object]] = {
     "supply": lambda robot, s: s.voltage,
     "electrical": lambda robot, s: s.voltage,
@@ -51,26 +51,26 @@ WHOLE: dict[str, Callable[[Robot, Signals], object]] = {
     ),
     "inductance": lambda robot, s: robot.motor.inductance,
 }
-#: What a shape parameter is scaled with, by its unit; a speed in rad/s by the shaft of its balance.
+#: Quantity that scales a shape parameter, by its unit; a speed in rad/s is scaled by the shaft of its balance.
 SCALED_WITH: dict[str, Callable[[Signals], object]] = {
     "A": lambda s: s.current,
     "m/s": lambda s: s.speed_theoretical,
     "N": lambda s: s.demand,
     "V": lambda s: s.voltage,
 }
-#: Channels that show where the output is.
+#: Channels of the output's position.
 PLACED = ("output_angle", "position")
 AT_THE_OUTPUT = ("track", "ground", "slip")
-#: Shares of slip are those of tracks and tyres on the paper's grounds; small wheels on soft ones slip by half.
+#: Shares of slip are for tracks and tyres on the paper's grounds; small wheels on soft grounds slip by half.
 SLIPPERY = 16.0
-#: The library's sds are those of one robot whose parts are known; of a rig known by its file alone any effect may be
-#: so many times as large a share of its balance. With 1, 5 of 26 random rigs with an effect of at most three ordinary
-#: sizes got no name for its size (benchmarks/rigs.py). Its mass was on scales: half of a robot is not missing there.
+#: Factor on the sds for rigs known only by their file, because the library's are for one robot with known parts.
+#: With 1, 5 of 26 random rigs with an effect of at most three ordinary sizes got no name because of its size
+#: (benchmarks/rigs.py). The factor does not apply to mass, which is weighed.
 UNKNOWN = 4.0
-#: Most that an instrument is taken to be off by, as a share of what its channel shows (rms): beyond it whoever reads
-#: it would know; 47 A on readings of 114 A are no ammeter's offset.
+#: Largest error of an instrument, as a share of the channel's rms reading: a larger one would be noticed (47 A on
+#: readings of 114 A are no ammeter's offset).
 MOST_OFF = 0.25
-#: What of the signals grows with the motors' current, and what with their speed.
+#: Signals that grow with the motors' current, and signals that grow with their speed.
 LOADS = (
     "current",
     "total_current",
@@ -83,12 +83,12 @@ LOADS = (
 SPEEDS = ("speed_motor", "speed_wheel", "speed_theoretical", "speed", "speed_output")
 
 
-def library_for(robot: Robot, conditions: Conditions, library: Library, turned: float = math.nan) -> Library:
-    """`library` with the priors of a rig's size; as it is for robots that are not a rig's from nothing.
+def library_of_size(robot: Robot, conditions: Conditions, library: Library, turned: float = math.nan) -> Library:
+    """`library` with priors of a rig's size; unchanged for robots that inherit the nominal one.
 
     Args:
         robot: of the rig; conditions: of its table, shape (runs,).
-        turned: how far its output goes, see `turned_in`; NaN: not known.
+        turned: rotation of its output, see `output_rotation`; NaN: not known.
     """
     if robot.rig.inherits:
         return library
@@ -96,19 +96,21 @@ def library_for(robot: Robot, conditions: Conditions, library: Library, turned: 
     nominal, theirs = _nominal()
     sized = {}
     for name, kind in library.items():
-        if not present(kind, robot):
+        if not effect_applies(kind, robot):
             continue
-        sized[name] = _sized(kind, (robot, _placed(mine, kind, turned)), (nominal, _placed(theirs, kind)))
+        sized[name] = _scale_effect(
+            kind, (robot, _at_position(mine, kind, turned)), (nominal, _at_position(theirs, kind))
+        )
     return sized
 
 
-def nominal_ahead() -> None:
-    """Compute what the nominal robot does on another core, for `library_for`."""
+def precompute_nominal() -> None:
+    """Compute the nominal robot's signals for `library_of_size` on another core."""
     threading.Thread(target=in_double(_nominal), daemon=True).start()
 
 
-def turned_in(runs: Runs, robot: Robot) -> float:
-    """Root mean square of the angles of the output that a table's channels show [rad]; NaN where none does."""
+def output_rotation(runs: Runs, robot: Robot) -> float:
+    """Root mean square of the output's angles in a table [rad]; NaN without such a channel."""
     measured = runs.measured()
     for k, channel in enumerate(runs.channels):
         if channel.name in PLACED and math.isfinite(size := _size(measured[:, k])):
@@ -116,17 +118,17 @@ def turned_in(runs: Runs, robot: Robot) -> float:
     return math.nan
 
 
-def _placed(signals: Signals, kind: type[Effect], turned: float | None = None) -> Signals:
-    """Signals of an effect that goes with the position, at such an angle; None: at the one that it is stated for."""
+def _at_position(signals: Signals, kind: type[Effect], turned: float | None = None) -> Signals:
+    """Signals of an effect that depends on position, at a given angle, or for None at its reference angle."""
     if kind.driver != "position" or kind.memory_size is None:
         return signals
-    at = jnp.full(jnp.shape(signals.speed_motor), kind.memory_size if turned is None else turned)
-    return dataclasses.replace(signals, memory={**signals.memory, kind.name: at})
+    positions = jnp.full(jnp.shape(signals.speed_motor), kind.memory_size if turned is None else turned)
+    return dataclasses.replace(signals, memory={**signals.memory, kind.name: positions})
 
 
-def present(kind: type[Effect], robot: Robot) -> bool:
-    """Whether a rig has the balance that an effect enters, and what it needs there."""
-    if kind.balance in absent(robot) or (not robot.has_ground and (kind.movers or kind.needs_belt)):
+def effect_applies(kind: type[Effect], robot: Robot) -> bool:
+    """True if a rig has the balance that an effect enters, and the parts that it needs there."""
+    if kind.balance in absent_balances(robot) or (not robot.has_ground and (kind.movers or kind.needs_belt)):
         return False
     if kind.driver == "position" and not set(PLACED) & set(robot.rig.channels):
         return False
@@ -134,12 +136,12 @@ def present(kind: type[Effect], robot: Robot) -> bool:
 
 
 def _steady(robot: Robot, conditions: Conditions) -> Conditions:
-    """One instant a run, of conditions that may change over time."""
+    """Conditions at one instant of each run, for conditions that may change over time."""
     return jax.tree.map(lambda x: x if jnp.ndim(x) < 2 else x[:, x.shape[1] // 2], conditions)
 
 
 def _signals(robot: Robot, conditions: Conditions) -> Signals:
-    return shown_batch(robot, conditions)[1] if conditions.turns else _travelling(robot, conditions)
+    return results_of_rows(robot, conditions)[1] if conditions.turns else _travelling(robot, conditions)
 
 
 @functools.partial(compiled, options=OVER_TIME)
@@ -150,7 +152,7 @@ def _travelling(robot: Robot, conditions: Conditions) -> Signals:
 @functools.cache
 def _nominal() -> tuple[Robot, Signals]:
     """The nominal robot and its signals over Table 8."""
-    robot = params.strong(paper_robots.nominal())
+    robot = params.without_weak_types(paper_robots.nominal())
     axes = np.meshgrid(
         paper_robots.VOLTAGES_V, paper_robots.SLOPES_DEG, paper_robots.PAYLOADS_KG, (0, 1), indexing="ij"
     )
@@ -159,7 +161,7 @@ def _nominal() -> tuple[Robot, Signals]:
 
 
 def _size(x: object) -> float:
-    """Root mean square of what is finite and not zero, however small; NaN for nothing."""
+    """Root mean square of the finite values other than zero, however small; NaN without any."""
     sizes = np.abs(np.ravel(np.asarray(x, float)))
     sizes = sizes[np.isfinite(sizes) & (sizes > 0)]
     largest = np.max(sizes, initial=0.0)  # squares of less than 1e-162 are zero
@@ -167,11 +169,11 @@ def _size(x: object) -> float:
 
 
 def _ratio(mine: float, theirs: float) -> float:
-    """Of two sizes; 1 where one of them is none."""
+    """Ratio of two sizes; 1 if one of them is NaN."""
     return mine / theirs if math.isfinite(mine) and math.isfinite(theirs) else 1.0
 
 
-def _sized(kind: type[Effect], mine: tuple[Robot, Signals], theirs: tuple[Robot, Signals]) -> type[Effect]:
+def _scale_effect(kind: type[Effect], mine: tuple[Robot, Signals], theirs: tuple[Robot, Signals]) -> type[Effect]:
     """The effect with its priors scaled from one robot to another."""
     effect = kind()
     shape, amplitude = shape_of(effect), amplitude_of(effect)
@@ -185,7 +187,7 @@ def _sized(kind: type[Effect], mine: tuple[Robot, Signals], theirs: tuple[Robot,
             stretch = _ratio(_size(with_(mine[1])), _size(with_(theirs[1])))
     grown = effect if shape is None else params.replace(effect, {shape.name: jnp.asarray(stretch * shape.value)})
     factor = 1.0
-    if amplitude.spec.unit == BALANCES[kind.balance][0]:  # of its own size, also where operating points show none
+    if amplitude.spec.unit == BALANCES[kind.balance][0]:  # by its own size, even if operating points show none
         whole = WHOLE[kind.balance]
         factor = _ratio(_size(whole(*mine)), _size(whole(*theirs)))
     elif amplitude.spec.unit != "-":
@@ -194,18 +196,19 @@ def _sized(kind: type[Effect], mine: tuple[Robot, Signals], theirs: tuple[Robot,
     factor *= SLIPPERY if slips else 1.0 if kind.balance == "mass" else UNKNOWN
     limits = factor
     if kind.balance != "sensor":
-        own, rated = (_unit_share(grown, mine[0], s) for s in (mine[1], _rated(*mine)))
+        own, rated = (_unit_share(grown, mine[0], s) for s in (mine[1], _at_rated_load(*mine)))
         limits = factor * min(1.0, _ratio(own, rated))
     else:
         low, high = amplitude_of(grown).spec.bounds
         limits = min(factor, MOST_OFF / (max(-low, high) * _unit_share(grown, *mine)))
-    return scaled(kind, (float(factor), float(stretch), float(limits)))
+    return scaled_effect(kind, (float(factor), float(stretch), float(limits)))
 
 
-def _rated(robot: Robot, signals: Signals) -> Signals:
-    """The operating points of a rig at the largest load and speed that its motors are good for: for long at the
-    current that they bear, or a share of that at stall, where resistance and voltage are known. No smaller than they
-    are."""
+def _at_rated_load(robot: Robot, signals: Signals) -> Signals:
+    """Operating points of a rig scaled to the largest load and speed of its motors, never reduced.
+
+    That load is at the continuous current, or at a share of the stall current if resistance and voltage are known.
+    """
     motor, rig = robot.motor, robot.rig
     largest = lambda x: float(np.nanmax(np.abs(np.asarray(x)), initial=0.0))  # noqa: E731
     current, speed, volts = largest(signals.current), largest(signals.speed_motor), largest(signals.voltage)
@@ -220,14 +223,14 @@ def _rated(robot: Robot, signals: Signals) -> Signals:
 
 
 def _unit_share(effect: Effect, robot: Robot, signals: Signals) -> float:
-    """How much of its balance a term of amplitude one is [1/unit of the amplitude]."""
+    """Share of a term of amplitude one in its balance [1/unit of the amplitude]."""
     one = params.replace(effect, {amplitude_of(effect).name: jnp.asarray(1.0)})
     alone = dataclasses.replace(robot, effects=(one,))
 
     def share(s: Signals) -> tuple[jax.Array, jax.Array]:
         shown = next((c.read(robot, s) for c in channels.EVERY if c.name == effect.channel), None)
         whole = WHOLE[effect.balance](robot, s) if shown is None else shown
-        return jnp.asarray(added(alone, s, effect.balance, effect.channel), float), jnp.asarray(whole, float)
+        return jnp.asarray(effects_sum(alone, s, effect.balance, effect.channel), float), jnp.asarray(whole, float)
 
     term, total = jax.vmap(share)(signals)
     return _size(term) / _size(total)

@@ -1,9 +1,9 @@
-"""Score tests of a residual: what every effect, and every smooth curve in a balance, could explain of it.
+"""Score tests of residuals for every effect, and for every smooth curve in a balance.
 
-Everything is linear algebra at one fit. With whitened residuals e (readings, the limit on adhesion, priors),
-their Jacobian J by the free parameters, and the signature g = ∂e/∂a of an effect, what is left of g after
-the free parameters have been fitted again is r = (I - P) g, P = J (JᵀJ)⁻¹ Jᵀ; its score is (r·e)² / ‖r‖², χ²
-with one degree of freedom where nothing is missing (Rao 1948).
+Everything is linear algebra at one fit. It has whitened residuals e (readings, the limit on adhesion, priors) and
+their Jacobian J by the free parameters. An effect has the signature g = ∂e/∂a. After the free parameters have been
+fitted again, r = (I - P) g remains of g, with P = J (JᵀJ)⁻¹ Jᵀ. The score of the effect is (r·e)² / ‖r‖², χ²
+with one degree of freedom under the null hypothesis (Rao 1948).
 """
 
 from __future__ import annotations
@@ -19,39 +19,39 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from calibration.inference.bases import Bases, signature
+from calibration.inference.bases import Bases, place_signature
 from calibration.inference.linearization import Linearization, ScoredEffect
-from calibration.inference.optimizers import CORES, rooted
+from calibration.inference.optimizers import CORES, with_roots
 from calibration.inference.problem import Problem
 from mmrjax.compile.compiling import SELDOM, SMALL, compiled
 from mmrjax.compile.precision import Threads
-from mmrjax.numerics.linear_equations import half_solved
+from mmrjax.numerics.linear_equations import solve_lower
 
-#: Share of a signature's norm below which the free parameters explain it all.
+#: Share of a signature's norm below which the free parameters absorb it completely.
 ABSORBED = 1e-3
-#: Fall of the objective [½σ²] that a refit may still predict for its statistics to count.
+#: Largest predicted decrease of the objective [½σ²] for a refit's statistics to count.
 UNSETTLED = 0.05
-#: Prior sd of a curve's columns where they are fitted with the free parameters [σ]: wide, and keeps their rank.
+#: Prior sd of a curve's columns in a fit with the free parameters [σ]: wide, but it keeps their rank.
 WIDE = 30.0
-#: Coordinates are filled up to a multiple of this.
+#: Coordinates are padded to a multiple of this.
 FILLED = 72
-#: By which factors an estimated sd may be off.
+#: Range of the ratio of the true to an estimated sd.
 UNSURE = 0.3, 4.0
 #: Replicates in one batch of the bootstrap.
 CHUNK = 64
 
 
 class ScoreTable(eqx.Module):
-    """What candidates could explain of a residual.
+    """Scores of candidates on a fit's residuals.
 
     Attributes:
         single: signed root of each instance's score, -(r·e)/‖r‖, shape (instances,); amplitude: -(r·e)/‖r‖²,
-            in prior sds; left: ‖r‖, the sigmas that a prior sd leaves.
+            in prior sds; left: ‖r‖, the change of the readings by a prior sd in sigmas.
         pair: scores of pairs of instances (χ² with two degrees of freedom), shape (instances, instances);
-            zero where the two can't be told apart; cosine: between what is left of two signatures.
+            zero if they can't be separated; cosine: between two projected signatures.
         curve: of each family, as a normal deviate, shape (families,); explained: its ridge score [σ²].
-        row: signed root of the score of a shift of each reading alone, shape (rows, channels).
-        fall: of the objective that a step of the fit still predicts [½σ²].
+        row: signed root of the score of a shift of each single reading, shape (rows, channels).
+        fall: further decrease of the objective predicted by a step of the fit [½σ²].
     """
 
     single: Float[Array, " instances"]
@@ -66,11 +66,11 @@ class ScoreTable(eqx.Module):
 
 
 class Fit(eqx.Module):
-    """How a fit answers, L Lᵀ = JᵀJ.
+    """Factors of a fit for projections, L Lᵀ = JᵀJ.
 
     Attributes:
         half: L⁻¹ Jᵀ of the readings, shape (coordinates, readings).
-        step: L⁻¹ Jᵀ e, shape (coordinates,); left: e of the readings, once the step is taken.
+        step: L⁻¹ Jᵀ e, shape (coordinates,); left: e of the readings after that step.
     """
 
     half: Float[Array, "coordinates readings"]
@@ -79,21 +79,21 @@ class Fit(eqx.Module):
 
     @staticmethod
     def of(linear: Linearization) -> Fit:
-        """Of a linearisation."""
+        """Factors of a linearisation."""
         jacobian, e, readings = linear.jacobian, linear.residual, linear.readings
         asked = jnp.concatenate([jacobian[:readings].T, (jacobian.T @ e)[:, None]], 1)
-        solved = half_solved(jacobian.T @ jacobian, asked)
+        solved = solve_lower(jacobian.T @ jacobian, asked)
         half, step = solved[:, :-1], solved[:, -1]
         return Fit(half, step, e[:readings] - half.T @ step)
 
     def projected(self, columns: Array) -> tuple[Array, Array]:
-        """What is left of columns over the readings: their products with e, and those with each other."""
+        """Projected columns over the readings: their products with e, and those with each other."""
         inside = self.half @ columns
         return columns.T @ self.left, columns.T @ columns - inside.T @ inside
 
 
 def score_tests(linear: Linearization, bases: Bases) -> ScoreTable:
-    """Scores of every instance, pair, curve and reading."""
+    """Scores of each instance, pair, curve and reading."""
     g, fit = linear.signatures, Fit.of(linear)
     dots, products = fit.projected(g)
     whole = jnp.sum(g**2, 0)
@@ -110,8 +110,8 @@ def score_tests(linear: Linearization, bases: Bases) -> ScoreTable:
     leverage = jnp.sum(fit.half**2, 0)
     row = jnp.where(leverage < 1 - 1e-6, fit.left / jnp.sqrt(jnp.maximum(1 - leverage, 1e-12)), 0.0)
 
-    found = [jax.vmap(lambda c: _curve_score(fit, c))(basis.signatures(linear)) for basis in bases]
-    deviate, explained = (jnp.concatenate([f[k] for f in found] or [jnp.zeros(0)]) for k in (0, 1))
+    scores = [jax.vmap(lambda c: _curve_score(fit, c))(basis.signatures(linear)) for basis in bases]
+    deviate, explained = (jnp.concatenate([f[k] for f in scores] or [jnp.zeros(0)]) for k in (0, 1))
     amplitude = jnp.where(seen, -dots / norm**2, 0.0)
     row = row.reshape(linear.rows, -1)
     fall = 0.5 * jnp.sum(fit.step**2)
@@ -119,9 +119,9 @@ def score_tests(linear: Linearization, bases: Bases) -> ScoreTable:
 
 
 def _curve_score(fit: Fit, columns: Array) -> tuple[Array, Array]:
-    """(rᵀe)ᵀ (rᵀr + I)⁻¹ (rᵀe), and the same as a normal deviate.
+    """(rᵀe)ᵀ (rᵀr + I)⁻¹ (rᵀe), as a normal deviate and in σ².
 
-    The columns are scaled so that each by itself leaves ten sigmas: a prior that the discrepancy is of such a size.
+    The columns are scaled so that each one changes the readings by ten sigmas, as a prior of the discrepancy's size.
     """
     dots, products = fit.projected(columns)
     norm2 = jnp.diag(products)
@@ -130,7 +130,7 @@ def _curve_score(fit: Fit, columns: Array) -> tuple[Array, Array]:
     products = products * scale[:, None] * scale
     dots = dots * scale
     asked = jnp.concatenate([dots[:, None], jnp.eye(dots.size)], 1)
-    half = half_solved(products + jnp.eye(dots.size), asked)
+    half = solve_lower(products + jnp.eye(dots.size), asked)
     explained = jnp.sum(half[:, 0] ** 2)
     # E = tr(A (A + I)⁻¹) under the null: degrees of freedom.
     freedom = dots.size - jnp.sum(half[:, 1:] ** 2)
@@ -139,11 +139,11 @@ def _curve_score(fit: Fit, columns: Array) -> tuple[Array, Array]:
 
 
 def normal_deviate(chi2: Array, freedom: Array) -> Array:
-    """The standard normal deviate that is as improbable as χ² with so many degrees of freedom, [-].
+    """Standard normal deviate with the same p-value as χ² with so many degrees of freedom, [-].
 
     Modified signed root, Barndorff-Nielsen (1986), of a gamma distribution: within 0.03 from 1 to 20 degrees of
-    freedom and for any improbability, where Wilson and Hilferty's cube root makes much too little of a large χ² with
-    few of them; the latter near the mean, where the root is 0/0.
+    freedom and for any p-value. Wilson and Hilferty's cube root gives much too little for a large χ² with few degrees
+    of freedom. The cube root is used near the mean, where the root is 0/0.
     """
     x, k = jnp.maximum(chi2, 1e-12) / 2, freedom / 2
     spread = 1 / (9 * k)
@@ -155,8 +155,10 @@ def normal_deviate(chi2: Array, freedom: Array) -> Array:
 
 
 class Statistics(eqx.Module):
-    """The strongest of each kind: |single|, pair [σ²], curve [normal deviate]; χ² of the residuals; memory of
-    the residuals, see `Linearization.memory`; and whether the fit that left them is an optimum."""
+    """Strongest statistics: |single|, pair [σ²], curve [normal deviate], χ² and memory of the residuals.
+
+    `settled` is True if the fit is an optimum; `white` is `Linearization.memory`.
+    """
 
     single: Array
     pair: Array
@@ -166,8 +168,8 @@ class Statistics(eqx.Module):
     settled: Array
 
 
-def strongest(scores: ScoreTable, linear: Linearization) -> Statistics:
-    """The largest statistics of a table; what a bootstrap draws the distribution of."""
+def strongest_statistics(scores: ScoreTable, linear: Linearization) -> Statistics:
+    """Largest statistics of a table; a bootstrap draws their distribution."""
     return Statistics(
         jnp.max(jnp.abs(scores.single)),
         jnp.max(scores.pair),
@@ -181,23 +183,23 @@ def strongest(scores: ScoreTable, linear: Linearization) -> Statistics:
 Diagnosed = tuple[Linearization, ScoreTable, Statistics]
 
 
-def diagnosed(
+def diagnose_fit(
     problem: Problem, z: Array, effects: tuple[ScoredEffect, ...], bases: Bases, near: Linearization | None = None
 ) -> Diagnosed:
-    """A fit linearised, what effects and curves could explain of its residual, and the strongest of that.
+    """A linearised fit, the scores of effects and curves on its residuals, and the strongest of these.
 
     Args:
-        near: of a fit nearby, whose signatures and defects serve for this one where runs are long: a curve moves the
-            residual, and hardly what an effect would add.
+        near: linearization of a fit nearby; its signatures and defects are reused for long runs, because a curve
+            changes the residuals, but barely the signatures.
     """
     if not problem.observe.long:
-        linear = _linearised(rooted(problem, z), z, effects)
-    elif near is None:  # by programs of its own
+        linear = _linearised(with_roots(problem, z), z, effects)
+    elif near is None:  # by separate programs
         linear = problem.observe.linearise(problem, z, problem.data, effects)
     else:
         residual, jacobian, _ = problem.observe.at(problem, z)
         linear = dataclasses.replace(near, residual=residual, jacobian=jacobian)
-    return linear, *_looked_at(linear, bases)
+    return linear, *_padded_scores(linear, bases)
 
 
 @functools.partial(compiled, options=SELDOM)
@@ -205,9 +207,11 @@ def _linearised(problem: Problem, z: Array, effects: tuple[ScoredEffect, ...]) -
     return problem.observe.linearise(problem, z, problem.data, effects)
 
 
-def _looked_at(linear: Linearization, bases: Bases) -> tuple[ScoreTable, Statistics]:
-    """Scores and the strongest of them, by a program that serves fits of any number of coordinates: to so many more
-    of them, of which readings tell nothing, that the sizes are few."""
+def _padded_scores(linear: Linearization, bases: Bases) -> tuple[ScoreTable, Statistics]:
+    """Scores and the strongest of them, by a program that serves fits of any number of coordinates.
+
+    Coordinates are padded by ones without influence on the readings, so that there are few sizes.
+    """
     filled = np.zeros((linear.readings, -linear.jacobian.shape[1] % FILLED))
     jacobian, residual = augment_with_columns(linear, filled)
     wide: Any = {"jacobian": jacobian, "residual": residual}
@@ -217,7 +221,7 @@ def _looked_at(linear: Linearization, bases: Bases) -> tuple[ScoreTable, Statist
 @functools.partial(compiled, options=SELDOM)
 def _scores_and_strongest(linear: Linearization, bases: Bases) -> tuple[ScoreTable, Statistics]:
     scores = score_tests(linear, bases)
-    return scores, strongest(scores, linear)
+    return scores, strongest_statistics(scores, linear)
 
 
 def family_columns(linear: Linearization, bases: Bases, chosen: int) -> np.ndarray:
@@ -229,7 +233,7 @@ def family_columns(linear: Linearization, bases: Bases, chosen: int) -> np.ndarr
     linear = jax.tree.map(np.asarray, linear)
     for basis in bases:
         if chosen < len(basis.places):
-            columns = signature(linear, basis.places[chosen], np.asarray(basis.columns)[chosen])
+            columns = place_signature(linear, basis.places[chosen], np.asarray(basis.columns)[chosen])
             norm = np.linalg.norm(columns, axis=0)
             return columns[:, norm > 0] / norm[norm > 0] * WIDE
         chosen -= len(basis.places)
@@ -237,7 +241,7 @@ def family_columns(linear: Linearization, bases: Bases, chosen: int) -> np.ndarr
 
 
 def augment_with_columns(linear: Linearization, extra: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Jacobian and residuals of a fit with further columns, each of prior mean 0 and sd 1, fitted beside.
+    """Jacobian and residuals of a fit with further columns, each with prior mean 0 and sd 1.
 
     Args:
         extra: columns over the readings, shape (readings, columns).
@@ -251,21 +255,21 @@ def augment_with_columns(linear: Linearization, extra: np.ndarray) -> tuple[np.n
     return whole, np.concatenate([np.asarray(linear.residual), np.zeros(wide)])
 
 
-def beside_columns(
+def statistics_with_columns(
     linear: Linearization, bases: Bases, extra: np.ndarray, names: Sequence[str]
 ) -> tuple[Statistics, np.ndarray]:
-    """The strongest statistics that are left once further columns are fitted with the free parameters, and the normal
-    deviate of every family of curves, -inf for those of the columns' own places.
+    """Strongest statistics after further columns are fitted with the free parameters, and the normal deviate of each
+    family of curves, -inf for families in the columns' own places.
 
     Args:
         extra: columns over the readings, shape (readings, columns); names: their places.
     """
     wide: tuple[Any, Any] = augment_with_columns(linear, extra)
-    scores, _ = _looked_at(dataclasses.replace(linear, jacobian=wide[0], residual=wide[1]), bases)
+    scores, _ = _padded_scores(dataclasses.replace(linear, jacobian=wide[0], residual=wide[1]), bases)
     balances = np.array([n[0] for b in bases for n in b.names])
     deviate = np.where(np.isin(balances, list(names)), -np.inf, np.asarray(scores.curve))
     nothing = jnp.asarray(-jnp.inf)
-    found = Statistics(
+    statistics = Statistics(
         single=np.max(np.abs(np.asarray(scores.single))),
         pair=np.max(np.asarray(scores.pair)),
         curve=np.max(deviate, initial=-np.inf),
@@ -273,7 +277,7 @@ def beside_columns(
         white=nothing,
         settled=jnp.asarray(True),
     )
-    return found, deviate
+    return statistics, deviate
 
 
 @functools.partial(compiled, options=SELDOM)
@@ -295,27 +299,27 @@ def bootstrap(
 ) -> Statistics:
     """Statistics of `replicates` tables drawn from the fitted base and fitted again; shape (replicates,).
 
-    Replicates whose refit did not settle are left out; there may be fewer than asked for.
+    Replicates with a refit that did not settle are omitted, so there may be fewer.
 
     Args:
-        problem: of the base alone, z its fit; linear: the same fit, linearised.
+        problem: of the base only, z its fit; linear: the same fit, linearised.
         seed: random seed.
-        freedom: degrees of freedom that the sd of each channel was estimated with, infinite where it is known; None
-            for all known. Each table is drawn with sds that such an estimate might have been of.
+        freedom: degrees of freedom of each channel's estimated sd, infinite if it is known; None if all are known.
+            Each table is drawn with random true sds, given such estimates.
     """
     count = -(-replicates // CHUNK)
     drawn = problem.observe.draws(
         problem, jnp.asarray(z), linear, _keys(jnp.asarray(seed), count, replicates),
         _factors(freedom, len(problem.channels), replicates, seed),
     )  # fmt: skip
-    # To whole batches: those that are repeated are cut off.
+    # Padded to whole batches by repeats, which are cut off later.
     drawn = jax.tree.map(lambda x: np.resize(np.asarray(x), (count, CHUNK, *x.shape[1:])), drawn)
 
     def part(k: int) -> Statistics:
         mine = jax.tree.map(lambda x: x[k], drawn)
         return jax.device_get(_replicates(problem, linear, effects, bases, mine))
 
-    # The first batch compiles what the others run; a batch keeps one core busy.
+    # The first batch compiles the program of the others; a batch keeps one core busy.
     with Threads(CORES) as cores:
         parts = [part(0), *cores.map(part, range(1, count))]
     whole = jax.tree.map(lambda *x: np.concatenate(x)[:replicates], *parts)
@@ -336,10 +340,10 @@ def _factors(freedom: np.ndarray | None, channels: int, replicates: int, seed: i
 def _replicates(
     problem: Problem, linear: Linearization, effects: tuple[ScoredEffect, ...], bases: Bases, drawn: Any
 ) -> Statistics:
-    """A batch of a bootstrap, from what the observer drew."""
+    """A batch of a bootstrap, from the observer's draws."""
 
     def one(drawn: Any) -> Statistics:
         again = problem.observe.replicate(problem, problem.data, effects, linear, drawn)
-        return strongest(score_tests(again, bases), again)
+        return strongest_statistics(score_tests(again, bases), again)
 
     return jax.vmap(one)(drawn)

@@ -1,10 +1,10 @@
-"""Screening by regression: fits of sets of effects on the equations of one fit made linear, where runs take long.
+"""Screening by regression for long runs: fits of sets of effects on the linearised equations of one fit.
 
 A signature is the derivative of the readings by an amplitude. With the signatures at one fit, a fit of any set of
 effects is a least-squares problem of a few unknowns. (Gautier and Khalil 1990 do so with torques, their inverse
 dynamic identification model.) It ranks every effect in milliseconds. Simulation then confirms the first of them,
-since a signature does not show how a run bends. The equations of a log in weak form rank every effect before the
-first simulation, and state where the base fit begins (`beforehand`).
+because a signature does not show the nonlinearity of a run. The equations of a log in weak form rank every effect
+before the first simulation, and give the start of the base fit (`screen_by_weak_form`).
 """
 
 from __future__ import annotations
@@ -17,24 +17,23 @@ import numpy as np
 
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import Diagnosis
-from calibration.discovery.candidates import Candidate, candidate, empty, fit_candidates
+from calibration.discovery.candidates import Candidate, candidate_of_fit, empty_slots, fit_candidates
 from calibration.discovery.score_tests import ABSORBED, ScoreTable
 from calibration.discovery.settings import Settings
 from calibration.inference.linearization import Linearization
 from calibration.inference.optimizers import Optimum
 from calibration.inference.weak_form import weak_form
 
-#: Sets that are fitted by simulation in a round: the first by regression and its nearest rivals, of which one is of
+#: Number of sets that are simulated in a round: the first by regression and its nearest rivals, one of them from
 #: another family.
 CONFIRMED = 3
-#: Further ones where simulation does not confirm the first.
+#: Number of further ones if simulation does not confirm the first.
 FURTHER = 3
 
 
-#: Largest amplitude at which a fit begins [prior sds of a fit].
+#: Largest initial amplitude of a fit [prior sds of a fit].
 FAR = 1.5
-#: Effects for which the program of a log's fits is compiled at first, and how many of them are there since they act
-#: like the first.
+#: Number of effects in the first program of a log's fits, and of those among them that are similar to the first.
 ROOM, NEAR = 8, 5
 
 
@@ -43,10 +42,10 @@ class Confirmed:
     """Sets of effects after a round of screening.
 
     Attributes:
-        candidates: of every set, by simulation where it was made, else by regression.
-        asked: how many fits by simulation were set against their regression; otherwise: how many of these explained
-            less than the regression said, by more than `Settings.same`.
-        room: names of the effects for which the program of these fits has room, see `CandidateSpace`.
+        candidates: of every set, by simulation if available, else by regression.
+        asked: number of regressions that were simulated; otherwise: number of these that explained less than the
+            regression by more than `Settings.same`.
+        room: names of the effects in the program of these fits, see `CandidateSpace`.
     """
 
     candidates: tuple[Candidate, ...]
@@ -59,7 +58,7 @@ class Regression:
     """Fits of sets of effects on the linearisation of a fit.
 
     Args:
-        at: the fit; linear, scores: it linearised, and what each effect could explain of what it leaves.
+        at: the fit; linear, scores: its linearization, and the scores of effects on its residuals.
     """
 
     def __init__(
@@ -70,7 +69,7 @@ class Regression:
         self.signatures = np.asarray(linear.signatures)
 
     def __call__(self, active: tuple[str, ...]) -> Candidate:
-        """The candidate with these effects in the slots; new ones have the shape of their grid that scores best."""
+        """Candidate with these effects in the slots; new ones have the shape of their grid with the best score."""
         p, s, at = self.space.free, self.settings.slots, self.at
         size = self.jacobian.shape[1]  # residuals of the priors come last, in the order of the coordinates
         slopes, residual, own = self.jacobian[:-size], self.residual[:-size].copy(), self.residual[-size:]
@@ -102,24 +101,24 @@ class Regression:
         cost = np.asarray(0.5 * np.sum((left + whole @ step) ** 2))
         parts: tuple[Any, ...] = (z, sd, covariance, cost, np.asarray(0.0), np.asarray(True), np.asarray(0))
         found = Optimum(*parts)
-        return dataclasses.replace(candidate(self.space, active, found, self.settings), simulated=False)
+        return dataclasses.replace(candidate_of_fit(self.space, active, found, self.settings), simulated=False)
 
 
-def confirmed(space: CandidateSpace, screened: Sequence[Candidate], settings: Settings) -> Confirmed:
+def confirm_by_simulation(space: CandidateSpace, screened: Sequence[Candidate], settings: Settings) -> Confirmed:
     """Simulate the first sets of a round that was screened by regression.
 
-    These are the plausible set that explains most, its nearest rival, the nearest of another family, and one that
-    explains more and is not of a plausible size. Where the first explains less than its regression said, by more than
-    `Settings.same`, the simulation decides, and the next by regression is tried too: of those for which the program
-    has room, or which promise more.
+    These are the plausible set that explains most, its nearest rival, the nearest of another family, and any
+    implausible set that explains more. If the first explains less than its regression by more than
+    `Settings.same`, the simulation decides, and the next by regression is tried too. Further sets must be in the
+    program, or must promise more.
     """
     fits = lambda c: {*c.effects} <= {*space.room}  # noqa: E731
-    # What the program has no room for takes another program, and has to promise that much more; beside a verdict that
-    # is known it is not worth one.
+    # Sets outside the program need another program, and have to promise that much more. For verdicts at other noises
+    # they are omitted.
     screened = [c for c in screened if fits(c)] if space.near else screened
     order = sorted(screened, key=lambda c: c.cost + (0.0 if fits(c) else settings.same / 2))
     order = [c for c in order if np.isfinite(c.cost)]
-    first, found = _first(space, order), dict[tuple[str, ...], Candidate]()
+    first, found = _first_to_simulate(space, order), dict[tuple[str, ...], Candidate]()
     space = space.with_room([*space.room, *(n for c in first for n in c.effects)])  # one program for all of them
     said = {c.active: c for c in order}
 
@@ -127,13 +126,16 @@ def confirmed(space: CandidateSpace, screened: Sequence[Candidate], settings: Se
         return 2 * (c.cost - said[c.active].cost) > settings.same
 
     def simulate(those: Sequence[Candidate]) -> None:
-        """From where the regression has them; what explains less there, and the first of all, from the prior mean
-        too: what a model lacks may have led the fit without it elsewhere."""
-        made = fit_candidates(space, [(c.active, _begins(space, c)) for c in those], settings)
+        """Simulate from the regression's coordinates.
+
+        Sets that explain less there, and the first of all, are repeated from the prior mean: a model error may have
+        led the fit without the effect elsewhere.
+        """
+        made = fit_candidates(space, [(c.active, _start_of_simulation(space, c)) for c in those], settings)
         found.update({c.active: c for c in made})
         new = [c for c in those if c.active not in space.near]
         doubted = [c for c in new if less(found[c.active]) or c is first[0]]
-        at_mean = [np.where(np.arange(len(c.z)) < space.free, 0.0, _begins(space, c)) for c in doubted]
+        at_mean = [np.where(np.arange(len(c.z)) < space.free, 0.0, _start_of_simulation(space, c)) for c in doubted]
         again = fit_candidates(space, [(c.active, z) for c, z in zip(doubted, at_mean, strict=True)], settings)
         found.update({c.active: c for c in again if c.cost < found[c.active].cost})
 
@@ -151,15 +153,15 @@ def confirmed(space: CandidateSpace, screened: Sequence[Candidate], settings: Se
     return Confirmed(every, len(found), sum(less(c) for c in found.values()), space.room)
 
 
-def _begins(space: CandidateSpace, screened: Candidate) -> np.ndarray:
-    """Where a simulation of a screened set begins: amplitudes no larger than a step of a search may be."""
+def _start_of_simulation(space: CandidateSpace, screened: Candidate) -> np.ndarray:
+    """Start of a simulation of a screened set: amplitudes limited to the largest step of a search."""
     z, p, slots = screened.z.copy(), space.free, len(screened.active)
     z[p : p + slots] = np.clip(z[p : p + slots], -FAR, FAR)
     return z
 
 
-def _first(space: CandidateSpace, order: Sequence[Candidate]) -> list[Candidate]:
-    """The sets that are simulated first, of those in the order of what they explain."""
+def _first_to_simulate(space: CandidateSpace, order: Sequence[Candidate]) -> list[Candidate]:
+    """Sets that are simulated first, from those sorted by what they explain."""
     families = lambda c: frozenset(space.library[n].family() for n in c.effects)  # noqa: E731
     sound = [c for c in order if c.plausible]
     if not sound:
@@ -172,13 +174,13 @@ def _first(space: CandidateSpace, order: Sequence[Candidate]) -> list[Candidate]
 
 @dataclasses.dataclass(frozen=True)
 class Beforehand:
-    """What the equations of a log in weak form say before anything is simulated.
+    """Results of a log's equations in weak form before any simulation.
 
     Attributes:
-        base: the fit without effects, by regression; None where the load may slide on its ground, of which the
-            equations show nothing, so that a search does not begin there.
-        scores: of every instance; windows: how many equations there are.
-        null: root of the strongest score of tables in which nothing is missing [σ], shape (replicates,).
+        base: the fit without effects, by regression. None if the load may slide on its ground, which the
+            equations do not show, so that a search should not begin there.
+        scores: of every instance; windows: number of equations.
+        null: root of the strongest score of tables under the null hypothesis [σ], shape (replicates,).
     """
 
     base: Candidate | None
@@ -187,8 +189,8 @@ class Beforehand:
     null: np.ndarray
 
 
-def beforehand(space: CandidateSpace, settings: Settings) -> Beforehand | None:
-    """Base parameters and effects by regression on a log's equations in weak form; None where it does not show its
+def screen_by_weak_form(space: CandidateSpace, settings: Settings) -> Beforehand | None:
+    """Base parameters and effects by regression on a log's equations in weak form; None if it does not show its
     states (`weak_form`)."""
     problem = space.bare
     found = weak_form(problem, space.library.scored) if problem.observe.long else None
@@ -213,33 +215,35 @@ def beforehand(space: CandidateSpace, settings: Settings) -> Beforehand | None:
     cost = np.asarray(0.5 * np.sum(found.residual**2))
     of_fit: tuple[Any, ...] = (z, sd, np.zeros((0, 0)), cost, np.asarray(0.0), np.asarray(True), np.asarray(0))
     at = Optimum(*of_fit)
-    base = dataclasses.replace(candidate(space, empty(settings), at, settings), simulated=False)
+    base = dataclasses.replace(candidate_of_fit(space, empty_slots(settings), at, settings), simulated=False)
     slides = problem.base.has_ground and problem.base.rig.imposed == "voltage"
     return Beforehand(None if slides else base, scores, found.windows, null)
 
 
-def ranked(
+def fit_by_regression(
     space: CandidateSpace, wanted: Sequence[tuple[tuple[str, ...], Candidate, Diagnosis]], settings: Settings
 ) -> list[Candidate]:
-    """Sets of effects by regression, each beside another fit.
+    """Sets of effects by regression, each in addition to another fit.
 
     Args:
-        wanted: (active effects, the other fit, what that leaves).
+        wanted: (active effects, the other fit, its diagnosis).
     """
     known = {id(left): Regression(space, at, left.linear, left.scores, settings) for _, at, left in wanted}
     return [known[id(left)](active) for active, _, left in wanted]
 
 
-def with_room(
+def with_program_room(
     space: CandidateSpace, base: Candidate, linear: Linearization, scores: ScoreTable, settings: Settings
 ) -> CandidateSpace:
-    """The space with room in its fits for the effects that are simulated first, for others that act like the first of
-    them, and for the best of other families; as it is where runs are not long."""
+    """Space with a program for the effects simulated first, for similar ones, and for the best of other families.
+
+    Unchanged unless runs are long.
+    """
     if not space.bare.observe.long:
         return space
     beside, library = Regression(space, base, linear, scores, settings), space.library
-    order = sorted((beside((name, *empty(settings)[1:])) for name in library.names), key=lambda c: c.cost)
-    first = [c.active[0] for c in _first(space, order)]
+    order = sorted((beside((name, *empty_slots(settings)[1:])) for name in library.names), key=lambda c: c.cost)
+    first = [c.active[0] for c in _first_to_simulate(space, order)]
     cosine = np.abs(np.asarray(scores.cosine)[library.best_instance(first[0], np.asarray(scores.single))])
     alike = library.largest(cosine)
     near = [library.names[k] for k in np.argsort(-alike) if alike[k] > settings.alike]

@@ -1,4 +1,4 @@
-"""The search for effects: singles, then further ones beside the best, as long as the fit is rejected."""
+"""Search for effects: single ones, then further ones in addition to the best, while the fit is rejected."""
 
 from __future__ import annotations
 
@@ -11,26 +11,26 @@ import numpy as np
 
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
-from calibration.discovery.candidates import Candidate, filled, fit_beside, fit_candidates, start
-from calibration.discovery.score_tests import ScoreTable, Statistics, diagnosed
-from calibration.discovery.screening import Confirmed, confirmed, ranked
+from calibration.discovery.candidates import Candidate, fill_slots, fit_candidates, fit_in_addition, start_of_fit
+from calibration.discovery.score_tests import ScoreTable, Statistics, diagnose_fit
+from calibration.discovery.screening import Confirmed, confirm_by_simulation, fit_by_regression
 from calibration.discovery.settings import Settings
 from calibration.inference.bases import Bases
 from calibration.inference.fit_notes import Step
 
-#: Pairs of instances that are looked through for pairs of effects.
+#: Largest number of pairs of instances that are examined for pairs of effects.
 PAIRS = 4000
 
 
 @dataclasses.dataclass(frozen=True)
 class Search:
-    """What was tried.
+    """Outcome of the search.
 
     Attributes:
         ladder: every candidate that was fitted.
-        best: the one that is proposed, None where none is plausible; diagnosis: what it leaves.
-        asked, otherwise: fits by simulation of what was screened by regression, and how many of these did not confirm
-            it, see `screening.Confirmed`; room: for which effects the program of these fits has room.
+        best: the proposed one, None without a plausible one; diagnosis: of its residuals.
+        asked, otherwise: number of simulated sets that were screened by regression, and of unconfirmed ones among
+            them, see `screening.Confirmed`; room: effects in the program of these fits.
     """
 
     ladder: tuple[Candidate, ...]
@@ -41,17 +41,17 @@ class Search:
     room: tuple[str, ...] = ()
 
 
-def diagnose(
+def diagnose_candidate(
     space: CandidateSpace, fitted: Candidate, bases: Bases, null: Statistics, settings: Settings
 ) -> Diagnosis:
-    """Look at a fit, and test what it leaves."""
+    """Diagnosis of a fit."""
     z = jnp.asarray(fitted.z)
-    seen = diagnosed(space.problem(fitted.active), z, space.library.scored, bases)
+    seen = diagnose_fit(space.problem(fitted.active), z, space.library.scored, bases)
     linear, scores, found = jax.device_get(seen)
     return Diagnosis(linear, scores, AdequacyTest(found, null, settings))
 
 
-def search(
+def search_effects(
     space: CandidateSpace,
     base: Candidate,
     left: Diagnosis,
@@ -59,22 +59,22 @@ def search(
     settings: Settings,
     progress: Callable[[Step], None],
 ) -> Search:
-    """Effects that explain what the base leaves, as few as leave nothing that is beyond doubt.
+    """Smallest set of effects that explains the discrepancy of the base to within the test's margin.
 
     Args:
-        base: the fit without effects; left: what it leaves.
+        base: the fit without effects; left: its diagnosis.
     """
     rounds = [_singles(space, base, left, settings)]
     space = space.with_room(rounds[0].room)
     ladder = list(rounds[0].candidates)
     null = np.asarray(left.test.null.single)
     best, diagnosis, seen = _best(ladder), None, None
-    if best is not None and own_p(2 * (base.cost - best.cost), null) > settings.family_wise_error:
+    if best is not None and single_p_value(2 * (base.cost - best.cost), null) > settings.family_wise_error:
         best = None
     while best is not None:
         seen = best
-        diagnosis = diagnose(space, best, bases, left.test.null, settings)
-        if not diagnosis.test.rejected_with_margin or len(best.effects) == _most(space, settings):
+        diagnosis = diagnose_candidate(space, best, bases, left.test.null, settings)
+        if not diagnosis.test.rejected_with_margin or len(best.effects) == _largest_set_size(space, settings):
             break
         progress(Step("more effects", (best.effects,)))
         rounds.append(_extend(space, best, diagnosis, base, left, settings))
@@ -85,14 +85,14 @@ def search(
             fewer = without_each(space, best, settings)
             ladder += fewer
             gains = [2 * (c.cost - best.cost) for c in fewer]
-            if any(own_p(gain, null) > settings.family_wise_error for gain in gains):
+            if any(single_p_value(gain, null) > settings.family_wise_error for gain in gains):
                 best = None
     asked, otherwise = (sum(getattr(r, name) for r in rounds) for name in ("asked", "otherwise"))
     return Search(tuple(ladder), seen, diagnosis, asked, otherwise, space.room)
 
 
-def path(found: Search) -> list[Candidate]:
-    """The best plausible candidate of each number of effects, up to that of what the search proposes."""
+def best_of_each_size(found: Search) -> list[Candidate]:
+    """Best plausible candidate of each number of effects, up to the number in the search's proposal."""
     if found.best is None:
         return []
     sizes = range(1, len(found.best.effects))
@@ -100,12 +100,12 @@ def path(found: Search) -> list[Candidate]:
     return [*(c for c in smaller if c is not None), found.best]
 
 
-def own_p(gain: float, null: np.ndarray) -> float:
+def single_p_value(gain: float, null: np.ndarray) -> float:
     """Share of bootstrap tables in which the strongest single effect explains as much [σ²], never below
     1 / (replicates + 1).
 
     Args:
-        null: root of what it explains in each [σ].
+        null: root of its score in each table [σ].
     """
     return (1 + int(np.sum(null**2 >= gain))) / (1 + len(null))
 
@@ -113,46 +113,48 @@ def own_p(gain: float, null: np.ndarray) -> float:
 def without_each(
     space: CandidateSpace, best: Candidate, settings: Settings, ladder: Sequence[Candidate] = ()
 ) -> list[Candidate]:
-    """The candidate without each of its effects in turn, all else fitted again.
+    """The candidate without each of its effects in turn, refitted.
 
     Args:
-        ladder: fits that are known, of which none is made again.
+        ladder: known fits, which are not repeated.
     """
     fewer = [tuple("" if s == slot else n for s, n in enumerate(best.active)) for slot in range(len(best.effects))]
-    known = {c.active: c for c in ladder if c.simulated}
-    new = fit_candidates(space, [(w, start(space, best, w, settings)) for w in fewer if w not in known], settings)
-    known |= {c.active: c for c in new}
-    return [known[w] for w in fewer]
+    simulated = {c.active: c for c in ladder if c.simulated}
+    new = fit_candidates(
+        space, [(w, start_of_fit(space, best, w, settings)) for w in fewer if w not in simulated], settings
+    )
+    simulated |= {c.active: c for c in new}
+    return [simulated[w] for w in fewer]
 
 
-def _most(space: CandidateSpace, settings: Settings) -> int:
-    """Effects that the data allow, no more than there are slots."""
+def _largest_set_size(space: CandidateSpace, settings: Settings) -> int:
+    """Largest number of effects that the data allow, at most the number of slots."""
     return int(min(settings.slots, max(1, space.included.sum() // settings.rows_per_effect)))
 
 
 def _ranked(space: CandidateSpace, scores: ScoreTable, without: Sequence[str] = ()) -> list[str]:
-    """Effects by their best |score|, the strongest first; those to leave out come last."""
+    """Effects by their best |score|, the strongest first; those in `without` come last."""
     strength = space.library.largest(np.abs(np.asarray(scores.single)))
     strength[list(space.library.indices(without))] = 0.0
     return [space.library.names[k] for k in np.argsort(-strength)]
 
 
 def _singles(space: CandidateSpace, base: Candidate, left: Diagnosis, settings: Settings) -> Confirmed:
-    """Single effects: those that score highest, or where a run takes long all of them by regression."""
+    """Single effects: those with the highest scores, or for long runs all of them by regression."""
     names = _ranked(space, left.scores)
     if not space.bare.observe.long:
         names = names[: _batch(space)]
-    return _tried(space, [(filled([name], settings), base, left) for name in names], settings)
+    return _fit_sets(space, [(fill_slots([name], settings), base, left) for name in names], settings)
 
 
-def _tried(
+def _fit_sets(
     space: CandidateSpace, wanted: Sequence[tuple[tuple[str, ...], Candidate, Diagnosis]], settings: Settings
 ) -> Confirmed:
-    """Sets of effects, each beside another fit and what that leaves: fitted, or screened by regression first where a
-    run takes long."""
+    """Sets of effects, each in addition to another fit and its diagnosis; for long runs first screened by
+    regression."""
     if not space.bare.observe.long:
-        return Confirmed(tuple(fit_beside(space, [(w, at, by.scores) for w, at, by in wanted], settings)))
-    return confirmed(space, ranked(space, wanted, settings), settings)
+        return Confirmed(tuple(fit_in_addition(space, [(w, at, by.scores) for w, at, by in wanted], settings)))
+    return confirm_by_simulation(space, fit_by_regression(space, wanted, settings), settings)
 
 
 def _batch(space: CandidateSpace) -> int:
@@ -167,29 +169,29 @@ def _extend(
     left: Diagnosis,
     settings: Settings,
 ) -> Confirmed:
-    """One effect more beside the best, and pairs from the base."""
+    """Sets with one more effect than the best, and pairs for the base."""
     names = _ranked(space, left_by_best.scores, best.effects)[: _batch(space)]
-    sources = {filled([*best.effects, name], settings): (best, left_by_best) for name in names}
+    sources = {fill_slots([*best.effects, name], settings): (best, left_by_best) for name in names}
     if len(best.effects) == 1:
         for pair in _pairs(space, left.scores):
-            one, other = filled(pair, settings), filled(pair[::-1], settings)
+            one, other = fill_slots(pair, settings), fill_slots(pair[::-1], settings)
             if one not in sources and other not in sources:
                 sources[one] = (base, left)
-    return _tried(space, [(w, at, by) for w, (at, by) in sources.items()], settings)
+    return _fit_sets(space, [(w, at, by) for w, (at, by) in sources.items()], settings)
 
 
 def _pairs(space: CandidateSpace, scores: ScoreTable) -> list[tuple[str, str]]:
-    """Pairs of effects by their joint score, the strongest first, a batch of them."""
+    """One batch of pairs of effects by their joint score, the strongest first."""
     effect, names = space.library.of, space.library.names
     pair = np.triu(np.asarray(scores.pair))
-    found: list[tuple[str, str]] = []
+    pairs: list[tuple[str, str]] = []
     for flat in np.argsort(-pair, axis=None)[:PAIRS]:
         i, j = sorted((int(effect[flat // len(effect)]), int(effect[flat % len(effect)])))
-        if i != j and (names[i], names[j]) not in found:
-            found.append((names[i], names[j]))
-        if len(found) == _batch(space):
+        if i != j and (names[i], names[j]) not in pairs:
+            pairs.append((names[i], names[j]))
+        if len(pairs) == _batch(space):
             break
-    return found
+    return pairs
 
 
 def _best(candidates: Sequence[Candidate]) -> Candidate | None:
@@ -198,7 +200,7 @@ def _best(candidates: Sequence[Candidate]) -> Candidate | None:
 
 
 def _accepted(c: Candidate | None, ladder: Sequence[Candidate], settings: Settings) -> Candidate | None:
-    """The candidate, if it explains so much more than any with one effect fewer that every effect is needed."""
+    """The candidate if each of its effects is needed: it explains clearly more than any with one effect fewer."""
     if c is None:
         return None
     fewer = [x.cost for x in ladder if len(x.effects) == len(c.effects) - 1 and x.plausible]

@@ -1,56 +1,56 @@
-"""The statistical constants of the closed loop, in one recorded place."""
+"""Statistical constants of the closed loop, recorded in one place."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
 
-from calibration.data.input_errors import BadConfiguration, choices
+from calibration.data.input_errors import BadConfiguration, allowed_words
 from calibration.inference.observers import Observer
 
-#: Family-wise error of «something is missing», shared out among the kinds of evidence: single effects, curves, pairs,
-#: χ², and where the order of the residuals means something also their memory (`white`).
+#: Family-wise error of the test for a missing effect, divided among the kinds of evidence: single effects, curves,
+#: pairs, χ², and for residuals in order of time also their memory (`white`).
 SHARES = {
     ("single", "curve", "pair", "chi2"): (0.03, 0.01, 0.004, 0.006),
     ("single", "curve", "pair", "chi2", "white"): (0.03, 0.01, 0.004, 0.003, 0.003),
 }
-#: Verdicts by which something is missing and no effect of the library is established.
+#: Verdicts with a missing effect, none of which is established.
 WITHOUT_NAME = ("mechanism", "place")
-#: By what the leader of a class is chosen among its members.
+#: Criteria for the leader of a class.
 PREFERENCES = FIT, HELD_OUT = ("fit", "held-out")
-#: How far beyond its threshold a statistic has to be for a fit with effects to be rejected: two sigmas of a
-#: leftover that lies right on it would flip the verdict, at a family-wise error of some 1 %.
+#: Margin above its threshold at which a statistic rejects a fit with effects. A residual effect of two sigmas right
+#: on the threshold would otherwise flip the verdict, at a family-wise error of about 1 %.
 MARGINS = {"single": 0.5, "curve": 0.7, "pair": 6.0, "chi2": 10.0, "white": 1.0}
 
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """What decides a verdict; written to `result.json`.
+    """Constants that decide a verdict; written to `result.json`.
 
     Attributes:
         shares: family-wise error by kind of evidence; margins: see `MARGINS`.
-        replicates: of the bootstrap; seed: random.
-        slots: most effects that are found at once; rows_per_effect: rows that each needs.
-        width: prior sd of an amplitude in a fit, in sds of its field: wide enough to leave a visible effect
-            unshrunk; plausible: sds of its field beyond which an amplitude is not plausible; stretched: times that
-            up to which an effect is listed beside a plausible one of its family, whose size is known no better.
-        visible: sigmas that the largest plausible amplitude has to leave for an effect to be visible [σ].
-        same, same_parallel: rise of the objective up to which another effect explains the data as well, and up to
-            which it does where |cos| of the signatures is above `parallel` [σ²].
-        form, form_family: share of an effect's sigmas by which another one may explain less and still be the same but
-            for its form; of one of its family.
-        alike: |cos| above which an effect is tried in the place of another one.
-        needed: what each of two effects has to explain, given the other, for both to be named [σ].
-        preferred: evidence by which a smooth curve has to be the better explanation for names not to stand [σ²].
-        alternative: rise of the objective up to which a candidate is listed [σ²].
-        outlier_share: largest share of rows set aside; outlier_few: how many may be of a short table, up to a fifth
-            of it; outlier_error: family-wise error of that.
-        gross: how many times further off than the median row no row can be that was measured as it is stated [σ].
+        replicates: of the bootstrap; seed: random seed.
+        slots: largest number of effects in a fit; rows_per_effect: rows that each needs.
+        width: prior sd of an amplitude in a fit, in sds of its field: wide enough not to shrink a visible effect;
+            plausible: largest plausible amplitude in sds of its field; stretched: factor on that for effects listed
+            next to a plausible one of their family, because their size is equally uncertain.
+        visible: least change of the readings by the largest plausible amplitude of a visible effect [σ].
+        same, same_parallel: largest rise of the objective for another effect that explains the data as well, and the
+            same if |cos| of the signatures is above `parallel` [σ²].
+        form, form_family: share of an effect's sigmas that another one may lack and still differ only in its form;
+            the same within one family.
+        alike: |cos| above which an effect is tried in place of another one.
+        needed: least contribution of each of two effects, given the other, for both to be named [σ].
+        preferred: advantage in evidence of a smooth curve that refutes names [σ²].
+        alternative: largest rise of the objective for a listed candidate [σ²].
+        outlier_share: largest share of excluded rows; outlier_few: largest number in a short table, up to a fifth
+            of it; outlier_error: family-wise error of an exclusion.
+        gross: distance over the median row's beyond which a row cannot have been measured as stated [σ].
         cauchy: scale of Cauchy's weights [σ]; reweightings: their iterations.
-        worth, apart: separation from which an experiment is worth while, and from which it tells two apart [σ].
-        enough, gain: chance beyond which telling a pair apart better is no gain; what a second experiment has to
-            add to the number of pairs that are expected to be told apart.
-        refuted: rise of χ² by which an alternative is refuted [σ²].
+        worth, apart: least separation of an experiment to be worthwhile, and to separate two alternatives [σ].
+        enough, gain: probability above which a better separation is no gain; least addition of a second experiment
+            to the expected number of separated pairs.
+        refuted: rise of χ² that refutes an alternative [σ²].
         prefer: one of `PREFERENCES`.
         forbidden: kinds of experiments, and configurations, that are not proposed (see `menu.KINDS`).
     """
@@ -89,28 +89,30 @@ class Settings:
     forbidden: tuple[str, ...] = ()
 
     def outliers(self, rows: int) -> int:
-        """How many of so many rows may be set aside."""
+        """Largest number of rows that may be excluded."""
         return max(int(self.outlier_share * rows), min(self.outlier_few, rows // 5))
 
     @property
     def family_wise_error(self) -> float:
-        """Of the test whether anything is missing."""
+        """Error of the test for a missing effect."""
         return sum(self.shares.values())
 
 
 def fewest_replicates(kind: type[Observer]) -> int:
-    """Tables of the bootstrap from which on every kind of evidence that data of a kind give can count: below, a
-    statistic beyond all of them is no more improbable than 1 / (1 + tables)."""
+    """Least number of bootstrap tables for which every kind of evidence of such data can be significant.
+
+    The p-value of a statistic is never below 1 / (1 + tables).
+    """
     return math.ceil(1 / min(SHARES[kind.evidence])) - 1
 
 
 def settings_for(kind: type[Observer], replicates: int = 500, seed: int = 0, prefer: str = FIT) -> Settings:
-    """The settings for data of a kind.
+    """Settings for data of a kind.
 
     Raises:
-        BadConfiguration: `prefer` is none of `PREFERENCES`.
+        BadConfiguration: `prefer` is not one of `PREFERENCES`.
     """
     if prefer not in PREFERENCES:
-        raise BadConfiguration(f"--prefer: got {prefer}; {choices(prefer, PREFERENCES)}")
+        raise BadConfiguration(f"--prefer: got {prefer}; {allowed_words(prefer, PREFERENCES)}")
     shares = dict(zip(kind.evidence, SHARES[kind.evidence], strict=True))
     return Settings(shares, replicates=replicates, seed=seed, prefer=prefer)

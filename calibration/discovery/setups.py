@@ -1,4 +1,4 @@
-"""How a robot is set up for an experiment: lifted, its motors alone, held, braked, turned about."""
+"""Setups of a robot for experiments: lifted, motors alone, held, braked, turned about."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mmrjax.model.robot import Robot
 
 #: Friction of a shaft that is held in a vice [N·m].
 BLOCKED = 1e3
-#: A robot set up, of the robot and the torque of the brake on each motor shaft [N·m].
+#: Function of the robot and the brake's torque on each motor shaft [N·m] that returns the robot as set up.
 Setup = Callable[[Robot, Scalar], Robot]
 
 
@@ -26,16 +26,16 @@ def without(robot: Robot, *closed: str) -> Robot:
 
 
 def on_ground(robot: Robot, brake: Scalar = 0.0) -> Robot:
-    """The robot as it is; so with every setup but `braked`, nothing brakes it."""
+    """The unchanged robot; all setups except `braked` ignore the brake."""
     return robot
 
 
 def reversed_(robot: Robot, brake: Scalar = 0.0) -> Robot:
     """The robot turned about, so that its travel is forward again.
 
-    With the negative of the slope in the command, friction, slip and what meters show stay as they are: they
-    follow the travel. What is odd in travel flips: a slope that is steeper than stated stays so, and now drives. So
-    does the zero error of an instrument that shows signs.
+    With the negative of the slope as condition, friction, slip and meters are unchanged, because they follow the
+    travel. Effects that are odd in travel change sign: an error of the slope remains but now drives, and so does
+    the zero error of an instrument with signed readings.
     """
     odd = (e for e in robot.effects if e.odd_in_travel and e.channel not in robot.rig.magnitudes)
     biased = {f"effects.{e.name}.amplitude": -e.amplitude for e in odd}
@@ -43,13 +43,13 @@ def reversed_(robot: Robot, brake: Scalar = 0.0) -> Robot:
 
 
 def lifted(robot: Robot, brake: Scalar = 0.0) -> Robot:
-    """The robot on stands, its movers in the air: no normal load, no ground."""
+    """The robot on stands, with its movers in the air: no normal load, no ground."""
     rolling = {f"{c}.ground.rolling_resistance": 0.0 for c in robot.configurations}
     return _with(without(robot, "mass", "ground", "slip"), rolling)
 
 
 def bare(robot: Robot, brake: Scalar = 0.0) -> Robot:
-    """The motors with their gearboxes uncoupled: of the balances, supply, electrical and motor are left."""
+    """The motors with their gearboxes uncoupled; only supply, electrical and motor balances remain."""
     losses = {f"{c}.track.loss_{kind}": 0.0 for c in robot.configurations for kind in ("coulomb", "viscous")}
     gear = {"gearbox.friction_coulomb": 0.0, "gearbox.friction_viscous": 0.0, "gearbox.efficiency_load": 1.0}
     return _with(without(lifted(robot), "gearbox", "track"), losses | gear)
@@ -65,5 +65,5 @@ def braked(robot: Robot, brake: Scalar = 0.0) -> Robot:
     return _with(bare(robot), {"gearbox.friction_coulomb": brake})
 
 
-#: Setups in which nothing carries weight.
+#: Setups that carry no weight.
 WEIGHTLESS = (lifted, bare, blocked, braked)

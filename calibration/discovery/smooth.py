@@ -1,4 +1,4 @@
-"""Smooth curves over a variable in a balance, linear at a fit, with the prior that the data find most likely."""
+"""Smooth curves over a variable in a balance, linear at a fit, with the prior of the greatest evidence."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from jaxtyping import Array
 from numpy.polynomial import legendre
 
 from calibration.discovery.projection import Projection
-from calibration.inference.bases import ORDERS, scaled, signature, window
+from calibration.inference.bases import ORDERS, place_signature, scale_to_unit_range, window_from_name
 from calibration.inference.linearization import Linearization
 from mmrjax.compile.compiling import compiled
-from mmrjax.effects.curve import ORDINATES, weights
+from mmrjax.effects.curve import ORDINATES, ordinate_weights
 
-#: Priors that are tried for the ordinates: correlation lengths [spacings], sizes [σ that an ordinate makes].
+#: Priors of the ordinates that are tried: correlation lengths [spacings], sizes [σ by an ordinate].
 LENGTHS, SIZES = (1.0, 1.5, 2.5, 4.0), tuple(np.geomspace(0.3, 300.0, 25))
-#: Terms of each variable of a surface, and the fall of their prior sd with the degree (in logarithms).
+#: Terms of each variable of a surface, and the decrease of their prior sd with the degree (in logarithms).
 PRODUCT, FALL = 4, 0.35
-#: Room beside what happens for a while for it to begin and end, as a share of how long it lasts.
+#: Margin for the start and end of a temporary change, as a share of its duration.
 BESIDE = 0.3
-#: Width of a level of a condition for that, as a share of the condition's range.
+#: Width of a condition's level for that margin, as a share of the condition's range.
 NARROW = 0.05
 #: Prior sd of a curve's level and trend, over that of its shape.
 WIDE = 3.0
@@ -30,13 +30,13 @@ WIDE = 3.0
 
 @dataclasses.dataclass(frozen=True)
 class Smooth:
-    """A smooth curve (or a wave) at the base fit, with the prior that these data find most likely.
+    """A smooth curve (or a wave) at the base fit, with the prior of the greatest evidence.
 
     Attributes:
-        effect, variable: name of the curve, and what it is over; low, high: ends of its range; scale: its amplitude.
+        effect, variable: name of the curve, and its variable; low, high: ends of its range; scale: its amplitude.
         root: L of the prior covariance L Lᵀ of the ordinates, shape (ordinates, ordinates).
         start: ordinates in prior coordinates, y = L z, shape (ordinates,).
-        explained: fall of χ²; freedom: how many parameters that took; evidence: twice the log of the marginal
+        explained: decrease of χ²; freedom: effective number of parameters; evidence: twice the log of the marginal
             likelihood over that without a curve [σ²].
     """
 
@@ -53,17 +53,17 @@ class Smooth:
 
     @property
     def wave(self) -> bool:
-        """Whether it repeats with the angle of a shaft."""
+        """True if it repeats with the angle of a shaft."""
         return self.variable in ORDERS
 
     @property
     def happening(self) -> bool:
-        """Whether it stands for what happens for a while."""
-        return window(self.variable) is not None
+        """True for a temporary change."""
+        return window_from_name(self.variable) is not None
 
     @property
     def ordinates(self) -> tuple[str, ...]:
-        """Parameters of the effect that make its shape."""
+        """Parameters of the effect that define its shape."""
         return ("y_sin", "y_cos") if self.wave else ORDINATES
 
     @property
@@ -74,7 +74,7 @@ class Smooth:
         return {"amplitude": self.scale, "low": self.low, "high": self.high}
 
     def basis(self, x: np.ndarray) -> np.ndarray:
-        """What each ordinate counts at x, shape (points, ordinates)."""
+        """Weight of each ordinate at x, shape (points, ordinates)."""
         return _basis(self.variable, x, self.low, self.high)
 
 
@@ -84,20 +84,20 @@ def _basis(variable: str, x: np.ndarray, low: float, high: float) -> np.ndarray:
     return np.asarray(_weights(np.asarray(x), np.asarray(low), np.asarray(high)))
 
 
-_weights: Callable[..., Array] = compiled(weights)
+_weights: Callable[..., Array] = compiled(ordinate_weights)
 
 
-def smooth(linear: Linearization, balance: str, variable: str, counts: np.ndarray) -> Smooth:
-    """The curve of a variable in a balance, linear at the base fit.
+def smooth_curve(linear: Linearization, balance: str, variable: str, counts: np.ndarray) -> Smooth:
+    """Curve over a variable in a balance, linear at the base fit.
 
-    The ordinates are a Gaussian process with covariance s² exp(-½ (Δ/l)²) over their distance Δ, and a level
-    and a trend WIDE times as large, which base parameters can hide; size s and length l are those of the
-    greatest evidence (Rasmussen and Williams 2006, eqs. (2.39), (5.8)). Of a wave sine and cosine are independent.
+    The ordinates are a Gaussian process with covariance s² exp(-½ (Δ/l)²) over their distance Δ. A level
+    and a trend WIDE times as large are added, which base parameters can hide. Size s and length l have the
+    greatest evidence (Rasmussen and Williams 2006, eqs. (2.39), (5.8)). Sine and cosine of a wave are independent.
 
     Args:
-        counts: whether a row counts, shape (rows,).
+        counts: True for included rows, shape (rows,).
     """
-    happens = window(variable)
+    happens = window_from_name(variable)
     axis = variable if happens is None else happens.axis
     (x, way), counts = linear.in_travel(balance, axis), linear.at_points(counts)
     low, high = (0.0, 2 * np.pi) if variable in ORDERS else (float(x[counts].min()), float(x[counts].max()))
@@ -105,9 +105,9 @@ def smooth(linear: Linearization, balance: str, variable: str, counts: np.ndarra
         beside = BESIDE * max(happens.high - happens.low, NARROW * (high - low))
         low, high = happens.low - beside, happens.high + beside
     if not high - low > 1e-9 * max(abs(high), abs(low), 1e-9):
-        high = low + max(abs(low), 1.0)  # the variable stands still: an offset is all that can be seen
+        high = low + max(abs(low), 1.0)  # a constant variable: only an offset can be seen
     basis = _basis(variable, x, low, high)
-    a, b = Projection(linear)(signature(linear, balance, way[:, None] * basis))
+    a, b = Projection(linear)(place_signature(linear, balance, way[:, None] * basis))
     size = 1 / np.sqrt(max(np.diag(a).max(), 1e-300))
     roots = [np.eye(2)] if variable in ORDERS else [_smoothness(length, happens is not None) for length in LENGTHS]
     best: tuple[float, tuple] = (-np.inf, ())
@@ -126,8 +126,8 @@ def smooth(linear: Linearization, balance: str, variable: str, counts: np.ndarra
 
 
 def _smoothness(length: float, happening: bool = False) -> np.ndarray:
-    """L of the prior covariance of the ordinates at a correlation length [spacings]; what happens for a while begins
-    and ends at nothing."""
+    """L of the prior covariance of the ordinates at a correlation length [spacings]; a temporary change is zero at
+    its ends."""
     distance = np.subtract.outer(np.arange(len(ORDINATES)), np.arange(len(ORDINATES)))
     across = np.linspace(-1.0, 1.0, len(ORDINATES))
     if happening:
@@ -144,8 +144,8 @@ class Surface:
     """A smooth discrepancy over two variables in a balance, linear at a fit.
 
     Attributes:
-        columns: its signatures, scaled to the prior that the data find most likely, shape (readings, terms).
-        explained: fall of χ² [σ²]; evidence: as of `Smooth`.
+        columns: its signatures, scaled to the prior of the greatest evidence, shape (readings, terms).
+        explained: decrease of χ² [σ²]; evidence: as in `Smooth`.
     """
 
     columns: np.ndarray
@@ -153,20 +153,24 @@ class Surface:
     evidence: float
 
 
-def surface(
+def smooth_surface(
     linear: Linearization, balance: str, variables: tuple[str, str], counts: np.ndarray, project: Projection
 ) -> Surface:
-    """The discrepancy over two variables: products of Legendre polynomials, each term's prior sd the smaller the
-    higher its degree, of the size of the greatest evidence.
+    """Discrepancy over two variables, as products of Legendre polynomials.
+
+    The prior sd of a term decreases with its degree; the common size has the greatest evidence.
 
     Args:
-        counts: whether a row counts, shape (rows,).
+        counts: True for included rows, shape (rows,).
     """
     weight = linear.at_points(counts).astype(float)
     each, ways = zip(*(linear.in_travel(balance, v) for v in variables), strict=True)
-    sides = [legendre.legvander(scaled(x, weight), PRODUCT - 1) * np.exp(-FALL * np.arange(PRODUCT)) for x in each]
+    sides = [
+        legendre.legvander(scale_to_unit_range(x, weight), PRODUCT - 1) * np.exp(-FALL * np.arange(PRODUCT))
+        for x in each
+    ]
     shapes = ways[0][:, None] * (sides[0][:, :, None] * sides[1][:, None, :]).reshape(linear.points, -1)
-    columns = signature(linear, balance, shapes)
+    columns = place_signature(linear, balance, shapes)
     a, b = project(columns)
     size = 1 / np.sqrt(max(np.diag(a).max(), 1e-300))
     best = (-np.inf, 0.0, 0.0)

@@ -1,9 +1,9 @@
-"""Whether names may stand: what smooth curves would explain in their place, or take away from them.
+"""Tests of names against smooth curves that would explain as much, or take their significance away.
 
-A name is a claim about a cause; a curve claims only a place and a shape. Effects that were searched for among many
-can together imitate a law that the library lacks. So names are compared with curves by evidence that counts what was
-searched (MacKay, Information Theory, Inference, and Learning Algorithms, 2003, ch. 28), and where a fit with effects
-is not adequate each has to keep its significance with the best curves beside it.
+A name is a claim about a cause; a curve claims only a place and a shape. Effects selected from many
+can together imitate a law that the library lacks. So names are compared with curves by evidence that includes the
+number of alternatives (MacKay, Information Theory, Inference, and Learning Algorithms, 2003, ch. 28). If a fit with
+effects is not adequate, each has to keep its significance in addition to the best curves.
 """
 
 from __future__ import annotations
@@ -19,38 +19,38 @@ import numpy as np
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import Candidate
-from calibration.discovery.discrepancy import CurveBeside, locate
+from calibration.discovery.discrepancy import CurveBeside, locate_discrepancy
 from calibration.discovery.loop_notes import CurveOver, NameSupport, NameTest
 from calibration.discovery.projection import Projection
-from calibration.discovery.score_tests import ABSORBED, augment_with_columns, beside_columns, family_columns
-from calibration.discovery.search import Search, diagnose, without_each
+from calibration.discovery.score_tests import ABSORBED, augment_with_columns, family_columns, statistics_with_columns
+from calibration.discovery.search import Search, diagnose_candidate, without_each
 from calibration.discovery.settings import Settings
-from calibration.discovery.smooth import smooth, surface
+from calibration.discovery.smooth import smooth_curve, smooth_surface
 from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
 from calibration.inference.linearization import Linearization
 
-#: Curves that are put beside effects, one after the other.
+#: Number of curves that are added to effects, one after the other.
 CURVES = 3
-#: Curves that are tried by themselves, whether one of them does without any name.
+#: Number of curves that are tried alone, without any name.
 ALONE = 4
-#: Share of what a fit with an effect gains that slopes without it have to promise to be asked about other effects.
+#: Least share of an effect's gain that the slopes without it must predict for them to be used for other effects.
 PROMISED = 0.8
-#: Balances whose curves stand for effects of a balance: those of one equation. What a speed meter shows too much is
-#: what slip takes away.
+#: Balances with curves of another balance, those of one equation. A positive error of a speed meter has the same
+#: effect as negative slip.
 EQUATION = {"mass": "ground", "speed": "slip"} | {
     other: b for b, others in bases_room.STANDS_FOR.items() for other in others
 }
-#: Pairs of variables over which a surface is tried.
+#: Variables of surfaces, in pairs.
 VARIABLES = ("voltage", "current", "speed_motor", "slope", "payload")
 
 
-def equation(place: str) -> str:
-    """The place whose curves stand for what is in a balance, or in the readings of a channel."""
+def equation_of_place(place: str) -> str:
+    """Place with the curves that represent effects in a balance, or in the readings of a channel."""
     return EQUATION.get(place, place)
 
 
-def standing(
+def judge_names(
     space: CandidateSpace,
     base: Candidate,
     searched: Search,
@@ -61,14 +61,14 @@ def standing(
     blocks: Sequence[np.ndarray] = (),
     beside: CurveBeside | None = None,
 ) -> NameSupport:
-    """Which effects of the best candidate of a search may be named, or of another that is proposed.
+    """Tests which effects of the best candidate of a search, or of a given proposal, may be named.
 
-    A set that leaves nothing is weighed against curves, one that leaves something against one curve alone; then each
-    effect by itself (`name_tests`).
+    An adequate set is compared with curves, an inadequate one with a single curve; then each
+    effect is tested independently (`name_tests`).
 
     Args:
-        left: what the base leaves; blocks: masks of rows that are left out in turn, each of shape (rows,).
-        beside: the curve of what the base leaves, where others ask for it too.
+        left: diagnosis of the base; blocks: masks of rows that are left out in turn, each of shape (rows,).
+        beside: the curve of the base's discrepancy, if it is shared with others.
     """
     best, after = (searched.best, searched.diagnosis) if proposed is None else proposed
     if best is None or after is None:
@@ -93,7 +93,7 @@ def standing(
 def _ruled_out(
     space: CandidateSpace, base: Candidate, best: Candidate, ladder: Sequence[Candidate], settings: Settings
 ) -> list[Candidate]:
-    """Candidates that are the better explanation by their evidence and ruled out by their size alone, best first."""
+    """Candidates with better evidence that are excluded only by their size, best first."""
     names = evidence_of_names(space, base, best, settings)
     fits = [c for c in ladder if c.simulated and np.isfinite(c.cost) and len(c.effects) <= len(best.effects)]
     ruled_out = [c for c in fits if not c.plausible]
@@ -106,10 +106,9 @@ def _ruled_out(
 
 
 def cost_of_names(space: CandidateSpace, best: Candidate, settings: Settings) -> float:
-    """What the fall of χ² by a set of effects is worth less [σ²]: for what their amplitudes and shapes were free to
-    take, and the number of sets of its size.
+    """Penalty on a set's decrease of χ² [σ²]: for its free amplitudes and shapes, and the number of sets of its size.
 
-    As of a curve, the prior of an amplitude is taken of the size that the data find most likely, which is its own.
+    As for a curve, the prior of an amplitude has the size of the greatest evidence, which is its own.
     """
     slots = [slot for slot, name in enumerate(best.active) if name]
     sets = 2 * math.log(math.comb(len(space.library), len(slots)))
@@ -117,7 +116,7 @@ def cost_of_names(space: CandidateSpace, best: Candidate, settings: Settings) ->
 
 
 def _cost_of(space: CandidateSpace, best: Candidate, slot: int, settings: Settings) -> float:
-    """What the amplitude and the shape of an effect were free to take [σ²]."""
+    """Penalty for the free amplitude and shape of an effect [σ²]."""
     sds = np.clip(np.asarray(best.sd), 1e-6, 1.0)
     k = space.free + slot
     amplitude = min(-2 * math.log(sds[k]), 1 + math.log1p((float(best.z[k]) / sds[k]) ** 2))
@@ -125,22 +124,22 @@ def _cost_of(space: CandidateSpace, best: Candidate, slot: int, settings: Settin
 
 
 def evidence_of_names(space: CandidateSpace, base: Candidate, best: Candidate, settings: Settings) -> float:
-    """Twice the log of the evidence of a set of effects over none [σ²]."""
+    """Twice the log of the evidence for a set of effects over none [σ²]."""
     return 2 * (base.cost - best.cost) - cost_of_names(space, best, settings)
 
 
 def _against_curves(
     space: CandidateSpace, base: Candidate, best: Candidate, linear: Linearization, bases: Bases, settings: Settings
 ) -> NameSupport:
-    """Names against one smooth curve of one variable, or of two, in the balance of several of them or anywhere."""
-    equations = [equation(space.library[e].channel or space.library[e].balance) for e in best.effects]
-    places = {place for place, _ in bases_room.names(bases)}
+    """Test of names against one smooth curve of one variable anywhere, or of two in a balance with several names."""
+    equations = [equation_of_place(space.library[e].channel or space.library[e].balance) for e in best.effects]
+    places = {place for place, _ in bases_room.family_names(bases)}
     crowded = {e for e in equations if equations.count(e) > 1 and e in places}
     tried = _curves(space, linear, bases, crowded)
     if not tried:
         return NameSupport(True)
     curve, over = max(tried)
-    # Curves are linear at the base: names are weighed by the better of their fit and what they explain there too.
+    # Curves are linear at the base, so names get the better of their fit and of their linear gain there.
     fall = max(2 * (base.cost - best.cost), _linearly(space, best, linear, settings))
     names = fall - cost_of_names(space, best, settings)
     if curve - 2 * math.log(len(tried)) > names + settings.preferred:
@@ -151,8 +150,8 @@ def _against_curves(
 def _curves(
     space: CandidateSpace, linear: Linearization, bases: Bases, crowded: set[str]
 ) -> list[tuple[float, CurveOver]]:
-    """Evidence of every smooth curve and wave: of one variable in any place, of two in the crowded ones."""
-    included, offered = space.included, dict.fromkeys(bases_room.names(bases))
+    """Evidence of each smooth curve and wave: of one variable in any place, of two in the crowded ones."""
+    included, offered = space.included, dict.fromkeys(bases_room.family_names(bases))
     known = [
         v
         for v in (*bases_room.VARIABLES, *bases_room.ORDERS)
@@ -161,17 +160,17 @@ def _curves(
     tried = []
     for place, variable in offered:
         if variable in known:
-            found = smooth(linear, place, variable, included)
-            tried.append((found.evidence, CurveOver(place, (variable,))))
+            curve = smooth_curve(linear, place, variable, included)
+            tried.append((curve.evidence, CurveOver(place, (variable,))))
     project = Projection(linear)
     for place in sorted(crowded):
         for pair in itertools.combinations([v for v in VARIABLES if v in known], 2):
-            over = surface(linear, place, pair, included, project)
+            over = smooth_surface(linear, place, pair, included, project)
             tried.append((over.evidence, CurveOver(place, pair)))
     return tried
 
 
-def _over(place: str, variable: str) -> CurveOver:
+def _curve_over(place: str, variable: str) -> CurveOver:
     return CurveOver(place, (variable,))
 
 
@@ -181,7 +180,7 @@ def _varies(linear: Linearization, variable: str, included: np.ndarray) -> bool:
 
 
 def _linearly(space: CandidateSpace, best: Candidate, linear: Linearization, settings: Settings) -> float:
-    """What the effects of a candidate explain at the base fit, at their nearest shapes [σ²]."""
+    """Decrease of χ² by the effects of a candidate at the base fit, at their nearest shapes [σ²]."""
     p, s = space.free, settings.slots
     chosen = []
     for slot, name in enumerate(best.active):
@@ -195,35 +194,35 @@ def _linearly(space: CandidateSpace, best: Candidate, linear: Linearization, set
 # --- a fit that is not adequate: do the names keep their significance? -------------------------------------
 
 
-#: A candidate in the place of a search's best, and what it leaves.
+#: A candidate instead of a search's best, and its diagnosis.
 Proposed = tuple[Candidate, Diagnosis]
 
 
 def _equation(space: CandidateSpace, effect: str) -> str:
-    return equation(space.library[effect].channel or space.library[effect].balance)
+    return equation_of_place(space.library[effect].channel or space.library[effect].balance)
 
 
 def _one_curve(
     space: CandidateSpace, best: Candidate, left: Diagnosis, bases: Bases, settings: Settings, beside: CurveBeside
 ) -> NameSupport:
-    """Whether one curve alone leaves nothing, where the names of a candidate leave something that is beyond doubt."""
-    names = bases_room.names(bases)
+    """Test whether a single curve is adequate where the names of a candidate are not."""
+    names = bases_room.family_names(bases)
     for k in _strongest(left, names):
-        found, _ = beside_columns(left.linear, bases, family_columns(left.linear, bases, k), [names[k][0]])
+        found, _ = statistics_with_columns(left.linear, bases, family_columns(left.linear, bases, k), [names[k][0]])
         if not AdequacyTest(found, left.test.null, settings).rejected_with_margin:
-            return NameSupport(False, "curve alone", curves=(_over(*names[k]),))
+            return NameSupport(False, "curve alone", curves=(_curve_over(*names[k]),))
     where = beside.where
-    if equation(where.place) in {_equation(space, e) for e in best.effects}:
-        # Names mend what a strong curve in their equation leaves at a base fit that it has pulled far away.
-        # Beyond doubt there is no need to compile a closer look.
+    if equation_of_place(where.place) in {_equation(space, e) for e in best.effects}:
+        # A strong curve distorts the base fit, and names then absorb its residuals in the same equation.
+        # If the result is highly significant, no closer look is compiled.
         adequate = not left.test.beyond_doubt("chi2", beside.curve.chi2[1])
         if adequate and not beside.diagnosis.test.rejected_with_margin:
-            return NameSupport(False, "curve alone", curves=(_over(where.place, where.variable),))
+            return NameSupport(False, "curve alone", curves=(_curve_over(where.place, where.variable),))
     return NameSupport(True)
 
 
 def _strongest(left: Diagnosis, names: Sequence[tuple[str, str]]) -> list[int]:
-    """The most improbable family of curves of each place, the most improbable of these first, at most `ALONE`."""
+    """The most significant family of curves of each place, the most significant of these first, at most `ALONE`."""
     deviate = np.asarray(left.scores.curve)
     first: dict[str, int] = {}
     for k in np.argsort(-deviate):
@@ -234,20 +233,19 @@ def _strongest(left: Diagnosis, names: Sequence[tuple[str, str]]) -> list[int]:
 def _curves_beside(
     linear: Linearization, seen: Diagnosis, bases: Bases, without: set[str], most: int, settings: Settings
 ) -> tuple[list[int], AdequacyTest]:
-    """Families of curves, the most improbable first, until what is left with them is noise, at most so many; and the
-    test of what is left.
+    """Families of curves, the most significant first, until the residuals with them are noise, and that test.
 
     Args:
-        seen: what the fit leaves; without: equations that get none.
+        seen: diagnosis of the fit; without: equations without curves; most: largest number of curves.
     """
-    places = [n[0] for n in bases_room.names(bases)]
-    barred = np.isin([equation(p) for p in places], list(without))
+    places = [n[0] for n in bases_room.family_names(bases)]
+    barred = np.isin([equation_of_place(p) for p in places], list(without))
     chosen, columns = list[int](), np.zeros((linear.readings, 0))
     deviate, test = np.array(seen.scores.curve), seen.test
     while test.rejected_with_margin and len(chosen) < most:
         chosen.append(int(np.argmax(np.where(barred, -np.inf, deviate))))
         columns = np.concatenate([columns, family_columns(linear, bases, chosen[-1])], 1)
-        found, deviate = beside_columns(linear, bases, columns, [places[k] for k in chosen])
+        found, deviate = statistics_with_columns(linear, bases, columns, [places[k] for k in chosen])
         test = AdequacyTest(found, seen.test.null, settings)
     return chosen, test
 
@@ -262,35 +260,37 @@ def name_tests(
     blocks: Sequence[np.ndarray] = (),
     better: Sequence[Candidate] = (),
 ) -> tuple[NameTest, ...]:
-    """Each effect by itself, at the fit of the others: the root of its score beside the curves that all of them leave
-    in other equations, the row that it rests on most, whether it is found without blocks of rows, and its evidence
-    against curves of its own equation.
+    """Independent test of each effect, at the fit of the others.
 
-    A score, and not an amplitude over its sd: where a shape is free too, that ratio stays small however much an
-    effect explains (Hauck and Donner, J. Am. Stat. Assoc. 72 (1977); Davies, Biometrika 64 (1977)). Curves in its own
-    equation would take away what it explains, whatever that is; whether one of them does better is asked beside the
-    largest set that was searched for, since it would else stand for what that adds in the same equation.
+    A test has the root of the effect's score in addition to curves of other equations, and its most influential row.
+    It also has the share of hold-out blocks that find the effect again, and its evidence against curves of its own
+    equation.
+
+    The test uses a score instead of an amplitude over its sd. With a free shape that ratio stays small, however
+    much an effect explains (Hauck and Donner, J. Am. Stat. Assoc. 72 (1977); Davies, Biometrika 64 (1977)). Curves in
+    the effect's own equation would absorb it. So they are compared with it in addition to the largest set of
+    the search. Without that set, a curve would represent its other effects in the same equation.
 
     Args:
-        after: what the fit with all of them leaves; blocks: as of `standing`.
-        better: candidates that are the better explanation and not of a plausible size.
+        after: diagnosis of the fit with all of them; blocks: as in `judge_names`.
+        better: candidates that are the better explanation but not of a plausible size.
     """
-    names, largest, tests = bases_room.names(bases), searched.best or best, []
+    names, largest, tests = bases_room.family_names(bases), searched.best or best, []
     most = searched.diagnosis or after
-    lacks = _lacks(space, most, bases)
+    lacks = _deficient_equations(space, most, bases)
     fewer = dict(zip(largest.effects, without_each(space, largest, settings, searched.ladder), strict=True))
     each = without_each(space, best, settings, searched.ladder)
     fits = {c.active: c for c in (*each, *(c for e, c in fewer.items() if e in best.effects))}
-    seen = {at: diagnose(space, c, bases, after.test.null, settings).linear for at, c in fits.items()}
+    seen = {at: diagnose_candidate(space, c, bases, after.test.null, settings).linear for at, c in fits.items()}
     for effect, without in zip(best.effects, each, strict=True):
-        own = _equation(space, effect)
+        equation = _equation(space, effect)
         linear = seen[without.active]
-        chosen, _ = _curves_beside(after.linear, after, bases, {own}, CURVES, settings)
-        beside = _beside(space, linear, bases, chosen, effect)
+        chosen, _ = _curves_beside(after.linear, after, bases, {equation}, CURVES, settings)
+        beside = _with_curves(space, linear, bases, chosen, effect)
         promised = _root(np.asarray(linear.jacobian), np.asarray(linear.residual), beside[2]) ** 2
         judged, signatures = beside, linear.signatures
         if promised < PROMISED * 2 * (without.cost - best.cost):
-            judged = _put_back(space, best, effect, _beside(space, after.linear, bases, chosen, effect))
+            judged = _put_back(space, best, effect, _with_curves(space, after.linear, bases, chosen, effect))
             signatures = after.linear.signatures
         run, root_without = _weakest_run(space, linear.runs(), *beside, differ=space.bare.observe.long)
         whole, others = (largest, fewer[effect]) if effect in fewer else (best, without)
@@ -300,7 +300,7 @@ def name_tests(
                 effect,
                 _root(*beside),
                 after.test.threshold("single"),
-                tuple(_over(*names[k]) for k in chosen),
+                tuple(_curve_over(*names[k]) for k in chosen),
                 _evidence_over_curves(space, whole, others, effect, seen[others.active], bases, settings),
                 run,
                 root_without,
@@ -308,7 +308,7 @@ def name_tests(
                     space, (space.library[effect].family(),), judged, np.asarray(signatures), blocks, settings
                 ),
                 next((c.effects for c in better if effect not in c.effects), ()),
-                own in lacks,
+                equation in lacks,
                 "run" if space.bare.observe.long else "row",
                 *_varies_most(space, whole, effect, beside_all, settings.shares["single"]),
             )
@@ -316,12 +316,12 @@ def name_tests(
     return tuple(tests)
 
 
-def _lacks(space: CandidateSpace, seen: Diagnosis, bases: Bases) -> set[str]:
-    """Equations in which a fit leaves something that is beyond doubt: where a curve is the most improbable, and where
-    the strongest effect would act."""
+def _deficient_equations(space: CandidateSpace, seen: Diagnosis, bases: Bases) -> set[str]:
+    """Equations with a significant discrepancy of a fit: those of the most significant curve and of the strongest
+    effect."""
     if not seen.test.rejected_with_margin:
         return set()
-    lacks = {equation(locate(seen, bases, space.included).place)}
+    lacks = {equation_of_place(locate_discrepancy(seen, bases, space.included).place)}
     if seen.test.beyond_doubt("single"):
         strongest = space.library.of[int(np.argmax(np.abs(np.asarray(seen.scores.single))))]
         lacks.add(_equation(space, space.library.names[strongest]))
@@ -331,16 +331,17 @@ def _lacks(space: CandidateSpace, seen: Diagnosis, bases: Bases) -> set[str]:
 def _varies_most(
     space: CandidateSpace, best: Candidate, effect: str, linear: Linearization, share: float
 ) -> tuple[float, str, float, float]:
-    """Root of the most that an amplitude explains which changes with a variable, along a line or bent [σ], all else
-    fitted again; the variable; what chance leaves to so many looks (Bonferroni 1936); and the change at an end of the
-    variable over the amplitude [-].
+    """Largest change of an effect's amplitude over a variable, as a line or a parabola.
 
-    What a law of another form leaves beside a name is, to first order, that name's own term with an amplitude that
-    differs from place to place: so few columns see what a family of curves, with many more, leaves to chance. Of
-    settled runs, where each row answers to its own term alone; 0 of histories.
+    Returns the root of its score after a refit [σ], the variable, the critical value and the relative change of the
+    amplitude at an end of the variable [-]. The critical value holds for all these tests (Bonferroni 1936).
+
+    To first order, the residual of a law of another form is the name's own term with an amplitude that varies. So
+    a few columns can test what a whole family of curves, with many more, cannot. For settled runs, where each row
+    depends only on its own term; 0 for histories.
 
     Args:
-        linear: the fit of the candidate, linearised; share: of clean tables in which chance exceeds that.
+        linear: the fit of the candidate, linearised; share: family-wise error of the critical value.
     """
     most = 0.0, "", math.inf
     if space.bare.observe.long:
@@ -350,10 +351,10 @@ def _varies_most(
     of_row = jacobian[: linear.readings, slot].reshape(linear.rows, -1)
     variables = [v for v in (*VARIABLES, "speed") if _varies(linear, v, space.included)]
     for variable in variables:
-        at = linear.in_travel(bases_room.SHAFTS, variable)[0].reshape(-1, linear.rows).mean(0)
-        x = bases_room.scaled(np.nan_to_num(at), space.included.astype(float))
+        values = linear.in_travel(bases_room.SHAFTS, variable)[0].reshape(-1, linear.rows).mean(0)
+        x = bases_room.scale_to_unit_range(np.nan_to_num(values), space.included.astype(float))
         changed = np.stack([(of_row * shape[:, None]).ravel() for shape in (x, 2 * x**2 - 1)], 1)
-        left, told = _left_of(jacobian, residual, changed)
+        left, told = _projected_columns(jacobian, residual, changed)
         for k, root in enumerate(_roots(jacobian, residual, changed)):
             spread = abs(told[k] / max(left[k], 1e-300) / best.z[slot]) if best.z[slot] else math.inf
             most = max(most, (float(root), variable, float(spread)))
@@ -372,53 +373,55 @@ def _evidence_over_curves(
 ) -> float:
     """Twice the log of the evidence for an effect of a candidate over the best smooth curve of its equation [σ²].
 
-    Both pay for having been searched for in that equation: the effect among the effects, the curve among the curves.
+    Both are penalised for the number of alternatives in that equation: effects, and curves.
 
     Args:
-        without: the same fit without it; linear: that one, linearised.
+        without: the same fit without it; linear: linearization of that fit.
     """
-    own = _equation(space, effect)
-    offered = sum(_equation(space, name) == own for name in space.library.names)
+    equation = _equation(space, effect)
+    offered = sum(_equation(space, name) == equation for name in space.library.names)
     cost = _cost_of(space, best, best.active.index(effect), settings) + 2 * math.log(offered)
-    tried = [e for e, over in _curves(space, linear, bases, set()) if equation(over.place) == own]
+    tried = [e for e, over in _curves(space, linear, bases, set()) if equation_of_place(over.place) == equation]
     return 2 * (without.cost - best.cost) - cost - max(tried, default=-math.inf) + 2 * math.log(max(len(tried), 1))
 
 
 def _root(jacobian: np.ndarray, residual: np.ndarray, signatures: np.ndarray) -> float:
-    """Root of the most that one of several columns over the readings explains, all else fitted again [σ]."""
+    """Largest root of the scores of several columns over the readings, after a refit [σ]."""
     return float(np.max(_roots(jacobian, residual, signatures)))
 
 
 def _roots(jacobian: np.ndarray, residual: np.ndarray, signatures: np.ndarray) -> np.ndarray:
-    """The same of each column; 0 of what the fit imitates."""
-    left, told = _left_of(jacobian, residual, signatures)
+    """Root of the score of each column; 0 for columns that the fit imitates."""
+    left, told = _projected_columns(jacobian, residual, signatures)
     root = np.abs(told) / np.sqrt(np.maximum(left, 1e-12))
     return np.where(left > ABSORBED**2 * np.sum(signatures**2, 0), root, 0.0)
 
 
-def _left_of(jacobian: np.ndarray, residual: np.ndarray, signatures: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of columns over the readings what a fit cannot imitate, squared, and what the residual has along that."""
+def _projected_columns(
+    jacobian: np.ndarray, residual: np.ndarray, signatures: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Squared norm of columns over the readings after projection, and their product with the residual."""
     half = np.linalg.solve(np.linalg.cholesky(jacobian.T @ jacobian), jacobian.T)
     left, inside = residual - half.T @ (half @ residual), half[:, : len(signatures)] @ signatures
     return np.sum(signatures**2, 0) - np.sum(inside**2, 0), signatures.T @ left[: len(signatures)]
 
 
-def _beside(
+def _with_curves(
     space: CandidateSpace, linear: Linearization, bases: Bases, curves: Sequence[int], effect: str
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Jacobian and residual of a fit with families of curves beside, and an effect's signatures over its readings."""
+    """Jacobian and residual of a fit with additional families of curves, and an effect's signatures."""
     columns = [np.zeros((linear.readings, 0)), *(family_columns(linear, bases, k) for k in curves)]
-    own = np.asarray(linear.signatures)[:, space.library.of == space.library.names.index(effect)]
-    return *augment_with_columns(linear, np.concatenate(columns, 1)), own
+    own_columns = np.asarray(linear.signatures)[:, space.library.of == space.library.names.index(effect)]
+    return *augment_with_columns(linear, np.concatenate(columns, 1)), own_columns
 
 
 def _put_back(
     space: CandidateSpace, best: Candidate, effect: str, beside: tuple[np.ndarray, np.ndarray, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The same of a fit with the effect, what that explains put back by its amplitude.
+    """The same for a fit with the effect, after its contribution is restored by its amplitude.
 
-    Where it explains much, the fit without it may be so far off that what its slopes promise of each effect is
-    nothing that a fit would find.
+    If it explains much, the fit without it may be so far off that its slopes predict nothing that a fit would
+    confirm.
     """
     jacobian, residual, signatures = beside
     k = space.free + best.active.index(effect)
@@ -436,17 +439,18 @@ def chosen_again(
     blocks: Sequence[np.ndarray],
     settings: Settings,
 ) -> float:
-    """Share of the informative blocks without which an effect of these families explains as much as any other; 1
-    where there are none. An informative block leaves half of what is known of the candidate's first effect.
+    """Share of the informative blocks without which an effect of these families explains as much as any.
+
+    1 without such blocks. An informative block leaves half of the information on the candidate's first effect.
 
     Args:
-        left: what the base leaves.
+        left: diagnosis of the base.
     """
     effect, linear = best.effects[0], left.linear
-    judged = _beside(space, linear, bases, (), effect)
+    judged = _with_curves(space, linear, bases, (), effect)
     if _root(*judged) ** 2 < PROMISED * 2 * (base.cost - best.cost):
-        linear = diagnose(space, best, bases, left.test.null, settings).linear
-        judged = _put_back(space, best, effect, _beside(space, linear, bases, (), effect))
+        linear = diagnose_candidate(space, best, bases, left.test.null, settings).linear
+        judged = _put_back(space, best, effect, _with_curves(space, linear, bases, (), effect))
     return _chosen_again(space, families, judged, np.asarray(linear.signatures), blocks, settings)
 
 
@@ -458,21 +462,22 @@ def _chosen_again(
     blocks: Sequence[np.ndarray],
     settings: Settings,
 ) -> float:
-    """Share of the blocks without which an effect of these families still explains as much as any of the library, as
-    `classes` has it, of those that leave half of what is known of an effect; 1 where there are none.
+    """Share of the informative blocks without which an effect of these families explains as much as any other.
+
+    The criterion is that of `classes`; informative blocks leave half of the information on an effect; 1 without any.
 
     Args:
-        beside: Jacobian, residual and the effect's own signatures, as `_root` takes them.
+        beside: Jacobian, residual and the effect's own signatures, as for `_root`.
         signatures: of the library, there.
     """
     library, again = space.library, []
     akin = np.array([library[name].family() in families for name in library.names])[library.of]
-    whole = _left_of(*beside)[0].max()
+    whole = _projected_columns(*beside)[0].max()
     for out in blocks:
-        kept = _kept(space, out, len(signatures))
+        kept = _kept_readings(space, out, len(signatures))
         every = signatures[kept]
-        j, e, own = _rest(kept, *beside)
-        if _left_of(j, e, own)[0].max() < 0.5 * whole:
+        j, e, own = _restrict_readings(kept, *beside)
+        if _projected_columns(j, e, own)[0].max() < 0.5 * whole:
             continue
         roots = _roots(j, e, every)
         most = np.max(roots) ** 2
@@ -488,34 +493,34 @@ def _weakest_run(
     signatures: np.ndarray,
     differ: bool = False,
 ) -> tuple[int | None, float]:
-    """Number of the run without which that root is smallest, and the root; None of fewer than three runs.
+    """Number of the run without which the root is smallest, and that root; None for fewer than three runs.
 
     Args:
-        runs: rows of each; differ: on purpose, in what they can tell, as those of histories do: then it is the root
-            that all of them would have if the others told as much.
+        runs: rows of each; differ: True for runs of different information, as histories have; the root is then scaled
+            to the information of all runs.
     """
     least: tuple[int | None, float] = None, math.inf
-    known = np.max(_left_of(jacobian, residual, signatures)[0]) if differ else 1.0
+    known = np.max(_projected_columns(jacobian, residual, signatures)[0]) if differ else 1.0
     counting = [(k, rows) for k, rows in enumerate(runs) if space.included[rows].any()]
     for k, rows in counting if len(counting) > 2 else ():
         out = np.zeros(len(space.included), bool)
         out[rows] = True
-        rest = _rest(_kept(space, out, len(signatures)), jacobian, residual, signatures)
-        told = math.sqrt(np.max(_left_of(*rest)[0]) / known) if differ else 1.0
+        rest = _restrict_readings(_kept_readings(space, out, len(signatures)), jacobian, residual, signatures)
+        told = math.sqrt(np.max(_projected_columns(*rest)[0]) / known) if differ else 1.0
         root = _root(*rest) / max(told, 1e-9)
         least = (k + 1, root) if root < least[1] else least
     return least
 
 
-def _kept(space: CandidateSpace, out: np.ndarray, readings: int) -> np.ndarray:
-    """Readings that are left without some rows, which are padded behind; shape (readings,)."""
+def _kept_readings(space: CandidateSpace, out: np.ndarray, readings: int) -> np.ndarray:
+    """True for readings that remain without some rows, which are padded; shape (readings,)."""
     rows = np.concatenate([out, np.zeros(len(space.included) - len(out), bool)])
     return np.repeat(~rows, readings // len(rows))
 
 
-def _rest(
+def _restrict_readings(
     kept: np.ndarray, jacobian: np.ndarray, residual: np.ndarray, signatures: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The same of the readings that are kept, and of all that follows them."""
+    """Jacobian, residual and signatures of the remaining readings, and of all further residuals."""
     whole = np.concatenate([kept, np.ones(len(residual) - len(kept), bool)])
     return jacobian[whole], residual[whole], signatures[kept]

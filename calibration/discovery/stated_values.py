@@ -1,7 +1,7 @@
-"""Stated values that may be the wrong ones: base parameters whose shift explains the data as well as an effect.
+"""Stated values that may be wrong: base parameters with a shift that explains the data as well as an effect.
 
-A prior is a measurement made beforehand, and may be off like any reading. The score of a shift of one prior's mean is
-that of a column that is 1 in its residual; where it is large, the fit is made again with that prior left out.
+A prior is an earlier measurement, and may be wrong like any reading. The score of a shift of one prior's mean is
+that of a column that is 1 in its residual. If it is large, the fit is repeated without that prior.
 """
 
 from __future__ import annotations
@@ -13,22 +13,22 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibration.discovery.active_set import CandidateSpace
-from calibration.discovery.candidates import Candidate, candidate
+from calibration.discovery.candidates import Candidate, candidate_of_fit
 from calibration.discovery.settings import Settings
 from calibration.inference.held_out import search_each
 from calibration.inference.linearization import Linearization
 
-#: Refits with a prior's mean where the last one ended, until it pulls no longer [prior sds].
+#: Refits with a prior's mean at the end of the last one, until its pull is small [prior sds].
 ROUNDS, PULL = 3, 0.3
 
 
 @dataclasses.dataclass(frozen=True)
 class Shift:
-    """A base parameter freed of its prior, in the place of an effect.
+    """A base parameter without its prior, instead of an effect.
 
     Attributes:
         name: dotted, of the parameter; index: of its coordinate.
-        fit: all else fitted again; cost of its prior left out.
+        fit: of all other parameters; its cost excludes the prior.
     """
 
     name: str
@@ -36,52 +36,52 @@ class Shift:
     fit: Candidate
 
 
-def scores(jacobian: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What a shift of the mean of each coordinate's prior would explain [σ²], and where the data alone would have the
-    coordinate, as far as a line tells [prior sds].
+def prior_shift_scores(jacobian: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Score of a shift of the mean of each coordinate's prior [σ²], and the linear estimate of each coordinate
+    without its prior [prior sds].
 
     Args:
         jacobian, residual: of a fit, the priors' residuals last.
     """
     half = np.linalg.solve(np.linalg.cholesky(jacobian.T @ jacobian), jacobian.T)
-    at = np.arange(len(residual) - jacobian.shape[1], len(residual))
-    leverage = np.sum(half[:, at] ** 2, 0)
-    left = residual[at] - half[:, at].T @ (half @ residual)
+    prior_rows = np.arange(len(residual) - jacobian.shape[1], len(residual))
+    leverage = np.sum(half[:, prior_rows] ** 2, 0)
+    left = residual[prior_rows] - half[:, prior_rows].T @ (half @ residual)
     free = np.maximum(1 - leverage, 1e-9)
     seen = leverage < 1 - 1e-6
-    return np.where(seen, left**2 / free, 0.0), np.where(seen, residual[at] / free, 0.0)
+    return np.where(seen, left**2 / free, 0.0), np.where(seen, residual[prior_rows] / free, 0.0)
 
 
-def shifts(
+def find_prior_shifts(
     space: CandidateSpace, at: Candidate, needed: float, settings: Settings, linear: Linearization | None = None
 ) -> list[Shift]:
-    """Base parameters that, freed of their prior, would explain at least `needed` σ² of what a fit leaves.
+    """Base parameters that, without their prior, would explain at least `needed` σ² of a fit's discrepancy.
 
     Args:
-        at: the fit; its effects stay; linear: the same, linearised, where that is known.
+        at: the fit; its effects stay; linear: the same, linearised, if known.
     """
     if linear is None:
         problem, (active,) = space.fitted_by([at.active])
         residual, jacobian, _ = problem.observe.at(problem, at.z, active)
     else:
         residual, jacobian = linear.residual, linear.jacobian
-    explained, values = scores(np.asarray(jacobian), np.asarray(residual))
-    found = []
+    explained, values = prior_shift_scores(np.asarray(jacobian), np.asarray(residual))
+    shifts = []
     for k in np.argsort(-explained[: space.free]):
         if explained[k] < needed:
             break
         fit = _without_prior(space, at, int(k), float(values[k]), settings)
         if fit is not None:
-            found.append(Shift(space.coordinates.base.names[k], int(k), fit))
-    return found
+            shifts.append(Shift(space.coordinates.base.names[k], int(k), fit))
+    return shifts
 
 
 def _without_prior(
     space: CandidateSpace, at: Candidate, k: int, value: float, settings: Settings
 ) -> Candidate | None:
-    """The fit with the prior of coordinate k left out: with its mean where the data have it.
+    """Fit without the prior of coordinate k: the prior's mean is moved to the data's estimate.
 
-    None where that is beyond the parameter's bounds, or no optimum.
+    None if that is beyond the parameter's bounds, or without an optimum.
     """
     p, mean, start = space.free, value, np.array(at.z)
     equipped, (indices,) = space.fitted_by([at.active])
@@ -91,8 +91,8 @@ def _without_prior(
         start[k] = mean
         data = dataclasses.replace(equipped.data, centre=jnp.asarray(centre))
         problem = dataclasses.replace(equipped, data=data)
-        found, _ = search_each(problem, [start], [space.weight], [indices])
-        best = jax.tree.map(lambda x: x[0], found)
+        optima, _ = search_each(problem, [start], [space.weight], [indices])
+        best = jax.tree.map(lambda x: x[0], optima)
         z = np.asarray(best.z)
         if not np.isfinite(best.cost):
             return None
@@ -101,4 +101,4 @@ def _without_prior(
         mean, start = float(z[k]), z.copy()
     if space.coordinates.base.beyond(z[:p])[k]:
         return None
-    return candidate(space, at.active, best, settings)
+    return candidate_of_fit(space, at.active, best, settings)

@@ -1,1 +1,1 @@
-"""Calibration: what is free, how it is observed, fitted and judged."""
+"""Calibration: free parameters, observers, fits and their analysis."""

@@ -1,4 +1,4 @@
-"""Bases of smooth curves over the rows, with which a discrepancy that no effect explains is looked for."""
+"""Bases of smooth curves over the rows; the search for a discrepancy that no effect explains uses them."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from numpy.polynomial import legendre
 
 from calibration.data.columns import CURRENT, LOAD, SPEED, Layout
 from calibration.inference.linearization import Linearization
-from mmrjax.effects.curve import DRIFT, EVERY_VARIABLE, READ_BY, WAYS, acts_along, counted_by, in_travel
+from mmrjax.effects.curve import DRIFT, EVERY_VARIABLE, READ_BY, WAYS, direction_signal, in_travel_frame, sign_factor
 from mmrjax.model import channels
-from mmrjax.model.balances import absent
+from mmrjax.model.balances import absent_balances
 from mmrjax.model.channels import Channel
 from mmrjax.model.robot import Robot
 
 #: Balances that carry curves: one for each equation that the channels close, and the ground's, whose defect
-#: also loads the contact; and those for which they stand, as what these lack has the same shape in them.
+#: also loads the contact. And the balances that each represents, because a defect has the same shape in them.
 BALANCES = ("electrical", "track", "ground", "slip")
 STANDS_FOR = {"electrical": ("supply",), "track": ("gearbox", "motor")}
 #: Variables of a curve, fields of `Signals` (and the time of histories and the order of runs), with the column that
@@ -34,8 +34,8 @@ OF_TURNS = ("yaw",)
 #: Terms of a curve of one variable (Legendre polynomials), and degree of the polynomial in all conditions.
 TERMS, DEGREE = 5, 2
 CONDITIONS = "conditions"
-#: Axes along which something may happen for a while, the first that a table has; shares of the range that its windows
-#: have, each of which starts in the middle of the one before; fewest rows in one.
+#: Axes along which a temporary change may occur (the first that a table has is used); lengths of its windows as
+#: shares of the range, where each window starts in the middle of the one before; fewest rows in a window.
 AXES, WINDOWS, FEWEST = DRIFT, (1 / 4, 1 / 8, 1 / 16), 3
 #: Conditions of which a level may differ from the others, the SI value of their column's unit, and the unit; most
 #: levels that each may have.
@@ -43,12 +43,12 @@ LEVELS = {name: (v.shown, v.unit_shown) for name, v in EVERY_VARIABLE.items() if
 #: Columns of conditions that a run may have.
 EVERY_AXIS = ("supply_voltage_V", "slope_deg", "payload_kg")
 MOST_LEVELS = 6
-#: Share of the variance of the order that conditions explain from which drift cannot be told from them.
+#: Share of the variance of the order explained by the conditions, from which drift cannot be separated from them.
 COLLINEAR = 0.9
-#: Combinations of conditions, as a share of the runs, up to which each is a level in that.
+#: Number of combinations of conditions over the number of runs, up to which each combination is a level there.
 FEW_CELLS = 1 / 3
-#: Waves of histories: per turn of the driving pulley or wheel, and whether of the belt (168 teeth, 24 grousers
-#: around a pulley of 48 teeth).
+#: Waves of histories: order per turn of the driving pulley or wheel, and True for waves of the belt (168 teeth,
+#: 24 grousers around a pulley of 48 teeth).
 ORDERS: dict[str, tuple[float, bool]] = {
     "order 1 of the driving shaft": (1.0, False),
     "order 2 of the driving shaft": (2.0, False),
@@ -58,20 +58,20 @@ ORDERS: dict[str, tuple[float, bool]] = {
     "order of the grousers": (24 * 48 / 168, True),
     "order of the teeth": (48.0, True),
 }
-#: Largest angle of a wave between knots [rad]: two and a half a period.
+#: Largest angle of a wave between two knots [rad]: two and a half knots a period.
 RESOLVED = 2.5
 
 
 class Basis(eqx.Module):
-    """Families of smooth curves: a defect of one balance, or what is added to the readings of one channel, as a
-    combination of columns over the rows.
+    """Families of smooth curves, each a combination of columns over the rows.
 
-    All families of one `Basis` have as many columns.
+    A curve is a defect of one balance, or an error of one channel's readings. All families of one `Basis` have the
+    same number of columns.
 
     Attributes:
         columns: of each family, shape (families, rows, terms).
-        places: of each family; all are balances, or all are channels.
-        variables: of each family, over which it is.
+        places: place of each family; all are balances, or all are channels.
+        variables: independent variable of each family.
     """
 
     columns: Float[Array, "families rows terms"]
@@ -80,7 +80,7 @@ class Basis(eqx.Module):
 
     @staticmethod
     def of(columns: np.ndarray, names: Sequence[tuple[str, str]]) -> Basis:
-        """Families with the (place, variable) of each."""
+        """Basis of columns, shape (families, rows, terms), with the (place, variable) of each family."""
         places, variables = zip(*names, strict=True)
         return Basis(jnp.asarray(columns), places, variables)
 
@@ -90,13 +90,15 @@ class Basis(eqx.Module):
         return tuple(zip(self.places, self.variables, strict=True))
 
     def for_equations(self) -> Basis:
-        """Without the variables of its families: a window's is the table's own."""
+        """Copy without the names of the variables, because a window's name depends on the table."""
         return dataclasses.replace(self, variables=())
 
     def signatures(self, linear: Linearization) -> Float[Array, "families readings terms"]:
-        """Change of the whitened readings by every family's columns, one after the other: of histories each takes a
-        copy of a balance's defects."""
-        of_channels = in_readings(self.places[0])
+        """Change of the whitened readings per unit of each column.
+
+        Families are computed one at a time, because each takes a copy of a balance's defects for histories.
+        """
+        of_channels = is_channel_place(self.places[0])
         known, change = (linear.channels, linear.shown) if of_channels else (linear.probed, linear.columns)
         places = jnp.asarray([known.index(place) for place in self.places])
         return jax.lax.map(lambda family: change(*family), (places, self.columns))
@@ -105,67 +107,67 @@ class Basis(eqx.Module):
 Bases = tuple[Basis, ...]
 
 
-def in_readings(place: str) -> bool:
-    """Whether a place of curves is a channel, whose readings are off; else it is a balance."""
-    return place not in (*BALANCES, *OF_TURNS) and place in channels.names(channels.EVERY)
+def is_channel_place(place: str) -> bool:
+    """True if a place is a channel, whose readings have an error; False if it is a balance."""
+    return place not in (*BALANCES, *OF_TURNS) and place in channels.channel_names(channels.EVERY)
 
 
 def balance_of(place: str) -> str:
-    """The balance of a place of curves: `sensor` for a channel."""
-    return "sensor" if in_readings(place) else place
+    """The balance of a place; `sensor` for a channel."""
+    return "sensor" if is_channel_place(place) else place
 
 
-def in_words(place: str) -> str:
-    """`slip balance`, `reading of motor speed`."""
-    return f"reading of {place}".replace("_", " ") if in_readings(place) else f"{place} balance"
+def place_in_words(place: str) -> str:
+    """Name of a place in words: `slip balance`, `reading of motor speed`."""
+    return f"reading of {place}".replace("_", " ") if is_channel_place(place) else f"{place} balance"
 
 
-def signature(linear: Linearization, place: str, shapes: np.ndarray) -> np.ndarray:
-    """Change of the readings by terms of a place, shape (readings, terms), of shapes (rows, terms)."""
-    if in_readings(place):
+def place_signature(linear: Linearization, place: str, shapes: np.ndarray) -> np.ndarray:
+    """Change of the readings, shape (readings, terms), by defects of one place with shapes (rows, terms)."""
+    if is_channel_place(place):
         return np.asarray(linear.shown(linear.channels.index(place), shapes))
     return np.asarray(linear.columns(linear.probed.index(place), shapes))
 
 
-def scaled(x: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """x mapped linearly so that the rows that count span -1 to 1; zeros where it does not vary."""
+def scale_to_unit_range(x: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """x mapped linearly so that rows of positive weight span -1 to 1; zeros if x does not vary."""
     counting = x[weight > 0]
     low, high = counting.min(), counting.max()
     return np.clip((2 * x - low - high) / (high - low), -1, 1) if high - low > 1e-9 * max(abs(high), 1e-9) else 0 * x
 
 
 def balances_of(robot: Robot | None, among: Sequence[str] = BALANCES) -> tuple[str, ...]:
-    """Those balances that a robot has; None: any."""
+    """Balances of `among` that a robot has; all for None."""
     if robot is None:
         return tuple(among)
-    return tuple(b for b in among if b not in absent(robot))
+    return tuple(b for b in among if b not in absent_balances(robot))
 
 
 def channels_of(robot: Robot | None) -> tuple[Channel, ...]:
-    """Channels of a robot; None: of the packaged one."""
+    """Channels of a robot; for None, of the packaged one."""
     return Layout.of(robot).channels
 
 
 def axes_of(robot: Robot | None) -> tuple[str, ...]:
-    """Columns of the conditions over which curves are, of a robot; None: of the packaged one."""
+    """Columns of conditions that are variables of a robot's curves; for None, of the packaged robot's."""
     axes = Layout.of(robot).axes
     return tuple(c for c in (SPEED, CURRENT, *EVERY_AXIS) if c in axes)
 
 
 @dataclasses.dataclass(frozen=True)
 class Scope:
-    """Where curves are looked for: balances that can lack something, and columns of the conditions."""
+    """Scope of a search for curves: balances that can have a defect, and columns of the conditions."""
 
     balances: tuple[str, ...]
     axes: tuple[str, ...]
 
     @classmethod
     def of(cls, robot: Robot | None) -> Scope:
-        """All that straight travel of a robot has; None: of the packaged one."""
+        """All balances and conditions of a robot's straight travel; for None, of the packaged one."""
         return cls(balances_of(robot), axes_of(robot))
 
     def over(self, columns: Mapping[str, np.ndarray]) -> Scope:
-        """The same with the torque of a brake among the conditions, of a table that states it."""
+        """Scope that includes a brake's torque among the conditions if the table has it."""
         return dataclasses.replace(self, axes=(*self.axes, LOAD)) if LOAD in columns else self
 
 
@@ -174,78 +176,89 @@ Ways = Mapping[str, np.ndarray]
 SHAFTS = "electrical"
 
 
-def forward(points: int) -> Ways:
-    """The ways of travel that never turns back."""
+def forward_ways(points: int) -> Ways:
+    """Ways of travel that is always forward."""
     return dict.fromkeys(WAYS, np.ones(points))
 
 
-def families(
+def curve_families(
     columns: Mapping[str, np.ndarray],
     weight: np.ndarray,
     robot: Robot | None = None,
     scope: Scope | None = None,
     ways: Ways | None = None,
 ) -> Bases:
-    """Curves of one variable, and polynomials in all conditions for each configuration, in every balance; and curves
-    of what the readings of a channel are off by, over the reading and over what time or order brings.
+    """Curves of one variable and polynomials in all conditions, in each balance, and curves of a channel's error.
+
+    The polynomials are separate for each configuration. A channel's error is a curve over its reading, and over
+    time or order.
 
     Args:
-        columns: of the table, with fitted readings; weight: 0 for rows that do not count, shape (rows,), or of points
+        columns: of the table, with fitted readings; weight: 0 for excluded rows, shape (rows,), or of points
             (see `Linearization`).
-        robot: whose channels and balances can be off; scope: None takes `Scope.of` it.
+        robot: its channels and balances are searched; scope: None takes `Scope.of` the robot.
         ways: of each point, shape (rows,); None: all forward.
     """
     scope = (Scope.of(robot) if scope is None else scope).over(columns)
     balances = scope.balances
-    ways = forward(len(weight)) if ways is None else ways
+    ways = forward_ways(len(weight)) if ways is None else ways
     unsigned = robot.rig.magnitudes if robot else ()
-    over: dict[str, str] = {}  # a variable, and that which has its place
+    over: dict[str, str] = {}  # a variable, and the one that takes its place
     for variable, column in VARIABLES.items():
         if column not in columns or (column in EVERY_AXIS and column not in scope.axes):
             continue
-        drift = variable == "order" and collinearity(columns, weight, scope.axes) > COLLINEAR
+        drift = variable == "order" and order_collinearity(columns, weight, scope.axes) > COLLINEAR
         if drift and not over:
             continue
-        # Another variable again in its place: tables of one size share what is compiled.
+        # A skipped variable is replaced by another, so that tables of one size share compiled programs.
         over[variable] = next(iter(over)) if drift else variable
 
     def curve(place: str, variable: str) -> np.ndarray:
-        x, way = in_travel(place, variable, np.asarray(columns[VARIABLES[variable]]), ways.__getitem__, unsigned)
-        return way[:, None] * legendre.legvander(scaled(x, weight), TERMS - 1) * np.exp(-0.35 * np.arange(TERMS))
+        x, way = in_travel_frame(
+            place, variable, np.asarray(columns[VARIABLES[variable]]), ways.__getitem__, unsigned
+        )
+        return (
+            way[:, None]
+            * legendre.legvander(scale_to_unit_range(x, weight), TERMS - 1)
+            * np.exp(-0.35 * np.arange(TERMS))
+        )
 
     names = [(balance, variable) for variable in over.values() for balance in balances]
     shown = [(c.name, v) for c in channels_of(robot) for v in over if v in AXES or v == READ_BY.get(c.name)]
     new = [n for n in shown if over[n[1]] == n[1]]
-    # As above: what is left out makes room for another of its channel, or of the first that has one.
+    # As above: a skipped curve is replaced by another of its channel, or else by the first.
     read = [n if n in new else next((m for m in new if m[0] == n[0]), new[0]) for n in shown] if new else []
     groups = [
         (names, [curve(*n) for n in names]),
-        ([(b, CONDITIONS) for b in balances], [surface(columns, weight, scope, ways, b) for b in balances]),
+        (
+            [(b, CONDITIONS) for b in balances],
+            [condition_polynomials(columns, weight, scope, ways, b) for b in balances],
+        ),
         (read, [curve(*n) for n in read]),
     ]
     return tuple(Basis.of(np.stack(b), ns) for ns, b in groups if ns)
 
 
-def surface(
+def condition_polynomials(
     columns: Mapping[str, np.ndarray], weight: np.ndarray, scope: Scope, ways: Ways, place: str
 ) -> Float[np.ndarray, "points terms"]:
-    """Polynomials in all conditions for each configuration; arguments as of `families`."""
+    """Polynomials in all conditions for each configuration; arguments as in `curve_families`."""
     of_column = {column: variable for variable, column in VARIABLES.items()}
-    of_column |= {CURRENT: "current", LOAD: "current"}  # whose sign is that of what drives the shafts too
-    along = (in_travel(place, of_column[c], np.asarray(columns[c]), ways.__getitem__)[0] for c in scope.axes)
-    spans = [scaled(x, weight) for x in along]
+    of_column |= {CURRENT: "current", LOAD: "current"}  # its sign is also that of the torque that drives the shafts
+    along = (in_travel_frame(place, of_column[c], np.asarray(columns[c]), ways.__getitem__)[0] for c in scope.axes)
+    spans = [scale_to_unit_range(x, weight) for x in along]
     powers = [p for p in itertools.product(range(DEGREE + 1), repeat=len(spans)) if sum(p) <= DEGREE]
     terms = [
         np.prod([a**k for a, k in zip(spans, p, strict=True)], 0) * (columns["configuration"] == name)
         for name in np.unique(columns["configuration"])
         for p in powers
     ]
-    return ways[acts_along(place)][:, None] * np.stack(terms, 1)
+    return ways[direction_signal(place)][:, None] * np.stack(terms, 1)
 
 
 @dataclasses.dataclass(frozen=True)
 class Window:
-    """A stretch of an axis, `time` [s] or `order` [-], in which something happens, or a level of a condition [SI]."""
+    """Interval of an axis, `time` [s] or `order` [-], in which something happens, or a level of a condition [SI]."""
 
     axis: str
     low: float
@@ -255,48 +268,50 @@ class Window:
         return f"{self.axis} {self.low:.5g} to {self.high:.5g}"
 
     def holds(self, x: np.ndarray) -> np.ndarray:
-        """Whether places of the axis are in it; its ends are rounded to five digits."""
+        """True for places of the axis in the window; its ends are rounded to five digits."""
         slack = 1e-4 * max(abs(self.low), abs(self.high), 1e-9)
         return (x >= self.low - slack) & (x <= self.high + slack)
 
     @property
     def words(self) -> str:
-        """`15 deg of slope`."""
+        """Window in words: `15 deg of slope`."""
         factor, unit = LEVELS.get(self.axis, (1.0, ""))
         return f"{self.low / factor:.4g} {unit} of {self.axis}"
 
 
-def window(variable: str) -> Window | None:
-    """The window that a variable's name stands for, None for another variable."""
-    found = re.fullmatch(rf"({'|'.join((*AXES, *LEVELS))}) (\S+) to (\S+)", variable)
-    return None if found is None else Window(found[1], float(found[2]), float(found[3]))
+def window_from_name(variable: str) -> Window | None:
+    """Window that a variable's name describes; None if the name is no window's."""
+    match = re.fullmatch(rf"({'|'.join((*AXES, *LEVELS))}) (\S+) to (\S+)", variable)
+    return None if match is None else Window(match[1], float(match[2]), float(match[3]))
 
 
-def windows(
+def window_families(
     columns: Mapping[str, np.ndarray],
     weight: np.ndarray,
     robot: Robot | None = None,
     scope: Scope | None = None,
     ways: Ways | None = None,
 ) -> Bases:
-    """Windows in time (at the same instants of all runs) or in the order of runs, and levels of conditions, in every
-    balance and channel; in the order only where the conditions do not tell it.
+    """Windows of time or of the order of runs, and levels of conditions, in each balance and channel.
+
+    Windows of time are at the same instants in all runs. Windows of the order are omitted if the conditions
+    explain the order.
 
     Args:
-        columns: of the table; weight: 0 for rows that do not count, shape (rows,).
-        robot, scope, ways: as of `families`.
+        columns: of the table; weight: 0 for excluded rows, shape (rows,).
+        robot, scope, ways: as in `curve_families`.
     """
     counts = weight > 0
     scope = (Scope.of(robot) if scope is None else scope).over(columns)
-    ways = forward(len(weight)) if ways is None else ways
-    facing = {name: np.where(way < 0, -1.0, 1.0) for name, way in ways.items()}  # of what starts from rest, too
+    ways = forward_ways(len(weight)) if ways is None else ways
+    facing = {name: np.where(way < 0, -1.0, 1.0) for name, way in ways.items()}  # also for starts from rest
     offered: list[tuple[str, np.ndarray, np.ndarray]] = []  # axis, its values, which rows are inside
     axis = next((a for a in AXES if VARIABLES[a] in columns), None)
     if axis is not None:
         x = np.asarray(columns[VARIABLES[axis]], float)
         low, high = x[counts].min(), x[counts].max()
-        # Some runs one after the other are then runs at some conditions, which have windows of their own.
-        sorted_runs = axis == "order" and collinearity(columns, weight, scope.axes) > COLLINEAR
+        # Consecutive runs then have similar conditions, and conditions have windows of their own.
+        sorted_runs = axis == "order" and order_collinearity(columns, weight, scope.axes) > COLLINEAR
         for share in WINDOWS:
             size = share * (high - low)
             for k in range(round(2 / share) - 1):
@@ -307,7 +322,7 @@ def windows(
         if VARIABLES[condition] not in scope.axes:
             continue
         told = factor * np.asarray(columns[VARIABLES[condition]], float)
-        x, _ = in_travel(SHAFTS, condition, told, facing.__getitem__)
+        x, _ = in_travel_frame(SHAFTS, condition, told, facing.__getitem__)
         levels = np.unique(x[counts])
         levels = levels if 2 < len(levels) <= MOST_LEVELS else levels[:0]
         offered += [(condition, x, counts & (x == level)) for level in levels]
@@ -319,13 +334,13 @@ def windows(
     ]
     if not shapes:
         return ()
-    # The first again for those that hold too few or too many rows: tables of one size share what is compiled.
+    # The first again for windows with too few or too many rows: tables of one size share compiled programs.
     shapes += shapes[:1] * (len(offered) - len(shapes))
     read = [c.name for c in channels_of(robot)]
     unsigned = robot.rig.magnitudes if robot else ()
     return tuple(
         Basis.of(
-            np.stack([s * counted_by(place, ways.__getitem__, unsigned) for place in places for s, _ in shapes])[
+            np.stack([s * sign_factor(place, ways.__getitem__, unsigned) for place in places for s, _ in shapes])[
                 :, :, None
             ],
             [(place, name) for place in places for _, name in shapes],
@@ -335,16 +350,18 @@ def windows(
     )
 
 
-def collinearity(columns: Mapping[str, np.ndarray], weight: np.ndarray, axes: Sequence[str] | None = None) -> float:
-    """Share of the variance of the order of runs that their conditions explain (R²): at 1 a drift from run to run
-    cannot be told from what the conditions do.
+def order_collinearity(
+    columns: Mapping[str, np.ndarray], weight: np.ndarray, axes: Sequence[str] | None = None
+) -> float:
+    """Share of the variance of the order of runs that their conditions explain (R²).
 
-    Conditions are a level for each combination of configuration, what is imposed and payload, where these are few
-    beside the runs, else a level for each configuration and direction and polynomials of the others; and a polynomial
-    of the slope.
+    At 1, drift from run to run cannot be separated from effects of the conditions. Conditions enter as a polynomial
+    of the slope and a level for each combination of configuration, imposed quantity and payload. If these
+    combinations are many compared with the runs, they enter instead as a level for each configuration and direction,
+    and polynomials of the others.
 
     Args:
-        columns, weight: as of `families`; axes: columns of the conditions, None: of the packaged robot's.
+        columns, weight: as in `curve_families`; axes: columns of the conditions, None: of the packaged robot's.
     """
     counts = weight > 0
     x = np.asarray(columns["order"], float)[counts]
@@ -360,7 +377,7 @@ def collinearity(columns: Mapping[str, np.ndarray], weight: np.ndarray, axes: Se
     smooth = [VARIABLES["slope"]] * (VARIABLES["slope"] in conditions) if few else conditions
     terms = list(np.eye(len(x))[cell.ravel() if few else which.ravel()].T)
     for column in smooth:
-        terms += list(legendre.legvander(scaled(columns[column], weight)[counts], DEGREE)[:, 1:].T)
+        terms += list(legendre.legvander(scale_to_unit_range(columns[column], weight)[counts], DEGREE)[:, 1:].T)
     matrix = np.stack(terms, 1).astype(float)
     left = x - matrix @ np.linalg.lstsq(matrix, x, rcond=None)[0]
     rank = int(np.linalg.matrix_rank(matrix))
@@ -368,20 +385,20 @@ def collinearity(columns: Mapping[str, np.ndarray], weight: np.ndarray, axes: Se
     return float(1 - freedom * np.sum(left**2) / np.sum((x - x.mean()) ** 2))
 
 
-def waves(
+def wave_families(
     on_tracks: np.ndarray, angle: np.ndarray, rows: np.ndarray, knots: np.ndarray, robot: Robot | None = None
 ) -> Bases:
-    """Waves of the orders that the samples of histories resolve, in every balance.
+    """Waves of the orders that the samples of histories resolve, in each balance.
 
-    A wave has its own amplitude and phase in each run that holds two of it: how the parts stood at its start is not
-    known. Where none does, a run shows a piece of a wave, and pieces of a phase each are any level and trend of
-    each run; then they are of one amplitude and phase, as if all runs began at a mark.
+    A wave has its own amplitude and phase in each run of at least two periods, because the position of the parts at
+    its start is unknown. Shorter runs show only part of a wave, and parts with free phases could fit any level
+    and trend. If all runs are shorter, a wave has one amplitude and phase, as if all runs began at a mark.
 
     Args:
-        on_tracks: whether each row's run is on tracks; angle: of the driving shaft [rad]; shape (rows,).
+        on_tracks: True for rows of a run on tracks; angle: of the driving shaft [rad]; shape (rows,).
         rows: indices of each run's rows in the order of time, -1 beyond its last, shape (runs, samples).
         knots: rows between which a defect is linear, shape (runs, knots).
-        robot: whose balances can lack something.
+        robot: its balances are searched.
     """
     bases, words = [], []
     for word, (order, belted) in ORDERS.items():
@@ -403,7 +420,7 @@ def waves(
             words.append(word)
     if not words:
         return ()
-    # The first again for orders that these samples do not resolve: logs of one size share what is compiled.
+    # The first again for orders that these samples do not resolve: logs of one size share compiled programs.
     possible = sum(1 for _, belted in ORDERS.values() if np.any(on_tracks) or not belted)
     bases += bases[:1] * (possible - len(bases))
     words += words[:1] * (possible - len(words))
@@ -411,6 +428,6 @@ def waves(
     return (Basis.of(np.stack(bases * len(balances_of(robot))), every),)
 
 
-def names(bases: Bases) -> tuple[tuple[str, str], ...]:
+def family_names(bases: Bases) -> tuple[tuple[str, str], ...]:
     """(place, variable) of every family, in order."""
     return tuple(n for basis in bases for n in basis.names)

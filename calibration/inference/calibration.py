@@ -1,4 +1,4 @@
-"""A calibration from table to result: noise, starts, optimum, what is known of it, errors seen and unseen."""
+"""A calibration from table to result: noise, starts, optimum, its analysis, errors on fitted and held-out rows."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ from calibration.inference import (
     solvers,
 )
 from calibration.inference.fit_notes import Elsewhere, Fact, Note, OfRows, PriorOfProduct, Step
-from calibration.inference.fit_posterior import of_coordinates
-from calibration.inference.multistart import Found
+from calibration.inference.fit_posterior import posterior_of_coordinates
+from calibration.inference.multistart import SearchResult
 from calibration.inference.noise import Noise
 from calibration.inference.noise_factor import noise_remarks
 from calibration.inference.population import GENERATIONS, LEAST
 from calibration.inference.preparation import Prepared, prepare
 from calibration.inference.problem import Problem
-from calibration.inference.remarks import numbers, remarks
+from calibration.inference.remarks import calibration_remarks, row_numbers
 from calibration.inference.residual_clusters import residual_clusters
 from calibration.inference.result import CalibrationResult
 from mmrjax import fidelities
@@ -47,11 +47,11 @@ from mmrjax.compile.precision import SINGLE, in_double, is_double
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import FLAGS, STATUSES
 
-#: Members of a generation where parameters are free that `steady` does not read.
+#: Members of a generation if parameters are free that `steady` does not read.
 POPULATION = 256
-#: Fidelity of time histories where none is stated.
+#: Default fidelity for time histories.
 OF_HISTORIES = "drive"
-#: Parameters that the resolved running gear gives another meaning: beginnings after their configuration.
+#: Parameters with another meaning in the resolved running gear: prefixes after the configuration's name.
 FRICTION = "ground.friction."
 
 
@@ -80,50 +80,51 @@ def calibrate(
 
     Args:
         runs: rows of settled runs, or of time histories.
-        robot: its values are the prior means; a mass that the table states takes the place of its own.
-        free, fix: parameter names, see `priors.choose`; stated: priors in place of the fields', (mean, sd) [SI].
-        noise: as `noise.parse`; None takes the file's sd columns, or estimates.
+        robot: its values are the prior means; a mass in the table replaces its own.
+        free, fix: parameter names, see `priors.choose_free_names`; stated: priors that replace the fields',
+            (mean, sd) [SI].
+        noise: as `noise.parse_noise`; None takes the file's sd columns, or estimates.
         model: name of a fidelity; None takes `drive` for time histories and `steady` for settled runs.
-        starts: the prior mean and `starts - 1` draws from the prior; for settled rows with a rollout the optimum of
-            `steady` and draws from its posterior.
-        population: members of each generation of a search without gradients, with which that of a rollout begins;
-            None takes `POPULATION` where parameters are free that `steady` does not read, else none.
-        generations: at most, None `population.GENERATIONS`; members: file in which those that were run are kept, and
-            from which the same calibration goes on.
-        seed: of the starts and of all that is drawn; profiles: whether to profile every parameter.
-        blocks: kinds of blocks to hold out; True: all that tell something of such data.
-            These three by default as the kind of data and the fidelity say.
-        rows: of a log over time from which on readings are used of fewer, evenly in time, which its notes say.
-        solver: of optimistix, or the name of one (`solvers.NAMES`), for the searches from the starts; None takes
-            ours, which also serves all fits that begin at the optimum (profiles, blocks). Penalties on adhesion are
-            cut off at 0 for any other than ours.
-        tell: is given a sentence now and then while a long calibration goes on.
+        starts: number of searches, from the prior mean and `starts - 1` draws from the prior. For settled rows with
+            a rollout, they begin at the optimum of `steady` and at draws from its posterior.
+        population: members of each generation of a search without gradients, which precedes a rollout's search;
+            None takes `POPULATION` if parameters are free that `steady` does not read, else 0.
+        generations: largest number of generations, None `population.GENERATIONS`; members: file that stores the
+            members run so far, so that the same calibration can resume.
+        seed: random seed of the starts and of all other draws; profiles: True to profile each parameter.
+        blocks: kinds of blocks to hold out; True: all that are informative for such data.
+            Defaults of these two depend on the kind of data and the fidelity.
+        rows: number of rows of a log over time above which readings are thinned evenly in time; a note reports it.
+        solver: an optimistix solver, or the name of one (`solvers.NAMES`), for the searches from the starts; None
+            takes ours, which also serves all fits that begin at the optimum (profiles, blocks). For any other
+            solver, penalties on adhesion are cut off at 0.
+        tell: callback for progress messages of a long calibration.
 
     Raises:
-        BadData: data that cannot be fitted, see `checks.check`.
-        BadConfiguration: an unknown fidelity or parameter, a prior or noise that is none, or of a mass that the
-            table states, rows that no robot near the priors reaches; an unknown solver; or a call inside `jax.jit`
-            where JAX is single.
+        BadData: data that cannot be fitted, see `checks.check_data`.
+        BadConfiguration: an unknown fidelity, parameter or solver; an invalid prior or noise, or a prior of a mass
+            that the table states; rows that no robot near the priors reaches; or a call inside `jax.jit` while JAX
+            uses single precision.
     """
     if not is_double():
         raise BadConfiguration(f"calibrate: {SINGLE}")
-    solver = solvers.solver(solver) if isinstance(solver, str) else solver
+    solver = solvers.solver_by_name(solver) if isinstance(solver, str) else solver
     runs, told = thinned(runs.of(robot), rows), in_words(tell)
-    plan = _planned(runs, model, starts, profiles, blocks)
+    plan = _make_plan(runs, model, starts, profiles, blocks)
     choose = functools.partial(_free_names, runs, plan, free, fix)
     ready = prepare(runs, robot, noise, stated, assume=False, choose=choose)
     for note in (*ready.foreign, *ready.doubted):
         told(note)
-    base, of_product = _guided(runs, ready, plan)
+    base, of_product = _with_guide_priors(runs, ready, plan)
     setting = _Setting(runs, plan, ready, base, of_product)
     posed = setting.problem()
-    evolved = _evolved(posed, ready.names, runs, population, generations, members)
-    found, beside = _searched(runs, base, posed, ready.noise, plan.starts, evolved, seed, told, solver)
+    evolved = _population_options(posed, ready.names, runs, population, generations, members)
+    found, beside = _search(runs, base, posed, ready.noise, plan.starts, evolved, seed, told, solver)
     optimum = _optimum(setting, found)
     if found.problem.observe.long:
         doing = ["the linear analysis", *["profiles"] * plan.profiles, *["blocks held out"] * bool(plan.kinds)]
         told(Step("optimum", (", ".join(doing),)))
-    return _result(setting, found, optimum, _analysed(setting, found, optimum), beside, seed)
+    return _result(setting, found, optimum, _analyse(setting, found, optimum), beside, seed)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -142,13 +143,13 @@ class _Plan:
     kinds: tuple[str, ...]
 
 
-def _planned(
+def _make_plan(
     runs: Runs, model: str | None, starts: int | None, profiles: bool | None, blocks: Sequence[str] | bool | None
 ) -> _Plan:
-    """Plan of a calibration from the arguments of `calibrate`; the kind of data and the fidelity fill in for None."""
-    observe = observers.kind(runs)
+    """Plan of a calibration from the arguments of `calibrate`; None is replaced by a default for the data."""
+    observe = observers.observer_kind(runs)
     fidelity = model or (OF_HISTORIES if observe.axis else fidelities.NAMES[0])
-    effort = observers.facts(fidelity).effort
+    effort = observers.fidelity_facts(fidelity).effort
     starts = (observe.searches or effort.starts) if starts is None else starts
     profiles = effort.profiles and observe.profiled if profiles is None else profiles
     blocks = effort.blocks if blocks is None else blocks
@@ -168,25 +169,27 @@ def _free_names(
     Raises:
         BadConfiguration: an unknown name, or one that the fidelity does not read.
     """
-    robot, fidelity, computes = prepared.robot, plan.fidelity, observers.facts(plan.fidelity).computes
+    robot, fidelity, computes = prepared.robot, plan.fidelity, observers.fidelity_facts(plan.fidelity).computes
     words = [surfaces.names_of_surfaces(names, robot, runs) for names in (free, fix)]
     present = _present(runs, robot)
     default = priors.default_names(present, robot, computed=computes, turns=runs.turns)
     owned = priors.stated_names(robot, present, () if plan.observe.axis else priors.OVER_TIME)
-    held = {*default, *fidelities.unread(fidelity, owned, runs.turns)}
+    held = {*default, *fidelities.unread_parameters(fidelity, owned, runs.turns)}
     default = (*default, *(n for n in owned if n not in held and not n.endswith(computes)))
-    default = (*default, *priors.delays(robot, plan.observe.free()[0]))
-    names = priors.choose(robot, default, *words)
-    if unread := fidelities.unread(fidelity, names, runs.turns):
+    default = (*default, *priors.delay_names(robot, plan.observe.free()[0]))
+    names = priors.choose_free_names(robot, default, *words)
+    if unread := fidelities.unread_parameters(fidelity, names, runs.turns):
         if fidelities.OF_TURNS in unread[0]:
             raise BadConfiguration(f"--free {unread[0]}: these runs are straight, which do not show it")
-        reads = ", ".join(other for other in fidelities.NAMES if not fidelities.unread(other, unread, runs.turns))
+        reads = ", ".join(
+            other for other in fidelities.NAMES if not fidelities.unread_parameters(other, unread, runs.turns)
+        )
         raise BadConfiguration(f"--free {unread[0]}: --model {fidelity} does not read it; allowed: --model {reads}")
     return names
 
 
 def _present(runs: Runs, robot: Robot) -> set[str]:
-    """Names of the configurations that the runs have."""
+    """Names of the configurations present in the runs."""
     return {robot.configurations.names[k] for k in runs.configurations(robot)}
 
 
@@ -195,7 +198,7 @@ class _Setting:
     """A table and a robot, ready for a search.
 
     Attributes:
-        base: the robot at the prior means; of_product: priors of its guide frictions, see `_guided`.
+        base: the robot at the prior means; of_product: priors of its guide frictions, see `_with_guide_priors`.
     """
 
     runs: Runs
@@ -205,9 +208,11 @@ class _Setting:
     of_product: dict[str, tuple[float, float]]
 
     def problem(self) -> Problem:
-        """The problem to be solved, with the noise as it is known before a search."""
-        coordinates = priors.coordinates(self.base, self.ready.names, {**self.of_product, **self.ready.stated})
-        return observers.pose(self.runs, self.base, coordinates, self.ready.noise.sd, self.plan.fidelity)
+        """The problem to be solved, with the noise known before the search."""
+        coordinates = priors.parameter_coordinates(
+            self.base, self.ready.names, {**self.of_product, **self.ready.stated}
+        )
+        return observers.pose_problem(self.runs, self.base, coordinates, self.ready.noise.sd, self.plan.fidelity)
 
     def remarks(self) -> list[Note | str]:
         """Remarks on the table and the priors."""
@@ -216,80 +221,82 @@ class _Setting:
         return [*ready.foreign, *ready.doubted, *ready.checked, *ready.weighed, *products, *ready.begins]
 
 
-def _guided(runs: Runs, ready: Prepared, plan: _Plan) -> tuple[Robot, dict[str, tuple[float, float]]]:
-    """The robot with the guides' share that the fidelity computes, and the priors of the guide frictions that are
-    free and not stated."""
+def _with_guide_priors(runs: Runs, ready: Prepared, plan: _Plan) -> tuple[Robot, dict[str, tuple[float, float]]]:
+    """Robot with the guides' share that the fidelity computes, and priors of the free guide frictions without a
+    stated prior."""
     robot, known = ready.robot, dict[str, tuple[float, float]]()
-    if priors.GUIDE_SHARE not in observers.facts(plan.fidelity).computes:
+    if priors.GUIDE_SHARE not in observers.fidelity_facts(plan.fidelity).computes:
         return robot, known
     present = _present(runs, robot)
     for name, chassis in ready.robot.configurations.items():
         if name in present and float(chassis.on_tracks) > 0.5:
-            robot, more = priors.guided(robot, name)
+            robot, more = priors.with_guide_share(robot, name)
             known |= more
     return robot, {name: prior for name, prior in known.items() if name in ready.names and name not in ready.stated}
 
 
-def _evolved(
+def _population_options(
     posed: Problem,
     names: Sequence[str],
     runs: Runs,
     population: int | None,
     generations: int | None,
     members: Path | None,
-) -> _Evolved:
+) -> _PopulationOptions:
     """Settings of the search by generations, from the arguments of `calibrate`.
 
     Raises:
-        BadConfiguration: settings of a population for a search without one, or for data that are not searched so.
+        BadConfiguration: options of a population without one, or for data that no population search supports.
     """
     if population is None:
-        population = POPULATION if fidelities.unread("steady", names, runs.turns) else 0
+        population = POPULATION if fidelities.unread_parameters("steady", names, runs.turns) else 0
     if (members is not None or generations is not None) and not population:
         raise BadConfiguration("--generations, --members: there is no population; state --population")
     if population and not posed.observe.eased:
         raise BadConfiguration(
-            f"--population: got {population}; settled rows with --model drive or track alone are searched so"
+            f"--population: got {population}; a population search needs settled rows and --model drive or track"
         )
     if 0 < population < LEAST:
         raise BadConfiguration(f"--population: got {population}; expected 0 or at least {LEAST} members")
-    return _Evolved(population, generations or GENERATIONS, members)
+    return _PopulationOptions(population, generations or GENERATIONS, members)
 
 
-def _searched(
+def _search(
     runs: Runs,
     base: Robot,
     posed: Problem,
     known: Noise,
     starts: int,
-    evolved: _Evolved,
+    evolved: _PopulationOptions,
     seed: int,
     tell: Callable[[Step], None],
     solver: optimizers.Solver | None,
-) -> tuple[Found, np.ndarray | None]:
+) -> tuple[SearchResult, np.ndarray | None]:
     """The searches of a problem, and where they began at the optimum of `steady`, that optimum."""
     rng, size = np.random.default_rng(seed), len(posed.coordinates)
     points = posed.observe.starts(posed, rng, starts)
     if not posed.observe.long:
-        return multistart.search(posed, known, points, solver), None
+        return multistart.search_from_starts(posed, known, points, solver), None
     if not posed.observe.eased:
-        shares = multistart.first_shares(known)
+        shares = multistart.initial_noise_shares(known)
         return multistart.search_one_by_one(posed, known, points, shares, tell, solver), None
     tell(Step("steady"))
     if evolved.size:
-        population.Members(posed, evolved.file)  # refuses a file of others before the search of steady
-    draws = rng.standard_normal((fidelities.facts("steady").effort.starts, size))
+        population.Members(posed, evolved.file)  # refuses another calibration's file before the search of steady
+    draws = rng.standard_normal((fidelities.fidelity_facts("steady").effort.starts, size))
     draws[0] = 0.0
-    easy = multistart.search(observers.pose(runs, base, posed.coordinates, known.sd), known, draws, solver)
+    easy = multistart.search_from_starts(
+        observers.pose_problem(runs, base, posed.coordinates, known.sd), known, draws, solver
+    )
     points[0] = beside = np.asarray(easy.best.z)
-    points[1:] = multistart.nearby(easy.problem, beside, rng, len(points) - 1)
+    points[1:] = multistart.starts_from_posterior(easy.problem, beside, rng, len(points) - 1)
     posed = dataclasses.replace(posed, data=easy.problem.data)
     if not evolved.size:
         return multistart.search_one_by_one(posed, known, points, easy.shares, tell, solver), beside
     covariance = _first_generation(easy.problem, beside)
     members = population.Members(posed, evolved.file)
     everyone = population.evolve(
-        members, population.objective(posed, known), beside, covariance, size=evolved.size,
+        members, population.member_objective(posed, known), beside, covariance, size=evolved.size,
         generations=evolved.generations, seed=seed, beside=points, tell=tell,
     )  # fmt: skip
     at = int(everyone.order[0])
@@ -297,23 +304,23 @@ def _searched(
         ended = population.Searched(everyone, at, (), None, np.nan).outcomes()
         said = ", ".join(f"{count} {word.replace('_', ' ')}" for word, count in ended.items())
         raise BadConfiguration(
-            f"--population: none of {len(everyone.z)} members can be run in every row (members with a row that ends "
-            f"so: {said or 'none'}); begin from another robot, or free less"
+            f"--population: none of {len(everyone.z)} members can be run in every row (members with a row that ended "
+            f"in: {said or 'none'}); begin from another robot, or free fewer parameters"
         )
     posed, shares = multistart.reestimate_noise_at(posed, known, everyone, at)
     tell(Step("derivatives"))
-    about = identifiability.analyse(posed, jnp.asarray(everyone.z[at]))
-    off = population.apart(posed, members, everyone.z[at], about.jacobian, about.sd)
+    about = identifiability.analyse_identifiability(posed, jnp.asarray(everyone.z[at]))
+    off = population.unreliable_derivatives(posed, members, everyone.z[at], about.jacobian, about.sd)
     names = tuple(n for n, apart in zip(posed.coordinates.names, off, strict=True) if apart)
-    slope, left = population.regression(posed, everyone, at) if names else (None, np.nan)
-    edge = population.edges(posed.coordinates, everyone.z[at])
+    slope, left = population.local_regression(posed, everyone, at) if names else (None, np.nan)
+    edge = population.parameters_at_edge(posed.coordinates, everyone.z[at])
     searched = population.Searched(everyone, at, names, slope, left, edge)
-    return multistart.at_best(posed, known, shares, searched, tell, solver), beside
+    return multistart.optimum_of_population(posed, known, shares, searched, tell, solver), beside
 
 
 @dataclasses.dataclass(frozen=True)
-class _Evolved:
-    """A search by generations: members of each, 0 for none; how many at most; the file in which members are kept."""
+class _PopulationOptions:
+    """Options of a search by generations: members of each (0 for no search), largest number, file of members."""
 
     size: int
     generations: int
@@ -321,9 +328,11 @@ class _Evolved:
 
 
 def _first_generation(easy: Problem, z: np.ndarray) -> np.ndarray:
-    """Covariance of the first generation: what `steady` knows, but the friction of contacts is as the prior says, as
-    it meant another thing to `steady`."""
-    covariance = identifiability.analyse(easy, jnp.asarray(z)).covariance.copy()
+    """Covariance of the first generation: the posterior of `steady`, but the prior for friction of contacts.
+
+    That friction has another meaning in `steady`.
+    """
+    covariance = identifiability.analyse_identifiability(easy, jnp.asarray(z)).covariance.copy()
     friction = np.array([FRICTION in name for name in easy.coordinates.names])
     covariance[friction] = covariance[:, friction] = 0.0
     covariance[friction, friction] = 1.0
@@ -335,7 +344,7 @@ class _Optimum:
     """The model at the optimum and before the fit.
 
     Attributes:
-        z: coordinates; robot: that they make; after: what is observed of it.
+        z: coordinates; robot: the robot at z; after: its observation.
         status, status_before: codes, shape (rows,).
         seen, seen_before: readings [SI], shape (rows, channels), NaN in rows that the model does not reach.
     """
@@ -349,31 +358,34 @@ class _Optimum:
     seen_before: np.ndarray
 
 
-def _optimum(setting: _Setting, found: Found) -> _Optimum:
-    """The model at the optimum that was found and before the fit.
+def _optimum(setting: _Setting, found: SearchResult) -> _Optimum:
+    """Model at the optimum of the search and before the fit.
 
     Raises:
         BadConfiguration: the model reaches no operating point in some row at the optimum.
     """
     posed, z = found.problem, np.asarray(found.best.z)
     fitted = posed.robot(jnp.asarray(z))
-    after, before = optimizers.observation(posed, jnp.asarray(z)), optimizers.read(posed, posed.base)
+    after, before = optimizers.observe_at(posed, jnp.asarray(z)), optimizers.observe_robot(posed, posed.base)
     status, status_before = np.asarray(after.status), np.asarray(before.status)
-    lost = multistart.unreachable(posed, status)
+    lost = multistart.unreachable_rows(posed, status)
     if lost.any():
-        raise checks.infeasible(setting.runs, fitted, status, lost, setting.ready.names)
-    seen, seen_before = _reached(posed, status, after.reading), _reached(posed, status_before, before.reading)
+        raise checks.infeasible_error(setting.runs, fitted, status, lost, setting.ready.names)
+    seen, seen_before = (
+        _reached_readings(posed, status, after.reading),
+        _reached_readings(posed, status_before, before.reading),
+    )
     return _Optimum(z, fitted, after, status, status_before, seen, seen_before)
 
 
 @dataclasses.dataclass(frozen=True)
 class _Analysis:
-    """What is known of an optimum.
+    """Analysis of an optimum.
 
     Attributes:
         about: the linear analysis; scanned: scans along parameters, by the number of the coordinate.
-        elsewhere: searches that ended where the scans have nothing, see `scans.apart`.
-        profile: of every parameter, None without profiles; held: blocks held out, by kind.
+        elsewhere: number of searches that ended in a minimum that the scans do not show, see `scans.count_outside`.
+        profile: of each parameter, None without profiles; held: blocks held out, by kind.
         notes: remarks on these.
     """
 
@@ -385,32 +397,41 @@ class _Analysis:
     notes: list[Note | str]
 
 
-def _analysed(setting: _Setting, found: Found, optimum: _Optimum) -> _Analysis:
+def _analyse(setting: _Setting, found: SearchResult, optimum: _Optimum) -> _Analysis:
     """Linear analysis, scans, profiles and held-out blocks at the optimum."""
     posed, z, plan, searched = found.problem, optimum.z, setting.plan, found.searched
     notes: list[Note | str] = [*posed.observe.cautions(optimum.robot)]
-    about = identifiability.analyse(posed, jnp.asarray(z), slope=None if searched is None else searched.slope)
+    about = identifiability.analyse_identifiability(
+        posed, jnp.asarray(z), slope=None if searched is None else searched.slope
+    )
     notes += searched.remarks() if searched is not None else []
-    scanned = scans.profiles(posed, z)
+    scanned = scans.scan_all(posed, z)
     about = scans.with_scanned_sds(about, scanned)
-    notes += scans.remarks(posed, scanned)
-    elsewhere = scans.apart(scanned, found.starts.z, found.starts.converged)
+    notes += scans.scan_remarks(posed, scanned)
+    elsewhere = scans.count_outside(scanned, found.starts.z, found.starts.converged)
     if elsewhere:
         over = tuple(posed.coordinates.names[k] for k in scanned)
         notes.append(Elsewhere(elsewhere, len(found.starts.cost), over))
     if not np.isfinite(about.covariance).all():
         notes.append(Fact("no covariance"))
-    if jumps := numbers(np.asarray(optimum.after.flags) >> FLAGS.index("jumps") & 1):
+    if jumps := row_numbers(np.asarray(optimum.after.flags) >> FLAGS.index("jumps") & 1):
         notes.append(OfRows(jumps, "jumps"))
     profile = None
     if plan.profiles:
-        profile = identifiability.profile(posed, jnp.asarray(z), float(found.best.cost), about)
-    held = holdout.held_out(posed, z, {kind: holdout.blocks(setting.runs, kind) for kind in plan.kinds})
+        profile = identifiability.profile_likelihoods(posed, jnp.asarray(z), float(found.best.cost), about)
+    held = holdout.hold_out_by_kind(
+        posed, z, {kind: holdout.blocks_of_kind(setting.runs, kind) for kind in plan.kinds}
+    )
     return _Analysis(about, scanned, elsewhere, profile, held, notes)
 
 
 def _result(
-    setting: _Setting, found: Found, optimum: _Optimum, analysis: _Analysis, beside: np.ndarray | None, seed: int
+    setting: _Setting,
+    found: SearchResult,
+    optimum: _Optimum,
+    analysis: _Analysis,
+    beside: np.ndarray | None,
+    seed: int,
 ) -> CalibrationResult:
     """The result of a calibration; `beside` is the optimum of `steady` that the search began from, if any."""
     runs, known, posed, about = setting.runs, setting.ready.noise, found.problem, analysis.about
@@ -427,17 +448,17 @@ def _result(
         channels=runs.channels,
         model=setting.plan.fidelity,
         seed=seed,
-        parameters=estimates.parameters(
+        parameters=estimates.parameter_estimates(
             posed, setting.base, z, about, analysis.profile, beside, sources, analysis.scanned
         ),
-        tied=estimates.tied(posed),
-        noise=estimates.noise(posed, known, found.shares, measured),
+        tied=estimates.tied_parameters(posed),
+        noise=estimates.channel_noise(posed, known, found.shares, measured),
         axis=observe.axis,
-        errors_before=estimates.errors(runs.channels, seen_before, measured, sd),
-        errors_after=estimates.errors(runs.channels, seen, measured, sd),
-        held_out={kind: estimates.held_out(posed, h, measured, sd) for kind, h in analysis.held.items()},
-        conditions=estimates.conditions(observe, runs),
-        readings=estimates.readings(runs.channels, measured, sd, seen_before, seen),
+        errors_before=estimates.errors_by_channel(runs.channels, seen_before, measured, sd),
+        errors_after=estimates.errors_by_channel(runs.channels, seen, measured, sd),
+        held_out={kind: estimates.hold_out_errors(posed, h, measured, sd) for kind, h in analysis.held.items()},
+        conditions=estimates.condition_columns(observe, runs),
+        readings=estimates.readings_by_channel(runs.channels, measured, sd, seen_before, seen),
         status_before=np.array(STATUSES)[optimum.status_before],
         status=np.array(STATUSES)[optimum.status],
         adhesion_used=np.asarray(optimum.after.adhesion_used),
@@ -446,15 +467,15 @@ def _result(
         starts=found.starts,
         searched=found.searched,
         chi_square=estimates.chi_square(seen, measured, sd, about, known),
-        adequacy=lack_of_fit.judged(left, seen_before, sd, estimated=known.estimated, converged=converged),
+        adequacy=lack_of_fit.judge_adequacy(left, seen_before, sd, estimated=known.estimated, converged=converged),
         residual_clusters=residual_clusters(left, seed),
         identifiability=about,
-        posterior=of_coordinates(posed.coordinates, z, about.covariance),
-        remarks=(*notes, *checks.unmeasured(setting.ready.names, about.sensitivity)),
+        posterior=posterior_of_coordinates(posed.coordinates, z, about.covariance),
+        remarks=(*notes, *checks.unmeasured_notes(setting.ready.names, about.sensitivity)),
     )
-    return dataclasses.replace(result, remarks=(*result.remarks, *remarks(result)))
+    return dataclasses.replace(result, remarks=(*result.remarks, *calibration_remarks(result)))
 
 
-def _reached(posed: Problem, status: np.ndarray, reading: jax.Array) -> np.ndarray:
+def _reached_readings(posed: Problem, status: np.ndarray, reading: jax.Array) -> np.ndarray:
     """Readings [SI], NaN in rows that the model does not reach."""
     return np.where(posed.observe.unreachable(status)[:, None], np.nan, np.asarray(reading))

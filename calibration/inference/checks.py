@@ -1,4 +1,4 @@
-"""What makes data unfit for a calibration, each said in one sentence, and what is worth saying of the rest."""
+"""Checks that data can be fitted, with one sentence for each failure, and notes on data that can."""
 
 from __future__ import annotations
 
@@ -11,39 +11,44 @@ from calibration.data.courses import applied
 from calibration.data.input_errors import BadConfiguration, BadData, number
 from calibration.data.runs import Runs
 from calibration.inference import observers
-from calibration.inference.conduct import conduct
+from calibration.inference.conduct import conduct_notes
 from calibration.inference.fit_notes import Constant, Note, StiffSupply, Unmeasured
 from calibration.inference.noise import Noise
 from calibration.inference.ranges import check_ranges
-from calibration.inference.uninformative import copied, nothing_varies
-from calibration.inference.unused import no_load_gives, unused
-from mmrjax.errors import counted
+from calibration.inference.uninformative import copied_channels, nothing_varies
+from calibration.inference.unused import unexplained_torque_notes, unused_notes
+from mmrjax.errors import count_noun
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import SLIDES, STATUSES
 
 
-def check(runs: Runs, robot: Robot, names: Sequence[str], noise: Noise) -> list[Note | str]:
-    """Refuse data that cannot be fitted; return what should be said of data that can.
+def check_data(runs: Runs, robot: Robot, names: Sequence[str], noise: Noise) -> list[Note | str]:
+    """Refuse data that cannot be fitted; return notes on data that can.
 
     Raises:
         BadData: too few readings, a stuck channel, contradictory replicates, samples of one run under
             different conditions, a configuration that `robot` does not have, readings in other units.
         BadConfiguration: a free parameter of a configuration that has no rows.
     """
-    _configurations(runs, robot, names)
-    _enough(runs, names, noise)
-    _nothing_moves(runs, noise)
-    said = [*runs.missing(), *_stuck(runs), *observers.kind(runs).check(runs, noise), *_constant_conditions(runs)]
-    said += [*unused(runs), *no_load_gives(runs)]
-    return [*said, *check_ranges(runs, robot), *_uninformative(runs, robot, noise), *conduct(runs, robot)]
+    _check_configurations(runs, robot, names)
+    _check_enough_readings(runs, names, noise)
+    _check_motion(runs, noise)
+    said = [
+        *runs.missing(),
+        *_check_stuck_channels(runs),
+        *observers.observer_kind(runs).check(runs, noise),
+        *_constant_conditions(runs),
+    ]
+    said += [*unused_notes(runs), *unexplained_torque_notes(runs)]
+    return [*said, *check_ranges(runs, robot), *_uninformative(runs, robot, noise), *conduct_notes(runs, robot)]
 
 
-#: Scatter of a speed over that of its changes from row to row, up to which it is noise alone.
+#: Scatter of a speed over the scatter of its changes from row to row, up to which the speed is only noise.
 WHITE = 1.5
 
 
-def _nothing_moves(runs: Runs, noise: Noise) -> None:
-    """Refuse a log whose speeds are noise alone, except a locked shaft: it is driven, and its noise is stated."""
+def _check_motion(runs: Runs, noise: Noise) -> None:
+    """Refuse a log with speeds that are only noise, except a locked shaft that is driven and has stated noise."""
     speeds = [(k, c) for k, c in enumerate(runs.channels) if c.zero_at_rest and runs.has(c.column)]
     if not runs.sampled or runs.turns or not speeds:
         return
@@ -69,14 +74,14 @@ def _nothing_moves(runs: Runs, noise: Noise) -> None:
 
 
 def _uninformative(runs: Runs, robot: Robot, noise: Noise) -> list[Note]:
-    """Notes on settled runs of one condition, and on channels that are computed from others."""
+    """Notes on settled runs of one condition, and on channels computed from others."""
     if runs.sampled or runs.turns:
         return []
     same = nothing_varies(runs, robot, noise)
-    return [same] if same is not None else [*copied(runs, robot)]
+    return [same] if same is not None else [*copied_channels(runs, robot)]
 
 
-def _configurations(runs: Runs, robot: Robot, names: Sequence[str]) -> None:
+def _check_configurations(runs: Runs, robot: Robot, names: Sequence[str]) -> None:
     present = {robot.configurations.names[k] for k in np.unique(runs.configurations(robot))}
     for name in names:
         word = name.split(".")[0]
@@ -87,7 +92,7 @@ def _configurations(runs: Runs, robot: Robot, names: Sequence[str]) -> None:
             )
 
 
-def _enough(runs: Runs, names: Sequence[str], noise: Noise) -> None:
+def _check_enough_readings(runs: Runs, names: Sequence[str], noise: Noise) -> None:
     levels = int(noise.estimated.sum())
     readings = int(np.isfinite(runs.measured()).sum())
     shown = sum(word != "no readings" for word in noise.source)
@@ -97,17 +102,17 @@ def _enough(runs: Runs, names: Sequence[str], noise: Noise) -> None:
     also = f" and estimate {levels} noise levels" if levels else ""
     cure = "fix some with --fix, or state --noise" if levels else "fix some with --fix"
     whole = readings == len(runs) * shown
-    rows = counted(len(runs), "row")
-    have = f"{rows} of {shown} channels" if whole else f"{counted(readings, 'reading')} in {rows}"
+    rows = count_noun(len(runs), "row")
+    have = f"{rows} of {shown} channels" if whole else f"{count_noun(readings, 'reading')} in {rows}"
     least = f"{needed} rows" if whole else f"{needed * shown} readings"
-    what = f"cannot fit {counted(len(names), 'parameter')}{also}" if names else "cannot be fitted"
+    what = f"cannot fit {count_noun(len(names), 'parameter')}{also}" if names else "cannot be fitted"
     raise BadData(f"{runs.source}: {have} {what}; at least {least} are needed{f', or {cure}' if names else ''}")
 
 
-def _stuck(runs: Runs) -> list[StiffSupply]:
-    """Refuses a channel that shows one number under several conditions; notes a voltage that does."""
+def _check_stuck_channels(runs: Runs) -> list[StiffSupply]:
+    """Refuses a channel with one value under several conditions; returns notes for a motor voltage with one value."""
     labels = () if runs.layout.complete else ("configuration", "surface")
-    columns = [c for c in (*observers.kind(runs).axes_of(runs), *labels) if runs.has(c)]
+    columns = [c for c in (*observers.observer_kind(runs).axes_of(runs), *labels) if runs.has(c)]
     varied = [np.unique(runs[c], return_inverse=True)[1] for c in columns]
     stiff: list[StiffSupply] = []
     if len(np.unique(np.stack(varied, 1), axis=0)) < 2:
@@ -131,7 +136,7 @@ def _constant_conditions(runs: Runs) -> list[Constant]:
     imposed = runs.layout.imposed_column
     alike = {
         "slope_deg": "guides" if runs.layout.complete else "slope",
-        imposed: "voltage" if imposed == SUPPLY else "speed",  # and friction by speed is told by levels of current
+        imposed: "voltage" if imposed == SUPPLY else "speed",  # and levels of current identify friction by speed
     }
     return [
         Constant(column, runs[column][0], losses)
@@ -140,19 +145,19 @@ def _constant_conditions(runs: Runs) -> list[Constant]:
     ]
 
 
-def unmeasured(names: Sequence[str], sensitivity: np.ndarray) -> list[Unmeasured]:
-    """Free parameters that move no reading."""
+def unmeasured_notes(names: Sequence[str], sensitivity: np.ndarray) -> list[Unmeasured]:
+    """Notes on free parameters that change no reading."""
     return [Unmeasured(name) for name, s in zip(names, sensitivity, strict=True) if s < 1e-6]
 
 
-def infeasible(
+def infeasible_error(
     runs: Runs, robot: Robot, status: np.ndarray, lost: np.ndarray, names: Sequence[str]
 ) -> BadConfiguration:
-    """The error for rows that the model does not reach at the best point found, from every start.
+    """Error for rows that the model does not reach at the best point of all searches.
 
     Args:
         robot: of that point; status: of each row there, shape (rows,).
-        lost: whether a row is not reached, shape (rows,); names: of the free parameters.
+        lost: True for rows not reached, shape (rows,); names: of the free parameters.
     """
 
     def rows(which: np.ndarray) -> str:
@@ -167,9 +172,9 @@ def infeasible(
         )
     sliding = sorted(set(runs.configurations_named(robot)[slides]), key=robot.configurations.index)
     parameter = {c: f"{c}.ground.friction.static" for c in sliding}
-    at = ", ".join(f"{float(robot.configurations[c].ground.friction.static):.3g}" for c in sliding)
+    frictions = ", ".join(f"{float(robot.configurations[c].ground.friction.static):.3g}" for c in sliding)
     cure = "free it, or raise it in --robot" if set(parameter.values()) - set(names) else "widen its prior"
     return BadConfiguration(
         f"no start is feasible: {runs.source} rows {rows(slides)} were measured in steady travel, but the model "
-        f"slides there ({' and '.join(parameter.values())} = {at} cannot carry the demand); {cure}"
+        f"slides there ({' and '.join(parameter.values())} = {frictions} cannot carry the demand); {cure}"
     )

@@ -1,4 +1,4 @@
-"""What histories did, as far as it limits what they can tell: whether a run got under way, and whether it gripped."""
+"""Conduct of histories as far as it limits their information: runs that end early, and runs that never grip."""
 
 from __future__ import annotations
 
@@ -13,46 +13,46 @@ from calibration.inference.ranges import UNDER_WAY
 from mmrjax.model import channels
 from mmrjax.model.robot import Robot
 
-#: Share of the speed of steady travel below which a short run is not under way, and of that of its movers below which
-#: a long one does not grip [-].
+#: Share of the speed of steady travel below which a short run has ended early, and share of the movers' speed below
+#: which a long run does not grip [-].
 SLOW, SLIDING = 0.7, 0.7
 
 
-def conduct(runs: Runs, robot: Robot) -> list[Note]:
-    """Say which runs end before they are under way, and which never grip."""
+def conduct_notes(runs: Runs, robot: Robot) -> list[Note]:
+    """Notes on runs that end before they reach steady travel, and on runs that never grip."""
     runs = runs.of(robot)
-    kind = observers.kind(runs)
+    kind = observers.observer_kind(runs)
     ends, shown, lasts = kind.settled(runs)
     if not kind.axis or not len(ends) or not robot.has_ground or "speed" not in robot.rig.channels:
         return []
-    speed = shown[:, channels.index("speed", robot.channels)]
+    speed = shown[:, channels.channel_index("speed", robot.channels)]
     names = ends["run_id"] if ends.has("run_id") else np.array(["(no run_id)"] * len(ends))
     conditions = ends.conditions(robot)
     if "motor_speed" in robot.rig.channels:
-        turning = shown[:, channels.index("motor_speed", robot.channels)]
+        turning = shown[:, channels.channel_index("motor_speed", robot.channels)]
     else:
         imposed = conditions.motor_speed
         turning = np.full(len(ends), np.nan) if imposed is None else np.asarray(imposed)
-    steady = operating_readings(robot, conditions)[:, channels.index("speed", robot.channels)]
+    steady = operating_readings(robot, conditions)[:, channels.channel_index("speed", robot.channels)]
     radius = np.asarray([float(c.radius) for c in robot.configurations.members])[np.asarray(conditions.configuration)]
     movers = radius * turning / float(robot.gearbox.ratio)
-    known = np.isfinite(speed)
-    slow = known & np.isfinite(steady) & (speed < SLOW * steady)
-    early = (lasts < UNDER_WAY) & (slow | ~known)
-    slides = (lasts >= UNDER_WAY) & known & np.isfinite(movers) & (movers > 0) & (speed < SLIDING * movers)
-    slides &= ~np.isin(names, runs.run_names[varies(runs)])  # what is shown of those is a part of them
+    measured = np.isfinite(speed)
+    slow = measured & np.isfinite(steady) & (speed < SLOW * steady)
+    early = (lasts < UNDER_WAY) & (slow | ~measured)
+    slides = (lasts >= UNDER_WAY) & measured & np.isfinite(movers) & (movers > 0) & (speed < SLIDING * movers)
+    slides &= ~np.isin(names, runs.run_names[varies(runs)])  # their settled ends are only parts of them
     said: list[Note] = []
     if early.any():
         seen = slow & early
         share = float(np.nanmedian(speed[seen] / steady[seen])) if seen.any() else float("nan")
-        said.append(EndsEarly(_names(names, early), float(lasts[early].max()), share))
+        said.append(EndsEarly(_run_names(names, early), float(lasts[early].max()), share))
     if slides.any():
         share = max(float(np.median(speed[slides] / movers[slides])), 0.0)
-        said.append(NeverGrips(_names(names, slides), share))
+        said.append(NeverGrips(_run_names(names, slides), share))
     if slides.any() and (slides | early).all():
         said.append(Fact("no grip"))
     return said
 
 
-def _names(names: np.ndarray, which: np.ndarray) -> tuple[str, ...]:
+def _run_names(names: np.ndarray, which: np.ndarray) -> tuple[str, ...]:
     return tuple(str(n) for n in names[which])

@@ -1,4 +1,4 @@
-"""What one kind of data tells beside the fit: equations run by run, or memory, orders and drift over time."""
+"""Further findings of one kind of data: defects of each run's equations, or memory, orders and drift over time."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 @dataclasses.dataclass(frozen=True)
 class Detail(abc.ABC):
-    """Further findings of one kind of data; reports choose their section by its type."""
+    """Further findings of one kind of data; reports select their section by its type."""
 
     @abc.abstractmethod
     def to_json(self) -> dict[str, Any]:
@@ -24,11 +24,11 @@ class Detail(abc.ABC):
 
 @dataclasses.dataclass(frozen=True)
 class EquationDefects(Detail):
-    """Defect of each equation in every run [its balance's unit], NaN for rows that do not count.
+    """Defect of each equation in each run [its balance's unit], NaN for excluded rows.
 
     Attributes:
-        before, after: balance, with its side where sides are driven apart (`track_left`) → values, shape (rows,);
-            what closes the readings' residual there.
+        before, after: balance, with its side if sides are driven independently (`track_left`) → values, shape
+            (rows,), that would cancel the readings' residuals.
     """
 
     before: dict[str, np.ndarray]
@@ -44,8 +44,10 @@ class EquationDefects(Detail):
 
 @dataclasses.dataclass(frozen=True)
 class Memory:
-    """Memory of the residual: Ljung and Box's statistic as a normal deviate, its threshold and p among bootstrap
-    tables, the lags, and each channel's autocorrelation at lags 1 to that."""
+    """Autocorrelation of the residuals: the Ljung-Box statistic as a normal deviate, with threshold and p.
+
+    Threshold and p are from bootstrap tables; `autocorrelation` is each channel's, at lags 1 to `lags`.
+    """
 
     deviate: float
     threshold: float
@@ -56,7 +58,7 @@ class Memory:
 
 @dataclasses.dataclass(frozen=True)
 class Strongest:
-    """The balance in which a wave or a drift explains most: its score as a normal deviate, the fall of χ² [σ²]."""
+    """Balance in which a wave or a drift explains most: its score as a normal deviate, the decrease of χ² [σ²]."""
 
     balance: str
     deviate: float
@@ -65,25 +67,25 @@ class Strongest:
 
 @dataclasses.dataclass(frozen=True)
 class TimeSide:
-    """Of one fit: memory; order (its word, waves a turn of the driving shaft) → what a wave of it explains; drift."""
+    """Statistics of one fit over time: memory; order (word, waves a turn of the driving shaft) → score; drift."""
 
     memory: Memory
     orders: dict[tuple[str, float], Strongest]
     drift: Strongest
 
     def to_json(self) -> dict[str, Any]:
-        """As `result.json` has it."""
+        """Entries of `result.json`."""
         orders = [{"order": w, "a_turn": n, **dataclasses.asdict(s)} for (w, n), s in self.orders.items()]
         return {"memory": dataclasses.asdict(self.memory), "orders": orders, "drift": dataclasses.asdict(self.drift)}
 
 
 @dataclasses.dataclass(frozen=True)
 class TimeStatistics(Detail):
-    """What only histories tell.
+    """Statistics that only histories have.
 
     Attributes:
-        runs, samples: how many; orders_unresolved: waves that the samples do not resolve.
-        before, after: of base and proposed robot.
+        runs, samples: counts; orders_unresolved: waves that the samples do not resolve.
+        before, after: statistics of the base and of the proposed robot.
     """
 
     runs: int

@@ -1,4 +1,4 @@
-"""What a finished search says of parameters, noise and errors: the parts of a calibration's result."""
+"""Parts of a calibration's result: parameters, noise and errors after a finished search."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from calibration.inference.noise import Noise
 from calibration.inference.observers import Observer
 from calibration.inference.problem import Problem
 from calibration.inference.result import (
-    Beside,
     Block,
     ChannelErrors,
     ChannelNoise,
@@ -26,6 +25,7 @@ from calibration.inference.result import (
     HeldOut,
     Prior,
     ProfileCurve,
+    SteadyEstimate,
     Tie,
 )
 from calibration.inference.scans import Scan
@@ -34,13 +34,13 @@ from mmrjax.model import channels
 from mmrjax.model.channels import Channel
 from mmrjax.model.robot import Robot
 
-#: How many data sds one prior sd has to move the readings to be measured by them at all.
+#: Least change of the readings by one prior sd of a parameter, in data sds, for the data to determine it at all.
 SENSITIVE = 1e-6
 
 _SIDE = {-1: "lower", 0: None, 1: "upper"}
 
 
-def parameters(
+def parameter_estimates(
     posed: Problem,
     base: Robot,
     z: np.ndarray,
@@ -50,14 +50,14 @@ def parameters(
     sources: dict[str, str],
     scans: Mapping[int, Scan],
 ) -> dict[str, Estimate]:
-    """Every free parameter by its name.
+    """Estimate of each free parameter, by name.
 
     Args:
         posed, base: the problem, and the robot whose values are the prior means.
-        z: the optimum; beside: that of the same problem with `steady`, or None.
+        z: the optimum; beside: the optimum of the same problem with `steady`, or None.
         about, profile: the linear analysis there, and the profiles, if any.
-        sources: of the priors that are not the fields'; scans: of the coordinates that are scanned, whose intervals
-            are those of their profiles.
+        sources: of priors other than the fields' own; scans: of the scanned coordinates, whose intervals are those
+            of their profiles.
     """
     coordinates = posed.coordinates
     at, sd = np.asarray(z), np.asarray(about.sd)
@@ -66,8 +66,8 @@ def parameters(
     median = coordinates.value(np.zeros_like(at))
     wide = np.stack([coordinates.value(np.full_like(at, side * Z95)) for side in (-1, 1)], 1)
     other = None if beside is None else coordinates.value(np.asarray(beside))
-    bound, fields = coordinates.beyond(z), priors.known(base)
-    found = {}
+    bound, fields = coordinates.beyond(z), priors.parameters_by_name(base)
+    estimates = {}
     for k, name in enumerate(coordinates.names):
         interval, shift, is_open = linear[k], z[k] + Z95 * about.sd[k] * np.array([-1.0, 1.0]), (False, False)
         if profile is not None:
@@ -78,7 +78,7 @@ def parameters(
             shift, is_open = np.array(scans[k].interval()), scans[k].open()
             ends = [np.where(np.arange(len(z)) == k, x, at) for x in shift]
             interval = np.array([coordinates.value(end)[k] for end in ends])
-        found[name] = Estimate(
+        estimates[name] = Estimate(
             value=float(value[k]),
             sd=float(about.sd[k] * slope[k]),
             interval=_pair(interval),
@@ -101,23 +101,23 @@ def parameters(
             profile=None if profile is None else ProfileCurve(profile.value[k], profile.rise[k]),
             with_steady=None
             if beside is None or other is None
-            else Beside(float(other[k]), float((z[k] - beside[k]) / about.sd[k])),
+            else SteadyEstimate(float(other[k]), float((z[k] - beside[k]) / about.sd[k])),
         )
-    return found
+    return estimates
 
 
 def _pair(ends: np.ndarray) -> tuple[float, float]:
     return float(ends[0]), float(ends[1])
 
 
-def tied(posed: Problem) -> dict[str, Tie]:
-    """Parameters that follow a free one, by name."""
+def tied_parameters(posed: Problem) -> dict[str, Tie]:
+    """Parameters tied to a free one, by name."""
     names = posed.coordinates.names
     return {follower: Tie(names[k], ratio) for follower, k, ratio in posed.coordinates.tied}
 
 
-def noise(posed: Problem, known: Noise, shares: np.ndarray, measured: np.ndarray) -> dict[str, ChannelNoise]:
-    """Where each channel's sd comes from, and its size."""
+def channel_noise(posed: Problem, known: Noise, shares: np.ndarray, measured: np.ndarray) -> dict[str, ChannelNoise]:
+    """Source and size of each channel's sd, by channel."""
     share = np.where(np.isfinite(measured), np.asarray(posed.data.sd) / np.maximum(np.abs(measured), 1e-12), np.nan)
     return {
         name: ChannelNoise(
@@ -125,11 +125,13 @@ def noise(posed: Problem, known: Noise, shares: np.ndarray, measured: np.ndarray
             100 * float(np.nanmedian(share[:, k])) if np.isfinite(share[:, k]).any() else np.nan,
             100 * float(shares[k]) if known.estimated[k] else None,
         )
-        for k, name in enumerate(channels.names(posed.channels))
+        for k, name in enumerate(channels.channel_names(posed.channels))
     }
 
 
-def errors(shown: Sequence[Channel], simulated: np.ndarray, measured: np.ndarray, sd: np.ndarray) -> Errors:
+def errors_by_channel(
+    shown: Sequence[Channel], simulated: np.ndarray, measured: np.ndarray, sd: np.ndarray
+) -> Errors:
     """Errors by channel; arrays of shape (rows, channels)."""
     return _errors(shown, simulated, measured, sd, sized_error(simulated, measured))
 
@@ -137,17 +139,17 @@ def errors(shown: Sequence[Channel], simulated: np.ndarray, measured: np.ndarray
 def _errors(
     shown: Sequence[Channel], simulated: np.ndarray, measured: np.ndarray, sd: np.ndarray, percent: np.ndarray
 ) -> Errors:
-    found = channel_errors(shown, simulated, measured, sd, percent)
+    errors = channel_errors(shown, simulated, measured, sd, percent)
     return {
         name: ChannelErrors(
             int(e["rows"]), *(float(e[x]) for x in ("rms_percent", "max_percent", "rms_sigma", "rms"))
         )
-        for name, e in found.items()
+        for name, e in errors.items()
     }
 
 
-def held_out(posed: Problem, held: holdout.HeldOut, measured: np.ndarray, sd: np.ndarray) -> HeldOut:
-    """Errors on blocks that the fit had not seen, in all and block by block."""
+def hold_out_errors(posed: Problem, held: holdout.HeldOut, measured: np.ndarray, sd: np.ndarray) -> HeldOut:
+    """Hold-out errors, overall and for each block."""
     percent, lost = sized_error(held.reading, measured), posed.observe.unreachable(held.status)
     blocks = {}
     for k, label in enumerate(held.labels):
@@ -155,45 +157,45 @@ def held_out(posed: Problem, held: holdout.HeldOut, measured: np.ndarray, sd: np
         alone = [np.where(inside[:, None], x, np.nan) for x in (held.reading, percent)]
         blocks[label] = Block(
             _errors(posed.channels, alone[0], measured, sd, alone[1]),
-            _counted(inside & lost),
+            _row_numbers(inside & lost),
             bool(held.converged[k]),
         )
-    reading = dict(zip(channels.names(posed.channels), held.reading.T, strict=True))
-    return HeldOut(_errors(posed.channels, held.reading, measured, sd, percent), _counted(lost), blocks, reading)
+    reading = dict(zip(channels.channel_names(posed.channels), held.reading.T, strict=True))
+    return HeldOut(_errors(posed.channels, held.reading, measured, sd, percent), _row_numbers(lost), blocks, reading)
 
 
-def _counted(rows: np.ndarray) -> tuple[int, ...]:
-    """Rows of a mask, counted from 1."""
+def _row_numbers(rows: np.ndarray) -> tuple[int, ...]:
+    """Row numbers of a mask, from 1."""
     return tuple((np.flatnonzero(rows) + 1).tolist())
 
 
-def readings(
+def readings_by_channel(
     shown: Sequence[Channel],
     measured: np.ndarray,
     sd: np.ndarray,
     before: np.ndarray,
     after: np.ndarray,
 ) -> dict[str, ChannelReadings]:
-    """Readings by channel; arrays of shape (rows, channels), NaN where there is none."""
+    """Readings by channel; arrays of shape (rows, channels), NaN for missing ones."""
     percent, sigma = sized_error(after, measured), (after - measured) / sd
     return {
         name: ChannelReadings(*(x[:, k] for x in (measured, sd, before, after, percent, sigma)))
-        for k, name in enumerate(channels.names(shown))
+        for k, name in enumerate(channels.channel_names(shown))
     }
 
 
 def chi_square(
     after: np.ndarray, measured: np.ndarray, sd: np.ndarray, about: Identifiability, known: Noise
 ) -> ChiSquare:
-    """Misfit of the readings that are there, and the degrees of freedom that the fit leaves them."""
+    """χ² of the finite readings, and the degrees of freedom left by the fit."""
     finite = np.isfinite(measured)
     misfit = np.where(finite, (after - measured) / sd, 0.0)
     freedom = float(finite.sum() - about.leverage.sum())
     return ChiSquare(float(np.sum(misfit**2)), freedom, not bool(known.estimated.any()))
 
 
-def conditions(observe: type[Observer], runs: Runs) -> dict[str, np.ndarray]:
-    """Columns of the runs that say which row is which."""
+def condition_columns(observe: type[Observer], runs: Runs) -> dict[str, np.ndarray]:
+    """Columns that identify the rows."""
     others = (axis for axis in observe.axes_of(runs) if axis not in runs.axes)
     columns = ("run_id", *others, "configuration", *runs.axes, *DRIVING, "surface")
     return {column: runs[column] for column in columns if runs.has(column)}

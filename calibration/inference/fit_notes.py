@@ -20,12 +20,12 @@ class Note:
         dataclasses.dataclass(frozen=True)(cls)
 
 
-#: Notes as results hold them: sentences of the room of data are words already.
+#: Notes as results hold them: those of `calibration/data` are sentences already.
 Notes = tuple[Note | str, ...]
 
 
 class Step(Note):
-    """What a long computation does next.
+    """Next step of a long computation.
 
     Attributes:
         name: a row of `step_words.STEPS`; about: values for its sentence, in order.
@@ -36,18 +36,18 @@ class Step(Note):
 
 
 class HeldByPrior(Note):
-    """Parameters that are held by their priors."""
+    """Parameters held by their priors."""
 
     names: tuple[str, ...]
 
 
 class Pair(NamedTuple):
-    """Two parameters of which data determine a combination alone.
+    """Two parameters that the data determine only in combination.
 
     Attributes:
         one, other: their names; correlation: of their posterior.
         form: of the combination: their `ratio`, their `product`, or `linear`: `one` + `weight` · `other`.
-        weight: of that [unit of one / unit of other]; negative where the difference is determined.
+        weight: of `other` [unit of one / unit of other]; negative if the difference is determined.
     """
 
     one: str
@@ -78,7 +78,7 @@ class Determination(NamedTuple):
 
 
 class OnlyTogether(Note):
-    """Parameters that are not determined separately."""
+    """Parameters that the data do not determine separately."""
 
     pairs: tuple[Pair, ...]
 
@@ -87,8 +87,8 @@ class FarFromPrior(Note):
     """A parameter far from its prior.
 
     Attributes:
-        name: its; sds: how far [prior sds].
-        of: what that is told of: `loop`, `calibration`, or the `edge` of a search by population.
+        name: of the parameter; sds: distance [prior sds].
+        of: origin of the estimate: `loop`, `calibration`, or the `edge` of a search by population.
     """
 
     name: str
@@ -97,10 +97,10 @@ class FarFromPrior(Note):
 
 
 class NoiseOff(Note):
-    """Residuals without structure that are not of the size of the sds.
+    """Residuals without structure whose size disagrees with the sds.
 
     Attributes:
-        channel: whose, "" for all alike; factor: of the residuals over the sds; source: where these come from.
+        channel: name, "" for all; factor: size of the residuals over the sds; source: of the sds.
     """
 
     channel: str
@@ -118,16 +118,16 @@ class Fact(Note):
 
 
 class Unmeasured(Note):
-    """A free parameter that moves no reading."""
+    """A free parameter that changes no reading."""
 
     name: str
 
 
 class LargerNoise(Note):
-    """A channel whose repeats scatter more than its sd says, which is enlarged.
+    """A channel with repeats that scatter more than its sd, so that the sd was enlarged.
 
     Attributes:
-        channel: its name; factor: by which; pairs: of repeats; source: `stated` or `assumed`, the sd.
+        channel: its name; factor: of the enlargement; pairs: of repeats; source: of the sd, `stated` or `assumed`.
     """
 
     channel: str
@@ -137,14 +137,14 @@ class LargerNoise(Note):
 
 
 class Repeats(Note):
-    """Rows under the same conditions whose readings differ beyond their noise.
+    """Rows under the same conditions with readings that differ beyond their noise.
 
     Attributes:
-        source: of the table; rows: numbers of two of them; column: of the readings; values: theirs [its unit].
-        apart: by how much, in sds or as a share, as text.
-        unused: columns that differ between the two rows and are no conditions; near: condition that the first of them
-            is most like, "" for none.
-        more: groups of such rows beside this one.
+        source: of the table; rows: numbers of two such rows; column: of the readings; values: of both [its unit].
+        apart: their difference in sds or as a share, as text.
+        unused: columns that differ between the two rows and are no conditions; near: the condition most similar to
+            the first of them, "" for none.
+        more: number of further groups of such rows.
     """
 
     source: str
@@ -161,7 +161,7 @@ class Unused(Note):
     """Columns of numbers that vary from row to row and have no role.
 
     Attributes:
-        source: of the table; columns: each with the column of this program that it is most like, "" for none.
+        source: of the table; columns: each with the most similar column of this program, "" for none.
     """
 
     source: str
@@ -169,7 +169,7 @@ class Unused(Note):
 
 
 class NoLoadGives(Note):
-    """Readings of the torque at the output that vary as no load on a shaft makes them vary.
+    """Readings of the output torque with a variation that no load on a shaft causes.
 
     Attributes:
         source: of the table; column: of the channel; theirs: its name in the file.
@@ -183,10 +183,10 @@ class NoLoadGives(Note):
 
 
 class NothingVaries(Note):
-    """The robot foresees the same readings in all settled runs, within the noise of one.
+    """The robot predicts the same readings in all settled runs, within the noise of one.
 
     Attributes:
-        source: of the table; rows: how many; column: of what is imposed.
+        source: of the table; rows: number of rows; column: of the imposed quantity.
         unused: columns of numbers that vary and are no conditions.
     """
 
@@ -197,11 +197,11 @@ class NothingVaries(Note):
 
 
 class Copied(Note):
-    """A channel that is a line of another in every row.
+    """A channel that is a linear function of another in all rows.
 
     Attributes:
-        source: of the table; column: its; of: that of the other; intercept, slope: of the line, in their units.
-        tied: True where the rig itself ties the two to one another, as a rigid gear its speeds.
+        source: of the table; column: of the channel; of: column of the other; intercept, slope: in their units.
+        tied: True if the rig itself ties the two channels, as a rigid gear ties its speeds.
     """
 
     source: str
@@ -213,11 +213,11 @@ class Copied(Note):
 
 
 class Turned(Note):
-    """A channel whose readings fit the robot with the other sign.
+    """A channel with readings that fit the robot after a change of sign.
 
     Attributes:
         source: of the table; column: of the channel; theirs: its name in the file.
-        off, turned: rms difference from the robot of the file, as read and turned round [unit of the column].
+        off, turned: rms difference from the robot of the file, as read and with the other sign [unit of the column].
     """
 
     source: str
@@ -228,7 +228,7 @@ class Turned(Note):
 
 
 class StiffSupply(Note):
-    """A voltage that is read and is the same in every row."""
+    """A measured voltage that is the same in every row."""
 
     column: str
     value: float
@@ -238,8 +238,8 @@ class Constant(Note):
     """A condition that does not vary.
 
     Attributes:
-        column: its; value: in every row, in the column's unit.
-        alike: losses that then act alike: along `slope`, of `guides` too, or at one `voltage` or `speed`.
+        column: of the condition; value: in every row, in the column's unit.
+        alike: losses that are then indistinguishable: along `slope`, of `guides` too, or at one `voltage` or `speed`.
     """
 
     column: str
@@ -248,8 +248,12 @@ class Constant(Note):
 
 
 class EndsEarly(Note):
-    """Histories that end before the robot is under way: the longest [s], and their speed over that of steady travel
-    [-], NaN where it is not known."""
+    """Histories that end before the robot reaches steady travel.
+
+    Attributes:
+        runs: their names; lasts: duration of the longest [s].
+        share: their speed over that of steady travel [-], NaN if unknown.
+    """
 
     runs: tuple[str, ...]
     lasts: float
@@ -257,14 +261,14 @@ class EndsEarly(Note):
 
 
 class NeverGrips(Note):
-    """Histories in which the movers slide to the end: the robot's speed over theirs [-]."""
+    """Histories with movers that slide to the end; `share` is the robot's speed over the movers' [-]."""
 
     runs: tuple[str, ...]
     share: float
 
 
 class Thinned(Note):
-    """A log of so many rows of which fewer are read."""
+    """A log with more rows than are used; `kept` of its `rows` are read."""
 
     source: str
     rows: int
@@ -272,23 +276,23 @@ class Thinned(Note):
 
 
 class CoarseSteps(Note):
-    """Histories so long [s] that their steps [s] do not resolve waves of a shaft."""
+    """Histories of a duration [s] that makes their steps [s] too coarse for waves of a shaft."""
 
     lasts: float
     step: float
 
 
 class StopsOnSlope(Note):
-    """Histories whose motors are not driven on a slope."""
+    """Histories with motors that are not driven on a slope."""
 
     runs: tuple[str, ...]
 
 
 class InheritedPriors(Note):
-    """A part that is not the nominal robot's while friction of it is.
+    """A part that differs from the nominal robot's but has the same friction.
 
     Attributes:
-        part: its name; changed: what of it differs, here and on the nominal robot; kept: names of what does not.
+        part: its name; changed: values that differ (name, here, nominal robot); kept: names of values that do not.
     """
 
     part: str
@@ -297,12 +301,12 @@ class InheritedPriors(Note):
 
 
 class OffBy(Note):
-    """Readings that no robot like this one shows.
+    """Readings that a robot like this one cannot have.
 
     Attributes:
-        column, unit: of the channel; factor: by which they are too large, or below 1 too small.
-        units: in which they would be possible; others: columns that are off by as much.
-        imposed: column of what is imposed on the motors.
+        column, unit: of the channel; factor: of the readings over possible ones.
+        units: that would make the readings possible; others: columns with the same factor.
+        imposed: column of the quantity imposed on the motors.
     """
 
     column: str
@@ -314,7 +318,7 @@ class OffBy(Note):
 
 
 class SlopesIn(Note):
-    """Slopes in another unit: the current rises so many times as fast with them as it should."""
+    """Slopes in another unit: the current rises `rise` times as fast with the slope as the robot's."""
 
     unit: str
     rise: float
@@ -324,13 +328,13 @@ class SlopesIn(Note):
 
 
 class EstimatedNoise(Note):
-    """Channels whose noise was estimated, with the sd [%]."""
+    """Channels with estimated noise, with the sd [%]."""
 
     percent: tuple[tuple[str, float], ...]
 
 
 class BesideSteady(Note):
-    """Parameters within their intervals of the optimum with `steady`, of how many; the furthest and how far [sd]."""
+    """Number of parameters within their intervals of the optimum with `steady`; the furthest, its distance [sd]."""
 
     inside: int
     of: int
@@ -339,8 +343,8 @@ class BesideSteady(Note):
 
 
 class OfRows(Note):
-    """Numbers of rows of which something is so: they are `limited` by adhesion, all but a share of it [-], the
-    running gear `jumps`, or a status."""
+    """Numbers of the rows with a property: `limited` by adhesion to all but a share of it [-], the running gear
+    `jumps`, or a status."""
 
     rows: tuple[int, ...]
     what: str
@@ -355,7 +359,7 @@ class AtBound(Note):
 
 
 class ProductAlone(Note):
-    """A guide's share that acts by its product with its friction alone, which is `free` or held."""
+    """A guide's share that acts only through its product with a friction, which is `free` or fixed."""
 
     friction: str
     share: str
@@ -363,7 +367,7 @@ class ProductAlone(Note):
 
 
 class PriorOfProduct(Note):
-    """A guide friction whose prior is that of its product with the guides' share, which the model puts at `share`."""
+    """A guide friction with the prior of its product with the guides' share, for which the model computes `share`."""
 
     name: str
     mean: float
@@ -372,7 +376,7 @@ class PriorOfProduct(Note):
 
 
 class NoPrediction(Note):
-    """Rows without a prediction where blocks of a kind are held out, of how many."""
+    """Rows without a prediction if blocks of a kind are held out, and the number of all rows."""
 
     kind: str
     rows: int
@@ -380,21 +384,25 @@ class NoPrediction(Note):
 
 
 class SamePredictions(Note):
-    """Kinds of blocks without which every row is predicted as without those of `kind`."""
+    """Kinds of blocks that give the same hold-out predictions of all rows as those of `kind`."""
 
     kind: str
     others: tuple[str, ...]
 
 
 class BlockNotConverged(Note):
-    """A kind of block without which a search did not converge."""
+    """A kind of blocks with at least one hold-out search that did not converge."""
 
     kind: str
 
 
 class Agreement(Note):
-    """How searches from many starts ended: `agree` of them at the best optimum, `elsewhere` at others, the next of
-    which costs `more` [½σ²], the rest without converging."""
+    """Outcome of searches from several starts.
+
+    Attributes:
+        starts: number of searches; agree: those at the best optimum; elsewhere: those at other optima.
+        more: rise of the objective at the next best optimum [½σ²]; open: searches that did not converge.
+    """
 
     starts: int
     agree: int
@@ -404,7 +412,7 @@ class Agreement(Note):
 
 
 class Elsewhere(Note):
-    """Searches that converged at other values of parameters, of how many."""
+    """Number of searches, `of` all, that converged at other values of parameters."""
 
     searches: int
     of: int
@@ -412,7 +420,7 @@ class Elsewhere(Note):
 
 
 class InPieces(Note):
-    """A parameter whose 95 % interval is in pieces."""
+    """A parameter with a 95 % interval in several pieces."""
 
     name: str
     pieces: int
@@ -422,7 +430,7 @@ class InPieces(Note):
 
 
 class Generations(Note):
-    """Members and generations of a search, and whether the last gained nothing that counts."""
+    """Members and generations of a search; `settled` is True if the last generation brought no relevant gain."""
 
     members: int
     generations: int
@@ -430,35 +438,35 @@ class Generations(Note):
 
 
 class LostRows(Note):
-    """Members with a row that is lost, by status."""
+    """Number of members with a lost row, by status."""
 
     members: dict[str, int]
 
 
 class MembersJump(Note):
-    """Members whose running gear jumps in some row, and in which rows the best's does."""
+    """Number of members with a running gear that jumps in some row, and such rows of the best member."""
 
     members: int
     best: tuple[int, ...]
 
 
 class Edge(NamedTuple):
-    """Where a parameter is at the edge of what was allowed: at its `lower` or `upper` bound, else so far from the
-    middle of its prior [prior sd]."""
+    """Bound that a parameter reached, `lower`, `upper` or "", and its distance from the middle of its prior [prior
+    sd]."""
 
     bound: str
     sds: float
 
 
 class EndedAtEdge(Note):
-    """Parameters at the edge of what was allowed, by name."""
+    """Parameters at the edge of the allowed range, by name."""
 
     edge: dict[str, Edge]
 
 
 class ReadFromMembers(Note):
-    """Parameters by which the derivatives of a run are not to be trusted, and what the regression over the members
-    leaves [sd rms]."""
+    """Parameters with unreliable derivatives of a run, and the residual of the regression over the members that
+    replaces them [sd rms]."""
 
     names: tuple[str, ...]
     left: float
@@ -468,11 +476,11 @@ class ReadFromMembers(Note):
 
 
 class Shown(NamedTuple):
-    """What a test of adequacy shows, in the order in which equals are named.
+    """Finding of a test of adequacy; the order of the fields decides between equal p-values.
 
     Attributes:
-        channel: whose residuals, "" for all; what: they exceed the scatter of `repeats` or the `stated` noise, or
-            `follow` a variable, or `remember` the sample before; variable: its column or name.
+        channel: of the residuals, "" for all; what: `repeats` or `stated` (residuals exceed the scatter of repeats
+            or the stated noise), `follow` a variable, or `remember` the previous sample; variable: column or name.
     """
 
     channel: str = ""

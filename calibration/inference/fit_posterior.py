@@ -1,4 +1,4 @@
-"""Posteriors of fits, from their coordinates and the covariance of these."""
+"""Posteriors of fits, from their coordinates and covariance."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from calibration.inference.priors import SOFTNESS, Coordinates
 
 #: Correlation beyond which two parameters are not determined separately.
 TOGETHER = 0.95
-#: Ratio of two relative sds up to which a ratio or a product is what is determined of two parameters.
+#: Ratio of two relative sds up to which the combination of two parameters is a ratio or a product.
 EVEN = 1.25
 
 
-def of_coordinates(coordinates: Coordinates, z: np.ndarray, covariance: np.ndarray) -> Posterior:
-    """The posterior of a fit whose coordinates have this optimum and covariance."""
+def posterior_of_coordinates(coordinates: Coordinates, z: np.ndarray, covariance: np.ndarray) -> Posterior:
+    """Posterior of a fit with optimum z and this covariance."""
     size = len(coordinates)
     return Posterior(
         coordinates=coordinates.names,
@@ -35,18 +35,17 @@ def of_coordinates(coordinates: Coordinates, z: np.ndarray, covariance: np.ndarr
 
 
 def determined_together(posterior: Posterior, held: Collection[str] = ()) -> tuple[Pair, ...]:
-    """Pairs of parameters whose posterior is correlated beyond `TOGETHER`, the strongest first, each with the
-    combination that is determined.
+    """Pairs of parameters with a posterior correlation beyond `TOGETHER`, strongest first, and their combination.
 
     Args:
-        held: names of parameters that their priors hold; a pair of two of these is left out. With one of them,
-            the other is known as well as that prior, and the data determine their combination alone.
+        held: names of parameters held by their priors; a pair of two of these is omitted. In a pair with one of them,
+            the other is known only as well as that prior, and the data determine only their combination.
     """
     sd = np.sqrt(np.diag(posterior.covariance))
     value = posterior.at(posterior.mean)
     log = np.array([kind == LOG for kind in posterior.kinds])
     spread = posterior.spread * sd  # of the parameter, or of its logarithm
-    found = []
+    groups = []
     for i, j in zip(*np.triu_indices(len(sd), 1), strict=True):
         one, other = posterior.coordinates[i], posterior.coordinates[j]
         correlation = float(posterior.covariance[i, j] / max(sd[i] * sd[j], 1e-300))
@@ -56,11 +55,11 @@ def determined_together(posterior: Posterior, held: Collection[str] = ()) -> tup
         weight = -np.sign(correlation) * abs(size[i] / size[j])
         even = log[i] and log[j] and 1 / EVEN < spread[i] / spread[j] < EVEN
         form = "linear" if not even else "ratio" if correlation > 0 else "product"
-        found.append(Pair(one, other, correlation, form, float(weight)))
-    return tuple(sorted(found, key=lambda pair: -abs(pair.correlation)))
+        groups.append(Pair(one, other, correlation, form, float(weight)))
+    return tuple(sorted(groups, key=lambda pair: -abs(pair.correlation)))
 
 
-def undetermined(held: Collection[str], pairs: Collection[Pair]) -> tuple[str, ...]:
-    """Names that priors hold, without those of a pair: of these the data determine a combination."""
+def undetermined_names(held: Collection[str], pairs: Collection[Pair]) -> tuple[str, ...]:
+    """Names held by priors, without names in a pair with a determined combination."""
     paired = {name for pair in pairs for name in (pair.one, pair.other)}
     return tuple(name for name in held if name not in paired)

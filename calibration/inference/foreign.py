@@ -1,40 +1,40 @@
-"""Priors that come from another robot: a file changes a part of the nominal robot, but not that part's friction."""
+"""Priors inherited from another robot: a file changes a part of the nominal robot, but not that part's friction."""
 
 from __future__ import annotations
 
 from collections.abc import Collection
 
 from calibration.inference.fit_notes import InheritedPriors
-from calibration.inference.priors import FRICTION, GUIDE_FRICTION, GUIDE_SHARE, known
+from calibration.inference.priors import FRICTION, GUIDE_FRICTION, GUIDE_SHARE, parameters_by_name
 from mmrjax.model import paper_robots
 from mmrjax.model.robot import Robot
 
-#: What makers and scales state of a part, and what of its friction was measured on the nominal robot.
+#: Values of a part that makers and scales state, and values of its friction measured on the nominal robot.
 DRIVE = {
     "motor": (("resistance", "torque_constant"), ("friction_coulomb", "friction_viscous")),
     "gearbox": (("ratio",), ("efficiency_load", "friction_coulomb", "friction_viscous")),
 }
 CHASSIS, GUIDES = (("mass", "radius"), FRICTION), (GUIDE_SHARE, GUIDE_FRICTION)
-#: Share by which a stated value has to differ to be that of another part [-].
+#: Relative difference above which a stated value belongs to another part [-].
 DIFFERS = 0.2
 
 
 def inherited_priors(robot: Robot, stated: Collection[str] = ()) -> list[InheritedPriors]:
-    """Each part that is not the nominal robot's while friction of it still is.
+    """Parts that differ from the nominal robot's but have the same friction; none for a rig without inheritance.
 
-    None of a rig that starts from nothing.
-
-    A configuration is compared with that of the nominal robot whose friction it has.
+    A configuration is compared with the one of the nominal robot that has the same friction.
 
     Args:
         stated: names of parameters whose priors the user states.
     """
     if not robot.rig.inherits:
         return []
-    mine, nominal = ({name: float(p.value) for name, p in known(r).items()} for r in (robot, paper_robots.nominal()))
+    mine, nominal = (
+        {name: float(p.value) for name, p in parameters_by_name(r).items()} for r in (robot, paper_robots.nominal())
+    )
     pairs = [(part, part, *DRIVE[part]) for part in DRIVE]
     pairs += [(c, other, *CHASSIS) for c in robot.configurations for other in paper_robots.nominal().configurations]
-    found: dict[str, InheritedPriors] = {}
+    inherited: dict[str, InheritedPriors] = {}
     for part, other, sheet, friction in pairs:
         on_tracks = part in robot.configurations and float(robot.configurations[part].on_tracks) > 0.5
         guides = GUIDES if on_tracks else ()
@@ -48,6 +48,6 @@ def inherited_priors(robot: Robot, stated: Collection[str] = ()) -> list[Inherit
             for name in sheet
             if abs(mine[f"{part}.{name}"] / nominal[f"{other}.{name}"] - 1) > DIFFERS
         )
-        if len(kept) > len(found[part].kept if part in found else ()):
-            found[part] = InheritedPriors(part, changed, kept)
-    return [note for note in found.values() if note.changed]
+        if len(kept) > len(inherited[part].kept if part in inherited else ()):
+            inherited[part] = InheritedPriors(part, changed, kept)
+    return [note for note in inherited.values() if note.changed]

@@ -1,4 +1,4 @@
-"""What a table can determine of a rig before anything is fitted: posterior over prior sd, at the prior mean."""
+"""Parameters that a table can determine, before any fit: posterior over prior sd, at the prior mean."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from calibration.inference.fit_notes import (
     Turned,
     Unused,
 )
-from calibration.inference.fit_posterior import determined_together, of_coordinates
+from calibration.inference.fit_posterior import determined_together, posterior_of_coordinates
 from calibration.inference.preparation import prepare
 from mmrjax import fidelities
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import STATUSES
 
-#: What is to be looked at in a table before it is used.
+#: Notes that call for a look at the table before it is used.
 DOUBTS = (
     Copied, LargerNoise, NoLoadGives, NothingVaries, OffBy, Repeats, SlopesIn, StiffSupply, Turned, Unused,
 )  # fmt: skip
@@ -40,11 +40,11 @@ DOUBTS = (
 
 @dataclasses.dataclass(frozen=True)
 class Determined:
-    """What a table says of a free parameter.
+    """Information that a table has on a free parameter.
 
     Attributes:
         name: of the parameter; value: prior mean [unit]; prior_sd: of it [unit].
-        share: posterior over prior sd [-]; held: whether its prior holds it.
+        share: posterior over prior sd [-]; held: True if its prior holds it.
     """
 
     name: str
@@ -57,16 +57,16 @@ class Determined:
 
 @dataclasses.dataclass(frozen=True)
 class Foresight:
-    """What a table can determine.
+    """Information that a table has on a robot.
 
     Attributes:
         parameters: that `loop` would free.
-        status: of each row with the numbers of the file.
-        noise: of each channel: where its sd comes from.
-        alike: pairs of parameters that these data hardly tell apart, with the correlation of their posterior.
-        together: pairs of which they determine a combination alone.
-        robot: with what the table shows of it, see `preparation.prepare`.
-        doubts: what should be looked at in the table before a fit.
+        status: of each row, for the values in the file.
+        noise: source of each channel's sd.
+        alike: strongly correlated pairs of parameters, with the correlation of their posterior.
+        together: pairs of parameters that the data determine only in combination.
+        robot: completed from the table, see `preparation.prepare`.
+        doubts: notes to look at before a fit.
     """
 
     parameters: tuple[Determined, ...]
@@ -78,14 +78,14 @@ class Foresight:
     doubts: Notes = ()
 
 
-def foresee(runs: Runs, robot: Robot, noise: str | None = None, rows: int = ROWS) -> Foresight:
-    """What `runs` can determine of `robot`, by the linear analysis at its own values.
+def predict_identifiability(runs: Runs, robot: Robot, noise: str | None = None, rows: int = ROWS) -> Foresight:
+    """Returns which parameters of `robot` `runs` can determine, from the linear analysis at the robot's own values.
 
-    Rows that the robot does not reach with these values count for nothing.
+    Rows that the robot does not reach with these values are ignored.
 
     Args:
-        noise: as `noise.parse`; None takes the file's sd columns, or shares of the readings.
-        rows: of a log over time from which on readings are used of fewer.
+        noise: as `noise.parse_noise`; None takes the file's sd columns, or shares of the readings.
+        rows: number of rows of a log over time above which readings are thinned.
 
     Raises:
         BadData: data that cannot be used.
@@ -97,18 +97,18 @@ def foresee(runs: Runs, robot: Robot, noise: str | None = None, rows: int = ROWS
     present = {robot.configurations.names[k] for k in runs.configurations(robot)}
     names = priors.free_names(robot, present, *observe.free())
     if not observe.axis:
-        names = tuple(n for n in names if n not in fidelities.unread("steady", names, runs.turns))
+        names = tuple(n for n in names if n not in fidelities.unread_parameters("steady", names, runs.turns))
     if not names:
         raise BadConfiguration("nothing to determine: every loss is zero, so it is held; state yours with a ±")
-    coordinates = priors.coordinates(robot, names, any_surface=robot.rig.inherits)
-    posed = observers.pose(runs, robot, coordinates, known.sd)
+    coordinates = priors.parameter_coordinates(robot, names, any_surface=robot.rig.inherits)
+    posed = observers.pose_problem(runs, robot, coordinates, known.sd)
     z = jnp.zeros(len(names))
-    seen = optimizers.observation(posed, z)
+    seen = optimizers.observe_at(posed, z)
     reached = np.isfinite(np.asarray(seen.reading)).all(1) & ~posed.observe.unreachable(np.asarray(seen.status))
     data = dataclasses.replace(posed.data, weight=posed.data.weight * jnp.asarray(reached, float)[:, None])
-    about = identifiability.analyse(posed, z, data)
+    about = identifiability.analyse_identifiability(posed, z, data)
     held = identifiability.held_by_prior(about.sd)
-    fields = priors.known(robot)
+    fields = priors.parameters_by_name(robot)
     width = coordinates.prior_sd
     found = tuple(
         Determined(n, fields[n].spec.unit, float(fields[n].value), float(width[k]), float(about.sd[k]), bool(held[k]))
@@ -117,5 +117,7 @@ def foresee(runs: Runs, robot: Robot, noise: str | None = None, rows: int = ROWS
     statuses = tuple(STATUSES[int(s)] for s in np.asarray(seen.status))
     doubts = tuple(note for note in ready.checked if isinstance(note, DOUBTS))
     priors_hold = [p.name for p in found if p.held]
-    together = determined_together(of_coordinates(coordinates, np.asarray(z), about.covariance), priors_hold)
+    together = determined_together(
+        posterior_of_coordinates(coordinates, np.asarray(z), about.covariance), priors_hold
+    )
     return Foresight(found, statuses, known.source, tuple(about.correlated()), together, robot, doubts)

@@ -1,4 +1,4 @@
-"""Readings of rows that a fit has not seen: whole blocks left out."""
+"""Hold-out fits: predictions of rows by fits without their block."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ def search_each(
     active: Sequence | None = None,
     most: int | None = None,
 ) -> tuple[Optimum, Observation]:
-    """Fits from any number of starts, each to its own weights.
+    """Fits from several starts, each with its own weights.
 
     Args:
         starts: coordinates; weights: of the readings, (rows, channels) each; active: sets of effects, None for a
-            problem without slots; most: steps of each, None for as many as it takes.
+            problem without slots; most: largest number of steps of each, None for no limit.
 
     Returns:
-        Where each search ended, and what the model says of every row there; leading axis the starts.
+        Optimum of each search and the model's observation there; the leading axis is the starts.
     """
     z, weight = (np.stack([np.asarray(x) for x in xs]) for xs in (starts, weights))
     which = None if active is None else np.stack([np.asarray(x) for x in active])
@@ -38,10 +38,10 @@ class HeldOutFits:
     """Fits without each block.
 
     Attributes:
-        reading: of each row by the fit that has not seen its block [SI], NaN where no block holds the row or the
-            fit does not reach it, shape (rows, channels); status: of each row, -1 where no block holds it.
+        reading: of each row by the fit without its block [SI], NaN if no block holds the row or the fit does not
+            reach it, shape (rows, channels); status: of each row, -1 if no block holds it.
         block: index of each row's block, -1 for none; shape (rows,).
-        z: of each block's fit, shape (blocks, coordinates); converged: whether it is an optimum.
+        z: of each block's fit, shape (blocks, coordinates); converged: True if it is an optimum.
     """
 
     reading: np.ndarray
@@ -51,41 +51,41 @@ class HeldOutFits:
     converged: np.ndarray
 
 
-def held_out(
+def hold_out_blocks(
     problem: Problem, start: np.ndarray, masks: Sequence[np.ndarray], active: Sequence[int] | None = None
 ) -> HeldOutFits:
-    """Refit without each block in turn, and read the rows left out.
+    """Refit without each block in turn, and predict the omitted rows.
 
     Args:
         problem: as fitted to all rows; start: its optimum; active: its effects, for one with slots.
-        masks: of the rows of each block, shape (rows of the table,); the table may be padded behind them.
+        masks: of the rows of each block, shape (rows of the table,); the problem's rows may be padded beyond these.
     """
     rows, weight = len(masks[0]), np.asarray(problem.data.weight)
     out = [np.concatenate([m, np.zeros(len(weight) - rows, bool)]) for m in masks]
     which = None if active is None else [active] * len(masks)
-    found, seen = search_each(problem, [start] * len(masks), [weight * ~m[:, None] for m in out], which)
+    optima, seen = search_each(problem, [start] * len(masks), [weight * ~m[:, None] for m in out], which)
     reading, status = np.full((rows, weight.shape[1]), np.nan), np.full(rows, -1)
     block = np.full(rows, -1)
     for k, mask in enumerate(masks):
         lost = problem.observe.unreachable(np.asarray(seen.status[k]))[:rows, None]
         reading[mask] = np.where(lost, np.nan, seen.reading[k][:rows])[mask]
         status[mask], block[mask] = seen.status[k][:rows][mask], k
-    return HeldOutFits(reading, status, block, np.asarray(found.z), np.asarray(found.converged))
+    return HeldOutFits(reading, status, block, np.asarray(optima.z), np.asarray(optima.converged))
 
 
-def unseen(
+def predict_unseen(
     problem: Problem, start: np.ndarray, masks: Sequence[np.ndarray], active: Sequence[int] | None = None
 ) -> HeldOutFits:
-    """As `held_out`, but where runs take long a refit is the step of Gauss and Newton from the fit to all rows.
+    """Hold-out fits as `hold_out_blocks`; for long runs each refit is one Gauss-Newton step from the fit to all rows.
 
-    A log has hundreds of readings a parameter, and without one of its blocks a fit stays where the model is linear.
+    A log has hundreds of readings a parameter, and without one block a fit stays within the linear range.
     """
     if not problem.observe.long:
-        return held_out(problem, start, masks, active)
-    rows, at = len(masks[0]), np.asarray(start)
+        return hold_out_blocks(problem, start, masks, active)
+    rows, start_values = len(masks[0]), np.asarray(start)
     out = [np.concatenate([m, np.zeros(len(problem.data.weight) - rows, bool)]) for m in masks]
     data = problem.data
-    residual, jacobian, seen = problem.observe.at(problem, at, active)
+    residual, jacobian, seen = problem.observe.at(problem, start_values, active)
     residual, jacobian, read = np.asarray(residual), np.asarray(jacobian), np.asarray(seen.reading)
     scale = np.asarray(data.weight / data.sd)
     count, size = scale.shape[1], scale.size
@@ -94,7 +94,7 @@ def unseen(
         per_unit = np.where(scale[..., None] > 0, slopes / scale[..., None], 0.0)
     lost = problem.observe.unreachable(np.asarray(seen.status))
     reading, status = np.full((rows, count), np.nan), np.full(rows, -1)
-    block, z = np.full(rows, -1), np.tile(at, (len(out), 1))
+    block, z = np.full(rows, -1), np.tile(start_values, (len(out), 1))
     for k, mask in enumerate(out):
         kept = np.concatenate([np.repeat(~mask, count), ~mask, np.ones(len(residual) - size - len(mask), bool)])
         j = jacobian[kept]

@@ -1,4 +1,4 @@
-"""What the data say of each parameter and what only its prior says: covariance, rank, profiles, coverage."""
+"""Information of data and priors on each parameter: covariance, rank, profiles, coverage."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PROFILE_STEPS = (0.1, 0.25, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 6.0)
 
 
 def held_by_prior(sd: np.ndarray) -> np.ndarray:
-    """Whether each parameter is held by its prior: its posterior sd is above `HELD` of its prior's, or is not known.
+    """True for each parameter held by its prior: its posterior sd is above `HELD` of its prior sd, or not known.
 
     Args:
         sd: posterior, of coordinates whose prior sd is 1 (of a log-normal prior: of the logarithm), any shape.
@@ -41,12 +41,12 @@ class Identifiability:
         names: of the parameters.
         covariance: posterior, of z; shape (parameters, parameters).
         sd: posterior sd of z, thus the square root of the posterior over the prior variance.
-        singular_values: of the whitened Jacobian of the readings alone: prior sd over data sd along each
-            direction, largest first; above 1 the data say more than the prior.
-        directions: right singular vectors, one a row; those beyond the rank as `told_apart` has them.
-        rank: singular values above 1e-8 of the largest.
-        sensitivity: norm of each column of that Jacobian: how many data sds one prior sd moves the
-            readings; 0 for a parameter that nothing measures.
+        singular_values: of the whitened Jacobian of the readings without priors: prior sd over data sd along each
+            direction, largest first; above 1 the data are more informative than the prior.
+        directions: right singular vectors, one a row; those beyond the rank as `separate_directions` returns them.
+        rank: number of singular values above 1e-8 of the largest.
+        sensitivity: norm of each column of that Jacobian: change of the readings by one prior sd, in data sds;
+            0 for a parameter that nothing measures.
         leverage: share of each reading's variance that the fit explains, shape (rows, channels).
         jacobian: of the whitened readings, row by row, shape (rows · channels, parameters).
     """
@@ -68,7 +68,7 @@ class Identifiability:
 
     @property
     def held_by_prior(self) -> np.ndarray:
-        """Whether each parameter is held by its prior, shape (parameters,)."""
+        """True for each parameter held by its prior, shape (parameters,)."""
         return held_by_prior(self.sd)
 
     def correlated(self) -> list[tuple[str, str, float]]:
@@ -80,7 +80,7 @@ class Identifiability:
         return sorted((p for p in pairs if abs(p[2]) > CORRELATED), key=lambda p: -abs(p[2]))
 
     def weak_directions(self) -> list[tuple[float, dict[str, float]]]:
-        """Directions of which the prior says more than the data: singular value, main components in prior sds."""
+        """Directions in which the prior is more informative: singular value, main components in prior sds."""
         weak = []
         for s, v in zip(self.singular_values, self.directions, strict=True):
             if s < 1:
@@ -89,19 +89,21 @@ class Identifiability:
         return weak
 
 
-def told_apart(directions: np.ndarray) -> np.ndarray:
-    """Of a plane of directions, of which any orthonormal ones are as good, those next to one parameter each, the
-    parameter that lies in it most first: the same whatever basis rounding chose.
+def separate_directions(directions: np.ndarray) -> np.ndarray:
+    """Orthonormal basis of a subspace with each direction as close to one parameter as possible.
+
+    The parameter with the largest component in the subspace comes first. The result does not depend on the basis
+    given, and so not on rounding.
 
     Args:
-        directions: orthonormal, shape (directions, parameters), as the answer is.
+        directions: orthonormal, shape (directions, parameters), as the result.
     """
-    left, found = directions.T @ directions, np.zeros_like(directions)
-    for row in found:
+    left, separated = directions.T @ directions, np.zeros_like(directions)
+    for row in separated:
         k = int(np.argmax(np.round(np.diag(left), 6)))
         row[:] = left[k] / np.sqrt(left[k, k])
         left = left - np.outer(row, row)
-    return found
+    return separated
 
 
 @compiled
@@ -110,25 +112,27 @@ def _jacobians(problem: Problem, z: Array, data: Data) -> tuple[Array, Array]:
     return jnp.concatenate([readings, jnp.eye(z.size)]), readings
 
 
-def analyse(problem: Problem, z: Array, data: Data | None = None, slope: np.ndarray | None = None) -> Identifiability:
-    """The linear analysis of `problem` at coordinates z, from readings and priors alone.
+def analyse_identifiability(
+    problem: Problem, z: Array, data: Data | None = None, slope: np.ndarray | None = None
+) -> Identifiability:
+    """Linear analysis of `problem` at coordinates z, from readings and priors only.
 
-    `slope`, where it is given, is taken for the Jacobian of the whitened readings, (rows · channels, parameters).
-    Where the adhesion limit holds z the limit is one-sided, which is for the profile to show: no sd does.
+    `slope`, if given, replaces the Jacobian of the whitened readings, (rows · channels, parameters). The limit of
+    adhesion is excluded: it is one-sided, so a profile shows it and a standard error cannot.
     """
     data = problem.data if data is None else data
     if slope is not None:
         whole, readings = np.concatenate([slope, np.eye(len(z))]), slope
     elif problem.observe.long:
-        jacobian = np.asarray(optimizers.linearised(problem, z, data)[1])
-        whole, readings = jacobian[optimizers.informing(data)], jacobian[: data.measured.size]
+        jacobian = np.asarray(optimizers.linearise(problem, z, data)[1])
+        whole, readings = jacobian[optimizers.informative_residuals(data)], jacobian[: data.measured.size]
     else:
-        whole, readings = (np.asarray(j) for j in _jacobians(optimizers.rooted(problem, z), z, data))
+        whole, readings = (np.asarray(j) for j in _jacobians(optimizers.with_roots(problem, z), z, data))
     _, s, v = np.linalg.svd(whole, full_matrices=False)
     covariance = (v.T / s**2) @ v
     _, singular, directions = np.linalg.svd(readings, full_matrices=False)
     rank = int(np.sum(singular > 1e-8 * singular.max()))
-    directions[rank:] = told_apart(directions[rank:])
+    directions[rank:] = separate_directions(directions[rank:])
     leverage = np.einsum("ij,jk,ik->i", readings, covariance, readings)
     return Identifiability(
         names=problem.coordinates.names,
@@ -152,8 +156,8 @@ class Profile:
         value: the parameter there [SI].
         rise: twice the objective's rise above the optimum [σ²], χ² with one degree of freedom.
         low, high: ends of the 95 % interval, where the rise is 3.84 [SI]; shape (parameters,).
-        open: whether an end lies beyond the last point (the interval is at least so wide), (parameters, 2).
-        better: the largest fall below the given optimum found on the way [½σ²]; 0 if it is the best.
+        open: True if an end is beyond the last point (the interval is at least that wide), (parameters, 2).
+        better: largest decrease below the given optimum among the refits [½σ²]; 0 if the optimum is the best.
     """
 
     z: np.ndarray
@@ -170,34 +174,36 @@ def _profiles(problem: Problem, data: Data, starts: Array, pins: Pin) -> optimiz
     return jax.vmap(lambda z, pin: optimizers.levenberg_marquardt(problem, z, data, pin)[0])(starts, pins)
 
 
-def profile(problem: Problem, z: Array, cost: float, about: Identifiability, data: Data | None = None) -> Profile:
-    """Profiles of all parameters, every point of every profile in one vmapped batch of refits.
+def profile_likelihoods(
+    problem: Problem, z: Array, cost: float, about: Identifiability, data: Data | None = None
+) -> Profile:
+    """Profiles of all parameters; all points of all profiles are one vmapped batch of refits.
 
-    Each refit starts on the line along which the linear analysis says the others move. The end of an
+    Each refit starts on the line along which the linear analysis moves the other parameters. The end of an
     interval is interpolated on the signed root of the rise, which is straight for a linear model.
     """
     data = problem.data if data is None else data
     centre, size = np.asarray(z), len(about.names)
     steps = np.concatenate([-np.asarray(PROFILE_STEPS[::-1]), PROFILE_STEPS])
-    at = centre[:, None] + about.sd[:, None] * steps  # (parameters, points)
+    pinned = centre[:, None] + about.sd[:, None] * steps  # (parameters, points)
     along = about.covariance / np.diag(about.covariance)[:, None]  # row k: how all move with k
-    starts = centre + along[:, None, :] * (at - centre[:, None])[..., None]
+    starts = centre + along[:, None, :] * (pinned - centre[:, None])[..., None]
     held = np.broadcast_to(np.eye(size, dtype=bool)[:, None, :], starts.shape)
     pins = Pin(jnp.asarray(held.reshape(-1, size)), jnp.asarray(starts.reshape(-1, size)))
-    found = _profiles(problem, data, pins.at, pins)
-    rise = 2 * (np.asarray(found.cost).reshape(at.shape) - cost)
+    profiles = _profiles(problem, data, pins.at, pins)
+    rise = 2 * (np.asarray(profiles.cost).reshape(pinned.shape) - cost)
     root = np.sign(steps) * np.sqrt(np.maximum(rise, 0.0))
     middle = len(PROFILE_STEPS)
-    at_all = np.insert(at, middle, centre, axis=1)
+    at_all = np.insert(pinned, middle, centre, axis=1)
     root_all = np.insert(root, middle, 0.0, axis=1)
-    ends = np.array([_ends(a, r) for a, r in zip(at_all, root_all, strict=True)])
+    ends = np.array([_interval_ends(a, r) for a, r in zip(at_all, root_all, strict=True)])
     value = np.asarray(jax.vmap(problem.coordinates.value)(jnp.asarray(at_all.T))).T
     low, high = np.asarray(jax.vmap(problem.coordinates.value)(jnp.asarray(ends.T)))
     is_open = np.stack([root_all[:, 0] > -Z95, root_all[:, -1] < Z95], 1)
     return Profile(at_all, value, root_all**2, low, high, is_open, float(max(0.0, -rise.min() / 2)))
 
 
-def _ends(at: np.ndarray, root: np.ndarray) -> tuple[float, float]:
-    """Where a profile's signed root reaches ∓Z95; its last point where it does not."""
+def _interval_ends(at: np.ndarray, root: np.ndarray) -> tuple[float, float]:
+    """Coordinates where a profile's signed root reaches ∓Z95; its end points if it does not reach them."""
     rising = np.maximum.accumulate(root)
     return float(np.interp(-Z95, rising, at)), float(np.interp(Z95, rising, at))

@@ -1,10 +1,10 @@
-"""Whether a fit is adequate: χ² where the noise is known, and structure of the residuals over the conditions.
+"""Tests of a fit's adequacy: χ² if the noise is known, and structure of the residuals over the conditions.
 
-Columns of a smooth curve are cleared of what the free parameters and their priors could take up (projected on the
-complement of the whitened Jacobian J, priors included), so that what they explain of the residuals has a χ²
-distribution where nothing is missing; where the noise was estimated from the same residuals, their quotient has an F
-distribution (Seber and Lee, Linear Regression Analysis (2003), 4.3). Replicates, rows under the same conditions, give
-a noise that holds no model error (4.4: lack of fit).
+Columns of a smooth curve are projected on the complement of the whitened Jacobian J, priors included, which removes
+the part that free parameters could take up. Without a lack of fit, the decrease of χ² that they explain then has a χ²
+distribution. If the noise was estimated from the same residuals, its quotient has an F distribution (Seber and Lee,
+Linear Regression Analysis (2003), 4.3). Replicates, rows under the same conditions, give an estimate of the noise
+without model error (4.4: lack of fit).
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from calibration.inference.simulation_errors import share_of_measured
 LEVEL = 0.05
 #: Terms of a curve of one variable, of one over time; fewest degrees of freedom that an F test has to leave.
 TERMS, OVER_TIME, LEAST = 3, 6, 10
-#: Share of a column that free parameters have to leave for it to be a direction of its own.
+#: Share of a column that must remain after the free parameters for it to count as a direction of its own.
 CLEAR = 1e-3
 #: Fewest degrees of freedom of replicates.
 REPLICATES = 4
-#: Share of a channel's measured rms that a model which describes the runs misses at most; residuals up to so many
-#: stated sds are noise, whatever their size.
+#: Largest error, as a share of a channel's measured rms, of a model that describes the runs; residuals up to this
+#: many stated sds are noise, whatever their size.
 UNDESCRIBED, EXPLAINED = 0.25, 1.5
-#: Rise of χ² over that of the file as stated which rounding and the search for the noise leave [σ²].
+#: Rise of χ² over that of the file as stated that rounding and the search for the noise can cause [σ²].
 WORSE = 1.0
 
 
@@ -43,7 +43,7 @@ class Miss:
     """Error of a channel over its measured rms [-]: of the fit, and of the robot's file as stated.
 
     Attributes:
-        large: whether it is larger than noise that is stated, and than `UNDESCRIBED`.
+        large: True if it is larger than stated noise, and than `UNDESCRIBED`.
     """
 
     channel: str
@@ -54,16 +54,16 @@ class Miss:
 
 @dataclasses.dataclass(frozen=True)
 class Adequacy:
-    """Whether a fit's residuals are what noise leaves.
+    """Result of the tests whether a fit's residuals are consistent with noise.
 
     Attributes:
-        adequate: None where it cannot be tested, or the search did not converge.
-        chi2: misfit of the readings [σ²]; degrees_of_freedom: that the fit leaves them.
-        p_value: family-wise, of all tests made; None where none could be.
-        shown_by: the most telling test.
-        noise_known: whether χ² was among the tests.
-        obstacle: why no test of residuals decides: the model is `undescribed`, the search `not converged`, or the fit
-            `worse` than the file as stated by the same sds; "" where a test does.
+        adequate: None if it cannot be tested, or the search did not converge.
+        chi2: misfit of the readings [σ²]; degrees_of_freedom: of the residuals.
+        p_value: family-wise, of all tests made; None without tests.
+        shown_by: the test with the smallest p.
+        noise_known: True if χ² was among the tests.
+        obstacle: reason why no test of residuals decides: the model is `undescribed`, the search `not converged`, or
+            the fit `worse` than the file as stated with the same sds; "" if a test decides.
         misses: of each channel.
     """
 
@@ -82,7 +82,7 @@ class Adequacy:
         return described(self)
 
     def to_json(self) -> dict[str, object]:
-        """As in `adequate` of result.json."""
+        """Entries of `adequate` in result.json."""
         return {
             **dataclasses.asdict(self),
             "shown_by": described(self.shown_by),
@@ -92,12 +92,12 @@ class Adequacy:
 
 @dataclasses.dataclass(frozen=True)
 class Residuals:
-    """What a fit leaves.
+    """Residuals of a fit.
 
     Attributes:
         observe: kind of the runs.
-        simulated: fitted readings [SI]; whitened: simulated less measured, in sds, 0 where a reading does not count;
-            counts: whether it does; shape (rows, channels).
+        simulated: fitted readings [SI]; whitened: simulated less measured, in sds, 0 for excluded readings;
+            counts: True for included readings; shape (rows, channels).
         jacobian: of the whitened readings, row by row, shape (rows · channels, parameters).
         z: coordinates of the fit, shape (parameters,).
     """
@@ -117,7 +117,7 @@ class Residuals:
 
     @property
     def freedom(self) -> np.ndarray:
-        """Degrees of freedom that the fit leaves each channel, shape (channels,)."""
+        """Degrees of freedom left by the fit, by channel, shape (channels,)."""
         leverage = np.sum(self.taken[: self.counts.size] ** 2, 1).reshape(self.counts.shape)
         return np.sum(np.where(self.counts, 1.0 - leverage, 0.0), 0)
 
@@ -131,7 +131,7 @@ class Residuals:
 
         Args:
             as_stated: readings of the robot's file before any fit [SI], shape (rows, channels).
-            stated: whether the noise of a channel is, shape (channels,).
+            stated: True for channels with stated noise, shape (channels,).
         """
         counts = self.counts & np.isfinite(as_stated)
         measured = np.where(counts, self.runs.measured(), np.nan)
@@ -145,7 +145,7 @@ class Residuals:
         )
 
     def rescaled(self) -> Residuals:
-        """The same with each channel's sds as its own misfit says."""
+        """Residuals with each channel's sds rescaled to its own misfit."""
         factor = np.sqrt(np.maximum(self.chi2, 1e-300) / np.maximum(self.freedom, 1e-9))
         factor = np.where(self.counts.any(0) & (self.freedom > 0), factor, 1.0)
         whitened = self.whitened / factor
@@ -153,22 +153,21 @@ class Residuals:
         return dataclasses.replace(self, whitened=whitened, jacobian=jacobian)
 
 
-def judged(
+def judge_adequacy(
     fit: Residuals, as_stated: np.ndarray, sd: np.ndarray, *, estimated: np.ndarray, converged: bool
 ) -> Adequacy:
-    """Tests of a fit: meaningful where the model describes the runs, the search converged, and the fit is
-    no worse than the file of the robot.
+    """Adequacy of a fit, with the obstacles that make tests of its residuals meaningless.
 
-    A fit minimises χ² and the distance to the priors, so with the same sds its χ² cannot be above that at the prior
+    A fit minimises χ² plus the distance to the priors, so with the same sds its χ² cannot be above that at the prior
     means.
 
     Args:
         as_stated: readings of the file as stated [SI]; sd: of the readings [SI]; shape (rows, channels).
-        estimated: whether a channel's noise was, from the misfit, shape (channels,).
-        converged: whether the search was.
+        estimated: True for channels with noise estimated from the misfit, shape (channels,).
+        converged: True if the search converged.
     """
     misses = fit.misses(as_stated, ~estimated)
-    found = adequacy(fit, known=not estimated.any())
+    found = adequacy_of_residuals(fit, known=not estimated.any())
     both = fit.counts & np.isfinite(as_stated)
     before = np.sum(((as_stated - fit.runs.measured()) / sd) ** 2, where=both)
     obstacle = (
@@ -181,14 +180,14 @@ def judged(
     return dataclasses.replace(found, adequate=adequate, obstacle=obstacle, misses=misses)
 
 
-def adequacy(fit: Residuals, *, known: bool) -> Adequacy:
+def adequacy_of_residuals(fit: Residuals, *, known: bool) -> Adequacy:
     """Tests of a fit's residuals.
 
     Args:
-        known: whether the noise of every channel is, and was not estimated from the misfit.
+        known: True if the noise of every channel is known, not estimated from the misfit.
     """
     chi2, freedom = float(fit.chi2.sum()), float(fit.freedom.sum())
-    found = structure(fit, known=known)
+    found = structure_tests(fit, known=known)
     if known and freedom > 0:
         found.append((float(chdtrc(freedom, chi2)), Shown(what="stated")))
     if not found:
@@ -198,19 +197,19 @@ def adequacy(fit: Residuals, *, known: bool) -> Adequacy:
     return Adequacy(p > LEVEL, chi2, freedom, p, shown, known)
 
 
-def structure(fit: Residuals, *, known: bool) -> list[tuple[float, Shown]]:
-    """Tests of structure, each p-value with what it shows: curves over the conditions, memory, replicates."""
-    families = {shown: _p_value(fit, columns, known) for shown, columns in _families(fit).items()}
+def structure_tests(fit: Residuals, *, known: bool) -> list[tuple[float, Shown]]:
+    """Tests of structure: p-value and finding of curves over the conditions, memory and replicates."""
+    families = {shown: _p_value(fit, columns, known) for shown, columns in _curve_columns(fit).items()}
     tested = [(p, shown) for shown, p in families.items() if p is not None]
     found = []
     if tested:
         p, shown = min(tested)
         found.append((min(1.0, p * len(tested)), shown))
-    return [*found, *(made for made in (_memory(fit), _replicates(fit)) if made is not None)]
+    return [*found, *(made for made in (_autocorrelation_test(fit), _replicate_test(fit)) if made is not None)]
 
 
 def _p_value(fit: Residuals, columns: np.ndarray, known: bool) -> float | None:
-    """Of what columns over the readings explain, shape (readings, terms); None where too little is left."""
+    """p-value of the misfit that columns (readings, terms) explain; None if too few degrees of freedom remain."""
     parameters = fit.jacobian.shape[1]
     wide = np.concatenate([columns, np.zeros((parameters, columns.shape[1]))])
     size = np.linalg.norm(wide, axis=0)
@@ -228,8 +227,8 @@ def _p_value(fit: Residuals, columns: np.ndarray, known: bool) -> float | None:
     return float(fdtrc(terms, freedom - terms, explained / terms / rest))
 
 
-def _families(fit: Residuals) -> dict[Shown, np.ndarray]:
-    """Columns over the readings by what they show: for each channel, curves over each variable, by configuration."""
+def _curve_columns(fit: Residuals) -> dict[Shown, np.ndarray]:
+    """Columns over the readings, by finding: for each channel, curves over each variable, by configuration."""
     observe, runs, simulated, counts = fit.observe, fit.runs, fit.simulated, fit.counts
     variables = {c: (runs[c], TERMS) for c in (*runs.axes, *DUTY) if runs.has(c)}
     if observe.axis:
@@ -257,8 +256,8 @@ def _families(fit: Residuals) -> dict[Shown, np.ndarray]:
     return families
 
 
-def _memory(fit: Residuals) -> tuple[float, Shown] | None:
-    """Whether residuals of a run resemble those of the sample before, where rows of a run follow one another."""
+def _autocorrelation_test(fit: Residuals) -> tuple[float, Shown] | None:
+    """Test of autocorrelation at lag 1 within runs; None if the rows of a run have no order."""
     observe, runs, residual, counts = fit.observe, fit.runs, fit.whitened, fit.counts
     if not observe.axis:
         return None
@@ -279,13 +278,13 @@ def _memory(fit: Residuals) -> tuple[float, Shown] | None:
     return min(1.0, p * len(found)), shown
 
 
-def _replicates(fit: Residuals) -> tuple[float, Shown] | None:
-    """Whether the residuals exceed the scatter of rows under the same conditions."""
+def _replicate_test(fit: Residuals) -> tuple[float, Shown] | None:
+    """Test of the residuals against the scatter of rows under the same conditions; None with too few replicates."""
     observe, runs, residual, counts = fit.observe, fit.runs, fit.whitened, fit.counts
     freedom, chi2 = float(fit.freedom.sum()), float(fit.chi2.sum())
     columns = [c for c in ("configuration", *observe.axes_of(runs), "surface") if runs.has(c)]
     groups: dict[tuple[str, ...], list[int]] = {}
-    past = courses(runs).tolist()  # what a run met before counts too
+    past = courses(runs).tolist()  # replicates share their past too
     for row, key in enumerate(zip(past, *(runs[c].astype(str).tolist() for c in columns), strict=True)):
         groups.setdefault(key, []).append(row)
     pure, own = 0.0, 0

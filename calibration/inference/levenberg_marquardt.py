@@ -1,4 +1,4 @@
-"""Least-squares solver of optimistix for residuals some of which count only if they are positive.
+"""Least-squares solver of optimistix for residuals of two kinds: some count only if they are positive.
 
 The objective is ½ Σ r² over the two-sided residuals and the positive one-sided ones. The solver is
 Levenberg-Marquardt, built from optimistix's parts: a descent that determines which one-sided residuals are positive
@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from mmrjax.numerics.linear_equations import solved
+from mmrjax.numerics.linear_equations import solve
 
 #: Rejected steps in a row after which a search ends.
 PATIENCE = 12
@@ -51,12 +51,12 @@ def _slope(primals: tuple[Array, Array, Array], tangents: tuple[Array, Array, Ar
     return primals[1], primals[2] @ tangents[0]
 
 
-def at_known(value: Array, slope: Array, aux: Any = None) -> Function:
+def linear_residual_function(value: Array, slope: Array, aux: Any = None) -> Function:
     """Returns a residual function with a known value and slope at the single point where it will be called."""
     return lambda y, args: (with_slope(y, value, slope), aux)
 
 
-def counted(r: Array, jacobian: Array, one_sided: slice) -> tuple[Array, Array]:
+def zero_inactive_residuals(r: Array, jacobian: Array, one_sided: slice) -> tuple[Array, Array]:
     """Returns residuals and Jacobian with zeros for the one-sided residuals that are not positive."""
     counts = jnp.ones(r.shape, bool).at[one_sided].set(r[one_sided] > 0)
     return jnp.where(counts, r, 0.0), jnp.where(counts[:, None], jacobian, 0.0)
@@ -67,7 +67,7 @@ def half_squares(r: Array, one_sided: slice) -> Float[Array, ""]:
     return 0.5 * jnp.sum(r.at[one_sided].set(jnp.maximum(r[one_sided], 0.0)) ** 2)
 
 
-def stride_of(r: Array, jacobian: Array, one_sided: slice, damping: Array | float) -> Z:
+def one_sided_step(r: Array, jacobian: Array, one_sided: slice, damping: Array | float) -> Z:
     """Step to the optimum of a linearisation whose one-sided residuals count where they are positive.
 
     min_d ½ Σ (r + J d)² + ½ damping |d|², over the two-sided residuals and the one-sided ones that are positive at
@@ -87,7 +87,7 @@ def stride_of(r: Array, jacobian: Array, one_sided: slice, damping: Array | floa
     def again(carry: tuple) -> tuple:
         turns, active, _, best, lowest = carry
         counts = edge * active[:, None]
-        d = -solved(normal + counts.T @ counts, gradient + counts.T @ height)
+        d = -solve(normal + counts.T @ counts, gradient + counts.T @ height)
         beyond, here = height + edge @ d > 0, value(d)
         better = here < lowest
         return turns + 1, beyond, active, jnp.where(better, d, best), jnp.where(better, here, lowest)
@@ -145,11 +145,11 @@ class OneSidedDescent(optx.AbstractDescent[Z, Linearisation, Linearisation]):
     def step(self, step_size: Array, state: Linearisation) -> tuple[Z, optx.RESULTS]:
         tiny = jnp.finfo(step_size.dtype)
         damping = jnp.where(step_size > tiny.eps, 1 / jnp.maximum(step_size, tiny.eps), tiny.max)
-        return stride_of(state.residual, state.jacobian, state.one_sided, damping), optx.RESULTS.successful  # type: ignore[return-value]  # an enumeration of equinox's
+        return one_sided_step(state.residual, state.jacobian, state.one_sided, damping), optx.RESULTS.successful  # type: ignore[return-value]  # an enumeration of equinox's
 
 
 class OneSidedTrustRegion(optx.ClassicalTrustRegion):
-    """Classical trust region (Conn, Gould, Toint 2000, alg. 6.1.1) for residuals some of which are one-sided."""
+    """Classical trust region (Conn, Gould, Toint 2000, alg. 6.1.1) for partly one-sided residuals."""
 
     high_cutoff: float = NEARLY_ALL
     low_cutoff: float = LITTLE
@@ -200,7 +200,7 @@ class Searching(eqx.Module):
 
 
 class OneSidedLevenbergMarquardt(optx.AbstractLeastSquaresSolver[Z, Array, Any, Searching]):
-    """Levenberg-Marquardt for residuals some of which are one-sided; evaluates the function once a step.
+    """Levenberg-Marquardt for partly one-sided residuals; evaluates the function once a step.
 
     A step is rejected, and the next one shortened, if the objective falls by less than `LITTLE` of the prediction.
     The next one may be longer if it falls by `NEARLY_ALL` of it. A `mixed_step` has to leave the same one-sided
@@ -236,23 +236,23 @@ class OneSidedLevenbergMarquardt(optx.AbstractLeastSquaresSolver[Z, Array, Any, 
         """Returns the state of a search that has evaluated nothing yet."""
         none, no, still = jnp.asarray(0), jnp.asarray(False), jnp.zeros_like(y)
         jacobian = jnp.zeros((f_struct.size, y.size), f_struct.dtype)
-        found = Linearisation(jnp.zeros(f_struct.shape, f_struct.dtype), jacobian, self.first, self.last)
+        unevaluated = Linearisation(jnp.zeros(f_struct.shape, f_struct.dtype), jacobian, self.first, self.last)
         aux = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), aux_struct)
-        return Searching(found, aux, still, y, no, self.search.init(y, found), none, none, no)
+        return Searching(unevaluated, aux, still, y, no, self.search.init(y, unevaluated), none, none, no)
 
     def step(
         self, fn: Function, y: Z, args: Any, options: dict[str, Any], state: Searching, tags: frozenset
     ) -> tuple[Z, Searching, Any]:
         """Evaluates the function at the end of the last step, accepts or rejects that step, and finds the next."""
-        found, aux = self._linearised(fn, state.ahead, args)
+        linearised, aux = self._linearised(fn, state.ahead, args)
         moved, first, before = state.ahead - y, state.steps == 0, state.found
-        _, accepted, _, region = self.search.step(first, y, state.ahead, before, found, state.region)
-        alike = jnp.all(found.positive == before.positive)
+        _, accepted, _, region = self.search.step(first, y, state.ahead, before, linearised, state.region)
+        alike = jnp.all(linearised.positive == before.positive)
         accepted &= first | alike | ~state.mixed
         region = _where(state.mixed & ~accepted, state.region, region)
-        ended = self._is_small(state.ahead, moved, found, before) & accepted
+        ended = self._is_small(state.ahead, moved, linearised, before) & accepted
 
-        y, best, aux = _where(accepted, (state.ahead, found, aux), (y, before, state.aux))
+        y, best, aux = _where(accepted, (state.ahead, linearised, aux), (y, before, state.aux))
         stride, _ = self.descent.step(region.step_size, self.descent.query(y, best, best))
         mixed = accepted & alike & (state.steps > 1) & (jnp.max(jnp.abs(stride)) < self.near)
         ahead = y + jnp.where(mixed, mixed_step(stride, moved, stride - state.stride), stride)

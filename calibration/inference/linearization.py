@@ -1,4 +1,4 @@
-"""A fit, linearised: residuals, Jacobian, what effects and defects of balances would change of the readings."""
+"""Linearised fit: residuals, Jacobian, and changes of the readings by effects and by defects of balances."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from mmrjax.compile.compiling import compiled
 from mmrjax.effects import Effect
-from mmrjax.effects.curve import in_travel
+from mmrjax.effects.curve import in_travel_frame
 from mmrjax.effects.scaled import amplitude_of as amplitude_of
 from mmrjax.effects.scaled import shape_of as shape_of
 from mmrjax.model import balances, params
@@ -24,13 +24,13 @@ from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Signals
 from mmrjax.numerics.one_sided import clip
 
-#: Balances whose defect moves the readings of settled travel. Those of a line act alike on the readings, but
-#: for what they depend on: three channels close three equations.
+#: Balances with a defect that changes the readings of settled travel. Those on one line act on the readings in the
+#: same way except for the variables that they depend on: three channels close three equations.
 PROBED = ("mass", "supply", "electrical", "motor", "gearbox", "track", "ground", "slip")
 
 
-def probe(whose: str) -> Effect:
-    """An effect that adds its amplitude to a balance: of every side, or of each its own, shape (2,): left, right."""
+def balance_probe(whose: str) -> Effect:
+    """Effect that adds its amplitude to a balance: one number for all sides, or shape (2,): left, right."""
 
     class Probe(Effect):
         name: ClassVar[str] = f"probe_{whose}"
@@ -50,7 +50,7 @@ def probe(whose: str) -> Effect:
 # --- effects as they are scored -------------------------------------------------------------------------
 
 
-def _phase(p: Parameter) -> bool:
+def _is_phase(p: Parameter) -> bool:
     return p.name == "phase"
 
 
@@ -58,38 +58,42 @@ Scales = tuple[Scalar, Scalar, Scalar, Scalar, Scalar]
 
 
 def shape_scales(shape: Parameter | None) -> tuple[float, float, float, float, float]:
-    """(value, spread, sd, low, high) of a shape parameter, value · exp(spread · z) + sd · z at coordinate z: a phase
-    is shifted, a scale multiplied; see `shaped` for the bounds."""
+    """(value, spread, sd, low, high) of a shape parameter, value · exp(spread · z) + sd · z at coordinate z.
+
+    A phase is shifted, a scale multiplied; `shape_at` applies the bounds.
+    """
     if shape is None:
         return 1.0, 0.0, 0.0, -math.inf, math.inf
     low, high = shape.spec.bounds
-    if _phase(shape):
+    if _is_phase(shape):
         return float(shape.value), 0.0, shape.spec.prior_sd(0.0), low, high
     return float(shape.value), math.sqrt(math.log1p((shape.spec.relative_sd or 0.0) ** 2)), 0.0, low, high
 
 
-def shaped(scales: Scales, z: Array) -> Array:
-    """A shape parameter at coordinate z, `scales` as by `shape_scales`, within the bounds that a robot file allows:
-    a phase by whole turns, a scale by a cut."""
+def shape_at(scales: Scales, z: Array) -> Array:
+    """Shape parameter at coordinate z, with `scales` from `shape_scales`, within the bounds of a robot file.
+
+    A phase is wrapped by whole turns, a scale clipped.
+    """
     value, spread, sd, low, high = scales
     moved = value * jnp.exp(spread * z) + sd * z
     turned = jnp.remainder(moved + jnp.pi, 2 * jnp.pi) - jnp.pi
     return jnp.where(jnp.asarray(sd) > 0, turned, clip(moved, low, high))
 
 
-#: Where on the prior of a shape parameter the library is scored, in its sds.
+#: Coordinates on the prior of a shape parameter at which the library is scored, in its sds.
 GRID = (-1.5, -0.75, 0.0, 0.75, 1.5)
 #: The same for a phase, whose sd is 2 rad: 36 degrees apart through half a turn; an amplitude has either sign.
 TURN = tuple(float(x) for x in np.arange(-2, 3) * math.pi / 10)
 
 
 class ScoredEffect(eqx.Module):
-    """One effect at every point of its shape's grid, with an amplitude of one prior sd.
+    """One effect at each point of its shape's grid, with an amplitude of one prior sd.
 
     Attributes:
         effect: of amplitude one sd.
         shape: name of its shape parameter, "" for none.
-        at: coordinates of the shape on the grid, in its sds; values: of the shape there.
+        at: coordinates of the shape on the grid, in its sds; values: values of the shape there.
     """
 
     effect: Effect
@@ -103,78 +107,80 @@ class ScoredEffect(eqx.Module):
         return eqx.tree_at(lambda e: e.amplitude, self.effect, jnp.zeros_like(jnp.asarray(self.effect.amplitude)))
 
     def each(self, function: Callable[[Effect], Array]) -> Array:
-        """`function` of the effect at every point of the grid, along a new leading axis."""
+        """`function` of the effect at each point of the grid, along a new leading axis."""
         if not self.shape:
             return function(self.effect)[None]
         return jax.vmap(lambda v: function(params.replace(self.effect, {self.shape: v})))(self.values)
 
 
-def scored(effect: Effect, grid: Sequence[float] = GRID) -> ScoredEffect:
-    """An effect with the grid of its shape parameter, cut at the bounds."""
+def with_shape_grid(effect: Effect, grid: Sequence[float] = GRID) -> ScoredEffect:
+    """Effect with the grid of its shape parameter, clipped at the bounds."""
     shape, amplitude = shape_of(effect), amplitude_of(effect)
     unit = params.replace(effect, {amplitude.name: jnp.asarray(amplitude.spec.prior_sd(0.0))})
     if shape is None:
         return ScoredEffect(unit, "", (0.0,), jnp.zeros(0))
-    grid = TURN if _phase(shape) else grid
+    grid = TURN if _is_phase(shape) else grid
     scales = [np.asarray(x) for x in shape_scales(shape)]
-    return ScoredEffect(unit, shape.name, tuple(grid), _shaped(tuple(scales), np.asarray(grid)))
+    return ScoredEffect(unit, shape.name, tuple(grid), _shape_at(tuple(scales), np.asarray(grid)))
 
 
-_shaped: Callable[..., Array] = compiled(shaped)
+_shape_at: Callable[..., Array] = compiled(shape_at)
 
 
-def shaped_as_in(robot: Robot, scored: ScoredEffect) -> ScoredEffect:
-    """An effect with its grid; with the shape that it has in a robot in which it is present."""
-    own = next((e for e in robot.effects if e.name == scored.effect.name), None)
-    if own is None or not scored.shape:
+def with_shape_of_robot(robot: Robot, scored: ScoredEffect) -> ScoredEffect:
+    """Effect with its grid, or with the shape that it has in `robot` if it is present there."""
+    effect_of_robot = next((e for e in robot.effects if e.name == scored.effect.name), None)
+    if effect_of_robot is None or not scored.shape:
         return scored
-    shape = getattr(own, scored.shape)
-    return dataclasses.replace(scored, values=jnp.where(jnp.asarray(own.amplitude) == 0, scored.values, shape))
+    shape = getattr(effect_of_robot, scored.shape)
+    return dataclasses.replace(
+        scored, values=jnp.where(jnp.asarray(effect_of_robot.amplitude) == 0, scored.values, shape)
+    )
 
 
-def each_shape(scored: ScoredEffect, function: Callable[[Effect, Array], Array], given: Array) -> Array:
-    """A function of an effect at every point of its shape's grid, and of what is given there, shape (grid,)."""
+def map_over_shapes(scored: ScoredEffect, function: Callable[[Effect, Array], Array], given: Array) -> Array:
+    """A function of an effect and of the value in `given`, shape (grid,), at each point of its shape's grid."""
     if not scored.shape:
         return function(scored.effect, given[0])[None]
-    at = lambda v, x: function(params.replace(scored.effect, {scored.shape: v}), x)  # noqa: E731
-    return jax.vmap(at)(scored.values, given)
+    of_shape = lambda v, x: function(params.replace(scored.effect, {scored.shape: v}), x)  # noqa: E731
+    return jax.vmap(of_shape)(scored.values, given)
 
 
-def terms_of(robot: Robot, signals: Signals, effects: tuple[ScoredEffect, ...], memory: list[Array]) -> Array:
+def effect_terms(robot: Robot, signals: Signals, effects: tuple[ScoredEffect, ...], memory: list[Array]) -> Array:
     """Terms of effects in their balances at an instant, shape (instances,).
 
     Args:
-        memory: of every effect at each point of its grid, any number where it has none.
+        memory: of each effect at each point of its grid; any number for an effect without memory.
     """
 
     def term(effect: Effect, remembered: Array) -> Array:
         alone = dataclasses.replace(robot, effects=(effect,))
         with_memory = dataclasses.replace(signals, memory={**signals.memory, effect.name: remembered})
-        return jnp.asarray(balances.added(alone, with_memory, effect.balance, effect.channel), float)
+        return jnp.asarray(balances.effects_sum(alone, with_memory, effect.balance, effect.channel), float)
 
-    found = [each_shape(e, term, m) for e, m in zip(effects, memory, strict=True)]
-    return jnp.concatenate(found) if found else jnp.zeros(0)
+    terms = [map_over_shapes(e, term, m) for e, m in zip(effects, memory, strict=True)]
+    return jnp.concatenate(terms) if terms else jnp.zeros(0)
 
 
 # --- the fit ------------------------------------------------------------------------------------------------
 
 
 class Linearization(eqx.Module):
-    """A fit, linearised.
+    """A linearised fit.
 
     Attributes:
         residual: whitened residuals, shape (residuals,): readings (a channel after the other, row by row),
             adhesion (1 a row), priors.
         jacobian: by the free coordinates, shape (residuals, coordinates).
         signatures: by each instance's amplitude in prior sds, shape (readings, instances).
-        defects: by a defect of each balance of `probed` [its unit]; what further axes are is the observer's.
-        scale: of what is added to a reading [1/SI], 0 where it does not count, shape (rows, channels).
-        signals: of every row, at the fit.
-        channels: names of those that readings are of, in order; magnitudes: of those shown without a sign.
-        probed: balances whose defects are known.
+        defects: by a defect of each balance of `probed` [its unit]; further axes depend on the observer.
+        scale: change of a whitened reading per unit of the reading [1/SI], 0 if excluded, shape (rows, channels).
+        signals: of each row, at the fit.
+        channels: names of the readings' channels, in order; magnitudes: channels shown without a sign.
+        probed: balances with known defects.
 
-    A defect of a balance may be at every point: of each row, and of a robot whose sides are driven apart of each side
-    of it, the left side of all rows first.
+    A defect of a balance has a value at each point: one for each row, or for a robot with independently driven sides
+    one for each row and side, with the left side of all rows first.
     """
 
     probed: ClassVar[tuple[str, ...]] = PROBED
@@ -190,12 +196,12 @@ class Linearization(eqx.Module):
 
     @property
     def rows(self) -> int:
-        """How many rows there are."""
+        """Number of rows."""
         return self.signatures.shape[0] // len(self.channels)
 
     @property
     def readings(self) -> int:
-        """How many readings there are, missing ones among them."""
+        """Number of readings, including missing ones."""
         return self.signatures.shape[0]
 
     def by_row(self) -> Float[Array, "rows channels"]:
@@ -203,24 +209,24 @@ class Linearization(eqx.Module):
         return self.residual[: self.readings].reshape(self.rows, -1)
 
     def with_residual(self, residual: Array) -> Linearization:
-        """The same at other residuals."""
+        """Copy with other residuals."""
         return dataclasses.replace(self, residual=residual)
 
     @property
     def points(self) -> int:
-        """How many points there are at which a balance may lack something."""
+        """Number of points where a balance may have a defect."""
         return self.rows
 
     def at_points(self, rows: np.ndarray) -> np.ndarray:
-        """What is known by row, at every point; shape (points,)."""
+        """Values by row, repeated at each point; shape (points,)."""
         return rows
 
     def of_rows(self, points: np.ndarray) -> np.ndarray:
-        """Whether any of a row's points is among those of a mask; shape (rows,)."""
+        """True for rows with at least one point in a mask; shape (rows,)."""
         return points
 
     def columns(self, balance: Scalar | int, shapes: Array | np.ndarray) -> Float[Array, "readings terms"]:
-        """Change of the whitened readings by defects of a balance, each a column over the points.
+        """Change of the whitened readings by defects of a balance; each column is a defect over the points.
 
         Args:
             balance: index into `probed`; shapes: shape (points, terms).
@@ -228,7 +234,7 @@ class Linearization(eqx.Module):
         raise NotImplementedError
 
     def shown(self, channel: Scalar | int, shapes: Array | np.ndarray) -> Float[Array, "readings terms"]:
-        """Change of the whitened readings by what is added to those of a channel [SI], each a column over the points.
+        """Change of the whitened readings by errors of a channel's readings [SI]; each column is over the points.
 
         Args:
             channel: position in the table of channels; shapes: shape (points, terms).
@@ -237,35 +243,35 @@ class Linearization(eqx.Module):
         return (mine[:, :, None] * shapes[:, None, :]).reshape(-1, shapes.shape[1])
 
     def places(self) -> np.ndarray:
-        """Rows at which a defect of a single row is told, indices."""
+        """Indices of the rows with an identifiable defect of a single row."""
         raise NotImplementedError
 
     def variable(self, name: str) -> np.ndarray:
-        """What a curve may be over, by point [SI]: a signal, or what else the observer knows."""
+        """Variable of a curve, by point [SI]: a signal, or another quantity of the observer."""
         return np.broadcast_to(np.asarray(getattr(self.signals, name), float), (self.rows,))
 
     def in_travel(self, place: str, variable: str) -> tuple[np.ndarray, np.ndarray]:
-        """What a curve in a place is over [SI] and by what it counts, by point, as `effects.curve` takes both."""
-        x, way = in_travel(place, variable, self.variable(variable), self.variable, self.magnitudes)
+        """Variable of a curve in a place [SI] and its factor, by point, as `effects.curve` uses both."""
+        x, way = in_travel_frame(place, variable, self.variable(variable), self.variable, self.magnitudes)
         return np.asarray(x), np.broadcast_to(way, (self.points,))
 
     def runs(self) -> list[np.ndarray]:
-        """Indices of the rows of each run; of settled runs each row is one."""
+        """Indices of the rows of each run; a settled run has one row."""
         return list(np.arange(self.rows)[:, None])
 
     def turned(self) -> np.ndarray | None:
-        """Angle of the driving shaft at every row since the start of its run [rad]; None where no run is followed."""
+        """Angle of the driving shaft at each row since the start of its run [rad]; None for settled runs."""
         return None
 
     def series(self) -> Float[Array, "runs samples channels"]:
-        """Whitened residuals of the readings of each run in the order of time; of settled rows each its own."""
+        """Whitened residuals of the readings of each run in the order of time; a settled row is a run."""
         return self.by_row()[:, None]
 
     def memory(self) -> Array:
-        """Whether residuals remember, as a normal deviate; -inf where their order means nothing."""
+        """Test of autocorrelation of the residuals, as a normal deviate; -inf if their order has no meaning."""
         return jnp.asarray(-jnp.inf)
 
 
-def finite(x: Array) -> Array:
-    """x with 0 in the place of what is not finite."""
+def finite_or_zero(x: Array) -> Array:
+    """x with 0 for non-finite values."""
     return jnp.where(jnp.isfinite(x), x, 0.0)

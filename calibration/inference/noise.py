@@ -1,4 +1,4 @@
-"""Standard deviations of the measured channels: from the file's columns, as stated, or to be estimated."""
+"""Standard deviations of the measured channels: from the file's columns, as stated, or estimated."""
 
 from __future__ import annotations
 
@@ -10,29 +10,29 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 from jaxtyping import Float
 
-from calibration.data.input_errors import BadConfiguration, BadData, choices
+from calibration.data.input_errors import BadConfiguration, BadData, allowed_words
 from calibration.data.runs import Runs
 from calibration.inference import series_noise
 from calibration.inference.series_noise import SeriesNoise
 from mmrjax.model import channels
 from mmrjax.model.channels import Channel
 
-#: Share of the reading that the estimate starts from [-].
+#: Initial estimate of a noise as a share of the reading [-].
 START = 0.02
-#: Sources of sds that nobody states, and what they are called in messages.
+#: Sources of sds that nobody states, with their names in messages.
 UNSTATED = {"assumed": "assumed", "series": "estimated"}
 
 
 @dataclasses.dataclass(frozen=True)
 class Noise:
-    """Where the sds come from, and what they are.
+    """Standard deviations of the readings and their sources.
 
     Attributes:
-        channels: that the sds are of, in the order of arrays.
-        sd: [SI], shape (rows, channels); the first guess where estimated, 1 where there is no reading.
-        estimated: whether a channel's sd is to be estimated from the misfit, shape (channels,).
+        channels: of the sds, in the order of arrays.
+        sd: [SI], shape (rows, channels); an initial guess if estimated, 1 for missing readings.
+        estimated: True for channels with an sd to be estimated from the misfit, shape (channels,).
         source: one word a channel: `columns`, `stated`, `estimated`, `series`, `assumed`, or `no readings`.
-        along_series: estimates, of the channels whose source is `series`.
+        along_series: estimates, for channels with the source `series`.
     """
 
     channels: tuple[Channel, ...]
@@ -43,48 +43,48 @@ class Noise:
 
     @property
     def word(self) -> str:
-        """Where sds come from, for messages."""
+        """Source of the sds, for messages."""
         return next((w for source, w in UNSTATED.items() if source in self.source), "stated")
 
     @property
     def silent(self) -> tuple[Channel, ...]:
-        """Channels whose sd nobody states."""
+        """Channels with an sd that nobody states."""
         return tuple(c for c, source in zip(self.channels, self.source, strict=True) if source in UNSTATED)
 
     @property
     def freedom(self) -> Float[np.ndarray, " channels"]:
-        """Degrees of freedom that the sd of each channel is known with; infinite where it is stated or assumed."""
-        found = {s.channel: s.freedom for s in self.along_series}
-        return np.array([found.get(c, np.inf) for c in self.channels])
+        """Degrees of freedom of each channel's sd; infinite if it is stated or assumed."""
+        freedoms = {s.channel: s.freedom for s in self.along_series}
+        return np.array([freedoms.get(c, np.inf) for c in self.channels])
 
     def scaled(self, factors: Mapping[str, float]) -> Noise:
-        """The same with the sds of channels times a factor, by name."""
-        factor = np.array([factors.get(name, 1.0) for name in channels.names(self.channels)])
+        """Noise with the sds of some channels multiplied by a factor, by channel name."""
+        factor = np.array([factors.get(name, 1.0) for name in channels.channel_names(self.channels)])
         return dataclasses.replace(self, sd=self.sd * factor)
 
 
-def parse(text: str, shown: tuple[Channel, ...]) -> dict[int, tuple[float, bool]]:
-    """`current=2%,motor_speed=0.5%,speed=1%` (or `current=0.05A,motor_speed=30rpm,speed=5mm/s`).
+def parse_noise(text: str, shown: tuple[Channel, ...]) -> dict[int, tuple[float, bool]]:
+    """Reads `current=2%,motor_speed=0.5%,speed=1%` (or `current=0.05A,motor_speed=30rpm,speed=5mm/s`).
 
     Args:
-        shown: the channels that there are.
+        shown: the available channels.
 
     Returns:
-        Position of the channel → (number, whether it is a share of the reading); absolute ones in SI.
+        Position of the channel → (number, True for a share of the reading); absolute numbers in SI.
 
     Raises:
-        BadConfiguration: an unknown channel, no positive number, or another unit.
+        BadConfiguration: an unknown channel, a number that is not positive, or another unit.
     """
     words = {c.word: k for k, c in enumerate(shown)}
-    known = words | {c.name: k for k, c in enumerate(shown)}
-    found: dict[int, tuple[float, bool]] = {}
+    channel_of_word = words | {c.name: k for k, c in enumerate(shown)}
+    stated: dict[int, tuple[float, bool]] = {}
     for part in text.split(","):
         name, _, value = part.strip().partition("=")
-        if name not in known:
-            raise BadConfiguration(f"--noise {part.strip()}: no such channel; {choices(name, words)}")
-        k = known[name]
-        if k in found:
-            raise BadConfiguration(f"--noise {part.strip()}: {name} stands twice; expected each channel once")
+        if name not in channel_of_word:
+            raise BadConfiguration(f"--noise {part.strip()}: no such channel; {allowed_words(name, words)}")
+        k = channel_of_word[name]
+        if k in stated:
+            raise BadConfiguration(f"--noise {part.strip()}: {name} is given twice; expected each channel once")
         channel = shown[k]
         match = re.fullmatch(r"\s*([-+0-9.eE]+)\s*(%|[^\d\s.]+)\s*", value)
         sizes = {channel.unit: channel.factor, **dict(channel.other_units)}
@@ -98,23 +98,24 @@ def parse(text: str, shown: tuple[Channel, ...]) -> dict[int, tuple[float, bool]
         if match is None or not size > 0 or math.isinf(size) or match[2] not in ("%", *sizes):
             raise BadConfiguration(f"--noise {part.strip()}: {form}")
         relative = match[2] == "%"
-        found[k] = (size / 100 if relative else size * sizes[match[2]], relative)
-    return found
+        stated[k] = (size / 100 if relative else size * sizes[match[2]], relative)
+    return stated
 
 
-def from_table(runs: Runs, sizes: np.ndarray, stated: str | None = None) -> Noise:
-    """Noise of a table: `stated` channels as stated, else the file's sd columns, else to be estimated; what is known
-    with the error by the step of an instrument, `Instrument.variance`.
+def noise_from_table(runs: Runs, sizes: np.ndarray, stated: str | None = None) -> Noise:
+    """Noise of a table: as stated, else from the file's sd columns, else to be estimated.
+
+    Known sds include the quantisation error of the instrument, `Instrument.variance`.
 
     Args:
-        sizes: of each reading [SI], that a share of the reading is of, see `Observer.sizes`; shape (rows, channels).
-        stated: as `parse`.
+        sizes: reference size of each reading [SI] for shares, see `Observer.sizes`; shape (rows, channels).
+        stated: as `parse_noise`.
 
     Raises:
-        BadConfiguration: as `parse`.
+        BadConfiguration: as `parse_noise`.
         BadData: a channel that reads zero everywhere and has no stated sd.
     """
-    shares = parse(stated, runs.channels) if stated else {}
+    shares = parse_noise(stated, runs.channels) if stated else {}
     measured, columns = runs.measured(), runs.deviations()
     sd, source = np.ones_like(measured), []
     for k, channel in enumerate(runs.channels):
@@ -133,33 +134,37 @@ def from_table(runs: Runs, sizes: np.ndarray, stated: str | None = None) -> Nois
             )
         sd[:, k] = np.where(finite, size * sizes[:, k] if relative else size, 1.0)
         source.append("stated" if k in shares else "estimated")
-    quantum = np.array([runs.layout.variance(name) for name in channels.names(runs.channels)])
-    known = np.array([s in ("columns", "stated") for s in source])  # an estimate has it in it already
-    if (known & (quantum > 0)).any():
-        sd = np.where(known & np.isfinite(measured), np.sqrt(sd**2 + quantum), sd)
+    quantum = np.array([runs.layout.variance(name) for name in channels.channel_names(runs.channels)])
+    given = np.array([s in ("columns", "stated") for s in source])  # an estimate already includes it
+    if (given & (quantum > 0)).any():
+        sd = np.where(given & np.isfinite(measured), np.sqrt(sd**2 + quantum), sd)
     return Noise(runs.channels, sd, np.array([s == "estimated" for s in source]), tuple(source))
 
 
-def default(shown: Iterable[Channel]) -> str:
-    """What the loop takes sds to be where neither the file nor the user says: averages of at least three repeats,
-    printed to 0.05 A, 10 rpm and 10 mm/s, as in Tables A1 and A2."""
+def default_noise(shown: Iterable[Channel]) -> str:
+    """Default sds of the loop if neither the file nor the user states them.
+
+    They are for averages of at least three repeats, printed to 0.05 A, 10 rpm and 10 mm/s, as in Tables A1 and A2.
+    """
     return ",".join(f"{c.word}={100 * c.sd_share:g}%" for c in shown)
 
 
-def inferred(runs: Runs, sizes: np.ndarray, stated: str | None = None) -> Noise:
-    """As `of`, but known before any fit: what would have to be estimated from the misfit is what the scatter along
-    series shows (`series_noise`), or `default` where the table has none.
+def infer_noise(runs: Runs, sizes: np.ndarray, stated: str | None = None) -> Noise:
+    """Noise as `noise_from_table`, but known before any fit.
+
+    Instead of an estimate from the misfit it takes the scatter along series (`series_noise`), or `default_noise` if
+    the table has none.
 
     Raises:
-        BadConfiguration, BadData: as `of`.
+        BadConfiguration, BadData: as `noise_from_table`.
     """
-    known = from_table(runs, sizes, stated)
-    if not known.estimated.any():
-        return known
-    sd, words, series = known.sd.copy(), list(known.source), []
-    guess = from_table(runs, sizes, default(runs.channels))
-    shown = (None,) * len(words) if runs.sampled else series_noise.estimate(runs, sizes)
-    for k in np.flatnonzero(known.estimated):
+    given = noise_from_table(runs, sizes, stated)
+    if not given.estimated.any():
+        return given
+    sd, words, series = given.sd.copy(), list(given.source), []
+    guess = noise_from_table(runs, sizes, default_noise(runs.channels))
+    shown = (None,) * len(words) if runs.sampled else series_noise.estimate_noise(runs, sizes)
+    for k in np.flatnonzero(given.estimated):
         found = shown[k]
         if found is None:
             sd[:, k], words[k] = guess.sd[:, k], "assumed"

@@ -1,4 +1,4 @@
-"""Whether sds are stated rightly: by what factor residuals without structure are off."""
+"""Check of the stated sds: factor between them and residuals without structure."""
 
 from __future__ import annotations
 
@@ -6,60 +6,61 @@ import numpy as np
 from scipy.special import chdtr, chdtrc
 
 from calibration.inference.fit_notes import NoiseOff
-from calibration.inference.lack_of_fit import LEVEL, Residuals, structure
+from calibration.inference.lack_of_fit import LEVEL, Residuals, structure_tests
 
-#: Factor on the sds from which it is said, either way; probability under right sds below which it is.
+#: Factor on the sds, in either direction, above which a note reports it; p-value under correct sds below which it
+#: does.
 OFF, IMPROBABLE = 1.25, 0.001
-#: Error of structure that speaks against sds that are off alike in every channel.
+#: Significance of structure that refutes a common factor of all channels.
 BEYOND_DOUBT = 0.005
-#: Fewest degrees of freedom of a channel for its residuals to be told from structure.
+#: Fewest degrees of freedom of a channel for a test of structure.
 FEWEST = 30
-#: How far apart the factors of channels may be to be called the same.
+#: Largest ratio of the factors of channels, squared, for one common factor.
 ALIKE = 1.3
 
 
 def noise_factors(fit: Residuals, level: float = LEVEL) -> dict[str, float]:
-    """By how much the residuals of each channel exceed its sds, where that is sure; none where they have structure.
+    """Ratios of the residuals of each channel to its sds, if significant; empty if they have structure.
 
-    Structure is looked for with sds as the misfit says, so that it does not depend on those that are stated.
+    Structure is tested with sds estimated from the misfit, so that it does not depend on the stated ones.
 
     Args:
-        level: family-wise error of seeing some where there is none.
+        level: family-wise significance of that test.
     """
-    tests = structure(fit.rescaled(), known=False)
+    tests = structure_tests(fit.rescaled(), known=False)
     if tests and min(p for p, _ in tests) * len(tests) < level:
         return {}
-    found = {}
+    factors = {}
     for channel, chi2, freedom in zip(fit.runs.channels, fit.chi2.tolist(), fit.freedom.tolist(), strict=True):
         if freedom < 1 or chi2 <= 0:
             continue
         factor = float(np.sqrt(chi2 / freedom))
         p = chdtrc(freedom, chi2) if factor > 1 else chdtr(freedom, chi2)
         if max(factor, 1 / factor) > OFF and p < IMPROBABLE:
-            found[channel.name] = factor
-    return found
+            factors[channel.name] = factor
+    return factors
 
 
 def common_factors(fit: Residuals) -> dict[str, float]:
-    """`noise_factors`, where every channel has one and they are the same; none else, or where readings are too few.
+    """`noise_factors` if every channel has the same one; empty otherwise, or with too few readings.
 
-    What the model lacks shows in some channels more than in others: structure has to be beyond doubt to speak against
-    sds that are off everywhere alike.
+    A model error affects some channels more than others. So structure has to be highly significant to refute a
+    factor that is common to all channels.
     """
     factors = noise_factors(fit, BEYOND_DOUBT)
     enough = bool(np.all(fit.freedom[fit.counts.any(0)] >= FEWEST))
-    return factors if enough and _everywhere(fit, factors) else {}
+    return factors if enough and _is_common_factor(fit, factors) else {}
 
 
-def _everywhere(fit: Residuals, factors: dict[str, float]) -> bool:
-    """Whether every channel that is read has a factor, and they are the same."""
+def _is_common_factor(fit: Residuals, factors: dict[str, float]) -> bool:
+    """True if every measured channel has a factor, and the factors are the same."""
     count = int(fit.counts.any(0).sum())
     return len(factors) == count > 1 and max(factors.values()) < ALIKE**2 * min(factors.values())
 
 
 def noise_remarks(fit: Residuals, source: str = "stated") -> list[NoiseOff]:
-    """Sds that are off by a factor; `source` says where they come from."""
+    """Notes on sds that are wrong by a factor; `source` is the origin of the sds."""
     factors = noise_factors(fit)
-    if _everywhere(fit, factors):
+    if _is_common_factor(fit, factors):
         return [NoiseOff("", float(np.exp(np.mean(np.log(list(factors.values()))))), source)]
     return [NoiseOff(name, factor, source) for name, factor in factors.items()]

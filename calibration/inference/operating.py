@@ -1,4 +1,4 @@
-"""Operating points of a robot under the conditions of a table: what its readings are about, before any fit."""
+"""Operating points of a robot under the conditions of a table: approximate readings before any fit."""
 
 from __future__ import annotations
 
@@ -10,23 +10,24 @@ import numpy as np
 from jaxtyping import Float
 
 from mmrjax.compile.compiling import SELDOM, compiled
-from mmrjax.fidelities.steady import shown_batch, steady
+from mmrjax.fidelities.steady import results_of_rows, steady
 from mmrjax.model import channels, params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.robot import Robot
-from mmrjax.model.signals import Result, done
+from mmrjax.model.signals import Result, is_done
 
-#: Conditions are padded to a multiple of this, so that tables of about one size share what is compiled.
+#: Conditions are padded to a multiple of this, so that tables of similar size share compiled programs.
 PAD = 16
-#: Adhesion at which no robot slides, as a ratio: what its motors take hardly depends on the slip.
+#: Adhesion ratio at which no robot slides; the motors' load depends only weakly on the slip.
 GRIPPING = 20.0
 
 
 def operating_readings(
     robot: Robot, conditions: Conditions, names: tuple[str, ...] | None = None
 ) -> Float[np.ndarray, "runs channels"]:
-    """Readings of steady travel on a surface that grips, and of turns on their own [SI]; NaN where the robot does not
-    get under way.
+    """Readings of steady travel on a surface that grips, and of turns on their own surface [SI].
+
+    NaN if the robot cannot move.
 
     Args:
         conditions: shape (runs,).
@@ -36,17 +37,19 @@ def operating_readings(
     index = np.concatenate([np.arange(runs), np.zeros(-runs % PAD, int)])
     mass = conditions.total_mass
     if mass is None:
-        own = np.asarray([float(c.mass) for c in robot.configurations.members])
-        mass = own[np.asarray(conditions.configuration)] + np.asarray(conditions.payload)
+        masses = np.asarray([float(c.mass) for c in robot.configurations.members])
+        mass = masses[np.asarray(conditions.configuration)] + np.asarray(conditions.payload)
     gripping, own_mass = jax.device_put((np.full(runs, GRIPPING), np.asarray(mass)))
     posed = dataclasses.replace(conditions, adhesion=gripping, total_mass=own_mass)
-    if conditions.turns:  # what a turn takes is friction's
+    if conditions.turns:  # the load of a turn is friction
         posed = conditions
     padded = jax.tree.map(lambda x: jax.device_put(np.asarray(x)[index]), posed)
-    strong = params.strong(robot)
-    found = shown_batch(strong, padded)[0] if conditions.turns else _settled(strong, padded)
-    reading = np.stack([np.asarray(found.reading[c]) for c in names or channels.names(robot.channels)], 1)[:runs]
-    moving = done(np.asarray(found.status))[:runs]
+    strong = params.without_weak_types(robot)
+    readings = results_of_rows(strong, padded)[0] if conditions.turns else _settled(strong, padded)
+    reading = np.stack([np.asarray(readings.reading[c]) for c in names or channels.channel_names(robot.channels)], 1)[
+        :runs
+    ]
+    moving = is_done(np.asarray(readings.status))[:runs]
     return np.where(moving[:, None], reading, np.nan)
 
 

@@ -1,5 +1,7 @@
-"""Maximum a posteriori by least squares with exact Jacobians, from many starts at once: searches by optimistix's
-solvers, ours (`levenberg_marquardt`) where none is named."""
+"""Maximum a posteriori by least squares with exact Jacobians, from many starts at once.
+
+Searches use solvers of optimistix; the default is ours (`levenberg_marquardt`).
+"""
 
 from __future__ import annotations
 
@@ -20,32 +22,32 @@ from calibration.inference.levenberg_marquardt import (
     Function,
     OneSidedLevenbergMarquardt,
     Searching,
-    at_known,
-    counted,
     half_squares,
-    stride_of,
+    linear_residual_function,
+    one_sided_step,
     with_slope,
+    zero_inactive_residuals,
 )
 from calibration.inference.problem import MISSING, Data, Observation, Problem
 from mmrjax.compile.compiling import OVER_TIME, SELDOM, SMALL, compiled
 from mmrjax.compile.precision import Threads
 from mmrjax.model.robot import Robot
-from mmrjax.numerics.linear_equations import half_solved
+from mmrjax.numerics.linear_equations import solve_lower
 
-#: Predicted decrease of the objective below which a point is an optimum: in ½σ² (the step left is then below
-#: a twentieth of a posterior sd, about what the integrator's tolerance leaves of a rollout), and as a share.
+#: Predicted decrease of the objective below which a point is an optimum: in ½σ² (the remaining step is then below
+#: a twentieth of a posterior sd, similar to the effect of the integrator's tolerance), and as a share.
 DECREMENT, DECREMENT_SHARE = 1e-3, 1e-6
 #: Change of z (and of the residuals, relative) at which a search ends; the second for rollouts.
 TOLERANCE, TOLERANCE_LONG = 1e-6, 1e-3
-#: Steps of a solver of optimistix at most: of least squares, of a minimiser.
+#: Largest number of steps of a solver of optimistix: for least squares, and for a minimiser.
 MOST_STEPS = 256, 2000
-#: How many times the decrease that its linearisation predicts a search of rollouts is given the hope of.
+#: Multiple of the decrease predicted by its linearisation that a search of rollouts may still achieve.
 HOPELESS = 10.0
-#: Steps that tell what a search of rollouts still brings.
+#: Number of last steps that predict the further decrease of a search of rollouts.
 LATELY = 5
-#: How many of them have to end in one place, to within so much of the objective, for it to be the optimum.
+#: Number of searches that have to end in one place, and their tolerance in the objective, for an optimum.
 AGREE, SAME = 3, 0.01
-#: Cores on which many searches run, at most.
+#: Largest number of cores for parallel searches.
 CORES = min(4, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
 
 Z = Float[Array, " parameters"]
@@ -54,7 +56,7 @@ Numbers = Any
 
 
 class Pin(eqx.Module):
-    """Coordinates held at a value: `z[k] = at[k]` where `held[k]`."""
+    """Coordinates held at a value: `z[k] = at[k]` for `held[k]`."""
 
     held: Bool[Array, " parameters"]
     at: Z
@@ -64,20 +66,20 @@ class Pin(eqx.Module):
 
 
 def no_pin(size: int) -> Pin:
-    """Nothing held."""
+    """Pin that holds no coordinate."""
     return Pin(jnp.zeros(size, bool), jnp.zeros(size))
 
 
 class Optimum(eqx.Module):
-    """Where one search ended.
+    """End of one search.
 
     Attributes:
         z: coordinates, shape (parameters,).
         covariance: of z, from the Gauss-Newton curvature (JᵀJ)⁻¹ of readings and priors, shape (parameters,
             parameters); sd: root of its diagonal.
         cost: objective, half the sum of squares of misfit and prior [-].
-        decrement: decrease that the Gauss-Newton step from here still predicts [-].
-        converged: whether the decrement is small (see `DECREMENT`); holds whatever the solver said.
+        decrement: further decrease predicted by the Gauss-Newton step from here [-].
+        converged: True if the decrement is small (see `DECREMENT`), whatever the solver reports.
         steps: iterations taken.
     """
 
@@ -90,14 +92,14 @@ class Optimum(eqx.Module):
     steps: Int[Array, ""]
 
 
-def penalties(data: Data) -> slice:
-    """Which residuals are penalties on adhesion, one a row, between readings and priors."""
+def penalty_slice(data: Data) -> slice:
+    """Slice of the residuals that are penalties on adhesion, one a row, between readings and priors."""
     return slice(data.measured.size, data.measured.size + data.measured.shape[0])
 
 
-def informing(data: Data) -> np.ndarray:
+def informative_residuals(data: Data) -> np.ndarray:
     """Indices of the residuals that carry information: readings and priors, not the penalty on adhesion."""
-    held = penalties(data)
+    held = penalty_slice(data)
     return np.r_[: held.start, held.stop : held.stop + data.centre.size]
 
 
@@ -108,15 +110,17 @@ Progress = tuple[Z, Searching]
 
 
 def _evaluated(problem: Problem, data: Data, pin: Pin, z: Z) -> tuple[Array, Array, Observation]:
-    """Residuals (readings, penalties with their signs, then prior) at z, their Jacobian, and what the model says of
-    every row: one evaluation serves all three."""
+    """Residuals (readings, penalties with their signs, then prior) at z, their Jacobian, and the observation.
+
+    One evaluation gives all three.
+    """
     r, jacobian, seen, _ = problem.linearised(lambda x: problem.robot(pin.apply(x)), z, data)
     prior = jnp.where(pin.held, z - pin.at, z - data.centre)
     return jnp.concatenate([r, prior]), jnp.concatenate([jacobian, jnp.eye(z.size)]), seen
 
 
-def residuals(problem: Problem, data: Data, pin: Pin) -> Function:
-    """The residuals of `_evaluated` as optimistix takes them, with the observation beside them."""
+def residual_function(problem: Problem, data: Data, pin: Pin) -> Function:
+    """Residual function of optimistix with the residuals of `_evaluated`, and the observation as auxiliary output."""
 
     def function(z: Z, args: Any) -> tuple[Array, Observation]:
         r, jacobian, seen = _evaluated(problem, data, pin, jax.lax.stop_gradient(z))
@@ -126,50 +130,50 @@ def residuals(problem: Problem, data: Data, pin: Pin) -> Function:
 
 
 def _solver(data: Data, long: bool) -> OneSidedLevenbergMarquardt:
-    """The solver of fits to such data; of rollouts where `long`."""
-    held, tolerance = penalties(data), TOLERANCE_LONG if long else TOLERANCE
+    """Solver of fits to such data; of rollouts if `long`."""
+    held, tolerance = penalty_slice(data), TOLERANCE_LONG if long else TOLERANCE
     return OneSidedLevenbergMarquardt(tolerance, tolerance, held.start, held.stop)
 
 
 def _optimum(jacobian: Array, r: Array, z: Array, data: Data, pin: Pin, steps: Array) -> Optimum:
-    held_rows = penalties(data)
-    informed = jacobian[informing(data)]
-    half = half_solved(informed.T @ informed, jnp.eye(z.shape[0]))
+    held_rows = penalty_slice(data)
+    informed = jacobian[informative_residuals(data)]
+    half = solve_lower(informed.T @ informed, jnp.eye(z.shape[0]))
     sd = jnp.linalg.norm(half, axis=0)
-    ahead = r + jacobian @ stride_of(r, jacobian, held_rows, 0.0)
+    ahead = r + jacobian @ one_sided_step(r, jacobian, held_rows, 0.0)
     decrement = half_squares(r, held_rows) - half_squares(ahead, held_rows)
     held = jnp.where(pin.held, pin.at - data.centre, 0.0)
     cost = half_squares(r, held_rows) + 0.5 * jnp.sum(held**2)
-    return Optimum(pin.apply(z), sd, half.T @ half, cost, decrement, _small(decrement, cost), steps)
+    return Optimum(pin.apply(z), sd, half.T @ half, cost, decrement, _is_converged(decrement, cost), steps)
 
 
-def _small(decrement: Any, cost: Array) -> Array:
+def _is_converged(decrement: Any, cost: Array) -> Array:
     return jnp.asarray(decrement < DECREMENT + DECREMENT_SHARE * cost)
 
 
-def optimum(jacobian: np.ndarray, residual: np.ndarray, z: np.ndarray, data: Data) -> Optimum:
-    """A point as an optimum, from its residuals (misfit, then prior) and their Jacobian, however these were found."""
-    j, r, at = (jnp.asarray(x, float) for x in (jacobian, residual, z))
-    return _optimum(j, r, at, data, no_pin(len(z)), jnp.asarray(0))
+def optimum_at_point(jacobian: np.ndarray, residual: np.ndarray, z: np.ndarray, data: Data) -> Optimum:
+    """A point as an optimum, from its residuals (misfit, then prior) and their Jacobian, of any origin."""
+    j, r, point = (jnp.asarray(x, float) for x in (jacobian, residual, z))
+    return _optimum(j, r, point, data, no_pin(len(z)), jnp.asarray(0))
 
 
 def _begin(solver: OneSidedLevenbergMarquardt, start: Z, size: int, aux: Any) -> Progress:
-    """A search that has evaluated nothing yet.
+    """State of a search before its first evaluation.
 
     Args:
-        size: number of residuals; aux: shapes and kinds of what else an evaluation gives.
+        size: number of residuals; aux: shapes and dtypes of an evaluation's auxiliary output.
     """
     struct = jax.ShapeDtypeStruct((size,), start.dtype)
     return start, solver.init(_unevaluated, start, None, {}, struct, aux, frozenset())
 
 
 def _unevaluated(z: Z, args: Any) -> tuple[Array, Any]:
-    """A residual function that nothing calls."""
+    """A residual function that is never called."""
     raise NotImplementedError
 
 
 def _of_every_row(data: Data) -> Observation:
-    """Shapes and kinds of an observation of the rows of data."""
+    """Shapes and dtypes of an observation of the rows of data."""
     codes = jnp.zeros(data.measured.shape[0], int)
     return jax.eval_shape(lambda: Observation(data.measured, data.measured[:, 0], codes, codes))
 
@@ -181,15 +185,18 @@ def _step(solver: OneSidedLevenbergMarquardt, function: Function, at: Progress) 
 
 
 def _begun(problem: Problem, start: Z, data: Data) -> Progress:
-    """A search of a problem that has evaluated nothing yet."""
-    size = penalties(data).stop + start.shape[0]
+    """State of a problem's search before its first evaluation."""
+    size = penalty_slice(data).stop + start.shape[0]
     return _begin(_solver(data, problem.observe.long), start, size, _of_every_row(data))
 
 
 def _advance(problem: Problem, at: Progress, data: Data, max_steps: int | Numbers) -> Progress:
-    """One step of a search. The model is evaluated in one place of the program, at the start of a step: what was
-    accepted there is what the search returns, with its residuals, Jacobian and observation."""
-    solver, function = _solver(data, problem.observe.long), residuals(problem, data, no_pin(at[0].shape[0]))
+    """One step of a search.
+
+    The program evaluates the model in one place, at the start of a step. The point accepted there is the search's
+    result, with its residuals, Jacobian and observation.
+    """
+    solver, function = _solver(data, problem.observe.long), residual_function(problem, data, no_pin(at[0].shape[0]))
     y, state = _step(solver, function, at)
     done, _ = solver.terminate(function, y, None, {}, state, frozenset())
     over = done | (state.steps >= max_steps) | ~jnp.all(jnp.isfinite(y))
@@ -206,10 +213,10 @@ def _ended(at: Progress, data: Data, pin: Pin) -> Optimum:
 def levenberg_marquardt(
     problem: Problem, start: Z, data: Data, pin: Pin | None = None, max_steps: int = 100
 ) -> tuple[Optimum, Observation]:
-    """One search, and what the model says where it ended. To be vmapped over starts, data and pins."""
+    """Optimum of one search, and the observation there; for `vmap` over starts, data and pins."""
     pin = no_pin(start.shape[0]) if pin is None else pin
-    function: Any = residuals(problem, data, pin)
-    found: optx.Solution = optx.least_squares(
+    function: Any = residual_function(problem, data, pin)
+    solution: optx.Solution = optx.least_squares(
         function,
         _solver(data, problem.observe.long),
         pin.apply(start),
@@ -217,15 +224,15 @@ def levenberg_marquardt(
         max_steps=max_steps,
         throw=False,
     )
-    return _ended((found.value, found.state), data, pin), found.aux
+    return _ended((solution.value, solution.state), data, pin), solution.aux
 
 
 class Member(eqx.Module):
-    """What one of many searches of a problem has of its own; a leading axis where there are many.
+    """Data of one of many searches of a problem, with a leading axis for many.
 
     Attributes:
-        start: where it begins, shape (parameters,); weight, measured, centre: as of `Data`; active: its effects, see
-            `ActiveSet`, None for those of the problem.
+        start: initial coordinates, shape (parameters,); weight, measured, centre: as in `Data`; active: its effects,
+            see `ActiveSet`, None for those of the problem.
     """
 
     start: Numbers
@@ -235,7 +242,7 @@ class Member(eqx.Module):
     active: Numbers | None = None
 
     def problem(self, problem: Problem) -> Problem:
-        """The problem that it is a search of."""
+        """The problem of its search."""
         data = dataclasses.replace(problem.data, weight=self.weight, measured=self.measured, centre=self.centre)
         coordinates = problem.coordinates
         if self.active is not None:
@@ -244,8 +251,8 @@ class Member(eqx.Module):
 
 
 @functools.partial(compiled, options=SELDOM)
-def _vacant(problem: Problem, members: Member) -> Progress:
-    """Searches that have ended before they began, from which nothing is taken."""
+def _placeholder_searches(problem: Problem, members: Member) -> Progress:
+    """States of searches that are over before they begin, as placeholders."""
 
     def one(member: Member) -> Progress:
         y, state = _begun(problem, member.start, member.problem(problem).data)
@@ -255,7 +262,7 @@ def _vacant(problem: Problem, members: Member) -> Progress:
 
 
 def _with_fresh(problem: Problem, members: Member, fresh: Numbers, at: Progress) -> Progress:
-    """Searches side by side; `fresh` ones begin at their starts."""
+    """States of parallel searches, in which `fresh` ones are reset to their starts."""
 
     def begin(member: Member, fresh: Array, at: Progress) -> Progress:
         begun = _begun(problem, member.start, member.problem(problem).data)
@@ -270,7 +277,7 @@ _admitted = compiled(_with_fresh, options=SELDOM)
 def _go_on(
     problem: Problem, members: Member, fresh: Numbers, at: Progress, enough: Numbers, max_steps: Numbers
 ) -> tuple[Progress, Optimum]:
-    """Searches side by side until `enough` of them have ended, those that are `fresh` from their starts."""
+    """Continue parallel searches until `enough` of them are over; `fresh` ones begin at their starts."""
     pin = no_pin(members.start.shape[-1])
 
     def advance(member: Member, at: Progress) -> Progress:
@@ -285,7 +292,7 @@ def _go_on(
 
 @functools.partial(compiled, options=OVER_TIME)
 def _roots(problem: Problem, z: Numbers, active: Numbers | None) -> tuple[Array, Array]:
-    """What `Observer.solve` gives at each of several z; arguments as of `Member`."""
+    """Result of `Observer.solve` at each of several z; arguments as in `Member`."""
 
     def one(z: Array, active: Array | None) -> tuple[Array, Array] | None:
         coordinates = problem.coordinates if active is None else problem.coordinates.with_effects(active)
@@ -300,7 +307,7 @@ def _roots(problem: Problem, z: Numbers, active: Numbers | None) -> tuple[Array,
 def _further(
     problem: Problem, members: Member, at: Progress, roots: tuple[Array, Array], max_steps: Numbers
 ) -> tuple[Progress, Optimum]:
-    """A step of each search that has not ended, its roots known, and the best point of each as an optimum."""
+    """One step of each unfinished search with known roots, and the best point of each as an optimum."""
     pin = no_pin(members.start.shape[-1])
 
     def advance(member: Member, at: Progress, roots: tuple[Array, Array]) -> tuple[Progress, Optimum]:
@@ -315,7 +322,7 @@ def _further(
 def _go_on_apart(
     problem: Problem, members: Member, fresh: Numbers, at: Progress, enough: Numbers, max_steps: Numbers
 ) -> tuple[Progress, Optimum]:
-    """`_go_on` where roots are found by a program of their own (`Observer.apart`)."""
+    """`_go_on` for observers with a separate program for roots (`Observer.apart`)."""
     at = _admitted(problem, members, fresh, at)
     while True:
         at, found = _further(problem, members, at, _roots(problem, at[1].ahead, members.active), max_steps)
@@ -323,8 +330,8 @@ def _go_on_apart(
             return at, found
 
 
-def rooted(problem: Problem, z: Z) -> Problem:
-    """The problem with its roots at z, found by the program of searches; unchanged if its observer is not `apart`."""
+def with_roots(problem: Problem, z: Z) -> Problem:
+    """Problem with its roots at z, found by the program of searches; unchanged if its observer is not `apart`."""
     if not problem.observe.apart:
         return problem
     active = getattr(problem.coordinates, "active", None)
@@ -334,8 +341,8 @@ def rooted(problem: Problem, z: Z) -> Problem:
     return dataclasses.replace(problem, roots=jax.tree.map(lambda x: x[0], _roots(problem, *many)))
 
 
-def roots_of(problem: Problem, zs: Numbers) -> tuple[np.ndarray, np.ndarray]:
-    """Roots at any number of z, by the program of searches, of a problem without slots; leading axis the z."""
+def solve_roots(problem: Problem, zs: Numbers) -> tuple[np.ndarray, np.ndarray]:
+    """Roots at several z, by the program of searches, of a problem without slots; the leading axis is z."""
     places = problem.observe.places(problem)
     filled = np.resize(zs, (-(-len(zs) // places) * places, zs.shape[1]))
     parts = [jax.device_get(_roots(problem, part, None)) for part in filled.reshape(-1, places, zs.shape[1])]
@@ -347,14 +354,14 @@ _go_on_seldom = compiled(_go_on, options=SELDOM)
 
 
 class Places:
-    """Members that go on side by side; one that has ended leaves its place to one that waits.
+    """Members of parallel searches; finished members are replaced by queued ones.
 
     Attributes:
-        holds: member in each place, -1 for none; ended: what each member that has ended found.
+        holds: member in each place, -1 for none; ended: result of each finished member.
     """
 
     def __init__(self, members: Iterable[int], count: int) -> None:
-        """So many places, empty; members that wait for them."""
+        """Queue of members, with `count` empty places."""
         self._waiting, self.holds = list(members)[::-1], np.full(count, -1)
         self.ended: dict[int, Any] = {}
 
@@ -363,53 +370,55 @@ class Places:
 
     @property
     def waiting(self) -> bool:
-        """Whether members wait."""
+        """True if members are queued."""
         return bool(self._waiting)
 
     @property
     def taken(self) -> np.ndarray:
-        """Whether each place holds a member."""
+        """True for places that hold a member."""
         return self.holds >= 0
 
     @property
     def member(self) -> np.ndarray:
-        """The member in each place, any where there is none."""
+        """Member in each place; an arbitrary one in empty places."""
         return np.maximum(self.holds, 0)
 
     def fill(self) -> np.ndarray:
-        """Let members in; the places that they take."""
+        """Move queued members into empty places; returns these places."""
         fresh = np.flatnonzero(~self.taken)[: len(self._waiting)]
         self.holds[fresh] = [self._waiting.pop() for _ in fresh]
         return fresh
 
     def leave(self, over: np.ndarray, found: Any) -> None:
-        """Members whose search is over go, with what they found; leading axis the places."""
+        """Remove members whose search is over, and keep their results; the leading axis is the places."""
         for place in np.flatnonzero(over & self.taken):
             self.ended[int(self.holds[place])] = jax.tree.map(lambda x: x[place], found)  # noqa: B023
             self.holds[place] = -1
 
 
-def searches_refilled(problem: Problem, members: Member, max_steps: int, places: int) -> tuple[Optimum, Observation]:
-    """`levenberg_marquardt` of any number of members, so many at a time: one that has ended leaves its place to one
-    that waits, where a batch would wait for the slowest of it. One program serves any number.
+def search_refilling(problem: Problem, members: Member, max_steps: int, places: int) -> tuple[Optimum, Observation]:
+    """`levenberg_marquardt` for any number of members, with a fixed number in parallel.
+
+    Finished members are replaced by queued ones, whereas a batch would wait for its slowest member. One program
+    serves any number.
 
     Args:
-        members: leading axis the searches, NumPy's arrays.
-        places: searches side by side on each core.
+        members: leading axis the searches, NumPy arrays.
+        places: number of searches in parallel on each core.
 
     Returns:
-        Where each search ended, and what the model says there.
+        End of each search, and the observation there.
     """
-    found, state = _refilled(problem, members, max_steps, places)
-    return found, state.aux
+    optima, state = _refilled(problem, members, max_steps, places)
+    return optima, state.aux
 
 
 def _refilled(problem: Problem, members: Member, max_steps: int, places: int) -> tuple[Optimum, Searching]:
-    """The same, with the solver's state where each search ended."""
+    """Results as of `search_refilling`, with the solver's state at the end of each search."""
     count, most = len(members.start), np.asarray(max_steps)
     cores = min(CORES, -(-count // places))
     first = jax.tree.map(lambda x: np.repeat(x[:1], places, 0), members)
-    idle = _vacant(problem, first)
+    idle = _placeholder_searches(problem, first)
     go_on = _go_on_seldom if getattr(problem.coordinates, "fitted_once", False) else _go_on_often
     go_on = _go_on_apart if problem.observe.apart else go_on
 
@@ -424,97 +433,105 @@ def _refilled(problem: Problem, members: Member, max_steps: int, places: int) ->
             mine.leave(*jax.device_get((at[1].over, (found, at[1]))))
         return mine.ended
 
-    if cores > 1:  # the program is made once, by a call that takes no step
+    if cores > 1:  # compiles the program once, by a call that takes no step
         go_on(problem, first, np.zeros(places, bool), idle, np.asarray(0), most)
     with Threads(cores) as pool:
         ended = {k: found for part in pool.map(some, range(cores)) for k, found in part.items()}
     return jax.tree.map(lambda *x: np.stack(x), *(ended[k] for k in range(count)))
 
 
-def linearised(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observation]:
-    """All that is asked of a model at z: residuals (misfit, then prior), their Jacobian, observation."""
-    r, jacobian, seen = (linearised_signed if problem.observe.long else _first_step)(problem, z, data)
-    return *_counting(r, jacobian, data), seen
+def linearise(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observation]:
+    """Residuals (misfit, then prior) at z, their Jacobian, and the observation."""
+    r, jacobian, seen = (linearise_rollout if problem.observe.long else _first_step)(problem, z, data)
+    return *_clip_penalties(r, jacobian, data), seen
 
 
 def _first_step(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observation]:
-    """The same with the signs of penalties, by the program that searches have compiled."""
+    """Result of `linearise` with the signs of penalties, by the compiled program of the searches."""
     active = getattr(problem.coordinates, "active", None)
-    own = [np.asarray(x)[None] for x in (z, data.weight, data.measured, data.centre)]
-    members = Member(own[0], own[1], own[2], own[3], None if active is None else np.asarray(active)[None])
+    one_member = [np.asarray(x)[None] for x in (z, data.weight, data.measured, data.centre)]
+    members = Member(
+        one_member[0],
+        one_member[1],
+        one_member[2],
+        one_member[3],
+        None if active is None else np.asarray(active)[None],
+    )
     _, ended = _refilled(problem, members, 1, problem.observe.places(problem))
     state = jax.tree.map(lambda x: jnp.asarray(x[0]), ended)
     return state.found.residual, state.found.jacobian, state.aux
 
 
-def counting(r: Array, jacobian: Array, data: Data) -> tuple[Array, Array]:
-    """Residuals and Jacobian with penalties cut off at 0, for solvers without one-sided residuals. Readings whose
-    slope is not finite count as not computed."""
-    return counted(*computed(r, jacobian, data), penalties(data))
+def clip_penalties(r: Array, jacobian: Array, data: Data) -> tuple[Array, Array]:
+    """Residuals and Jacobian with penalties cut off at 0, for solvers without one-sided residuals.
+
+    Readings with a non-finite slope count as not computed.
+    """
+    return zero_inactive_residuals(*mask_uncomputed(r, jacobian, data), penalty_slice(data))
 
 
-_counting = compiled(counting, options=SELDOM)
+_clip_penalties = compiled(clip_penalties, options=SELDOM)
 
 
-def computed(r: Array, jacobian: Array, data: Data) -> tuple[Array, Array]:
-    """Residuals and Jacobian; a row of that which is not finite counts as a reading that could not be computed."""
+def mask_uncomputed(r: Array, jacobian: Array, data: Data) -> tuple[Array, Array]:
+    """Residuals and Jacobian; a reading with a non-finite row of the Jacobian counts as not computed."""
     counts = jnp.concatenate([data.weight.ravel() > 0, jnp.ones(data.measured.shape[0] + jacobian.shape[1], bool)])
-    known = jnp.all(jnp.isfinite(jacobian), axis=1)
-    return jnp.where(known, r, MISSING * counts), jnp.where(known[:, None], jacobian, 0.0)
+    computed = jnp.all(jnp.isfinite(jacobian), axis=1)
+    return jnp.where(computed, r, MISSING * counts), jnp.where(computed[:, None], jacobian, 0.0)
 
 
 @functools.partial(compiled, options=OVER_TIME)
-def linearised_signed(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observation]:
-    """`linearised` of a rollout with the signs of penalties, and their slopes where they are negative too.
+def linearise_rollout(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observation]:
+    """`linearise` of a rollout with the signs of penalties, and with the slopes of negative ones.
 
-    Where a rollout's step is too long for its friction law (V_s small beside μ_s) the run shakes and its
-    derivative grows without limit; such a reading, if it counts, counts as one that could not be computed.
+    If a rollout's step is too long for its friction law (V_s small compared with μ_s), the run oscillates and its
+    derivative grows without limit. Such a reading counts as not computed if it has a weight.
     """
 
     r, jacobian, seen = _evaluated(problem, data, no_pin(z.size), z)
-    return *computed(r, jacobian, data), seen
+    return *mask_uncomputed(r, jacobian, data), seen
 
 
-def evaluated(problem: Problem, z: Z, data: Data) -> Array:
-    """The residuals of `linearised` alone, by the program of `read`: a rollout less to compile."""
-    seen = read(problem, problem.robot(z))
+def evaluate_residuals(problem: Problem, z: Z, data: Data) -> Array:
+    """Residuals of `linearise` without the Jacobian, by the program of `observe_robot`, which saves a compilation."""
+    seen = observe_robot(problem, problem.robot(z))
     return jnp.concatenate([problem.whitened(seen, data), z - data.centre])
 
 
 @eqx.filter_jit
 def _stepped(solver: OneSidedLevenbergMarquardt, at: Progress, r: Array, jacobian: Array) -> Progress:
-    return _step(solver, at_known(r, jacobian), at)
+    return _step(solver, linear_residual_function(r, jacobian), at)
 
 
-def search_long(
+def search_rollout(
     problem: Problem,
     start: Z,
     data: Data,
     max_steps: int = 100,
     tell: Callable[[int, float], None] = lambda steps, cost: None,
 ) -> tuple[Optimum, Observation, Observation]:
-    """`levenberg_marquardt` with the steps taken from outside, so that a rollout is compiled once in all.
+    """`levenberg_marquardt` with its steps in Python, so that a rollout is compiled only once.
 
-    It ends too where the step from a point would gain nothing that counts (a tenth of `DECREMENT`).
+    It also ends if the next step would bring no relevant gain (a tenth of `DECREMENT`).
 
     Returns:
-        Where the search ended, and what the model says where it started and where it ended.
+        The optimum, and the observations at the start and at the end.
     """
     pin, solver = no_pin(start.shape[0]), _solver(data, long=True)
-    size = penalties(data).stop + start.shape[0]
-    at, first, last = _begin(solver, start, size, None), None, None
+    size = penalty_slice(data).stop + start.shape[0]
+    progress, first, last = _begin(solver, start, size, None), None, None
     best: Optimum | None = None
     for steps in range(1, max_steps + 1):
-        ahead = at[1].ahead
-        # A step that follows a rejected one is often rejected too; that takes no Jacobian, so the last one stays.
-        r = evaluated(problem, ahead, data) if at[1].rejected > 0 else None
+        ahead = progress[1].ahead
+        # A step after a rejected one is often rejected too; that needs no Jacobian, so the previous one remains.
+        r = evaluate_residuals(problem, ahead, data) if progress[1].rejected > 0 else None
         if r is None or best is None or 0.5 * jnp.sum(r**2) < best.cost:
-            r, jacobian, seen = linearised_signed(problem, ahead, data)
+            r, jacobian, seen = linearise_rollout(problem, ahead, data)
         first = seen if first is None else first
-        at = _stepped(solver, at, r, jacobian)
-        done = bool(at[1].over)
-        if at[1].rejected == 0:
-            best, last = _optimum(jacobian, r, at[0], data, pin, jnp.asarray(steps)), seen
+        progress = _stepped(solver, progress, r, jacobian)
+        done = bool(progress[1].over)
+        if progress[1].rejected == 0:
+            best, last = _optimum(jacobian, r, progress[0], data, pin, jnp.asarray(steps)), seen
             done |= bool(best.decrement < 0.1 * (DECREMENT + DECREMENT_SHARE * best.cost))
         assert best is not None  # the first step only evaluates the start, and accepts it
         tell(steps, float(best.cost))
@@ -524,25 +541,25 @@ def search_long(
     return best, first, last
 
 
-#: Of so many members, by their indices, at their z: residuals, penalties with their signs, their Jacobian and the
-#: observation, as NumPy's arrays; leading axis these members.
+#: Function of members' coordinates and indices: residuals, penalties with their signs, their Jacobian and the
+#: observation, as NumPy arrays; leading axis these members.
 Evaluate = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray, Observation]]
 
 
 @functools.partial(compiled, options=SELDOM)
 def _steps(at: Progress, found: tuple[Array, Array, Any], data: Data, weights: Array) -> tuple[Progress, Optimum]:
-    """The next step of every search, and what its best point is as an optimum."""
+    """Next step of each search, and its best point as an optimum."""
 
     solver, pin = _solver(data, long=True), no_pin(at[0].shape[-1])
 
     def one(at: Progress, found: tuple[Array, Array, Any], weight: Array) -> tuple[Progress, Optimum]:
-        new = _step(solver, at_known(*found), at)
+        new = _step(solver, linear_residual_function(*found), at)
         return new, _ended(new, dataclasses.replace(data, weight=weight), pin)
 
     return jax.vmap(one)(at, found, weights)
 
 
-def searches_long(
+def search_rollouts(
     evaluate: Evaluate,
     starts: Numbers,
     data: Data,
@@ -552,38 +569,43 @@ def searches_long(
     *,
     rivals: bool = False,
 ) -> tuple[Optimum, Observation]:
-    """`levenberg_marquardt` of any number of members with the steps taken from outside, so that rollouts are compiled
-    once in all; what has ended is not evaluated again and leaves its place to one that waits.
+    """`levenberg_marquardt` of any number of members with its steps in Python, so that rollouts are compiled once.
+
+    Finished members are not evaluated again, and are replaced by queued ones.
 
     Args:
         starts: shape (members, coordinates); weights: of each member's readings, shape (members, rows, channels).
-        places: searches side by side.
-        rivals: whether all search the same optimum, so that all end once `AGREE` have ended in one place and none is
-            lower, and those that cannot come down to the lowest so far (by `HOPELESS` times what their step predicts,
-            or what their last `LATELY` steps brought) before.
+        places: number of searches in parallel.
+        rivals: True if all search the same optimum. All then end once `AGREE` of them have ended in one place and no
+            other is lower. A search ends earlier if it cannot reach the lowest so far: by `HOPELESS` times the
+            predicted decrease of its step, or by the decrease of its last `LATELY` steps.
 
     Returns:
-        Where each search ended, and what the model says there.
+        End of each search, and the observation there.
     """
     starts, weights, solver = np.asarray(starts), np.asarray(weights), _solver(data, long=True)
     mine = Places(range(len(starts)), max(places, len(starts) * rivals))
     cost, ahead = np.full(len(starts), np.inf), starts[mine.member]
     trail = np.full((LATELY, len(mine.member)), np.nan)
-    at: Progress | None = None
+    progress: Progress | None = None
     while mine:
         fresh, going = mine.fill(), np.flatnonzero(mine.taken)
-        # A step judges what was found where the last one led; what is accepted becomes y.
-        ahead = _put(ahead, fresh, starts[mine.holds[fresh]])
+        # A step accepts or rejects the point to which the last one led; an accepted point becomes y.
+        ahead = _with_values(ahead, fresh, starts[mine.holds[fresh]])
         evaluated = evaluate(ahead[going], mine.holds[going])
-        found = jax.tree.map(lambda x: _put(np.zeros((len(ahead), *x.shape[1:]), x.dtype), going, x), evaluated)  # noqa: B023
+        found = jax.tree.map(
+            lambda x: _with_values(np.zeros((len(ahead), *x.shape[1:]), x.dtype), going, x),  # noqa: B023
+            evaluated,
+        )
         if len(fresh):
             aux = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), found[2])
             begin = functools.partial(_begin, solver, size=found[0].shape[1], aux=aux)
             begun = jax.device_get(jax.vmap(begin)(jnp.asarray(ahead)))
-            at = begun if at is None else jax.tree.map(lambda old, new: _put(old, fresh, new[fresh]), at, begun)  # noqa: B023
-        assert at is not None  # the first searches are fresh
-        at, ends = jax.device_get(_steps(at, found, data, weights[mine.member]))
-        state = at[1]
+            put = lambda old, new: _with_values(old, fresh, new[fresh])  # noqa: B023, E731
+            progress = begun if progress is None else jax.tree.map(put, progress, begun)
+        assert progress is not None  # the first searches are fresh
+        progress, ends = jax.device_get(_steps(progress, found, data, weights[mine.member]))
+        state = progress[1]
         ahead, seen = state.ahead, state.aux
         small = 0.1 * (DECREMENT + DECREMENT_SHARE * ends.cost)
         over = state.over | (state.steps >= max_steps) | ((state.rejected == 0) & (ends.decrement < small))
@@ -594,7 +616,7 @@ def searches_long(
             lower = mine.taken & ~over & (ends.cost < lowest - SAME)
             agree = np.sum(cost[done] < lowest + SAME) >= AGREE and not lower.any()
             so_far = min(lowest, np.min(ends.cost[mine.taken]))
-            with np.errstate(invalid="ignore"):  # of what cannot be followed yet
+            with np.errstate(invalid="ignore"):  # NaN of runs that cannot be simulated yet
                 hope = HOPELESS * np.fmin(ends.decrement, trail[0] - ends.cost)
             over = over | (ends.cost - hope > so_far + SAME) | agree
             trail = np.concatenate([trail[1:], ends.cost[None]])
@@ -602,79 +624,82 @@ def searches_long(
     return jax.tree.map(lambda *x: np.stack(x), *(mine.ended[k] for k in range(len(starts))))
 
 
-def _put(x: np.ndarray, places: np.ndarray, values: np.ndarray) -> np.ndarray:
+def _with_values(x: np.ndarray, places: np.ndarray, values: np.ndarray) -> np.ndarray:
     x = np.array(x)
     x[places] = values
     return x
 
 
-def searches(
+def search_starts(
     problem: Problem, starts: Float[Array, "starts parameters"], data: Data, solver: Solver | None = None
 ) -> tuple[Optimum, Int[Array, "starts rows"], Int[Array, "starts rows"]]:
-    """A search from every start: in one vmapped batch by our solver, one after another by any other `solver`.
+    """A search from each start: in one vmapped batch by our solver, one after another by any other `solver`.
 
     Returns:
-        The end of each search, and the status of every row at its start and at its end.
+        The end of each search, and the status of each row at its start and at its end.
     """
     if solver is not None:
-        found, start, end = searches_by(problem, starts, data, solver)
-        return found, start.status, end.status
+        optima, start, end = search_with_solver(problem, starts, data, solver)
+        return optima, start.status, end.status
     if not problem.observe.apart:
-        return _searches(problem, starts, data)
-    own = (np.repeat(np.asarray(x)[None], len(starts), 0) for x in (data.weight, data.measured, data.centre))
-    members = Member(np.asarray(starts), *own)
+        return _search_starts(problem, starts, data)
+    tables = (np.repeat(np.asarray(x)[None], len(starts), 0) for x in (data.weight, data.measured, data.centre))
+    members = Member(np.asarray(starts), *tables)
     problem = dataclasses.replace(problem, data=data)
     # A search of one step evaluates its start.
-    begun, ended = (searches_refilled(problem, members, steps, problem.observe.places(problem)) for steps in (1, 100))
+    begun, ended = (search_refilling(problem, members, steps, problem.observe.places(problem)) for steps in (1, 100))
     return ended[0], begun[1].status, ended[1].status
 
 
 @compiled
-def _searches(problem: Problem, starts: Array, data: Data) -> tuple[Optimum, Array, Array]:
+def _search_starts(problem: Problem, starts: Array, data: Data) -> tuple[Optimum, Array, Array]:
     def search(z: Z) -> tuple[Optimum, Array, Array]:
-        found, seen = levenberg_marquardt(problem, z, data)
-        return found, problem.observation(z).status, seen.status
+        optimum, seen = levenberg_marquardt(problem, z, data)
+        return optimum, problem.observation(z).status, seen.status
 
     return jax.vmap(search)(starts)
 
 
 @eqx.filter_jit
-def searches_by(
+def search_with_solver(
     problem: Problem, starts: Float[Array, "starts parameters"], data: Data, solver: Solver
 ) -> tuple[Optimum, Observation, Observation]:
-    """Searches by a solver of optimistix, one after another: its linear algebra is LAPACK's, and batched calls of
-    that have waited for each other for ever (`linear_equations`).
+    """Searches by a solver of optimistix, one after another.
+
+    Its linear algebra is LAPACK's, and batched calls of that have deadlocked (`linear_equations`).
 
     Returns:
-        Where each search ended, and what the model says where it started and where it ended.
+        End of each search, and the observations at its start and at its end.
     """
     most = MOST_STEPS[isinstance(solver, optx.AbstractMinimiser)]
 
     def residual(z: Z, args: Any) -> Array:
         r, jacobian, _ = _evaluated(problem, data, no_pin(z.size), jax.lax.stop_gradient(z))
-        return with_slope(z, *counting(r, jacobian, data))
+        return with_slope(z, *clip_penalties(r, jacobian, data))
 
     def search(start: Z) -> tuple[Optimum, Observation, Observation]:
         solved: optx.Solution = optx.least_squares(residual, solver, start, max_steps=most, throw=False)
         z, pin = solved.value, no_pin(start.size)
         r, jacobian, seen = _evaluated(problem, data, pin, z)
-        r, jacobian = computed(r, jacobian, data)
-        found = _optimum(jacobian, r, z, data, pin, solved.stats["num_steps"])
-        return found, problem.observation(start), seen
+        r, jacobian = mask_uncomputed(r, jacobian, data)
+        optimum = _optimum(jacobian, r, z, data, pin, solved.stats["num_steps"])
+        return optimum, problem.observation(start), seen
 
     return jax.lax.map(search, starts)
 
 
-def read(problem: Problem, robot: Robot) -> Observation:
-    """What the model says of every row of the problem for any robot, compiled."""
-    return problem.observe.read(robot) if problem.observe.apart else _read(problem, robot)
+def observe_robot(problem: Problem, robot: Robot) -> Observation:
+    """Observation of any robot in each row of the problem, compiled."""
+    return problem.observe.read(robot) if problem.observe.apart else _observe_robot(problem, robot)
 
 
 @functools.partial(compiled, options=OVER_TIME)
-def _read(problem: Problem, robot: Robot) -> Observation:
+def _observe_robot(problem: Problem, robot: Robot) -> Observation:
     return problem.observe(robot)
 
 
-def observation(problem: Problem, z: Z) -> Observation:
-    """What the model says of every row at z, by a program that the search has compiled already if it is long."""
-    return linearised(problem, z, problem.data)[2] if problem.observe.long else read(problem, problem.robot(z))
+def observe_at(problem: Problem, z: Z) -> Observation:
+    """Observation at z, by a program that the search has already compiled if it is long."""
+    return (
+        linearise(problem, z, problem.data)[2] if problem.observe.long else observe_robot(problem, problem.robot(z))
+    )

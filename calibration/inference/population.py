@@ -1,9 +1,9 @@
-"""Searches that need no gradient: a population of robots run in one batch, in generations.
+"""Searches without gradients: a population of robots, run in one batch, in generations.
 
-What a rollout resolves has thresholds (contacts that open and close, regimes of vibration), across which no gradient
-leads. Members are drawn by CMA-ES (Hansen and Ostermeier 2001; the library `cmaes`); everything that a member's run
-gave is kept, so that noise can be estimated anew without running it again, and so that a regression over the members
-says how readings change near the best.
+A rollout has thresholds (contacts that open and close, regimes of vibration), across which gradients are no guide.
+Members are drawn by CMA-ES (Hansen and Ostermeier 2001; the library `cmaes`). All results of a member's run are kept.
+So the noise can be estimated again without another run, and a regression over the members shows how readings change
+near the best one.
 """
 
 from __future__ import annotations
@@ -42,30 +42,30 @@ from calibration.inference.problem import MISSING, Observation, Problem
 from mmrjax.compile.compiling import compiled
 from mmrjax.model.signals import FLAGS, STATUSES
 
-#: Members that are run together: on processors, and on an accelerator.
+#: Number of members run together: on processors, and on an accelerator.
 TOGETHER = (16, 512)
-#: Generations after which a search ends, and how many of them may pass without a gain of so much [½σ²].
+#: Largest number of generations, and number of generations that may pass without a gain of this size [½σ²].
 GENERATIONS, PATIENCE, GAIN = 30, 8, 0.5
 #: Fewest members of a generation.
 LEAST = 4
-#: What a row that is not reached costs [½σ²].
+#: Cost of a row that is not reached [½σ²].
 LOST = 1e3
-#: Members of the local regression for each coefficient of it.
+#: Number of members in the local regression per coefficient.
 MEMBERS_EACH = 3
 #: Distance from the middle of a prior beyond which a search is at its edge [prior sd].
 EDGE = 2.5
 #: Statuses with which a member loses a row.
 LOST_AS = ("slides", "tips", "failed", "stalled")
-#: Step of the differences by which derivatives are checked [posterior sd], and how far the two may be apart.
+#: Step of the differences that check derivatives [posterior sd], and largest relative difference between the two.
 STEP, APART = 0.2, 0.25
 
 
 @dataclasses.dataclass(frozen=True)
 class Generation:
-    """What a generation found.
+    """Outcome of a generation.
 
     Attributes:
-        members: that were run; failed: of them, those with a row that could not be run or left the ground.
+        members: number of members run; failed: number with a row that could not be run or left the ground.
         lowest: objective of the best so far; median: of this generation [½σ²].
     """
 
@@ -81,9 +81,9 @@ class Population:
 
     Attributes:
         z: coordinates, shape (members, parameters).
-        reading: what the model says of every row [SI], shape (members, rows, channels).
-        adhesion_used, status, flags: of every row, shape (members, rows).
-        cost: objective with the noise that the search ended with [½σ²]; inf where it has none.
+        reading: of each row [SI], shape (members, rows, channels).
+        adhesion_used, status, flags: of each row, shape (members, rows).
+        cost: objective with the final noise of the search [½σ²]; inf for members without one.
         generations: in order.
     """
 
@@ -102,13 +102,13 @@ class Population:
 
     @property
     def settled(self) -> bool:
-        """Whether the last generations gained nothing that counts."""
+        """True if the last generations brought no relevant gain."""
         lowest = [g.lowest for g in self.generations]
         return len(lowest) > PATIENCE and lowest[-PATIENCE - 1] - lowest[-1] < GAIN
 
 
 class Rows(NamedTuple):
-    """What the model says of every row, for members: see `Population`."""
+    """Observations of each row, for members: see `Population`."""
 
     reading: Float[np.ndarray, "members rows channels"]
     adhesion_used: Float[np.ndarray, "members rows"]
@@ -116,13 +116,13 @@ class Rows(NamedTuple):
     flags: Int[np.ndarray, "members rows"]
 
 
-#: What a file of members holds of them.
+#: Arrays in a file of members.
 KEPT = ("z", *Rows._fields)
 Objective = Callable[[np.ndarray, Rows], Float[np.ndarray, " members"]]
 
 
-def identity(posed: Problem) -> str:
-    """What makes two problems the same: data, base robot, coordinates, model."""
+def problem_hash(posed: Problem) -> str:
+    """Hash of a problem's data, base robot, coordinates and model."""
     arrays, rest = eqx.partition(posed, eqx.is_array_like)
     digest = hashlib.sha256(str(rest).encode())
     for leaf in jax.tree.leaves(arrays):
@@ -141,29 +141,29 @@ def saved_members(file: Path) -> tuple[str, list[np.ndarray]]:
             own, arrays = str(saved["identity"]), [saved[k] for k in KEPT]
         if len({len(array) for array in arrays}) != 1:
             raise ValueError("its arrays have different lengths")
-    except Exception as error:  # whatever a damaged file makes the reader raise
+    except Exception as error:  # a damaged file can make the reader raise anything
         raise BadConfiguration(
-            f"--members {file}: not a file of members that can be read ({type(error).__name__}); remove it, or name "
+            f"--members {file}: not a readable file of members ({type(error).__name__}); remove it, or name "
             "another file"
         ) from error
     return own, arrays
 
 
 class Members:
-    """Runs members, and keeps what they gave, in a file where one is named, from which a search goes on.
+    """Runs members and stores their results, optionally in a file, so that a search can resume.
 
     Args:
-        posed: the problem; file: of members; together: members that are run in one batch, None takes `TOGETHER`.
+        posed: the problem; file: of members; together: number of members in one batch, None takes `TOGETHER`.
 
     Raises:
-        BadConfiguration: the file is none of members, of another problem's members, or cannot be written.
+        BadConfiguration: the file is not a file of members, belongs to another problem, or cannot be written.
     """
 
     def __init__(self, posed: Problem, file: Path | None = None, together: int | None = None) -> None:
         self._together = together or TOGETHER[jax.default_backend() != "cpu"]
-        # The noise is none of it: it may be estimated anew on the way.
+        # The noise is excluded, because it may be estimated again during the search.
         bare = dataclasses.replace(posed.data, sd=jnp.ones_like(posed.data.sd), stiffness=jnp.zeros(()))
-        self._posed, self._file, self._own = posed, file, identity(dataclasses.replace(posed, data=bare))
+        self._posed, self._file, self._own = posed, file, problem_hash(dataclasses.replace(posed, data=bare))
         self._kept: dict[bytes, tuple[np.ndarray, ...]] = {}
         if file is not None and file.exists():
             self._load(file)
@@ -172,7 +172,7 @@ class Members:
         own, arrays = saved_members(file)
         if own != self._own:
             raise BadConfiguration(
-                f"--members {file}: its members are of another calibration (data, robot, parameters or model); "
+                f"--members {file}: its members belong to another calibration (data, robot, parameters or model); "
                 "remove it, or name another file"
             )
         self._kept = {row[0].tobytes(): row[1:] for row in zip(*arrays, strict=True)}
@@ -200,7 +200,7 @@ class Members:
         return self._posed.observe.unreachable(seen.status) & (np.asarray(self._posed.data.weight).max(1) > 0)
 
     def run(self, points: np.ndarray, advance: Callable[[int], None] = lambda _: None) -> Rows:
-        """What the model says of every row for each point."""
+        """Observation of each row for each point."""
         keys = [np.ascontiguousarray(z, float).tobytes() for z in points]
         new = [z for key, z in zip(keys, points, strict=True) if key not in self._kept]
         together = self._together
@@ -220,23 +220,22 @@ def _observed(posed: Problem, points: Float[Array, "points parameters"]) -> Obse
     return jax.vmap(posed.observation)(points)
 
 
-def most_probable(
+def most_probable_noise(
     posed: Problem, noise: Noise, reading: Float[np.ndarray, "... rows channels"]
 ) -> Float[np.ndarray, "... channels"]:
-    """Sd of each channel that is most probable for readings, as a share of its size; NaN where it is known."""
+    """Most probable sd of each channel for given readings, as a share of its size; NaN if it is known."""
     weight, size = np.asarray(posed.data.weight), noise.sd / noise_room.START
     error = np.where(weight > 0, (reading - np.asarray(posed.data.measured)) / size, 0.0)
     share = np.sqrt(np.sum(weight * error**2, -2) / np.maximum(weight.sum(0), 1.0))
     return np.where(noise.estimated, np.hypot(share, series_noise.FLOOR), np.nan)
 
 
-def objective(posed: Problem, noise: Noise) -> Objective:
-    """Half the sum of squares of misfit and prior, of members; where the sd of a channel is not known, with the sd
-    that is most probable for that member: n ln s in place of its squares, s the rms of its errors as shares of the
-    readings.
+def member_objective(posed: Problem, noise: Noise) -> Objective:
+    """Objective of members: half the sum of squares of misfit and prior.
 
-    A row that was measured and that a member does not reach costs `LOST`; a member of which a reading that counts
-    could not be computed has no cost: inf.
+    If the sd of a channel is unknown, the most probable one for each member is used: n ln s replaces the squares,
+    with s the rms of the errors as shares of the readings. A measured row that a member does not reach costs `LOST`.
+    A member with an included reading that could not be computed costs inf.
     """
     data = posed.data
     weight, measured, sd = np.asarray(data.weight), np.asarray(data.measured), np.asarray(data.sd)
@@ -244,7 +243,7 @@ def objective(posed: Problem, noise: Noise) -> Objective:
     def of(z: np.ndarray, seen: Rows) -> Float[np.ndarray, " members"]:
         error = np.where(weight > 0, seen.reading - measured, 0.0)
         squares = np.sum((z - np.asarray(data.centre)) ** 2, -1)
-        shares = most_probable(posed, noise, seen.reading)
+        shares = most_probable_noise(posed, noise, seen.reading)
         for k, estimated in enumerate(noise.estimated):
             count = weight[:, k].sum()
             if estimated and count:
@@ -272,11 +271,11 @@ def evolve(
     """Search by generations.
 
     Args:
-        members: runs them; objective: of members.
+        members: runner of members; objective: of members.
         centre, covariance: of the first generation, in coordinates z.
-        size: members of a generation; seed: of the draws.
-        beside: points that are run with the first generation.
-        tell: is given what was done after every batch.
+        size: number of members in a generation; seed: random seed of the draws.
+        beside: further points that are run with the first generation.
+        tell: callback for progress after every batch.
     """
     from cmaes import CMA
 
@@ -307,14 +306,16 @@ def evolve(
     return found
 
 
-def regression(posed: Problem, found: Population, at: int) -> tuple[Float[np.ndarray, "readings parameters"], float]:
-    """How whitened readings change with z near a member, by least squares over the members nearest to it.
+def local_regression(
+    posed: Problem, found: Population, at: int
+) -> tuple[Float[np.ndarray, "readings parameters"], float]:
+    """Slope of the whitened readings by z near a member, by least squares over the nearest members.
 
-    Where contacts open and close the derivative of a run says what happens without that; this says what happens
-    with it, over the distance of the members.
+    If contacts open and close, the derivative of a run excludes these events. The regression includes them, over the
+    distance of the members.
 
     Returns:
-        The slope, shape (rows · channels, parameters), and the rms of what it leaves [σ].
+        The slope, shape (rows · channels, parameters), and the rms of the residuals [σ].
     """
     finite = np.isfinite(found.cost)
     z, reading = found.z[finite], found.reading[finite]
@@ -325,20 +326,20 @@ def regression(posed: Problem, found: Population, at: int) -> tuple[Float[np.nda
     scale = np.asarray(posed.data.weight / posed.data.sd)
     moved = np.where(scale > 0, (reading[near] - found.reading[at]) * scale, 0.0).reshape(number, -1)
     design = np.column_stack([np.ones(number), apart[near]])
-    # A ridge of one prior sd: what the members do not tell is no slope.
+    # A ridge of one prior sd: parameters that the members do not determine get slope zero.
     ridge = np.diag([0.0, *np.full(z.shape[1], 1e-3 * number * np.var(apart[near]) + 1e-12)])
     slope = np.linalg.solve(design.T @ design + ridge, design.T @ moved)
     left = moved - design @ slope
     return slope[1:].T, float(np.sqrt(np.mean(left**2)))
 
 
-def apart(
+def unreliable_derivatives(
     posed: Problem, members: Members, z: np.ndarray, jacobian: np.ndarray, sd: np.ndarray
 ) -> Bool[np.ndarray, " parameters"]:
-    """Parameters by which the derivatives of a run are not those of its differences, shape (parameters,).
+    """True for parameters with derivatives of a run that disagree with finite differences, shape (parameters,).
 
-    Differences are central, `STEP` of the posterior sd to either side; a column is apart where it differs by more
-    than `APART` of its size and by more than one data sd per posterior sd.
+    Differences are central, `STEP` of the posterior sd to either side. A column disagrees if the difference exceeds
+    `APART` of its size and one data sd per posterior sd.
     """
     steps = STEP * np.diag(sd)
     seen = members.run(np.concatenate([z + steps, z - steps]))
@@ -351,9 +352,8 @@ def apart(
     return ~np.isfinite(off) | ((off > APART * size) & (off > 1.0))
 
 
-def edges(coordinates: Coordinates, z: np.ndarray) -> dict[str, Edge]:
-    """Parameters at the edge of what is allowed or was expected of them, with where: at a bound, or further than
-    `EDGE` from the middle of the prior, by name."""
+def parameters_at_edge(coordinates: Coordinates, z: np.ndarray) -> dict[str, Edge]:
+    """Parameters at a bound, or further than `EDGE` from the middle of their prior, with that distance, by name."""
     bound = coordinates.beyond(z)
     found = {}
     for name, shift, side in zip(coordinates.names, z, bound, strict=True):
@@ -366,14 +366,14 @@ def edges(coordinates: Coordinates, z: np.ndarray) -> dict[str, Edge]:
 
 @dataclasses.dataclass(frozen=True)
 class Searched:
-    """What a search by generations led to.
+    """Outcome of a search by generations.
 
     Attributes:
-        found: every member; at: the best of them.
-        apart: names of parameters by which the derivatives of a run are not those of its differences.
-        slope: of the whitened readings, from the members, where derivatives are not to be trusted; else None.
-        left: rms of what the slope leaves of the members that it is from [σ], NaN without.
-        edge: of the best member, see `edges`.
+        found: all members; at: index of the best one.
+        apart: names of parameters with derivatives of a run that disagree with finite differences.
+        slope: of the whitened readings, from the members, if derivatives are unreliable; else None.
+        left: rms residual of the regression that gives the slope [σ], NaN without one.
+        edge: of the best member, see `parameters_at_edge`.
     """
 
     found: Population
@@ -384,7 +384,7 @@ class Searched:
     edge: dict[str, Edge] = dataclasses.field(default_factory=dict)
 
     def outcomes(self) -> dict[str, int]:
-        """Members with a row that ended so, by the word of the status or flag; none that no member has."""
+        """Number of members with a row of each outcome, by the word of the status or flag, without zeros."""
         status, flags = self.found.status, self.found.flags
         ended = {word: int((status == k).any(1).sum()) for k, word in enumerate(STATUSES) if k}
         ended["jumps"] = int(self._jumps(flags).any(1).sum())
@@ -395,7 +395,7 @@ class Searched:
         return (flags >> FLAGS.index("jumps") & 1).astype(bool)
 
     def to_json(self) -> dict[str, Any]:
-        """As in result.json."""
+        """Entries of result.json."""
         return {
             "members": len(self.found.z),
             "settled": self.found.settled,
@@ -407,7 +407,7 @@ class Searched:
         }
 
     def remarks(self) -> list[Note]:
-        """What to know of it."""
+        """Notes on the search."""
         said: list[Note] = [Generations(len(self.found.z), len(self.found.generations), self.found.settled)]
         ended = self.outcomes()
         lost = {status: ended[status] for status in LOST_AS if status in ended}

@@ -1,8 +1,8 @@
-"""What is done to a table and a robot before anything is fitted, in one order for all that fits or foresees.
+"""Preparation of a table and a robot before any fit, in one order for all fits and predictions.
 
-`calibrate`, `discover` (so `loop` and its campaigns) and `foresee` (so `rig check`) take a table and a robot by this
-one function: instruments and surfaces of which the table tells, priors by their names then, the mass that the table
-states, the noise, the beginnings of histories, and the checks of all that.
+`calibrate`, `discover` (so `loop` and its campaigns) and `foresee` (so `rig check`) share this one function. It
+completes the robot's instruments and surfaces from the table and renames priors accordingly. Then it takes the mass
+from the table, the noise and the initial states of histories, and checks all these.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from mmrjax.model.robot import Robot
 
 @dataclasses.dataclass(frozen=True)
 class Prepared:
-    """A table and its robot, ready for a problem to be posed.
+    """A table and its robot, ready for a problem.
 
     Attributes:
-        robot: with the instruments, the configurations and the mass that the table shows, and its runs' beginnings.
+        robot: with instruments, configurations and mass from the table, and the initial states of its runs.
         observe: the kind of the data; noise: of the readings.
         stated: priors by name of parameter, (mean, sd) [SI].
         names: free parameters that were chosen, see `prepare`.
@@ -55,30 +55,30 @@ def prepare(
     assume: bool = True,
     choose: Callable[[Prepared], Sequence[str]] = lambda prepared: (),
 ) -> Prepared:
-    """A table and a robot as every fit takes them.
+    """A table and a robot, prepared for any fit.
 
     Args:
-        noise: as `noise.parse`; stated: parameter → (mean, sd) [SI], by the names that the user knows.
-        assume: whether a channel without an sd has a usual one, instead of one that the fit estimates.
-        choose: names of the free parameters, of what else is prepared.
+        noise: as `noise.parse_noise`; stated: parameter → (mean, sd) [SI], by the names that the user knows.
+        assume: True to take a usual sd for a channel without one, False to let the fit estimate it.
+        choose: function from the preparation to the names of the free parameters.
 
     Raises:
-        BadData: a table that contradicts itself, its robot or its model, see `checks.check`.
-        BadConfiguration: a noise or a prior that is none, what `choose` raises.
+        BadData: a table that contradicts itself, its robot or its model, see `checks.check_data`.
+        BadConfiguration: an invalid noise or prior, or any raised by `choose`.
     """
-    observe = observers.kind(runs)
+    observe = observers.observer_kind(runs)
     robot = surfaces.with_surface_configurations(instruments.with_inferred_instruments(robot, runs), runs)
     priors = surfaces.of_surfaces(stated or {}, robot, runs)
     own_mass.check_priors(priors, robot, runs)
     as_stated, weighed = robot, own_mass.remarks(robot, runs)
     robot = own_mass.with_table_mass(robot, runs)
-    known = (noise_room.inferred if assume else noise_room.from_table)(runs, observe.sizes(runs), noise)
-    known, larger = repeats.enlarged(known, runs)
+    known = (noise_room.infer_noise if assume else noise_room.noise_from_table)(runs, observe.sizes(runs), noise)
+    known, larger = repeats.enlarge_noise(known, runs)
     robot = observe.with_initial_states(robot, runs, known)
     found = Prepared(robot, observe, known, priors, (), (), (), (), tuple(weighed))
     names = tuple(choose(found))
-    # Its masses are compared with those of the file, which the table's have not yet replaced there.
-    checked = checks.check(runs, as_stated, names, known)
+    # The table's masses are compared with those of the file, which are not yet replaced there.
+    checked = checks.check_data(runs, as_stated, names, known)
     begins = observe.check_start(runs, known, robot)
     return dataclasses.replace(
         found,

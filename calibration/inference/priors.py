@@ -1,4 +1,4 @@
-"""Which parameters are free, what is known of them beforehand, and the coordinates in which they are fitted."""
+"""Free parameters, their priors, and the coordinates in which they are fitted."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from calibration.data.input_errors import BadConfiguration, choices, number
+from calibration.data.input_errors import BadConfiguration, allowed_words, number
 from calibration.data.surfaces import GROUND
 from mmrjax.compile.compiling import SELDOM, compiled
 from mmrjax.model import params
 from mmrjax.model.params import Parameter
 from mmrjax.model.robot import Robot
 
-#: Freed by default of each configuration that has rows: friction, with the makers' electrics, the gearbox and
-#: motor losses of Table 2, the ratio, radii and masses held where their tables put them.
+#: Free by default in each configuration with rows: friction. The makers' electrical values, the gearbox and motor
+#: losses of Table 2, the ratio and radii and masses stay at the values of their tables.
 FRICTION = (
     "track.loss_coulomb",
     "track.loss_viscous",
@@ -30,27 +30,26 @@ FRICTION = (
     "ground.friction.static",
     "ground.friction.speed_static",
 )
-#: Freed by default of a load on a shaft.
+#: Free by default for a load on a shaft.
 SHAFT = ("loss_coulomb", "loss_viscous", "torque_constant", "torque_gravity", "angle_zero")
-#: Ends of names of parameters that settled travel does not show.
+#: Ends of the names of parameters that settled travel does not show.
 OVER_TIME = (".inertia", ".inductance", ".backlash")
-#: And of configurations on tracks, after the losses; guide friction μ_t stays at Table 4 because only its product
-#: with the share of the guides acts.
+#: Free in addition for configurations on tracks, after the losses; guide friction μ_t stays at Table 4 because only
+#: its product with the share of the guides matters.
 GUIDE_SHARE, GUIDE_FRICTION = "track.guide_share", "track.guide_friction"
 #: Share of the weight on the guides in the track model, where it is an output (docs/explanation/track-model.md).
 GUIDED = 0.98
-#: Of configurations whose sides are driven apart; the rule of direction trades with the ratio of frictions, and the
-#: moment of inertia shows over time alone.
+#: Free for configurations with independently driven sides; the rule of direction is correlated with the ratio of
+#: frictions, and the moment of inertia shows only over time.
 OF_TURNS = ("turning.width", "turning.lateral")
-#: Parameters of a chassis whose source states a ratio to another one, which they keep while they are not freed
-#: themselves: follower, leader.
+#: Parameters of a chassis with a ratio to another one in their source, which they keep unless they are free:
+#: follower, leader.
 TIED = (
     ("ground.friction.dynamic", "ground.friction.static"),
     ("ground.friction.speed_dynamic", "ground.friction.speed_static"),
 )
-#: What a surface may be where nobody states it: relative sds around the robot's friction that hold dry grounds of
-#: every kind (μ_s from 0.2 to 1, V_s from 2 to 60 mm/s) within two sds. The fields' own are those of the surface of
-#: Table 5.
+#: Priors of an unspecified surface: relative sds around the robot's friction that contain dry grounds of all kinds
+#: (μ_s from 0.2 to 1, V_s from 2 to 60 mm/s) within two sds. The fields' own priors are for the surface of Table 5.
 SURFACE = {
     "ground.friction.static": 0.7,
     "ground.friction.dynamic": 0.7,
@@ -58,43 +57,43 @@ SURFACE = {
     "ground.friction.speed_dynamic": 3.0,
 }
 
-#: And of each of several surfaces of one robot, which differ in their resistance to rolling too.
+#: Priors of each of several surfaces of one robot, which differ in their rolling resistance too.
 SURFACE_OF_RIGS = {**SURFACE, "ground.rolling_resistance": 1.0}
 
-#: Friction of which a rig's file states no tolerance, by the end of its name, and its relative sd: rigs are alike
-#: within a factor of two or three. The fields' own are those of Tables 2 to 4.
+#: Friction without a tolerance in a rig's file, by the end of its name, and its relative sd: rigs agree within a
+#: factor of two or three. The fields' own are those of Tables 2 to 4.
 FRICTION_OF_RIGS = (".friction_coulomb", ".friction_viscous", ".loss_coulomb", ".loss_viscous", ".rolling_resistance")
 RELATIVE_OF_RIGS = 0.5
 
 DELAY = "rig.delay"
 
-SOFTNESS = 0.05  # of a prior sd: the width over which a bound is rounded off
+SOFTNESS = 0.05  # of a prior sd: the width over which a bound is rounded
 
 
-def held_within(u: Array, low: Array | np.ndarray, high: Array | np.ndarray, width: Array | np.ndarray) -> Array:
-    """u + w S((low - u)/w) - w S((u - high)/w), S softplus, within low and high; w = 0 cuts there."""
+def clip_softly(u: Array, low: Array | np.ndarray, high: Array | np.ndarray, width: Array | np.ndarray) -> Array:
+    """u + w S((low - u)/w) - w S((u - high)/w), S softplus, within low and high; clipped there for w = 0."""
     xp = np if isinstance(u, np.ndarray) else jnp
     w = xp.where(xp.asarray(width) > 0, width, 1.0)
     soft = u + w * xp.logaddexp((low - u) / w, 0.0) - w * xp.logaddexp((u - high) / w, 0.0)
-    return xp.clip(xp.where(xp.asarray(width) > 0, soft, u), low, high)  # also of rounding, far outside
+    return xp.clip(xp.where(xp.asarray(width) > 0, soft, u), low, high)  # also removes rounding errors far outside
 
 
 class Coordinates(eqx.Module):
-    """Free parameters θ as coordinates z whose prior is the standard normal distribution.
+    """Free parameters θ as coordinates z with a standard normal prior.
 
-    u = location + spread · z, and θ = clip(u), or exp(clip(u)) for a scale parameter, where
+    u = location + spread · z, and θ = clip(u), or exp(clip(u)) for a scale parameter. The clip is smooth:
     clip(u) = u + w S((low - u)/w) - w S((u - high)/w), S softplus, w = spread / 20.
 
-    A parameter whose field states a relative sd and cannot be negative is a scale: its prior is
+    A parameter is a scale if its field states a relative sd and it cannot be negative: its prior is
     log-normal with the nominal value as median. Every other one is normal. The clip is the identity
     inside the bounds (to e^-20 an sd away), has slope ½ on a bound, and is never flat: an amplitude with
-    prior mean zero, or a share whose nominal value is its bound, starts with a live gradient. What lies
-    beyond a bound is held by its prior, which is on z and pulls wherever z is.
+    prior mean zero, or a share with its nominal value on its bound, starts with a live gradient. Beyond a bound, a
+    parameter is held by its prior, which is on z and acts everywhere.
 
     Attributes:
         location, spread, low, high: in units of θ, or of log θ for a scale; shape (parameters,).
         names, units, scale: of each parameter.
-        ratios: of each parameter that follows a free one to that; shape (followers,).
+        ratios: of each parameter tied to a free one, to that one; shape (followers,).
         followers: (its name, index of the free one) of each.
     """
 
@@ -113,23 +112,25 @@ class Coordinates(eqx.Module):
 
     @property
     def tied(self) -> tuple[tuple[str, int, float], ...]:
-        """(Follower, index of its leader, ratio) of each parameter that follows a free one."""
+        """(Follower, index of its leader, ratio) of each parameter tied to a free one."""
         ratios = np.asarray(self.ratios)
         return tuple((name, k, float(ratios[n])) for n, (name, k) in enumerate(self.followers))
 
     def value(self, z: Float[Array | np.ndarray, "... parameters"]) -> Any:
-        """Parameters θ [SI] at coordinates z; of NumPy where these are."""
-        xp, own = (np, jax.tree.map(np.asarray, self)) if isinstance(z, np.ndarray) else (jnp, self)
-        u = held_within(own.location + own.spread * z, own.low, own.high, SOFTNESS * own.spread)
+        """Parameters θ [SI] at coordinates z; NumPy in, NumPy out."""
+        xp, arrays = (np, jax.tree.map(np.asarray, self)) if isinstance(z, np.ndarray) else (jnp, self)
+        u = clip_softly(arrays.location + arrays.spread * z, arrays.low, arrays.high, SOFTNESS * arrays.spread)
         return xp.where(xp.asarray(self.scale), xp.exp(u), u)
 
     @property
     def prior_sd(self) -> np.ndarray:
-        """Of each parameter [SI], as it is stated: of a log-normal prior the sd that its median and spread stand
-        for, m √(e^s² - 1) with m the median, by which a file's "m ± sd" is read."""
-        own = jax.tree.map(np.asarray, self)
-        size = np.exp(np.where(own.scale, own.location, 0.0))
-        return np.where(own.scale, size * np.sqrt(np.expm1(own.spread**2)), own.spread)
+        """Prior sd of each parameter [SI], as files state it.
+
+        For a log-normal prior m √(e^s² - 1) with median m, as a file's "m ± sd" is read.
+        """
+        arrays = jax.tree.map(np.asarray, self)
+        size = np.exp(np.where(arrays.scale, arrays.location, 0.0))
+        return np.where(arrays.scale, size * np.sqrt(np.expm1(arrays.spread**2)), arrays.spread)
 
     def slope(self, z: Float[Array, " parameters"]) -> Float[Array, " parameters"]:
         """dθ/dz [SI]."""
@@ -141,10 +142,10 @@ class Coordinates(eqx.Module):
         return params.replace(base, dict(zip(names, _numbers(self, z), strict=True)))
 
     def beyond(self, z: np.ndarray) -> np.ndarray:
-        """-1 or 1 where z lies on or beyond its lower or upper bound, else 0; shape (parameters,)."""
-        own = jax.tree.map(np.asarray, self)
-        u = own.location + own.spread * z
-        return np.where(u <= own.low, -1, np.where(u >= own.high, 1, 0))
+        """-1 or 1 if z is on or beyond its lower or upper bound, else 0; shape (parameters,)."""
+        arrays = jax.tree.map(np.asarray, self)
+        u = arrays.location + arrays.spread * z
+        return np.where(u <= arrays.low, -1, np.where(u >= arrays.high, 1, 0))
 
 
 @functools.partial(compiled, options=SELDOM)
@@ -154,21 +155,23 @@ def _slope(coordinates: Coordinates, z: Float[Array, " parameters"]) -> Float[Ar
 
 @functools.partial(compiled, options=SELDOM)
 def _numbers(coordinates: Coordinates, z: Float[Array, " parameters"]) -> tuple[Array, ...]:
-    """Parameters at coordinates z and those tied to them, one by one [SI]."""
+    """Parameters at coordinates z, and the tied ones, as scalars [SI]."""
     theta = coordinates.value(z)
     tied = coordinates.ratios * theta[np.array([k for _, k in coordinates.followers], int)]
-    return (*params.one_by_one(theta), *params.one_by_one(tied))
+    return (*params.split_numbers(theta), *params.split_numbers(tied))
 
 
-def known(robot: Robot) -> dict[str, Parameter]:
-    """Every parameter of the robot by its dotted name."""
-    return {p.name: p for p in params.walk(robot)}
+def parameters_by_name(robot: Robot) -> dict[str, Parameter]:
+    """Parameters of the robot by dotted name."""
+    return {p.name: p for p in params.walk_parameters(robot)}
 
 
-def friction(robot: Robot, configuration: str) -> tuple[str, ...]:
-    """The friction parameters of a configuration that are free by default, of those that its load has: what no
-    channel can show or is zero is held. The ground's friction shows in the speed, as slip; in turns it is what all
-    channels show."""
+def friction_names(robot: Robot, configuration: str) -> tuple[str, ...]:
+    """Friction parameters of a configuration that are free by default.
+
+    Parameters that are zero, or that no channel can show, are fixed. The ground's friction shows in the speed, as
+    slip; in turns it shows in all channels.
+    """
     names = [*FRICTION, *SHAFT]
     if float(robot.configurations[configuration].on_tracks) > 0.5:
         names.insert(2, GUIDE_SHARE)
@@ -178,18 +181,21 @@ def friction(robot: Robot, configuration: str) -> tuple[str, ...]:
 
 
 def _uncertain(robot: Robot, names: Iterable[str]) -> tuple[str, ...]:
-    """Those of a robot's parameters that are not held: what the rig's file states as exact is, and what is set to
-    zero, unless the file says how sure that zero is. Whether a rig's log is late nobody knows who does not say so: of
-    a rig the delay is uncertain unless it is exact."""
-    fields, exact = known(robot), robot.rig.exact
+    """Uncertain ones of a robot's parameters: neither exact in the rig's file nor zero.
+
+    A zero is uncertain if the file states its sd. The delay of a rig is uncertain unless it is exact, because a log
+    may be late without its author's knowledge.
+    """
+    fields, exact = parameters_by_name(robot), robot.rig.exact
     stated = robot.rig.stated if robot.rig.inherits else {*robot.rig.stated, DELAY}
     mine = (n for n in names if n in fields and n not in exact)
     return tuple(n for n in mine if float(fields[n].value) != 0.0 or n in stated)
 
 
 def stated_names(robot: Robot, configurations: Iterable[str], idle: tuple[str, ...] = ()) -> tuple[str, ...]:
-    """What a robot's file states with a ±, but as exact: who says how sure he is of a number asks for its fit. Of
-    these, parameters of configurations that the data have, that something shows, and that follow no other.
+    """Parameters that a robot's file states with a ± other than 0, which is a request to fit them.
+
+    They must belong to configurations in the data, show in the data, and follow no other parameter.
 
     Args:
         idle: ends of the names of parameters that the data do not show.
@@ -199,40 +205,40 @@ def stated_names(robot: Robot, configurations: Iterable[str], idle: tuple[str, .
     return _drive(robot, (n for n in mine if _leader(robot, n) is None and not n.endswith(idle)))
 
 
-def delays(robot: Robot, names: Iterable[str]) -> tuple[str, ...]:
-    """Of these, the delay of a rig whose file says how sure it is."""
+def delay_names(robot: Robot, names: Iterable[str]) -> tuple[str, ...]:
+    """The delay among `names`, for a rig with a file that states its sd."""
     return tuple(n for n in names if n == DELAY and n in robot.rig.stated - robot.rig.exact)
 
 
 def default_names(
     configurations: Iterable[str], robot: Robot, *, computed: Sequence[str] = (), turns: bool = False
 ) -> tuple[str, ...]:
-    """The default set of free parameters for data of these configurations.
+    """Default set of free parameters for data of these configurations.
 
     Args:
-        computed: parameters of a configuration that the fidelity puts out, see `fidelities.Facts`; for the guides'
-            share the guide friction μ_t stands then.
-        turns: whether the data are of turns.
+        computed: parameters of a configuration that the fidelity computes, see `fidelities.Facts`; the guide
+            friction μ_t then replaces the guides' share.
+        turns: True for data of turns.
     """
     present = set(configurations)
-    names = [n for c in robot.configurations if c in present for n in friction(robot, c)]
+    names = [n for c in robot.configurations if c in present for n in friction_names(robot, c)]
     if turns:
         names += _uncertain(robot, (f"{c}.{n}" for c in robot.configurations if c in present for n in OF_TURNS))
     names = [n for n in names if _leader(robot, n) is None]
     if GUIDE_SHARE in computed:
         names = [n.replace(GUIDE_SHARE, GUIDE_FRICTION) for n in names]
-    return (*names, *(f"effects.{e.name}.amplitude" for e in robot.effects), *begins(robot))
+    return (*names, *(f"effects.{e.name}.amplitude" for e in robot.effects), *initial_state_names(robot))
 
 
-def begins(robot: Robot) -> tuple[str, ...]:
-    """Speeds and angles at which histories begin, where a rig leaves them free."""
+def initial_state_names(robot: Robot) -> tuple[str, ...]:
+    """Initial speeds and angles of histories, if a rig leaves them free."""
     if robot.rig.begins is None or robot.rig.start != "free":
         return ()
     every = (f"rig.{run}.{field}" for run in robot.rig.begins.names for field in ("motor_speed", "angle"))
     return tuple(name for name in every if name in robot.rig.stated)
 
 
-#: Freed by the loop beside friction: what benches and makers state, with their tolerances.
+#: Freed by the loop in addition to friction: values from benches and makers, with their tolerances.
 BENCH = (
     "motor.resistance",
     "motor.torque_constant",
@@ -247,56 +253,60 @@ BENCH = (
 def free_names(
     robot: Robot, configurations: Iterable[str], drive: Sequence[str] = (), chassis: Sequence[str] = ()
 ) -> tuple[str, ...]:
-    """What the loop frees for data of these configurations.
+    """Parameters that the loop frees for data of these configurations.
 
     Args:
-        drive, chassis: what the data determine beside, see `Observer.free`.
+        drive, chassis: further parameters that the data determine, see `Observer.free`.
     """
     present = set(configurations)
-    own = [
+    names = [
         name
         for c in robot.configurations
         if c in present
-        for name in (*friction(robot, c), *_radius(robot, c), *(f"{c}.{n}" for n in chassis if _has(robot, c, n)))
+        for name in (
+            *friction_names(robot, c),
+            *_radius(robot, c),
+            *(f"{c}.{n}" for n in chassis if _has_nonzero(robot, c, n)),
+        )
     ]
-    own = [n for n in own if _leader(robot, n) is None]
-    return (*_uncertain(robot, (*_drive(robot, (*BENCH, *drive)), *own)), *begins(robot))
+    names = [n for n in names if _leader(robot, n) is None]
+    return (*_uncertain(robot, (*_drive(robot, (*BENCH, *drive)), *names)), *initial_state_names(robot))
 
 
 def _leader(robot: Robot, name: str) -> str | None:
-    """The parameter of another configuration that this one follows, as the two differ by their surface alone."""
+    """Parameter of another configuration that this one follows, because the two differ only by their surface."""
     configuration, _, rest = name.partition(".")
     leader = dict(robot.rig.surfaces).get(configuration)
     return None if leader is None or rest.startswith(GROUND) else f"{leader}.{rest}"
 
 
-def _has(robot: Robot, configuration: str, name: str) -> bool:
-    """Whether a load has a parameter, and one that is not zero."""
-    field = known(robot).get(f"{configuration}.{name}")
+def _has_nonzero(robot: Robot, configuration: str, name: str) -> bool:
+    """True if a load has a parameter that is not zero."""
+    field = parameters_by_name(robot).get(f"{configuration}.{name}")
     return field is not None and float(field.value) != 0.0
 
 
 def _radius(robot: Robot, configuration: str) -> tuple[str, ...]:
-    """The radius of a configuration, unless nothing shows the travel of what turns on a shaft."""
+    """Radius of a configuration, unless no channel shows the travel of its shaft."""
     return (f"{configuration}.radius",) if robot.shows_travel else ()
 
 
-#: What of the drive acts on the voltage alone.
+#: Parameters of the drive that act only on the voltage.
 ELECTRICAL = ("motor.resistance", "motor.inductance")
 
 
 def _drive(robot: Robot, names: Iterable[str]) -> tuple[str, ...]:
-    """Parameters of the drive, less those that only the voltage shows where it is neither imposed nor read."""
+    """Parameters of the drive, without those of the voltage if it is neither imposed nor measured."""
     if robot.rig.shows_voltage:
         return tuple(names)
     return tuple(n for n in names if n not in ELECTRICAL)
 
 
-def guided(robot: Robot, configuration: str) -> tuple[Robot, dict[str, tuple[float, float]]]:
-    """`robot` with the share that the track model's guides carry, and what is known of its guide friction.
+def with_guide_share(robot: Robot, configuration: str) -> tuple[Robot, dict[str, tuple[float, float]]]:
+    """`robot` with the track model's guide share, and the resulting prior of its guide friction.
 
-    The prior is that of the product of friction and share, on which all fidelities agree: Table 4 measured
-    the friction alone, and its 0.20 on all of the weight contradicts every measured current.
+    The prior is that of the product of friction and share, because all fidelities agree on the product. Table 4
+    measured the friction only, and its 0.20 on all of the weight contradicts every measured current.
 
     Args:
         configuration: one on tracks.
@@ -304,62 +314,63 @@ def guided(robot: Robot, configuration: str) -> tuple[Robot, dict[str, tuple[flo
     Returns:
         The robot, and (mean, sd) of the guide friction by its name.
     """
-    field = known(robot)
+    field = parameters_by_name(robot)
     of_share, of_friction = f"{configuration}.{GUIDE_SHARE}", f"{configuration}.{GUIDE_FRICTION}"
     size, share = float(field[of_friction].value), float(field[of_share].value)
     sd = size * field[of_share].spec.prior_sd(share) / GUIDED
     return params.replace(robot, {of_share: jnp.asarray(GUIDED)}), {of_friction: (size * share / GUIDED, sd)}
 
 
-def choose(
+def choose_free_names(
     robot: Robot, default: Sequence[str], free: Sequence[str] = (), fix: Sequence[str] = ()
 ) -> tuple[str, ...]:
-    """Names of the free parameters: `free` if it says any (with `default` among it standing for that set),
-    else the default set; less `fix`.
+    """Names of the free parameters: `free` if it has any, else the default set; less `fix`.
 
-    A name ending in `.*` stands for all parameters below it.
+    In `free`, `default` means the default set. A name that ends in `.*` means all parameters below it.
 
     Raises:
         BadConfiguration: an unknown name (with the choices), a name that is both freed and fixed by name,
             or nothing left to fit.
     """
-    everything = list(known(robot))
+    everything = list(parameters_by_name(robot))
     chosen: list[str] = []
     for word in free:
-        chosen += default if word == "default" else expand(word, everything, "--free")
-    fixed = [n for word in fix for n in expand(word, everything, "--fix")]
+        chosen += default if word == "default" else expand_name(word, everything, "--free")
+    fixed = [n for word in fix for n in expand_name(word, everything, "--fix")]
     both = [word for word in free if word in fix]
     if both:
         raise BadConfiguration(f"--free and --fix both name {both[0]}; name it once")
     names = [n for n in dict.fromkeys(chosen if free else default) if n not in fixed]
     if not names and not fix:
         raise BadConfiguration(
-            "no parameter to fit: every loss of the robot's file is zero or exact, so it is held, and nothing "
-            "is stated with a ±; state what is not known with one, or name a parameter with --free"
+            "no parameter to fit: every loss in the robot's file is zero or exact, so it is fixed, and no value "
+            "has a ±; give unknown values one, or name a parameter with --free"
         )
     if not names:
         raise BadConfiguration("--fix leaves no parameter to fit; name at least one with --free")
     return tuple(names)
 
 
-def expand(word: str, everything: list[str], option: str) -> list[str]:
-    """The parameters that a word names: one, or with `.*` at its end all below it.
+def expand_name(word: str, everything: list[str], option: str) -> list[str]:
+    """Parameters that a word names: one, or with `.*` at its end all below it.
 
     Raises:
-        BadConfiguration: none of that name; says the option and lists the choices.
+        BadConfiguration: no parameter of that name; the message has the option and the choices.
     """
     if word.endswith(".*"):
         below = [n for n in everything if n.startswith(word[:-1])]
         if below:
             return below
         groups = sorted({n.rsplit(".", 1)[0] + ".*" for n in everything})
-        raise BadConfiguration(f"{option} {word}: no parameters below it; {choices(word, groups)}")
+        raise BadConfiguration(f"{option} {word}: no parameters below it; {allowed_words(word, groups)}")
     if word not in everything:
-        raise BadConfiguration(f"{option} {word}: no such parameter; {choices(word, _near(word, everything))}")
+        raise BadConfiguration(
+            f"{option} {word}: no such parameter; {allowed_words(word, _similar_names(word, everything))}"
+        )
     return [word]
 
 
-def _near(word: str, everything: list[str]) -> list[str]:
+def _similar_names(word: str, everything: list[str]) -> list[str]:
     """The names to list for an unknown one: those that share its last part or its group, else all."""
     last = word.rsplit(".", 1)[-1]
     near = [n for n in everything if last and (n.endswith(f".{last}") or last in n)]
@@ -370,7 +381,7 @@ _PRIOR = re.compile(r"^(?P<name>[\w.-]+)=(?P<value>[^±]+?)(?:±|\+-|\+/-)(?P<sd
 
 
 def parse_prior(text: str) -> tuple[str, float, float]:
-    """`name=value±sd` (also `+-`, and an sd in %) as name, mean and sd in SI units.
+    """Reads `name=value±sd` (also `+-`, and an sd in %) as name, mean and sd in SI units.
 
     Raises:
         BadConfiguration: another form, no number, or an sd that is not positive.
@@ -400,32 +411,33 @@ def parse_priors(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
     for text in texts:
         name, mean, sd = parse_prior(text)
         if name in stated:
-            raise BadConfiguration(f"--prior {name}: given twice; give it once")
+            raise BadConfiguration(f"--prior {name}: given twice; expected once")
         stated[name] = (mean, sd)
     return stated
 
 
-def coordinates(
+def parameter_coordinates(
     robot: Robot,
     names: Sequence[str],
     stated: dict[str, tuple[float, float]] | None = None,
     *,
     any_surface: bool = False,
 ) -> Coordinates:
-    """Coordinates of the named parameters: prior from their fields around `robot`'s values, or as stated.
+    """Coordinates of the named parameters, with priors from their fields around `robot`'s values, or as stated.
 
     Args:
         robot: its values are the prior means (medians for scales).
-        names: of the free parameters, from `choose`.
-        stated: name → (mean, sd) [SI] that replace the file's (`Rig.priors`), which replace the field's.
-        any_surface: whether the friction of the ground has the priors of `SURFACE` where none is stated.
+        names: of the free parameters, from `choose_free_names`.
+        stated: name → (mean, sd) [SI]; these take precedence over the file's (`Rig.priors`), and those over the
+            fields'.
+        any_surface: True for the priors of `SURFACE` on ground friction without a stated prior.
 
     Raises:
-        BadConfiguration: a stated prior for an unknown or a fixed parameter, a mean out of bounds, or a
-            free parameter whose prior has no width (nominal value 0 with a relative sd, or stated as exact).
+        BadConfiguration: a stated prior for an unknown or a fixed parameter; a mean out of bounds; or a free
+            parameter with a prior of zero width (nominal value 0 with a relative sd, or stated as exact).
     """
     stated = stated or {}
-    fields = known(robot)
+    fields = parameters_by_name(robot)
     for name in names:
         if name in robot.rig.exact and name not in stated:
             raise BadConfiguration(
@@ -433,7 +445,9 @@ def coordinates(
             )
     for name in stated:
         if name not in fields:
-            raise BadConfiguration(f"--prior {name}: no such parameter; {choices(name, _near(name, list(fields)))}")
+            raise BadConfiguration(
+                f"--prior {name}: no such parameter; {allowed_words(name, _similar_names(name, list(fields)))}"
+            )
         if name not in names:
             raise BadConfiguration(f"--prior {name}: it is not free; add --free {name} (with --free default)")
     wide = {n: SURFACE[n.split(".", 1)[-1]] for n in names if any_surface and n.split(".", 1)[-1] in SURFACE}
@@ -444,7 +458,7 @@ def coordinates(
         wide = {n: RELATIVE_OF_RIGS for n in names if n.endswith(FRICTION_OF_RIGS)} | wide
     known_sds = {n: (float(fields[n].value), float(fields[n].value) * share) for n, share in wide.items()}
     known_sds |= {n: (mean, sd) for n, mean, sd in robot.rig.priors if n in names} | stated
-    rows = [_row(fields[name], known_sds.get(name)) for name in names]
+    rows = [_coordinate_of_parameter(fields[name], known_sds.get(name)) for name in names]
     location, spread, low, high, scale = zip(*rows, strict=True)
     tied = tuple(
         (follower, names.index(leader), float(fields[follower].value / fields[leader].value))
@@ -470,8 +484,10 @@ def coordinates(
     )
 
 
-def _row(parameter: Parameter, stated: tuple[float, float] | None) -> tuple[float, float, float, float, bool]:
-    """Location, spread, low and high [θ or log θ] and whether the parameter is a scale."""
+def _coordinate_of_parameter(
+    parameter: Parameter, stated: tuple[float, float] | None
+) -> tuple[float, float, float, float, bool]:
+    """Location, spread, low and high [θ or log θ] of a parameter, and True for a scale."""
     spec = parameter.spec
     low, high = spec.bounds
     mean, sd = stated or (float(parameter.value), spec.prior_sd(float(parameter.value)))

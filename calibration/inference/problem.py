@@ -1,4 +1,4 @@
-"""The calibration problem: what is observed, what the model says of it, and the whitened residuals of both."""
+"""The calibration problem: data, simulated readings, and whitened residuals."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from mmrjax.numerics.newton import implicit_slopes
 if TYPE_CHECKING:
     from calibration.inference.observers import Observer
 
-#: Share of the adhesion limit that a measured steady row is taken to leave unused [-].
+#: Share of the adhesion limit that a measured steady row leaves unused [-].
 MARGIN = 0.02
-#: Demand above that which costs one sigma, as a share of the limit [-]; tightened where a row still slides.
+#: Demand above that limit that costs one sigma, as a share of the limit [-]; reduced if a row still slides.
 STIFFNESS = 1e-3
 #: Whitened residual of a reading that the model could not compute [σ].
 MISSING = 1e3
 
 
 class Observation(eqx.Module):
-    """What the model says of every row.
+    """Simulated readings and statuses of all rows.
 
     Attributes:
-        reading: of every channel [SI], shape (rows, channels).
-        adhesion_used: demand on adhesion over its limit [-], 0 where that is no matter; shape (rows,).
+        reading: of each channel [SI], shape (rows, channels).
+        adhesion_used: demand on adhesion over its limit [-], 0 if irrelevant; shape (rows,).
         status, flags: of the row's run, shape (rows,).
     """
 
@@ -43,13 +43,13 @@ class Observation(eqx.Module):
 
 
 class Data(eqx.Module):
-    """Readings and how much each counts; the part of a problem that varies over refits.
+    """Readings and their weights; the part of a problem that varies between refits.
 
     Attributes:
-        measured, sd: of every channel [SI], shape (rows, channels); where a reading is missing any numbers.
-        weight: 1 where a reading is fitted, 0 where it is held out or missing, shape (rows, channels).
-        centre: what the priors say z is, shape (parameters,); 0 but in a bootstrap, where the bench
-            values too are drawn anew.
+        measured, sd: of each channel [SI], shape (rows, channels); arbitrary for missing readings.
+        weight: 1 for a fitted reading, 0 for a held-out or missing one, shape (rows, channels).
+        centre: prior mean of z, shape (parameters,); 0 except in a bootstrap, which draws the bench
+            values too.
         stiffness: of the penalty on adhesion, see `Problem`; shape ().
     """
 
@@ -60,12 +60,12 @@ class Data(eqx.Module):
     stiffness: Float[Array, ""]
 
 
-def data_of(measured: np.ndarray, sd: np.ndarray, parameters: int) -> Data:
-    """Data of a table in which every reading that is there counts fully.
+def data_from_readings(measured: np.ndarray, sd: np.ndarray, parameters: int) -> Data:
+    """Data of a table in which every reading that is present has full weight.
 
     Args:
-        measured: [SI], NaN where a reading is missing; sd: of each, shapes (rows, channels).
-        parameters: how many are free.
+        measured: [SI], NaN for missing readings; sd: of each, shapes (rows, channels).
+        parameters: number of free parameters.
     """
     finite = np.isfinite(measured)
     return Data(
@@ -81,14 +81,14 @@ class Problem(eqx.Module):
     """Maximum a posteriori over z: minimise half the sum of squared residuals.
 
     Residuals: (simulated - measured) / sd for each reading; z - centre for each free parameter; and, for a
-    settled row whose demand on adhesion exceeds 1 - MARGIN of its limit, the excess over `stiffness`.
+    settled row with a demand on adhesion above 1 - MARGIN of its limit, the excess over `stiffness`.
 
-    Steady travel does not exist beyond the limit (the model says `slides`), yet the robot was measured
-    there, and at Table 5's adhesion six of the packaged rows slide. The balances can still be written down
-    with the contact held at V_s, so the objective is finite and continuous everywhere, and the penalty
-    turns the search back: its gradient in μ_s lives where that of the speed has died. The margin keeps it
-    off the limit itself, where the inverse of Fig. 7 has an infinite slope. The penalty is zero, with zero
-    gradient, wherever every row leaves the margin, so it does not move such an optimum; one that it does
+    Steady travel does not exist beyond the limit (status `slides`), yet the robot was measured
+    there, and at Table 5's adhesion six of the packaged rows slide. The balances are still defined
+    with the contact held at V_s, so the objective is finite and continuous everywhere. The penalty
+    turns the search back, because its gradient in μ_s remains where that of the speed vanishes. The margin keeps the
+    search off the limit itself, where the inverse of Fig. 7 has an infinite slope. The penalty is zero, with zero
+    gradient, if every row leaves the margin, so it does not move such an optimum. An optimum that it does
     hold is reported as held by the adhesion limit.
     """
 
@@ -96,15 +96,15 @@ class Problem(eqx.Module):
     coordinates: Any
     observe: Observer
     data: Data
-    roots: tuple[Array, Array] | None = None  # of `Observer.solve` at z, where a program of its own found them
+    roots: tuple[Array, Array] | None = None  # of `Observer.solve` at z, if a separate program found them
 
     @property
     def channels(self) -> tuple[Channel, ...]:
-        """That readings are of, in the order of arrays."""
+        """Channels of the readings, in the order of arrays."""
         return self.base.channels
 
     def observation(self, z: Float[Array, " parameters"]) -> Observation:
-        """What the model says of every row at z."""
+        """Observation at z."""
         return self.observe(self.coordinates.robot(self.base, z))
 
     def misfit(self, z: Float[Array, " parameters"], data: Data) -> Float[Array, " residuals"]:
@@ -112,23 +112,23 @@ class Problem(eqx.Module):
         return self.whitened(self.observation(z), data)
 
     def whitened(self, seen: Observation, data: Data) -> Float[Array, " residuals"]:
-        """Residuals of what any robot shows: readings, then adhesion; shape (rows (channels + 1),)."""
+        """Whitened residuals of an observation: readings, then adhesion; shape (rows (channels + 1),)."""
         error = (seen.reading - data.measured) / data.sd
         error = data.weight * jnp.where(jnp.isfinite(error), error, MISSING)
         return jnp.concatenate([error.ravel(), jax.nn.relu(self.excess(seen, data))])
 
     def signed(self, seen: Observation, data: Data) -> Float[Array, " residuals"]:
-        """The same, that of adhesion negative where a row leaves some of its margin."""
+        """Residuals as of `whitened`, with that of adhesion negative if a row leaves some of its margin."""
         return jnp.concatenate([self.whitened(seen, data)[: data.measured.size], self.excess(seen, data)])
 
     def linearised(
         self, robot: Callable[[Array], Robot], x: Float[Array, " x"], data: Data
     ) -> tuple[Array, Array, Observation, Signals | None]:
-        """What a robot that depends on x shows, all of it by one evaluation.
+        """Residuals of a robot that depends on x, and their slopes, by one evaluation.
 
         Returns:
             Residuals of readings, then of adhesion with their signs; their Jacobian by x; the observation; and the
-            signals of every row, where the observer solves its equations (`Observer.solve`).
+            signals of each row, if the observer solves its equations (`Observer.solve`).
         """
         solved = self.observe.solve(robot(x)) if self.roots is None else self.roots
         if solved is None:
@@ -156,10 +156,10 @@ class Problem(eqx.Module):
         return r, jnp.concatenate([by_row[:, :count].reshape(-1, size), by_row[:, count]]), seen, signals
 
     def excess(self, seen: Observation, data: Data) -> Float[Array, " rows"]:
-        """Demand on adhesion over its margin, as the penalty counts it; negative where a row leaves some."""
+        """Demand on adhesion above its margin, in units of the penalty; negative if a row leaves some."""
         over = (seen.adhesion_used - (1 - MARGIN)) * jnp.max(data.weight, 1) / data.stiffness
         return jnp.where(jnp.isfinite(over), over, 0.0)
 
     def robot(self, z: Float[Array, " parameters"]) -> Robot:
-        """The robot at z."""
+        """Robot at coordinates z."""
         return self.coordinates.robot(self.base, z)

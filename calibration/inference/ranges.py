@@ -1,4 +1,4 @@
-"""Whether a table's readings lie where its robot's can be, before anything is fitted: mostly a matter of units."""
+"""Check before any fit that a table's readings are possible for its robot; most failures are wrong units."""
 
 from __future__ import annotations
 
@@ -17,41 +17,42 @@ from mmrjax.model import channels, params
 from mmrjax.model.channels import Channel
 from mmrjax.model.robot import Robot
 
-#: Factors between readings and robot beyond which a table is refused, and beyond which that is said.
+#: Factors between readings and robot above which a table is refused, and above which a note reports it.
 REFUSED, SAID = 5.0, 2.0
-#: Factor by which readings may still lie outside for another unit to explain them, or two channels to be off alike.
+#: Largest remaining factor for another unit to explain readings, and ratio of two channels' factors to be the same.
 ALIKE = 1.3
-#: Shortest history whose later half shows about what steady travel does [s].
+#: Shortest history with a later half near steady travel [s].
 UNDER_WAY = 0.25
-#: Factor beyond which another unit may explain torque and current of a rig whose friction nobody knows.
+#: Factor above which another unit may explain torque and current of a rig with unknown friction.
 FAR = 50.0
-#: Friction of a robot nobody has calibrated, as factors on what its file states.
+#: Friction of an uncalibrated robot, as factors on its file's values.
 FRICTION = (0.1, 1.0, 4.0)
-#: Channels that show torque: what they show depends on friction, of which nothing is known of a rig from nothing.
+#: Channels of torque: their readings depend on friction, which is unknown for a rig without inheritance.
 OF_TORQUE = ("total_current", "motor_current", "output_torque", "winding_temperature")
-#: Factor by which readings that are turned round come nearer to the robot, where their sign is doubted.
+#: Factor by which readings with the other sign are nearer to the robot, for a note on their sign.
 NEARER = 2.0
-#: Readings smaller than this share of the channel's largest tell no factor.
+#: Readings smaller than this share of the channel's largest are excluded from the factor.
 SMALL = 0.05
-#: What a robot could show is nothing, below this share of the readings: the yaw rate of one that goes straight.
+#: Possible readings below this share of the measured ones are zero: the yaw rate of a robot that drives straight.
 NOTHING = 1e-9
-#: A slope in other units than degrees: of one of those [deg]; how well the current has to follow it.
+#: Units of a slope other than degrees [deg]; least correlation of the current with the slope.
 SLOPES = {"radians": 180 / math.pi, "percent": math.degrees(0.01)}
 FOLLOWS = 0.9
 
 
 def check_ranges(runs: Runs, robot: Robot) -> list[Note]:
-    """Refuse readings that no robot like this one shows under these conditions; return what should be said of others.
+    """Refuse readings that no robot like this one has under these conditions; return notes on other doubts.
 
-    Each channel's readings are compared with steady travel of the robot as its file states it, and with a tenth and
-    four times its friction: the median factor by which they lie outside. Of histories, those that have settled.
+    Each channel's readings are compared with steady travel of the robot in its file, and with a tenth and four times
+    its friction. The result is the median factor between the readings and that range. Of histories, only settled
+    ones are compared.
 
     Raises:
-        BadData: a factor beyond `REFUSED`; of histories, which need not get under way, only where a known confusion
-            of units explains it.
+        BadData: a factor beyond `REFUSED`; for histories, which may not reach steady travel, only if a known
+            confusion of units explains it.
     """
     runs = runs.of(robot)
-    kind = observers.kind(runs)
+    kind = observers.observer_kind(runs)
     runs, measured, lasts = kind.settled(runs, steady=True)
     if not len(runs):
         return []
@@ -62,8 +63,8 @@ def check_ranges(runs: Runs, robot: Robot) -> list[Note]:
     if not robot.rig.inherits:
         _check_gear(runs, measured, robot)
     conditions = runs.conditions(robot)
-    possible = np.stack([operating_readings(_rubbing(robot, f), conditions) for f in FRICTION])
-    # A robot that moves with less friction and has no speed with more of it stands: any speed is possible between.
+    possible = np.stack([operating_readings(_with_friction_factor(robot, f), conditions) for f in FRICTION])
+    # A robot that moves with less friction but not with more may stand still: any speed between is possible.
     slow = np.array([c.zero_at_rest for c in robot.channels])
     possible = np.where(slow & np.isnan(possible) & np.isfinite(possible[0]), 0.0, possible)
     if not np.isfinite(possible).any():
@@ -78,7 +79,7 @@ def check_ranges(runs: Runs, robot: Robot) -> list[Note]:
         units = _units(channel, measured[:, k], possible[:, :, k], robot)
         if not units and (
             unknown or kind.axis or _slips(robot, channel, factor)
-        ):  # what slides has speeds of its own
+        ):  # a sliding vehicle may have other speeds
             continue
         typical = _factor(measured[:, k], possible[1:2, :, k])
         found = OffBy(
@@ -86,7 +87,7 @@ def check_ranges(runs: Runs, robot: Robot) -> list[Note]:
             channel.unit,
             typical if units else factor,
             tuple(units),
-            tuple(_others(channel, factors)),
+            tuple(_columns_with_same_factor(channel, factors)),
             runs.layout.imposed_column,
         )
         if off > REFUSED:
@@ -96,7 +97,7 @@ def check_ranges(runs: Runs, robot: Robot) -> list[Note]:
 
 
 def turned_signs(runs: Runs, robot: Robot) -> list[Turned]:
-    """Returns the channels of settled runs whose readings with the other sign are `NEARER` to the robot of the file.
+    """Returns the channels of settled runs with readings that are `NEARER` to the file's robot with the other sign.
 
     It needs a robot with a weight. Without a weight signs are checked row by row as a table is read.
     """
@@ -105,12 +106,14 @@ def turned_signs(runs: Runs, robot: Robot) -> list[Turned]:
         return []
     conditions = runs.conditions(robot)
     return _turned(
-        runs, runs.measured(), np.stack([operating_readings(_rubbing(robot, f), conditions) for f in FRICTION])
+        runs,
+        runs.measured(),
+        np.stack([operating_readings(_with_friction_factor(robot, f), conditions) for f in FRICTION]),
     )
 
 
 def _turned(runs: Runs, measured: np.ndarray, possible: np.ndarray) -> list[Turned]:
-    """As `turned_signs`, of readings [SI], shape (runs, channels), and those of several robots, (robots, ...)."""
+    """Result of `turned_signs` for readings [SI], shape (runs, channels), and for several robots, (robots, ...)."""
     found: list[Turned] = []
     for k, channel in enumerate(runs.channels if runs.layout.weight else ()):
         if not channel.directed or runs.layout.magnitude(channel.name):
@@ -119,29 +122,29 @@ def _turned(runs: Runs, measured: np.ndarray, possible: np.ndarray) -> list[Turn
         if turned * NEARER < off:
             theirs = runs.headings.get(channel.column, channel.column)
             found.append(Turned(runs.source, channel.column, theirs, off / channel.factor, turned / channel.factor))
-    return found if len(found) == 1 else []  # of several the file's numbers may be wrong as well
+    return found if len(found) == 1 else []  # with several, the file's values may be wrong instead
 
 
 def _rms(off: np.ndarray) -> float:
-    """The least root mean square along the rows of several robots, shape (robots, rows); infinite without numbers."""
+    """Least root mean square over the rows among several robots, shape (robots, rows); inf without numbers."""
     return min((float(np.sqrt(np.nanmean(x**2))) for x in off if np.isfinite(x).any()), default=math.inf)
 
 
-def _rubbing(robot: Robot, factor: float) -> Robot:
-    """The robot with so many times its friction torques, and its ground's resistance to rolling."""
+def _with_friction_factor(robot: Robot, factor: float) -> Robot:
+    """Robot with its friction torques and its ground's rolling resistance multiplied by a factor."""
     torques = [
         p
-        for p in params.walk(robot)
+        for p in params.walk_parameters(robot)
         if p.name.endswith((".friction_coulomb", ".friction_viscous", ".loss_coulomb", ".loss_viscous"))
     ]
     return params.replace(robot, {p.name: factor * p.value for p in torques})
 
 
 def _factor(measured: np.ndarray, possible: np.ndarray) -> float:
-    """Median factor by which readings lie outside what is possible; 1 inside, or where nothing can be said.
+    """Median factor between readings and the possible range; 1 inside, or if it cannot be determined.
 
     Args:
-        measured: shape (runs,); possible: of several robots, NaN where one does not move, shape (robots, runs).
+        measured: shape (runs,); possible: of several robots, NaN if one does not move, shape (robots, runs).
     """
     finite = np.isfinite(measured) & np.isfinite(possible).any(0)
     if not finite.any():
@@ -157,7 +160,7 @@ def _factor(measured: np.ndarray, possible: np.ndarray) -> float:
 
 
 def _units(channel: Channel, measured: np.ndarray, possible: np.ndarray, robot: Robot) -> list[str]:
-    """Units in which the readings would be possible, the likeliest first; the arguments as of `_factor`."""
+    """Units that would make the readings possible, the most probable first; arguments as in `_factor`."""
     known = {unit: channel.factor / size for unit, size in channel.other_units}
     if channel.name == "motor_speed" and robot.has_ground:
         known["rpm of the driving wheel"] = 1 / float(robot.gearbox.ratio)
@@ -165,26 +168,26 @@ def _units(channel: Channel, measured: np.ndarray, possible: np.ndarray, robot: 
     return sorted((u for u, x in left.items() if x < math.log(ALIKE)), key=left.__getitem__)
 
 
-def _others(channel: Channel, factors: dict[Channel, float]) -> list[str]:
-    """Columns of the other channels that are off by as much."""
+def _columns_with_same_factor(channel: Channel, factors: dict[Channel, float]) -> list[str]:
+    """Columns of the other channels with the same factor."""
     mine = factors[channel]
     return [c.column for c, f in factors.items() if c is not channel and abs(math.log(f / mine)) < math.log(ALIKE)]
 
 
 def _slips(robot: Robot, channel: Channel, factor: float) -> bool:
-    """Whether a vehicle's speed is low as its movers may slide, where nobody has stated the ground."""
+    """True if a low speed may be the slip of a vehicle's movers on an unspecified ground."""
     return not robot.rig.inherits and robot.has_ground and channel.name == "speed" and factor < 1
 
 
 def _check_gear(runs: Runs, measured: np.ndarray, robot: Robot) -> None:
-    """Refuse a gear ratio that is the inverse of what the speeds of motor and output show."""
-    shown = dict(zip(channels.names(robot.channels), measured.T, strict=True))
+    """Refuse a gear ratio that is the inverse of the ratio of the speeds of motor and output."""
+    shown = dict(zip(channels.channel_names(robot.channels), measured.T, strict=True))
     conditions = runs.conditions(robot)
     which = np.asarray(conditions.configuration)
     radius = np.asarray([float(c.radius) for c in robot.configurations.members])[which]
     output = shown.get("output_speed", shown["speed"] / radius if "speed" in shown else None)
     motor = shown.get("motor_speed", conditions.motor_speed)
-    if motor is None:  # about what it turns at without load
+    if motor is None:  # approximately its speed without load
         motor = np.asarray(conditions.voltage) / float(robot.motor.torque_constant)
     ratio = float(robot.gearbox.ratio)
     if output is None or abs(math.log(ratio)) < math.log(REFUSED):
@@ -201,7 +204,7 @@ def _check_gear(runs: Runs, measured: np.ndarray, robot: Robot) -> None:
 
 
 def _check_masses(runs: Runs, robot: Robot) -> None:
-    """Refuse total masses that are no mass of this robot."""
+    """Refuse total masses that are impossible for this robot."""
     if not runs.has("total_mass_kg"):
         return
     own = np.asarray([float(c.mass) for c in robot.configurations.members])[runs.configurations(robot)]
@@ -216,10 +219,10 @@ def _check_masses(runs: Runs, robot: Robot) -> None:
 
 
 def _slopes(runs: Runs, measured: np.ndarray, possible: np.ndarray, robot: Robot) -> Iterator[SlopesIn]:
-    """Say so where the current rises with the slope as if that were in another unit.
+    """Note if the current rises with the slope as if the slope had another unit.
 
-    Within runs that differ in their slope alone the current is about linear in it; the coefficient of what is
-    measured on what is possible is 1 where slopes are in degrees.
+    Among runs that differ only in their slope, the current is nearly linear in it. The regression of measured on
+    possible readings has the coefficient 1 for slopes in degrees.
     """
     k = next((k for k, c in enumerate(robot.channels) if c.name in ("total_current", "motor_current")), None)
     if k is None or "slope_deg" not in runs.axes:

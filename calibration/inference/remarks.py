@@ -1,4 +1,4 @@
-"""What a careful engineer would say of a calibration, read from its result."""
+"""Remarks of a careful engineer on a calibration, computed from its result."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ from calibration.inference.problem import MARGIN
 from calibration.inference.result import CalibrationResult
 from mmrjax.model.signals import DONE, STATUSES
 
-#: Shift from the prior above which the prior or the model is called wrong [prior sd].
+#: Shift from the prior above which a remark calls the prior or the model wrong [prior sd].
 FAR = 3.0
 
 
-def remarks(found: CalibrationResult) -> list[Note]:
+def calibration_remarks(found: CalibrationResult) -> list[Note]:
     """All remarks."""
     return [
         *_noise(found),
@@ -67,11 +67,11 @@ def _search(found: CalibrationResult) -> Iterator[Note]:
 def _statuses(found: CalibrationResult) -> Iterator[Note]:
     for k, word in enumerate(STATUSES):
         if k not in DONE and np.any(found.status == word):
-            yield OfRows(numbers(found.status == word), word)
+            yield OfRows(row_numbers(found.status == word), word)
 
 
 def _parameters(found: CalibrationResult) -> Iterator[Note]:
-    far = {name for name, p in found.parameters.items() if abs(p.shift) > FAR}  # which is said of them instead
+    far = {name for name, p in found.parameters.items() if abs(p.shift) > FAR}  # these get a remark of their own
     if held := tuple(name for name in found.undetermined if name not in far):
         yield HeldByPrior(held)
     if pairs := found.together:
@@ -90,7 +90,7 @@ def _parameters(found: CalibrationResult) -> Iterator[Note]:
 def _limits(found: CalibrationResult) -> Iterator[Note]:
     limited = found.adhesion_used > 1 - MARGIN
     if limited.any():
-        yield OfRows(numbers(limited), "limited", MARGIN)
+        yield OfRows(row_numbers(limited), "limited", MARGIN)
     for configuration in found.robot.configurations:
         friction = f"{configuration}.{priors.GUIDE_FRICTION}"
         share = f"{configuration}.{priors.GUIDE_SHARE}"
@@ -110,6 +110,6 @@ def _blocks(found: CalibrationResult) -> Iterator[Note]:
             yield BlockNotConverged(kind)
 
 
-def numbers(which: np.ndarray) -> tuple[int, ...]:
-    """Numbers of rows."""
+def row_numbers(which: np.ndarray) -> tuple[int, ...]:
+    """Row numbers of a mask, from 1."""
     return tuple(int(k) + 1 for k in np.flatnonzero(which))

@@ -1,4 +1,4 @@
-"""Noise as rows that repeat the same conditions show it."""
+"""Noise estimated from rows that repeat the same conditions."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from calibration.data.runs import Runs
 from calibration.inference.fit_notes import LargerNoise, Note
 from calibration.inference.noise import UNSTATED, Noise
 
-#: Fewest differences between repeats that tell a noise: one of two readings may be wrong.
+#: Fewest differences between repeats for an estimate of the noise: of two readings, one may be wrong.
 FEWEST = 3
-#: Probability of a median difference as large from the stated noise, below which the noise is taken to be larger.
+#: Probability of a median difference this large under the stated noise, below which the noise is enlarged.
 IMPROBABLE = 1e-3
 #: Median of the magnitude of a standard normal number.
 MEDIAN = 0.6745
 
 
-def same_conditions(runs: Runs) -> list[Int[np.ndarray, " rows"]]:
-    """Rows of each set of the same conditions, those of single rows too."""
+def rows_of_same_conditions(runs: Runs) -> list[Int[np.ndarray, " rows"]]:
+    """Rows of each set of equal conditions, including single rows."""
     columns = [c for c in ("configuration", *runs.axes, "surface") if runs.has(c)]
     alike: dict[tuple[str, ...], list[int]] = {}
     for row, key in enumerate(zip(*(runs[c].astype(str).tolist() for c in columns), strict=True)):
@@ -29,15 +29,15 @@ def same_conditions(runs: Runs) -> list[Int[np.ndarray, " rows"]]:
     return [np.array(rows) for rows in alike.values()]
 
 
-def enlarged(noise: Noise, runs: Runs) -> tuple[Noise, list[Note]]:
-    """Noise that repeats in a table do not contradict, and a note for each channel whose sd was enlarged.
+def enlarge_noise(noise: Noise, runs: Runs) -> tuple[Noise, list[Note]]:
+    """Noise that is consistent with repeats in a table, and a note for each channel with an enlarged sd.
 
-    The median of the differences between neighbouring repeats decides, so that a few wrong readings do not. An
-    estimate along series has the repeats in it already.
+    The median of the differences between neighbouring repeats decides, so that a few wrong readings have no effect.
+    An estimate along series already includes the repeats.
     """
     if runs.sampled:
         return noise, []
-    pairs = [pair for rows in same_conditions(runs) for pair in itertools.pairwise(rows)]
+    pairs = [pair for rows in rows_of_same_conditions(runs) for pair in itertools.pairwise(rows)]
     if len(pairs) < FEWEST:
         return noise, []
     first, second = np.array(pairs).T
@@ -48,7 +48,7 @@ def enlarged(noise: Noise, runs: Runs) -> tuple[Noise, list[Note]]:
         if len(told) < FEWEST or noise.source[k] in ("series", "estimated", "no readings"):
             continue
         median = float(np.median(told))
-        if _tail(median, len(told)) < IMPROBABLE:
+        if _median_tail(median, len(told)) < IMPROBABLE:
             factors[channel.name] = median / MEDIAN
             notes.append(
                 LargerNoise(channel.name, factors[channel.name], len(told), UNSTATED.get(noise.source[k], "stated"))
@@ -56,7 +56,7 @@ def enlarged(noise: Noise, runs: Runs) -> tuple[Noise, list[Note]]:
     return noise.scaled(factors), notes
 
 
-def _tail(median: float, count: int) -> float:
-    """Probability that the median of so many magnitudes of standard normal numbers is as large."""
+def _median_tail(median: float, count: int) -> float:
+    """Probability that the median of `count` magnitudes of standard normal numbers is at least `median`."""
     beyond, least = math.erfc(median / math.sqrt(2)), (count + 1) // 2
     return sum(math.comb(count, k) * beyond**k * (1 - beyond) ** (count - k) for k in range(least, count + 1))

@@ -1,12 +1,12 @@
-"""Whether what a fit leaves clusters by a column of the table that has no role.
+"""Test of whether the residuals of a fit cluster by a column of the table without a role.
 
-A column that nothing in the model reads may still say which rows differ: which wheel idles, who measured, which
-battery was in. For each channel the residuals are compared over the levels of each such column by a variance ratio
-(Seber and Lee, Linear Regression Analysis (2003), 4.3): over all rows, within the levels of each label of the
-conditions, and with opposite signs in the two directions of travel; columns of many numbers by their ranks. What the
-free parameters, the labels and smooth curves over the conditions take up is cleared away on both sides first. The
-error is family-wise over all columns, channels and tests, by Bonferroni and by the strongest test of permuted
-residuals (Freedman and Lane 1983), so that neither few rows nor wild ones make a finding.
+A column that the model does not read may still explain which rows differ: which wheel idles, who measured, which
+battery was in. For each channel a variance ratio (Seber and Lee, Linear Regression Analysis (2003), 4.3) compares the
+residuals over the levels of each such column: over all rows, within the levels of each label of the conditions, and
+with opposite signs in the two directions of travel. Columns of many numbers enter by their ranks. Free parameters,
+labels and smooth curves over the conditions are first projected out on both sides. The significance is family-wise
+over all columns, channels and tests. It is limited by Bonferroni and by the strongest test of permuted residuals
+(Freedman and Lane 1983), so that neither few rows nor outliers cause a finding.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ from calibration.described import described
 from calibration.inference.fit_notes import Note
 from calibration.inference.lack_of_fit import CLEAR, Residuals
 
-#: Family-wise error of reporting a cluster where there is none.
+#: Family-wise probability of reporting a cluster if there is none.
 LEVEL = 0.005
-#: Most distinct numbers of a column whose values are taken for levels.
+#: Most distinct numbers of a column for them to be levels.
 LEVELS = 12
-#: Fewest rows (of histories: runs) of a channel, and degrees of freedom that a test has to leave.
+#: Fewest rows (of histories: runs) of a channel, and fewest degrees of freedom after a test.
 FEWEST, LEAST = 8, 5
-#: Permutations; numbers that are held at once.
+#: Number of permutations; most numbers in memory at once.
 PERMUTATIONS, AT_ONCE = 1000, 4_000_000
-#: Degree of curves over the conditions that are cleared away, and largest share of the rows that they take up.
+#: Degree of the curves over the conditions that are projected out, and their largest number as a share of the rows.
 DEGREE, SHARE = 2, 1 / 3
-#: Share of a column (sine of its angle) that conditions and parameters have to leave for it to be one of its own.
+#: Share of a column (sine of its angle) that must remain after conditions and parameters for it to be tested.
 OWN = 0.3
-#: Names of columns that say when a row was measured.
+#: Names of columns with the time of a measurement.
 TIMES = re.compile(r"(^|_)(time|date|datetime|timestamp|stamp|epoch|clock)(_|$)", re.IGNORECASE)
-#: Share of the differences between levels from which a coarser column is said to make most of them [-].
+#: Share of the differences between levels from which a coarser column is reported to explain most of them [-].
 MOSTLY = 0.5
 
 
@@ -49,7 +49,7 @@ class LevelMean:
 
     Attributes:
         level: of the column; within: of the label within which it was compared, "" for all rows.
-        mean: simulated less measured [unit of the channel]; rows: that it is of.
+        mean: simulated less measured [unit of the channel]; rows: number of rows.
     """
 
     level: str
@@ -59,24 +59,24 @@ class LevelMean:
 
     @property
     def name(self) -> str:
-        """The level, and what it is within."""
+        """The level, and the label within which it was compared."""
         return f"{self.level} at {self.within}" if self.within else self.level
 
 
 class ResidualCluster(Note):
-    """Residuals of a channel that go with a column without a role.
+    """Residuals of a channel that are associated with a column without a role.
 
     Attributes:
-        column: its name; channel: whose residuals; unit: of the channel.
-        within: label within whose levels the column matters, "" where it does over all rows.
-        reversing: whether with opposite signs in the two directions of travel; means are then of the residual times
+        column: its name; channel: of the residuals; unit: of the channel.
+        within: label within whose levels the column matters, "" for all rows.
+        reversing: True for opposite signs in the two directions of travel; means are then of the residual times
             the sign of the reading.
         levels: means by level; empty for a column of many numbers.
         correlation: of ranks, for such a column; else None.
         p: family-wise.
-        alike: other columns that go with these residuals no better once this one is known.
-        coarser: columns whose levels this one divides further, and what share of the differences between its levels
-            theirs make by themselves, from `MOSTLY` on.
+        alike: other columns that explain these residuals no better once this one is known.
+        coarser: columns whose levels this one divides further, with the share of the differences between its levels
+            that they explain, from `MOSTLY` on.
         at: the column, or name of the level, of each row; residual: simulated less measured [unit], or that times the
             sign of the reading; shape (rows,), of histories (runs,).
     """
@@ -100,7 +100,7 @@ class ResidualCluster(Note):
         return described(self)
 
     def to_json(self) -> dict[str, object]:
-        """As in `residual_clusters` of result.json."""
+        """Entries of `residual_clusters` in result.json."""
         document = {
             f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name not in ("at", "residual")
         }
@@ -110,11 +110,11 @@ class ResidualCluster(Note):
 
 
 def residual_clusters(fit: Residuals, seed: int = 0) -> tuple[ResidualCluster, ...]:
-    """Columns without a role by which the residuals of a fit cluster, the most improbable first.
+    """Clusters of a fit's residuals by columns without a role, the most significant first.
 
     Args:
-        fit: what is left; of histories the mean of each run is tested.
-        seed: of the permutations.
+        fit: residuals of the fit; of histories the mean of each run is tested.
+        seed: random seed of the permutations.
     """
     whole = _by_run(fit) if fit.runs.sampled else _by_row(fit)
     columns = _without_role(whole)
@@ -143,16 +143,16 @@ def residual_clusters(fit: Residuals, seed: int = 0) -> tuple[ResidualCluster, .
                 taken.append((p, test, []))
             else:
                 explains[2].append(test.column)
-        answer += [_reported(whole, k, test, p, tuple(names)) for p, test, names in taken]
+        answer += [_report_cluster(whole, k, test, p, tuple(names)) for p, test, names in taken]
     return tuple(sorted(answer, key=lambda c: c.p))
 
 
 def _coarse_first(
     found: list[tuple[float, _Comparison]], columns: Mapping[str, np.ndarray]
 ) -> list[tuple[float, _Comparison]]:
-    """Findings in the order of their probability, but a column before such as divide its levels further."""
+    """Findings in the order of their p-values, but with a column before any finer division of its levels."""
     words = {test.column: _words(columns[test.column]) for _, test in found}
-    levels = {name for name in words if not _numbers(columns[name])}
+    levels = {name for name in words if not _is_numeric(columns[name])}
     ordered: list[tuple[float, _Comparison]] = []
     waiting = list(found)
     while waiting:
@@ -166,20 +166,20 @@ def _coarse_first(
 
 
 def _divides(fine: np.ndarray, coarse: np.ndarray) -> bool:
-    """Whether each level of one column fixes that of another, which has fewer."""
+    """True if each level of one column determines that of another, which has fewer levels."""
     pairs = len(set(zip(fine.tolist(), coarse.tolist(), strict=True)))
     return len(np.unique(coarse)) < len(np.unique(fine)) == pairs
 
 
-# --- what is tested -------------------------------------------------------------------------------------
+# --- tests ----------------------------------------------------------------------------------------------
 
 
 @dataclasses.dataclass(frozen=True)
 class _Units:
-    """What is compared, a settled row or a run of a history each.
+    """Units of comparison, each a settled row or a run of a history.
 
     Attributes:
-        runs: their table; counts: whether a reading does; whitened: residuals; jacobian: by the free parameters,
+        runs: their table; counts: True for included readings; whitened: residuals; jacobian: by the free parameters,
             shape (units, channels, parameters); residual, simulated: [SI]; covariance: of z, (JᵀJ + 1)⁻¹.
     """
 
@@ -201,7 +201,7 @@ def _by_row(fit: Residuals) -> _Units:
 
 
 def _by_run(fit: Residuals) -> _Units:
-    """Means of each run; whitened ones times the root of how many samples they are of, so that noise has the sd 1."""
+    """Means of each run; whitened means times the root of their number of samples, so that noise has the sd 1."""
     rows = _by_row(fit)
     run = fit.runs.run_names
     _, first, run_of = np.unique(run, return_index=True, return_inverse=True)
@@ -214,7 +214,7 @@ def _by_run(fit: Residuals) -> _Units:
 
     each = [member[:, r] for r in range(len(first))]
     one = {c: v[first] for c, v in fit.runs.extras.items() if all(len(np.unique(v[m])) == 1 for m in each)}
-    # A condition that changes within a run is there as its mean.
+    # A condition that changes within a run enters as its mean.
     columns = {
         c: np.array([v[m].mean() for m in each]) if v.dtype.kind == "f" else v[first]
         for c, v in fit.runs.columns.items()
@@ -232,30 +232,32 @@ def _by_run(fit: Residuals) -> _Units:
 
 
 def _without_role(whole: _Units) -> dict[str, np.ndarray]:
-    """Columns to look at: not ids, times or aliases of a condition, and of more than one level."""
+    """Columns to test: with more than one level, and no ids, times or aliases of a condition."""
     runs, kept = whole.runs, {}
-    # What is simulated follows from the conditions alone.
+    # Simulated readings depend only on the conditions.
     conditions = [runs[c] for c in CONDITIONS if runs.has(c)] + list(whole.simulated.T)
     for name, cells in runs.extras.items():
         words = _words(cells)
         levels = np.unique(words[words != ""])
         if len(levels) < 2 or _is_time(name, cells) or _is_id(cells, len(levels)):
             continue
-        if any(_same(words, alias) for alias in _known(runs)) or _steps(cells, words, conditions):
+        if any(_are_equivalent(words, alias) for alias in _columns_with_role(runs)) or _are_steps_of_condition(
+            cells, words, conditions
+        ):
             continue
         kept[name] = cells
     return kept
 
 
 def _words(cells: np.ndarray) -> np.ndarray:
-    """A column as words, "" where a cell is empty."""
+    """A column as words, "" for empty cells."""
     if cells.dtype.kind == "f":
         return np.array(["" if np.isnan(x) else f"{x:g}" for x in cells])
     return cells.astype(str)
 
 
-def _known(runs: Runs) -> Iterator[np.ndarray]:
-    """Columns that have a role, but for readings and their sds, and what labels say together."""
+def _columns_with_role(runs: Runs) -> Iterator[np.ndarray]:
+    """Columns with a role, except readings and their sds, and the combinations of the labels."""
     readings = {name for c in runs.channels for name in (c.column, c.sd_column)}
     known = {name: v.astype(str) for name, v in runs.columns.items() if name not in readings}
     labels = [known[name] for name in _labels(runs)]
@@ -265,21 +267,21 @@ def _known(runs: Runs) -> Iterator[np.ndarray]:
 
 
 def _labels(runs: Runs) -> list[str]:
-    """Columns of words that say under what a row was measured, of more than one level."""
+    """Columns of words that describe the conditions, with more than one level."""
     return [
         name for name, v in runs.columns.items()
         if v.dtype.kind == "U" and name not in ("run_id", "mode") and len(np.unique(v)) > 1
     ]  # fmt: skip
 
 
-def _same(one: np.ndarray, other: np.ndarray) -> bool:
-    """Whether each level of one column fixes that of the other, and the reverse."""
+def _are_equivalent(one: np.ndarray, other: np.ndarray) -> bool:
+    """True if each level of one column determines that of the other, and the reverse."""
     pairs = len(set(zip(one.tolist(), other.tolist(), strict=True)))
     return pairs == len(np.unique(one)) == len(np.unique(other))
 
 
-def _steps(cells: np.ndarray, words: np.ndarray, conditions: Sequence[np.ndarray]) -> bool:
-    """Whether numbers are steps of a condition: its values at one level lie all on one side of those at another."""
+def _are_steps_of_condition(cells: np.ndarray, words: np.ndarray, conditions: Sequence[np.ndarray]) -> bool:
+    """True if a column's levels divide the values of a condition into intervals that do not overlap."""
     if cells.dtype.kind != "f" or len(np.unique(words)) > LEVELS:
         return False
     for x in conditions:
@@ -292,7 +294,7 @@ def _steps(cells: np.ndarray, words: np.ndarray, conditions: Sequence[np.ndarray
 
 
 def _is_time(name: str, cells: np.ndarray) -> bool:
-    """Whether a column says when: by its name, by its words, or as numbers that only rise or only fall."""
+    """True if a column is a time: by its name, by its words, or as numbers that only rise or only fall."""
     if TIMES.search(name):
         return True
     if cells.dtype.kind == "f":
@@ -307,7 +309,7 @@ def _is_time(name: str, cells: np.ndarray) -> bool:
 
 
 def _is_id(cells: np.ndarray, levels: int) -> bool:
-    """Whether a column only numbers or names the rows: as many levels as rows, of words or whole numbers."""
+    """True if a column is only a row label: words or whole numbers with as many levels as rows."""
     if cells.dtype.kind == "f":
         return levels == len(cells) and bool(np.all(cells == np.round(cells)))
     return levels > len(cells) / 2
@@ -315,7 +317,7 @@ def _is_id(cells: np.ndarray, levels: int) -> bool:
 
 @dataclasses.dataclass(frozen=True, order=True)
 class _Comparison:
-    """One test of one channel: a column, within the levels of a label or not, reversing with the travel or not."""
+    """One test of one channel: a column, within the levels of a label or over all, reversing with travel or not."""
 
     column: str
     within: str
@@ -325,12 +327,12 @@ class _Comparison:
 
 @dataclasses.dataclass(frozen=True)
 class _Channel:
-    """Residuals of a channel as independent ones of one variance, and what is compared with them.
+    """Residuals of a channel, transformed to be independent with equal variance, and their tests.
 
     Attributes:
-        left: residuals less what conditions and parameters take up, shape (units,); freedom: their degrees.
-        taken: orthonormal directions of the latter, shape (units, directions).
-        tests: with orthonormal bases, cleared of the same.
+        left: residuals after conditions and parameters are projected out, shape (units,); freedom: of these.
+        taken: orthonormal directions of conditions and parameters, shape (units, directions).
+        tests: with orthonormal bases, after the same projection.
     """
 
     left: np.ndarray
@@ -339,26 +341,26 @@ class _Channel:
     tests: tuple[_Comparison, ...]
 
     def p_values(self, residuals: np.ndarray) -> list[tuple[_Comparison, np.ndarray]]:
-        """Of each test, of columns of residuals, shape (units, tables)."""
+        """p-values of each test for columns of residuals, shape (units, tables)."""
         total = np.sum(residuals**2, 0)
-        return [(test, _ratio(test.basis, residuals, total, self.freedom)) for test in self.tests]
+        return [(test, _variance_ratio_test(test.basis, residuals, total, self.freedom)) for test in self.tests]
 
     def cleared(self, residuals: np.ndarray) -> np.ndarray:
-        """Residuals less what conditions and parameters take up."""
+        """Residuals after conditions and parameters are projected out."""
         return residuals - self.taken @ (self.taken.T @ residuals)
 
     def beside(self, test: _Comparison, other: _Comparison) -> float:
-        """Probability of a test where what another one shows is taken up too; 1 where nothing is left to test."""
+        """p-value of a test after another one is projected out too; 1 if nothing is left to test."""
         own = _orthonormal(test.basis - other.basis @ (other.basis.T @ test.basis))
         left = self.left - other.basis @ (other.basis.T @ self.left)
         freedom = self.freedom - other.basis.shape[1]
         if own.shape[1] == 0 or freedom - own.shape[1] < LEAST:
             return 1.0
-        return float(_ratio(own, left[:, None], np.array([left @ left]), freedom)[0])
+        return float(_variance_ratio_test(own, left[:, None], np.array([left @ left]), freedom)[0])
 
 
-def _ratio(basis: np.ndarray, residuals: np.ndarray, total: np.ndarray, freedom: int) -> np.ndarray:
-    """Probability of what an orthonormal basis explains of residuals, by the variance ratio."""
+def _variance_ratio_test(basis: np.ndarray, residuals: np.ndarray, total: np.ndarray, freedom: int) -> np.ndarray:
+    """p-value of the part of residuals that an orthonormal basis explains, by the variance ratio."""
     terms = basis.shape[1]
     explained = np.sum((basis.T @ residuals) ** 2, 0)
     rest = np.maximum(total - explained, 1e-300) / (freedom - terms)
@@ -366,7 +368,7 @@ def _ratio(basis: np.ndarray, residuals: np.ndarray, total: np.ndarray, freedom:
 
 
 def _orthonormal(columns: np.ndarray, least: float = CLEAR) -> np.ndarray:
-    """Orthonormal directions of columns, such as are smaller than `least` left out."""
+    """Orthonormal directions of columns, without those smaller than `least`."""
     if columns.shape[1] == 0:
         return columns
     directions, size, _ = np.linalg.svd(columns, full_matrices=False)
@@ -374,12 +376,12 @@ def _orthonormal(columns: np.ndarray, least: float = CLEAR) -> np.ndarray:
 
 
 def _channel(whole: _Units, k: int, columns: dict[str, np.ndarray]) -> _Channel | None:
-    """A channel and its tests; None where too little is measured."""
+    """A channel and its tests; None with too few readings."""
     counts = whole.counts[:, k]
     if counts.sum() < FEWEST:
         return None
     runs = whole.runs.where(counts)
-    # The residuals' covariance is 1 - J (JᵀJ + 1)⁻¹ Jᵀ, of which only a few directions are not 1.
+    # The residuals' covariance is 1 - J (JᵀJ + 1)⁻¹ Jᵀ, which differs from 1 in only a few directions.
     j = whole.jacobian[counts, k]
     root = np.linalg.cholesky(whole.covariance)
     directions, size, _ = np.linalg.svd(j @ root, full_matrices=False)
@@ -393,8 +395,8 @@ def _channel(whole: _Units, k: int, columns: dict[str, np.ndarray]) -> _Channel 
 
     travel = np.sign(whole.simulated[counts, k])
     both = min(np.sum(travel > 0), np.sum(travel < 0)) >= 2
-    smooth = _smooth(runs, whole.simulated[counts], travel if both else None)
-    taken = _orthonormal(np.concatenate([directions[:, ~open_], _unit(scaled(smooth, forth))], 1))
+    smooth = _condition_columns(runs, whole.simulated[counts], travel if both else None)
+    taken = _orthonormal(np.concatenate([directions[:, ~open_], _unit_columns(scaled(smooth, forth))], 1))
     whitened = scaled(whole.whitened[counts, k][:, None], back)[:, 0]
     left = whitened - taken @ (taken.T @ whitened)
     freedom = len(left) - taken.shape[1]
@@ -402,41 +404,41 @@ def _channel(whole: _Units, k: int, columns: dict[str, np.ndarray]) -> _Channel 
     for name, cells in columns.items():
         for within in ("", *_labels(runs)):
             for reversing in (False, True)[: 1 + both]:
-                shape = _shape(cells[counts], runs[within] if within else None)
+                shape = _comparison_columns(cells[counts], runs[within] if within else None)
                 basis = scaled(shape * travel[:, None] if reversing else shape, forth)
-                basis = _orthonormal(_unit(basis))
+                basis = _orthonormal(_unit_columns(basis))
                 basis = _orthonormal(basis - taken @ (taken.T @ basis), OWN)
                 if basis.shape[1] and freedom - basis.shape[1] >= LEAST:
                     tests.append(_Comparison(name, within, reversing, basis))
     return _Channel(left, freedom, taken, tuple(tests)) if tests else None
 
 
-def _unit(columns: np.ndarray) -> np.ndarray:
-    """Columns of length 1, such as are next to nothing left out."""
+def _unit_columns(columns: np.ndarray) -> np.ndarray:
+    """Columns normalised to length 1, without zero ones."""
     size = np.linalg.norm(columns, axis=0)
     return columns[:, size > 1e-9] / size[size > 1e-9]
 
 
-def _numbers(cells: np.ndarray) -> bool:
-    """Whether a column is compared by ranks."""
+def _is_numeric(cells: np.ndarray) -> bool:
+    """True if a column is compared by ranks."""
     return cells.dtype.kind == "f" and len(np.unique(cells[np.isfinite(cells)])) > LEVELS
 
 
 def _ranks(cells: np.ndarray) -> np.ndarray:
-    """Ranks about their mean, 0 where a number is missing."""
+    """Ranks minus their mean, 0 for missing numbers."""
     fine = np.isfinite(cells)
     ranks = np.zeros(len(cells))
     if fine.any():
-        from scipy.stats import rankdata  # a second to import, and seldom needed
+        from scipy.stats import rankdata  # takes a second to import, and is rarely needed
 
         ranks[fine] = rankdata(cells[fine]) - (fine.sum() + 1) / 2
     return ranks
 
 
-def _shape(cells: np.ndarray, within: np.ndarray | None) -> np.ndarray:
-    """What a column may explain: a mean of each level, or a slope over ranks, at each level of `within`."""
+def _comparison_columns(cells: np.ndarray, within: np.ndarray | None) -> np.ndarray:
+    """Functions of a column: a mean of each level, or a slope over ranks, at each level of `within`."""
     cell = np.zeros(len(cells), str) if within is None else within
-    if _numbers(cells):
+    if _is_numeric(cells):
         return np.stack(
             [np.where(cell == c, _ranks(np.where(cell == c, cells, np.nan)), 0.0) for c in np.unique(cell)], 1
         )
@@ -445,9 +447,12 @@ def _shape(cells: np.ndarray, within: np.ndarray | None) -> np.ndarray:
     return np.stack([b for b in both if b.any()], 1).astype(float)
 
 
-def _smooth(runs: Runs, simulated: np.ndarray, travel: np.ndarray | None) -> np.ndarray:
-    """What the conditions may explain: a mean of each set of labels and direction, then smooth curves over conditions
-    and readings, as far as there are rows for them; shape (units, columns)."""
+def _condition_columns(runs: Runs, simulated: np.ndarray, travel: np.ndarray | None) -> np.ndarray:
+    """Functions of the conditions, shape (units, columns).
+
+    A mean of each set of labels and direction, then smooth curves over conditions and readings, as many as the number
+    of rows allows.
+    """
     labels = [runs[name] for name in _labels(runs)] + ([] if travel is None else [travel.astype(str)])
     cells = (
         np.array(["|".join(map(str, words)) for words in zip(*labels, strict=True)])
@@ -470,7 +475,7 @@ def _smooth(runs: Runs, simulated: np.ndarray, travel: np.ndarray | None) -> np.
 
 
 def _permuted(made: Sequence[tuple[int, _Channel]], seed: int) -> np.ndarray:
-    """Probability of the strongest test of each table of permuted residuals, shape (permutations,)."""
+    """Smallest p-value of all tests for each table of permuted residuals, shape (permutations,)."""
     random = np.random.default_rng(seed)
     longest = max(len(tested.left) for _, tested in made)
     times = max(PERMUTATIONS // 4, min(PERMUTATIONS, AT_ONCE // longest))
@@ -482,7 +487,7 @@ def _permuted(made: Sequence[tuple[int, _Channel]], seed: int) -> np.ndarray:
     return strongest
 
 
-def _reported(whole: _Units, k: int, test: _Comparison, p: float, alike: tuple[str, ...]) -> ResidualCluster:
+def _report_cluster(whole: _Units, k: int, test: _Comparison, p: float, alike: tuple[str, ...]) -> ResidualCluster:
     """A finding in the units of its channel."""
     channel, counts = whole.runs.channels[k], whole.counts[:, k]
     cells, residual = whole.runs.extras[test.column][counts], whole.residual[counts, k] / channel.factor
@@ -491,14 +496,16 @@ def _reported(whole: _Units, k: int, test: _Comparison, p: float, alike: tuple[s
     words, correlation, at = _words(cells), None, cells
     words = np.where(words == "", "not stated", words)
     levels: tuple[LevelMean, ...] = ()
-    if _numbers(cells):
+    if _is_numeric(cells):
         from scipy.stats import spearmanr
 
         fine = np.isfinite(cells)
         correlation = float(spearmanr(cells[fine], signed[fine]).statistic)
     else:
         at = np.array([f"{w} at {c}" if c else w for w, c in zip(words, within, strict=True)])
-        keys = sorted(set(zip(within.tolist(), words.tolist(), strict=True)), key=lambda x: (x[0], _place(x[1])))
+        keys = sorted(
+            set(zip(within.tolist(), words.tolist(), strict=True)), key=lambda x: (x[0], _level_order(x[1]))
+        )
         levels = tuple(
             LevelMean(w, c, float(signed[mine].mean()), int(mine.sum()))
             for c, w in keys if (mine := (within == c) & (words == w)).any()
@@ -513,7 +520,7 @@ def _reported(whole: _Units, k: int, test: _Comparison, p: float, alike: tuple[s
         correlation,
         p,
         alike,
-        () if _numbers(cells) else _coarser(whole, k, test.column, words, within, signed),
+        () if _is_numeric(cells) else _coarser(whole, k, test.column, words, within, signed),
         at,
         signed,
     )
@@ -522,10 +529,10 @@ def _reported(whole: _Units, k: int, test: _Comparison, p: float, alike: tuple[s
 def _coarser(
     whole: _Units, k: int, column: str, words: np.ndarray, within: np.ndarray, residual: np.ndarray
 ) -> tuple[tuple[str, float], ...]:
-    """Columns that a finding divides further and that make most of its differences by themselves."""
+    """Columns that a finding divides further and that explain most of its differences."""
 
     def between(labels: np.ndarray) -> float:
-        """Sum of squares between levels within those of the label."""
+        """Sum of squares between levels, within the levels of the label."""
         total = 0.0
         for c in np.unique(within):
             mine = within == c
@@ -536,7 +543,7 @@ def _coarser(
 
     found, all_of_it, counts = [], between(words), whole.counts[:, k]
     for name, cells in whole.runs.extras.items():
-        if name == column or _numbers(cells[counts]):
+        if name == column or _is_numeric(cells[counts]):
             continue
         coarse = _words(cells[counts])
         if len(np.unique(coarse)) > 1 and _divides(words, coarse) and all_of_it > 0:
@@ -545,8 +552,8 @@ def _coarser(
     return tuple(sorted(found, key=lambda one: -one[1]))
 
 
-def _place(word: str) -> tuple[float, str]:
-    """Order of levels: numbers by size, then words."""
+def _level_order(word: str) -> tuple[float, str]:
+    """Sort key of levels: numbers by size, then words."""
     try:
         return float(word), ""
     except ValueError:

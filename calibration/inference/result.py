@@ -1,4 +1,4 @@
-"""The result of a calibration: what was found, by name, and its plain-data forms for files."""
+"""Result of a calibration, by name, and its plain-data forms for files."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from calibration.data import writing
 from calibration.data.posterior_file import Posterior
 from calibration.described import described, sentences
 from calibration.inference.fit_notes import Determination, HeldByPrior, Notes, Pair
-from calibration.inference.fit_posterior import determined_together, undetermined
+from calibration.inference.fit_posterior import determined_together, undetermined_names
 from calibration.inference.identifiability import Identifiability
 from calibration.inference.lack_of_fit import Adequacy
 from calibration.inference.multistart import Starts
@@ -33,7 +33,7 @@ Interval = tuple[float, float]
 
 @dataclasses.dataclass(frozen=True)
 class Prior:
-    """What was known of a parameter beforehand.
+    """Prior of a parameter.
 
     Attributes:
         family: `normal` or `log-normal`.
@@ -65,11 +65,11 @@ class ProfileCurve:
 
 
 @dataclasses.dataclass(frozen=True)
-class Beside:
-    """The same parameter at the optimum of the same problem with `steady`.
+class SteadyEstimate:
+    """A parameter at the optimum of the same problem with `steady`.
 
     Attributes:
-        value: there [SI]; apart_in_sd: how far this one lies from it [posterior sd].
+        value: there [SI]; apart_in_sd: distance of the estimate from it [posterior sd].
     """
 
     value: float
@@ -78,21 +78,21 @@ class Beside:
 
 @dataclasses.dataclass(frozen=True)
 class Estimate:
-    """One free parameter.
+    """Estimate of one free parameter.
 
     Attributes:
         value: at the optimum; sd: posterior, linear; both [unit].
-        interval: of 95 %, that of the profile where there is one; interval_linear: from the sd alone [unit].
-        interval_open: whether an end lies beyond the last point of the profile.
+        interval: of 95 %, from the profile if there is one; interval_linear: from the sd only [unit].
+        interval_open: True if an end is beyond the last point of the profile.
         interval_shift: the ends of `interval` in prior sds from the prior's median.
         unit, meaning: of its field.
-        prior: what was known beforehand; shift: of the value from it [prior sd].
+        prior: before the fit; shift: of the value from the prior's median [prior sd].
         variance_ratio: posterior over prior variance [-].
-        held_by_prior: whether it is, see `identifiability.held_by_prior`.
+        held_by_prior: True if it is, see `identifiability.held_by_prior`.
         at_bound: `lower`, `upper` or None.
-        measured_by_data: whether any reading depends on it.
-        profile: None where none was made.
-        with_steady: None where the search did not begin at the optimum of `steady`.
+        measured_by_data: True if any reading depends on it.
+        profile: None without profiles.
+        with_steady: None unless the search began at the optimum of `steady`.
     """
 
     value: float
@@ -110,10 +110,10 @@ class Estimate:
     at_bound: str | None
     measured_by_data: bool
     profile: ProfileCurve | None = None
-    with_steady: Beside | None = None
+    with_steady: SteadyEstimate | None = None
 
     def to_json(self) -> dict[str, Any]:
-        """As in `parameters` of result.json."""
+        """Entry of `parameters` in result.json."""
         found = {
             "value": self.value,
             "sd": self.sd,
@@ -147,7 +147,7 @@ class ChannelNoise:
     Attributes:
         source: `stated`, `columns`, `estimated` (from the misfit), or `no readings`.
         median_percent: median over the readings of sd over reading.
-        estimated_percent: where estimated, of the channel's size, see `Observer.sizes`; else None.
+        estimated_percent: as a share of the channel's size, see `Observer.sizes`; None unless estimated.
     """
 
     source: str
@@ -160,7 +160,7 @@ class ChannelErrors:
     """Errors of one channel over the rows that have both a simulated and a measured value.
 
     Attributes:
-        rows: how many they are.
+        rows: number of rows.
         rms_percent, max_percent: of the channel's measured rms; rms_sigma: in sds of the noise.
         rms: in the channel's unit.
     """
@@ -172,7 +172,7 @@ class ChannelErrors:
     rms: float
 
     def __getitem__(self, name: str) -> float:
-        """A number by its name, as of the errors of `discover`."""
+        """A number by its name, as in the errors of `discover`."""
         if name not in self.__dataclass_fields__:
             raise KeyError(name)
         number: float = getattr(self, name)
@@ -185,11 +185,11 @@ Errors = dict[str, ChannelErrors]
 
 @dataclasses.dataclass(frozen=True)
 class Block:
-    """One block that was held out.
+    """One held-out block.
 
     Attributes:
-        errors: of its rows; unreachable_rows: that the fit without it does not reach, counted from 1.
-        converged: whether that fit did.
+        errors: of its rows; unreachable_rows: those that the fit without it does not reach, counted from 1.
+        converged: True if that fit converged.
     """
 
     errors: Errors
@@ -197,7 +197,7 @@ class Block:
     converged: bool
 
     def to_json(self) -> dict[str, Any]:
-        """As in `held_out_by` of result.json."""
+        """Entry of `held_out_by` in result.json."""
         return {
             **_by_name(self.errors),
             "unreachable_rows": self.unreachable_rows,
@@ -207,12 +207,12 @@ class Block:
 
 @dataclasses.dataclass(frozen=True)
 class HeldOut:
-    """Every row predicted by a fit that has not seen its block, for one kind of blocks.
+    """Hold-out predictions of all rows by fits without their block, for one kind of blocks.
 
     Attributes:
-        errors: of all rows; unreachable_rows: without a prediction, counted from 1.
+        errors: of all rows; unreachable_rows: those without a prediction, counted from 1.
         blocks: by label.
-        reading: by channel [SI], NaN where the fit's robot does not reach the row, shape (rows,).
+        reading: by channel [SI], NaN if the fit's robot does not reach the row, shape (rows,).
     """
 
     errors: Errors
@@ -221,7 +221,7 @@ class HeldOut:
     reading: dict[str, np.ndarray]
 
     def to_json(self) -> dict[str, Any]:
-        """As in `held_out_by` of result.json."""
+        """Entry of `held_out_by` in result.json."""
         return {
             "all": _by_name(self.errors),
             "unreachable_rows": self.unreachable_rows,
@@ -231,11 +231,11 @@ class HeldOut:
 
 @dataclasses.dataclass(frozen=True)
 class ChannelReadings:
-    """Readings of one channel, every array of shape (rows,).
+    """Readings of one channel, all arrays of shape (rows,).
 
     Attributes:
-        measured: [SI], NaN where missing; sd: of each.
-        before, after: of the robot as given and as calibrated [SI], NaN where it does not reach the row.
+        measured: [SI], NaN if missing; sd: of each.
+        before, after: of the robot as given and as calibrated [SI], NaN if it does not reach the row.
         percent, sigma: errors after.
     """
 
@@ -249,10 +249,10 @@ class ChannelReadings:
 
 @dataclasses.dataclass(frozen=True)
 class ChiSquare:
-    """Misfit of the readings [σ²], and the degrees of freedom that the fit leaves them.
+    """Misfit of the readings [σ²], and the degrees of freedom left by the fit.
 
     Attributes:
-        tests_adequacy: false where noise was estimated from the misfit.
+        tests_adequacy: False if noise was estimated from the misfit.
     """
 
     value: float
@@ -262,25 +262,25 @@ class ChiSquare:
 
 @dataclasses.dataclass(frozen=True)
 class CalibrationResult:
-    """All that a calibration found, computed once by `calibrate`; what is written and drawn is read from it.
+    """Result of `calibrate`; all files and figures are made from it.
 
     Attributes:
         robot: calibrated.
-        source: of the runs; channels: that its readings are of, in order; model: the fidelity; seed: of the starts.
-        parameters: the free ones, by name; tied: those that follow them, by name.
+        source: of the runs; channels: of the readings, in order; model: the fidelity; seed: of the starts.
+        parameters: the free ones, by name; tied: those tied to them, by name.
         noise: by channel.
-        axis: column along which the rows of a run follow one another.
+        axis: column that orders the rows of a run.
         errors_before, errors_after: of the robot as given and as calibrated, by channel.
-        held_out: by kind of block, in the order in which they tell most.
+        held_out: by kind of block, the most informative first.
         conditions: columns of the runs, as in their table; readings: by channel.
         status_before, status: word of each row, shape (rows,).
         adhesion_used: by the calibrated robot [-], shape (rows,).
-        objective: at the optimum [½σ²]; converged: whether the search did.
-        starts: how all searches ended; searched: the population that came before them, None without.
-        chi_square: of the readings that are there; adequacy: whether they are what noise leaves.
-        residual_clusters: columns without a role by which residuals cluster.
+        objective: at the optimum [½σ²]; converged: True if the search converged.
+        starts: outcome of all searches; searched: the population before them, None without.
+        chi_square: of the finite readings; adequacy: tests whether the residuals are consistent with noise.
+        residual_clusters: clusters of the residuals by columns without a role.
         identifiability: the linear analysis; posterior: of the free parameters.
-        remarks: what is worth reading before it is used.
+        remarks: notes to read before the result is used.
     """
 
     robot: Robot
@@ -312,7 +312,7 @@ class CalibrationResult:
     remarks: Notes
 
     def __len__(self) -> int:
-        """Rows of the table."""
+        """Number of rows of the table."""
         return len(self.status)
 
     @property
@@ -322,12 +322,12 @@ class CalibrationResult:
 
     @property
     def profiled(self) -> bool:
-        """Whether profiles were made."""
+        """True if profiles were computed."""
         return any(p.profile is not None for p in self.parameters.values())
 
     @property
     def held_by_prior(self) -> tuple[str, ...]:
-        """Names of the parameters that are held by their priors."""
+        """Names of the parameters held by their priors."""
         return tuple(name for name, p in self.parameters.items() if p.held_by_prior)
 
     @property
@@ -338,7 +338,7 @@ class CalibrationResult:
     @property
     def undetermined(self) -> tuple[str, ...]:
         """Names of the parameters that only their priors determine, without those of a pair in `together`."""
-        return undetermined(self.held_by_prior, self.together)
+        return undetermined_names(self.held_by_prior, self.together)
 
     def determined(self, name: str) -> str:
         """`yes`, `no`, or with which parameters together these data determine one."""
@@ -346,13 +346,13 @@ class CalibrationResult:
 
     @property
     def counts(self) -> dict[str, int]:
-        """How many rows have each status with the calibrated robot."""
+        """Number of rows with each status, for the calibrated robot."""
         return _counts(self.status)
 
     @property
     def held_out_alike(self) -> dict[str, tuple[str, ...]]:
-        """The kinds of blocks that tell something of their own, and of each the later ones that predict every row
-        as it does, to 1 % of a reading's sd."""
+        """Distinct kinds of blocks, each with the later kinds that predict every row in the same way (to 1 % of a
+        reading's sd)."""
         found: dict[str, tuple[str, ...]] = {}
         for kind, held in self.held_out.items():
             like = next((k for k in found if self._same(self.held_out[k], held)), None)
@@ -367,7 +367,7 @@ class CalibrationResult:
 
     @property
     def main_blocks(self) -> HeldOut | None:
-        """The most telling kind of blocks that was held out."""
+        """The most informative kind of held-out blocks."""
         return next(iter(self.held_out.values()), None)
 
     @property
@@ -379,7 +379,7 @@ class CalibrationResult:
         return {fit: {name: e.rms for name, e in by.items() if e.rows} for fit, by in fits.items()}
 
     def to_json(self) -> dict[str, Any]:
-        """As in result.json, docs/schemas/calibrate.schema.json."""
+        """Entries of result.json, docs/schemas/calibrate.schema.json."""
         about, before, main = self.identifiability, _by_name(self.errors_before), self.main_blocks
         return writing.finite(
             {
@@ -393,7 +393,7 @@ class CalibrationResult:
                 "noise": _by_name(self.noise),
                 "percent_of": OF_SIZE,
                 "errors": {
-                    # nothing is fitted before, so both are the same
+                    # no fit precedes, so both are the same
                     "before": {"fitted": before, "held_out": before},
                     "after": {
                         "fitted": _by_name(self.errors_after),
@@ -432,11 +432,11 @@ class CalibrationResult:
         )
 
     def rows(self) -> dict[str, np.ndarray]:
-        """Conditions, readings before and after and held out, errors in percent and in σ: a table, row by row."""
+        """Table of the rows: conditions, readings before, after and held out, errors in percent and in σ."""
         return {**self.conditions, **dict(self._readings()), "status": self.status}
 
     def rows_table(self) -> dict[str, np.ndarray]:
-        """The same as `rows`, under the name that all results have."""
+        """Result of `rows`, under the name that all results have."""
         return self.rows()
 
     def _readings(self) -> Iterator[tuple[str, np.ndarray]]:
@@ -452,11 +452,12 @@ class CalibrationResult:
             yield f"error_{channel.name}_percent", r.percent
             yield f"error_{channel.name}_sigma", r.sigma
 
-    def save(self, folder: Path | str, robot_name: str = "a robot") -> None:
-        """Write robot.toml, posterior.nc, result.json and rows.csv into a folder, which is made if it is not there.
+    def save(self, folder: Path | str, robot_name: str = "a robot", tables: str = "csv") -> None:
+        """Write robot.toml, posterior.nc, result.json and rows.csv into a folder, which is created if missing.
 
         Args:
-            robot_name: of the robot that was calibrated, for the head of robot.toml.
+            robot_name: name of the initial robot, for the head of robot.toml.
+            tables: as for `write_table`.
         """
         from calibration.data import robot_file
 
@@ -466,7 +467,7 @@ class CalibrationResult:
         note = "\n".join([described(self, "header", robot_name), *held])
         robot_file.write(self.robot, folder / "robot.toml", note=note)
         writing.write_json(folder / "result.json", self.to_json())
-        writing.write_table(folder / "rows.csv", self.rows())
+        writing.write_table(folder / "rows.csv", self.rows(), tables)
         posterior.write(self.posterior, folder / posterior.FILE)
 
 

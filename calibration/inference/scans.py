@@ -1,10 +1,10 @@
-"""Scans of parameters over which the misfit is a staircase or has several basins: a dead time, a phase, a gap.
+"""Scans of parameters with a misfit that is a staircase or has several local minima: a dead time, a phase, a gap.
 
-Where a current rises within L/R and is sampled once in twenty of that, the misfit over a delay is flat but for a
-cliff wherever a sample passes the rise: a gradient says nothing of what lies behind the next cliff, and a curvature
-is that of the step one stands on. So the misfit is looked at over the whole of the parameter's prior, all others
-moved with it as their linearisation says, before a search and after it; and what is known of the parameter afterwards
-is read from that profile.
+If a current rises within L/R and is sampled at a twentieth of that rate, the misfit over a delay is a staircase.
+It steps where a sample passes the rise. A gradient has no information on what is beyond the next step, and a
+curvature is that of the current step only. So the misfit is scanned over all of the parameter's prior, before and
+after a search, while the other parameters move with it according to their linearisation. The parameter's posterior is
+taken from that profile.
 """
 
 from __future__ import annotations
@@ -18,26 +18,26 @@ from jaxtyping import Float
 
 from calibration.inference.fit_notes import InPieces, Step
 from calibration.inference.identifiability import Z95, Identifiability
-from calibration.inference.optimizers import Optimum, evaluated
-from calibration.inference.priors import known
+from calibration.inference.optimizers import Optimum, evaluate_residuals
+from calibration.inference.priors import parameters_by_name
 from calibration.inference.problem import Data, Observation, Problem
 
 #: Half of the range of a scan [prior sd].
 RANGE = 4.0
-#: Basins that are looked at more closely, those from which searches begin, and how often a search is begun again.
+#: Number of basins (local minima) scanned more closely, number from which searches begin, most repeats of a search.
 CLOSER, TRIED, AGAIN = 16, 2, 6
-#: Fall of the objective [½σ²] that is worth another search: a parameter moves by a tenth of its sd for it.
+#: Decrease of the objective [½σ²] that justifies another search: it moves a parameter by a tenth of its sd.
 WORTH = 5e-3
 
 
 @dataclasses.dataclass(frozen=True)
 class Scan:
-    """The misfit over one coordinate.
+    """Misfit over one coordinate.
 
     Attributes:
         at: values of the coordinate, increasing, shape (points,).
-        cost: objective there, the others moved to where their linearisation has its minimum [½σ²], shape (points,).
-        others: all coordinates then, shape (points, parameters).
+        cost: objective there, with the others at the minimum of their linearisation [½σ²], shape (points,).
+        others: all coordinates there, shape (points, parameters).
     """
 
     at: Float[np.ndarray, " points"]
@@ -45,87 +45,91 @@ class Scan:
     others: Float[np.ndarray, "points parameters"]
 
     def basins(self) -> np.ndarray:
-        """Indices of the points that are lower than those beside them, the lowest first."""
+        """Indices of the local minima, the lowest first."""
         padded = np.concatenate([[np.inf], self.cost, [np.inf]])
         lowest = np.flatnonzero((self.cost <= padded[:-2]) & (self.cost < padded[2:]))
         return lowest[np.argsort(self.cost[lowest], kind="stable")]
 
     def interval(self) -> tuple[float, float]:
-        """Ends of what no point beyond is within 95 % (a rise of 3.84 σ²)."""
+        """Ends of the smallest interval with all points within 95 % (a rise of 3.84 σ²)."""
         inside = np.flatnonzero(2 * (self.cost - self.cost.min()) <= Z95**2)
         return self._crossing(inside[0], -1), self._crossing(inside[-1], 1)
 
     def _crossing(self, k: int, side: int) -> float:
-        """Where the rise passes 3.84 between the k-th point, inside, and the next; the last point if it does not."""
+        """Coordinate where the rise passes 3.84 between the inner k-th point and the next, or the end point."""
         if not 0 <= k + side < len(self.at):
             return float(self.at[k])
         one, two = (np.sqrt(max(2 * (self.cost[j] - self.cost.min()), 0.0)) for j in (k, k + side))
         return float(self.at[k] + (self.at[k + side] - self.at[k]) * (Z95 - one) / max(two - one, 1e-12))
 
     def open(self) -> tuple[bool, bool]:
-        """Whether the interval may go on beyond the first or the last point."""
+        """True for each end of the interval that may be beyond the first or the last point."""
         inside = 2 * (self.cost - self.cost.min()) <= Z95**2
         return bool(inside[0]), bool(inside[-1])
 
     def parts(self) -> int:
-        """Of how many pieces, apart from one another, the 95 % region consists."""
+        """Number of separate pieces of the 95 % region."""
         inside = 2 * (self.cost - self.cost.min()) <= Z95**2
         return int(np.sum(inside & ~np.concatenate([[False], inside[:-1]])))
 
     def sd(self) -> float:
-        """Of exp(-rise / 2) as a density over the coordinate."""
+        """Standard deviation of exp(-rise / 2) as a density over the coordinate."""
         width = np.gradient(self.at)
         mass = width * np.exp(self.cost.min() - self.cost)
         middle = np.sum(mass * self.at) / np.sum(mass)
         return float(np.sqrt(np.sum(mass * (self.at - middle) ** 2) / np.sum(mass)))
 
 
-def scanned(problem: Problem) -> tuple[int, ...]:
-    """Coordinates that are scanned: their fields say so, and the data follow them through time."""
+def scanned_coordinates(problem: Problem) -> tuple[int, ...]:
+    """Coordinates that are scanned: their fields request it, and the data are histories."""
     return problem.observe.scanned(problem)
 
 
-def beyond_a_basin(problem: Problem) -> tuple[int, ...]:
-    """Coordinates whose prior reaches beyond one basin of the misfit, as their fields say (`Spec.scanned`)."""
-    fields, c = known(problem.base), problem.coordinates
+def coordinates_beyond_a_basin(problem: Problem) -> tuple[int, ...]:
+    """Coordinates with a prior wider than one basin of the misfit, according to their fields (`Spec.scanned`)."""
+    fields, c = parameters_by_name(problem.base), problem.coordinates
     values = [c.value(np.full(len(c), side * RANGE)) for side in (-1.0, 1.0)]
     half = 0.5 * (values[1] - values[0])
     widths = [fields[n].spec.scanned if n in fields else None for n in c.names]
     return tuple(k for k, width in enumerate(widths) if width is not None and half[k] > width)
 
 
-def scan(problem: Problem, z: np.ndarray, data: Data, k: int) -> Scan:
-    """The misfit over coordinate k, the others near z: evenly over the prior's range, and closer where it is low."""
+def scan_coordinate(problem: Problem, z: np.ndarray, data: Data, k: int) -> Scan:
+    """Misfit over coordinate k near z: evenly over the prior's range, and more closely near minima."""
     count = problem.observe.scan_points(problem, k)
-    seen = _seen(problem, z, data, k, np.linspace(-RANGE, RANGE, count))
+    seen = _scan_values(problem, z, data, k, np.linspace(-RANGE, RANGE, count))
     around, few = np.array([z[k], *seen.at[seen.basins()]])[:CLOSER], count // CLOSER
     close = (around[:, None] + 2 * RANGE / (count - 1) * np.linspace(-1, 1, few)).ravel()
     if few > 2:
-        seen = _with(seen, _seen(problem, z, data, k, np.resize(close, count)))
+        seen = _join_scans(seen, _scan_values(problem, z, data, k, np.resize(close, count)))
     low, high = seen.interval()
-    return _with(seen, _seen(problem, z, data, k, np.linspace(1.5 * low - 0.5 * high, 1.5 * high - 0.5 * low, count)))
+    return _join_scans(
+        seen, _scan_values(problem, z, data, k, np.linspace(1.5 * low - 0.5 * high, 1.5 * high - 0.5 * low, count))
+    )
 
 
-def _seen(problem: Problem, z: np.ndarray, data: Data, k: int, at: np.ndarray) -> Scan:
+def _scan_values(problem: Problem, z: np.ndarray, data: Data, k: int, at: np.ndarray) -> Scan:
     at = np.clip(at, -RANGE, RANGE)
     cost, others = problem.observe.scan(problem, jnp.asarray(z), data, k, jnp.asarray(at))
-    return _sorted(at, np.asarray(cost), np.asarray(others))
+    return _sorted_scan(at, np.asarray(cost), np.asarray(others))
 
 
-def _with(one: Scan, two: Scan) -> Scan:
-    return _sorted(*(np.concatenate(x) for x in ((one.at, two.at), (one.cost, two.cost), (one.others, two.others))))
+def _join_scans(one: Scan, two: Scan) -> Scan:
+    return _sorted_scan(
+        *(np.concatenate(x) for x in ((one.at, two.at), (one.cost, two.cost), (one.others, two.others)))
+    )
 
 
-def _sorted(at: np.ndarray, cost: np.ndarray, others: np.ndarray) -> Scan:
+def _sorted_scan(at: np.ndarray, cost: np.ndarray, others: np.ndarray) -> Scan:
     order = np.unique(at, return_index=True)[1]
     return Scan(at[order], np.where(np.isfinite(cost), cost, np.inf)[order], others[order])
 
 
-def placed(problem: Problem, starts: Float[np.ndarray, "starts z"]) -> Float[np.ndarray, "starts z"]:
-    """Starts of searches with what is scanned where the misfit is lowest beside the first, all else as it was."""
+def place_at_minimum(problem: Problem, starts: Float[np.ndarray, "starts z"]) -> Float[np.ndarray, "starts z"]:
+    """Starts with the scanned coordinates at the lowest misfit near the first start; others are unchanged."""
     starts = np.array(starts, float)
-    for k in scanned(problem):
-        seen = scan(problem, starts[0], problem.data, k)
+    for k in scanned_coordinates(problem):
+        seen = scan_coordinate(problem, starts[0], problem.data, k)
         starts[:, k] = seen.at[np.argmin(seen.cost)]
     return starts
 
@@ -133,27 +137,27 @@ def placed(problem: Problem, starts: Float[np.ndarray, "starts z"]) -> Float[np.
 Found = tuple[Optimum, Observation]
 
 
-def searched_on(
+def search_lower_basins(
     problem: Problem, found: Found, data: Data, search: Callable[[np.ndarray], Found], tell: Callable[[Step], None]
 ) -> Found:
-    """Where a search ends that looks over what is scanned from where it ended, and begins again in a lower basin.
+    """Optimum of a search that is scanned afterwards, and repeated from lower basins.
 
-    It has converged where no basin is lower and none of the others would gain, whatever the gradient at a cliff says.
+    It has converged if no basin is lower and the other coordinates bring no gain, whatever the gradient at a step is.
 
     Args:
-        found: where a search ended, and what the model says there; search: another one from a start.
+        found: optimum of a search, and the observation there; search: function that searches from a start.
     """
-    every = scanned(problem)
+    every = scanned_coordinates(problem)
     if not every:
         return found
 
     def objective(z: np.ndarray) -> float:
-        cost = 0.5 * float(jnp.sum(evaluated(problem, jnp.asarray(z), data) ** 2))
+        cost = 0.5 * float(jnp.sum(evaluate_residuals(problem, jnp.asarray(z), data) ** 2))
         return cost if np.isfinite(cost) else np.inf
 
     for _ in range(AGAIN):
         here, z = float(found[0].cost), np.asarray(found[0].z)
-        looked = {k: scan(problem, z, data, k) for k in every}
+        looked = {k: scan_coordinate(problem, z, data, k) for k in every}
         lower = found
         for k, seen in looked.items():
             for j in [j for j in seen.basins() if seen.cost[j] < here - WORTH][:TRIED]:
@@ -167,7 +171,7 @@ def searched_on(
         tell(Step("basin", (over, float(found[0].cost))))
     else:
         return dataclasses.replace(found[0], converged=jnp.asarray(False)), found[1]
-    # At a kink there is a slope on either side: that nothing near is lower is what makes it an optimum.
+    # A kink has a slope on either side, so an optimum there is a point with no lower point nearby.
     lowest = min(float(seen.cost.min()) for seen in looked.values())
     sd = np.asarray(found[0].sd).copy()
     for k, seen in looked.items():
@@ -176,13 +180,13 @@ def searched_on(
     return dataclasses.replace(found[0], converged=jnp.asarray(settled), sd=jnp.asarray(sd)), found[1]
 
 
-def profiles(problem: Problem, z: np.ndarray) -> dict[int, Scan]:
-    """The scans at an optimum, by coordinate: what the data say of each."""
-    return {k: scan(problem, z, problem.data, k) for k in scanned(problem)}
+def scan_all(problem: Problem, z: np.ndarray) -> dict[int, Scan]:
+    """Scans at an optimum, by coordinate."""
+    return {k: scan_coordinate(problem, z, problem.data, k) for k in scanned_coordinates(problem)}
 
 
 def with_scanned_sds(about: Identifiability, scans: dict[int, Scan]) -> Identifiability:
-    """The linear analysis with the sds of what is scanned as its profile says; correlations stay."""
+    """Linear analysis with the sds of scanned coordinates from their profiles; correlations are kept."""
     sd = about.sd.copy()
     for k, seen in scans.items():
         sd[k] = seen.sd()
@@ -190,11 +194,11 @@ def with_scanned_sds(about: Identifiability, scans: dict[int, Scan]) -> Identifi
     return dataclasses.replace(about, sd=sd, covariance=about.covariance * np.outer(wider, wider))
 
 
-def apart(scans: dict[int, Scan], z: np.ndarray | None, converged: np.ndarray) -> int:
-    """How many searches that converged ended where the profile at the best optimum has nothing.
+def count_outside(scans: dict[int, Scan], z: np.ndarray | None, converged: np.ndarray) -> int:
+    """Number of converged searches that ended outside the profiles at the best optimum.
 
     Args:
-        z: where each ended, shape (searches, parameters), None where that is not known; converged: of each.
+        z: end of each, shape (searches, parameters), None if not known; converged: of each.
     """
     if z is None:
         return 0
@@ -203,6 +207,6 @@ def apart(scans: dict[int, Scan], z: np.ndarray | None, converged: np.ndarray) -
     return int(np.sum(np.any(outside, 0) & converged)) if outside else 0
 
 
-def remarks(problem: Problem, scans: dict[int, Scan]) -> list[InPieces]:
-    """Parameters whose 95 % region is in pieces."""
+def scan_remarks(problem: Problem, scans: dict[int, Scan]) -> list[InPieces]:
+    """Notes on parameters with a 95 % region in several pieces."""
     return [InPieces(problem.coordinates.names[k], parts) for k, seen in scans.items() if (parts := seen.parts()) > 1]

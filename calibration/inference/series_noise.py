@@ -1,9 +1,9 @@
-"""Noise that nobody states, from the scatter of readings along series of conditions.
+"""Estimate of unstated noise from the scatter of readings along series of conditions.
 
-Along a series, rows alike in every condition but one, what a model says is smooth: what a reading differs from the
-line between its neighbours is noise, and curvature where the steps are wide, which makes the estimate too large and
-never too small (second differences: von Neumann, Ann. Math. Stat. 12 (1941); Gasser, Sroka and Jennen-Steinmetz,
-Biometrika 73 (1986), for any spacing).
+Along a series, rows that differ in one condition only, a model's readings are smooth. The difference of a reading
+from the line between its neighbours is noise, plus curvature if the steps are wide. So the estimate may be too
+large, never too small (second differences: von Neumann, Ann. Math. Stat. 12 (1941); Gasser, Sroka and
+Jennen-Steinmetz, Biometrika 73 (1986), for any spacing).
 """
 
 from __future__ import annotations
@@ -18,29 +18,29 @@ from calibration.data.instruments import display_step
 from calibration.data.runs import Runs
 from mmrjax.model.channels import Channel
 
-#: The axis whose series are taken where they are enough; else the one of most degrees of freedom.
+#: The axis of the series if it has enough; else the axis with most degrees of freedom is used.
 FIRST = "slope_deg"
-#: Share of a reading that its sd is not below [-].
+#: Least sd as a share of its reading [-].
 FLOOR = 1e-3
 #: Fewest degrees of freedom of an estimate.
 FEWEST = 4.0
-#: Probability of a form below which it adds nothing.
+#: Probability of a form below which it is omitted.
 NEGLIGIBLE = 0.01
-#: Scales, of the median, beyond which a difference holds a reading that is wrong, and the most of them, as a share.
+#: Size of a difference with a wrong reading, in scales of the median, and the largest share of such differences.
 WRONG, MOST = 5.0, 0.25
-#: Columns that tell rows apart beside the axes.
+#: Columns that distinguish rows in addition to the axes.
 LABELS = ("configuration", "surface", "mode")
 
 
 @dataclasses.dataclass(frozen=True)
 class SeriesNoise:
-    """The noise of a channel.
+    """Noise of a channel.
 
     Attributes:
-        channel: whose; floor: part of the sd that is the same everywhere [SI]; share: part in proportion to the
-            reading [-]; both add as squares.
-        freedom: degrees of freedom of the estimate; axis: column along which the series are; count: how many.
-        least: sd that rounding alone leaves, by the step of the display [SI].
+        channel: its channel; floor: constant part of the sd [SI]; share: part in proportion to the reading [-];
+            they add as squares.
+        freedom: degrees of freedom of the estimate; axis: column along which the series are; count: number of series.
+        least: sd of rounding by the step of the display [SI].
     """
 
     channel: Channel
@@ -52,30 +52,29 @@ class SeriesNoise:
     least: float = 0.0
 
     def sd(self, sizes: Float[np.ndarray, " rows"]) -> Float[np.ndarray, " rows"]:
-        """Of readings of these sizes [SI]: no display shows less than its rounding, nor is a reading better than
-        `FLOOR` of itself."""
+        """Sd of readings of these sizes [SI], at least the display's rounding and `FLOOR` of the reading."""
         return np.maximum(np.hypot(self.floor, self.share * sizes), np.maximum(self.least, FLOOR * sizes))
 
 
-def estimate(runs: Runs, sizes: Float[np.ndarray, "rows channels"]) -> tuple[SeriesNoise | None, ...]:
-    """The noise of each channel; None where too few rows are along series.
+def estimate_noise(runs: Runs, sizes: Float[np.ndarray, "rows channels"]) -> tuple[SeriesNoise | None, ...]:
+    """Noise of each channel; None if too few rows are along series.
 
     Args:
-        sizes: of each reading [SI], that a share of the reading is of.
+        sizes: reference size of each reading for shares [SI].
     """
     measured = runs.measured()
-    by_axis = {axis: series_of(runs, axis) for axis in sorted(runs.axes, key=lambda axis: axis != FIRST)}
-    found: list[SeriesNoise | None] = []
+    by_axis = {axis: series_along(runs, axis) for axis in sorted(runs.axes, key=lambda axis: axis != FIRST)}
+    noises: list[SeriesNoise | None] = []
     for k, channel in enumerate(runs.channels):
-        each = [_of_channel(channel, measured[:, k], sizes[:, k], runs[a], a, s) for a, s in by_axis.items()]
+        each = [_noise_of_channel(channel, measured[:, k], sizes[:, k], runs[a], a, s) for a, s in by_axis.items()]
         enough = [e for e in each if e is not None and e.freedom >= FEWEST]
         first = next((e for e in enough if e.axis == FIRST), None)
-        found.append(first or max(enough, key=lambda e: e.freedom, default=None))
-    return tuple(found)
+        noises.append(first or max(enough, key=lambda e: e.freedom, default=None))
+    return tuple(noises)
 
 
-def series_of(runs: Runs, axis: str) -> list[np.ndarray]:
-    """Rows of each series along an axis, three or more; one that goes backward is another one."""
+def series_along(runs: Runs, axis: str) -> list[np.ndarray]:
+    """Rows of each series along an axis, three or more; backward travel is a separate series."""
     others = [c for c in (*LABELS, *runs.axes) if runs.has(c) and c != axis]
     driving = [c for c in (*runs.layout.axes[:1], "supply_voltage_V", "duty") if runs.has(c)]
     keys: list[tuple] = [
@@ -90,14 +89,14 @@ def series_of(runs: Runs, axis: str) -> list[np.ndarray]:
     return [np.array(rows) for rows in together.values() if len(rows) > 2]
 
 
-def _of_channel(
+def _noise_of_channel(
     channel: Channel, measured: np.ndarray, sizes: np.ndarray, x: np.ndarray, axis: str, series: list[np.ndarray]
 ) -> SeriesNoise | None:
-    """Mean of the variances of two forms, a constant sd and a share of the reading, by how likely each makes the
-    differences.
+    """Noise as a mixture of two forms, a constant sd and a share of the reading, by their likelihood.
 
-    A few series do not tell the forms apart, and the share alone would give the smallest readings a far too large
-    weight: with four series of five its smallest sd is too small by 3.7 in one table of twenty, the mean's by 2.2.
+    A few series do not decide between the forms, and a pure share would give the smallest readings a far too large
+    weight. With four series of five, its smallest sd is too small by a factor of 3.7 in one table of twenty; the
+    mixture's is too small by 2.2.
     """
     weights, used = _differences(measured, x, series)
     if not used:
@@ -109,7 +108,7 @@ def _of_channel(
         scale = weights * (sizes if in_share else 1.0)
         spread = np.sqrt(np.sum(scale**2, 1))
         unit, scale = difference / spread, scale / spread[:, None]
-        sound = _sound(unit)
+        sound = _without_wrong_readings(unit)
         unit, scale = unit[sound], scale[sound]
         count = len(unit)
         size = float(np.sqrt(np.mean(unit**2)))
@@ -124,24 +123,24 @@ def _of_channel(
 
 
 def _differences(measured: np.ndarray, x: np.ndarray, series: list[np.ndarray]) -> tuple[np.ndarray, int]:
-    """What each reading between two others differs from the line between these, as weights of all readings, shape
-    (differences, rows); and how many series have any."""
-    found, used = [], 0
+    """Difference of each reading from the line between its neighbours, as weights of all readings, shape
+    (differences, rows); and the number of series with any."""
+    differences, used = [], 0
     for rows in series:
         rows = rows[np.isfinite(measured[rows])]
         rows = rows[np.argsort(x[rows], kind="stable")]
-        before, at, after = rows[:-2], rows[1:-1], rows[2:]
+        before, middle, after = rows[:-2], rows[1:-1], rows[2:]
         wide = x[after] - x[before]
-        share = np.where(wide > 0, (x[after] - x[at]) / np.where(wide > 0, wide, 1.0), 0.5)
-        weights = np.zeros((len(at), len(measured)))
-        k = np.arange(len(at))
-        weights[k, at], weights[k, before], weights[k, after] = 1.0, -share, share - 1.0
-        found.append(weights)
-        used += bool(len(at))
-    return np.concatenate(found) if found else np.zeros((0, len(measured))), used
+        share = np.where(wide > 0, (x[after] - x[middle]) / np.where(wide > 0, wide, 1.0), 0.5)
+        weights = np.zeros((len(middle), len(measured)))
+        k = np.arange(len(middle))
+        weights[k, middle], weights[k, before], weights[k, after] = 1.0, -share, share - 1.0
+        differences.append(weights)
+        used += bool(len(middle))
+    return np.concatenate(differences) if differences else np.zeros((0, len(measured))), used
 
 
-def _sound(unit: np.ndarray) -> np.ndarray:
-    """Differences that hold no reading that is wrong: all, where they would be too many for that."""
+def _without_wrong_readings(unit: np.ndarray) -> np.ndarray:
+    """True for differences without a wrong reading; all True if too many would be wrong."""
     sound = np.abs(unit) <= WRONG * 1.4826 * np.median(np.abs(unit))
     return sound if np.mean(~sound) <= MOST else np.ones(len(unit), bool)

@@ -1,4 +1,4 @@
-"""States of a robot that a log shows, row by row, and windows of its runs in which the equations hold.
+"""States of a robot that a log shows, row by row, and windows of its runs for the equations.
 
 No window contains a jump of an imposed quantity, a gap between rows, or rest. After a jump the current rises within a
 fraction of the time between rows, and friction at rest is not a function of speed.
@@ -22,17 +22,17 @@ from mmrjax.model.channels import Channel
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.signals import State
 
-#: Times between rows that a window is long, within limits [s]; its fewest rows; and how far the next one begins after
-#: it, as a share of its length.
+#: Length of a window in times between rows, and its limits [s]; its fewest rows; distance between the starts of
+#: windows, as a share of their length.
 LONG, LENGTHS, FEWEST, APART = 16, (0.15, 0.3), 9, 0.25
-#: Share of its largest value by which what is imposed jumps, and the acceleration of an imposed speed, with which the
-#: current does; times the usual one, a time between rows that is a gap.
+#: Jump of an imposed quantity as a share of its largest value, and the same for the acceleration of an imposed speed,
+#: with which the current jumps; a time between rows that is a gap, over the usual one.
 JUMP, KINK, GAP = 0.05, 0.3, 3.0
-#: Speed at which a shaft may rest: in sds of its reading, and as a share of the largest.
+#: Speed below which a shaft may be at rest: in sds of its reading, and as a share of the largest.
 REST_SD, REST = 5.0, 0.01
-#: Sds of a delay that is not known within which a jump may act.
+#: Range of an unknown delay within which a jump may act [prior sd].
 DELAYED = 2.0
-#: Length of a window [s] beyond which it does not show how states change.
+#: Length of a window [s] beyond which it does not show changes of the states.
 LONGEST = 1.0
 
 
@@ -40,11 +40,11 @@ class Plan(eqx.Module):
     """States that a log shows, as indices of its channels.
 
     Attributes:
-        current: the channel that shows the current, -1: it follows from what is imposed.
-        motion: that which shows the motion, -1: it is imposed; angle: whether it is an angle, which is read twice
-            integrated; travels: whether it is of the load, and not of a shaft.
+        current: index of the channel of the current, -1 if it follows from an imposed quantity.
+        motion: index of the channel of the motion, -1 if it is imposed; angle: True if it is an angle, which enters
+            integrated twice; travels: True for motion of the load, not of a shaft.
         others: channels that follow from the states.
-        imposed: as of `Rig.imposed`.
+        imposed: as in `Rig.imposed`.
     """
 
     current: int = eqx.field(static=True)
@@ -73,7 +73,7 @@ def plan_of(problem: Problem) -> Plan | None:
         return None
     imposed = robot.rig.imposed
     pulsed = np.ptp(np.asarray(problem.observe.of_rows.duty)) > 0  # type: ignore[attr-defined]
-    drawn = "total_current"  # of which pulses take a share
+    drawn = "total_current"  # proportional to the duty of pulses
     currents = {k: c.name == drawn for k, c in shown.items() if c.rests_on == channels.CURRENT}
     speeds = [k for k, c in shown.items() if c.zero_at_rest and c.settled]
     angles = [k for k, c in shown.items() if c.zero_at_rest and not c.settled]
@@ -103,8 +103,8 @@ class Rows(eqx.Module):
     """Conditions, readings and states of each row, shape (rows, ...).
 
     Attributes:
-        conditions: as they are from the row on; shown: readings [SI].
-        rate: slope of the channel of the motion, where that is an angle [SI/s]; way: of travel, 0 where it may rest.
+        conditions: from the row on; shown: readings [SI].
+        rate: slope of the channel of the motion, if that is an angle [SI/s]; way: of travel, 0 if it may be at rest.
         angle: of the output since the run's first row [rad]; since: time since the row before [s], 0 for the first.
     """
 
@@ -126,28 +126,30 @@ class Windows:
     bend: np.ndarray
 
 
-def window(share: np.ndarray, length: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """w = sin⁴ π s, w' and w'' of a window at shares s of its length [s]; 0 outside, as its first three derivatives
-    are at its ends."""
+def window_function(share: np.ndarray, length: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """w = sin⁴ π s, w' and w'' of a window at shares s of its length [s]; 0 outside.
+
+    The first three derivatives are 0 at its ends.
+    """
     s, c = np.sin(np.pi * share), np.cos(np.pi * share)
     inside = (share > 0) & (share < 1)
     rise = np.pi / length
-    found = s**4, 4 * rise * s**3 * c, 4 * rise**2 * s**2 * (3 * c**2 - s**2)
-    return tuple(np.where(inside, x, 0.0) for x in found)  # type: ignore[return-value]
+    derivatives = s**4, 4 * rise * s**3 * c, 4 * rise**2 * s**2 * (3 * c**2 - s**2)
+    return tuple(np.where(inside, x, 0.0) for x in derivatives)  # type: ignore[return-value]
 
 
-def windows_in(time: np.ndarray, usable: np.ndarray, broken: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+def windows_of_run(time: np.ndarray, usable: np.ndarray, broken: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
     """Returns the windows of one run, each as (indices of its rows, their positions as shares of its length).
 
     Args:
-        time: of the rows [s], increasing; usable: whether a row may be in a window.
-        broken: whether no window may hold both a row and the one before it.
+        time: of the rows [s], increasing; usable: True for rows that may be in a window.
+        broken: True for rows that may not be in a window together with the previous row.
     """
     if len(time) < 2:
         return []
-    usual, found = float(np.median(np.diff(time))), list[tuple[np.ndarray, np.ndarray]]()
+    usual, windows = float(np.median(np.diff(time))), list[tuple[np.ndarray, np.ndarray]]()
     if (FEWEST - 1) * usual > LONGEST:
-        return found
+        return windows
     starts = usable & (np.r_[True, ~usable[:-1]] | broken)
     piece = np.cumsum(starts)
     for k in np.unique(piece[usable]):
@@ -160,44 +162,44 @@ def windows_in(time: np.ndarray, usable: np.ndarray, broken: np.ndarray) -> list
         for begin in time[rows[0]] + np.linspace(0.0, whole - length, count):
             inside = rows[(time[rows] >= begin - 1e-9) & (time[rows] <= begin + length + 1e-9)]
             if len(inside) >= FEWEST - 1:
-                found.append((inside, (time[inside] - begin) / length))
-    return found
+                windows.append((inside, (time[inside] - begin) / length))
+    return windows
 
 
-def windows_of(problem: Problem, plan: Plan, rate: np.ndarray) -> list[Windows]:
-    """Returns the windows of every run."""
+def windows_of_log(problem: Problem, plan: Plan, rate: np.ndarray) -> list[Windows]:
+    """Returns the windows of each run."""
     observe: Any = problem.observe
     time, weight = np.asarray(observe.time), np.asarray(problem.data.weight)
     measured, sd = np.asarray(problem.data.measured), np.asarray(problem.data.sd)
     states = [k for k in (plan.current, plan.motion if plan.mechanical else -1, *plan.others) if k >= 0]
-    moves = ways_of(problem, plan, measured, sd, rate)
-    late = _late(problem)
-    found = []
+    moves = travel_directions(problem, plan, measured, sd, rate)
+    late = _longest_delay(problem)
+    windows = []
     for r, every in enumerate(np.asarray(observe.rows_of)):
         rows = every[every >= 0]
         rows = rows[np.all(weight[rows][:, states] > 0, 1)]
         if len(rows) < FEWEST:
             continue
-        at, usable = time[rows], moves[rows] != 0
-        gap = np.r_[False, np.diff(at) > GAP * np.median(np.diff(at))]
+        times, usable = time[rows], moves[rows] != 0
+        gap = np.r_[False, np.diff(times) > GAP * np.median(np.diff(times))]
         turned = np.r_[False, np.diff(moves[rows]) != 0]
         broken = gap | turned
         for jump in _jumps(observe, r):
-            # A reading at the instant of a jump still shows what was before it.
-            usable &= ~((at > jump + 1e-9) & (at <= jump + late + 1e-9))
-            broken |= np.r_[False, (at[:-1] <= jump + 1e-9) & (at[1:] > jump + 1e-9)]
-        made = windows_in(at, usable, broken)
-        step = np.gradient(at)
+            # A reading at the instant of a jump still shows the state before it.
+            usable &= ~((times > jump + 1e-9) & (times <= jump + late + 1e-9))
+            broken |= np.r_[False, (times[:-1] <= jump + 1e-9) & (times[1:] > jump + 1e-9)]
+        made = windows_of_run(times, usable, broken)
+        step = np.gradient(times)
         whole = np.zeros((3, len(made), len(rows)))
         for k, (inside, share) in enumerate(made):
-            length = (at[inside[-1]] - at[inside[0]]) / max(share[-1] - share[0], 1e-12)
-            whole[:, k, inside] = np.array(window(share, length)) * step[inside]
+            length = (times[inside[-1]] - times[inside[0]]) / max(share[-1] - share[0], 1e-12)
+            whole[:, k, inside] = np.array(window_function(share, length)) * step[inside]
         if made:
-            found.append(Windows(rows, *whole))
-    return found
+            windows.append(Windows(rows, *whole))
+    return windows
 
 
-def _late(problem: Problem) -> float:
+def _longest_delay(problem: Problem) -> float:
     """Longest delay between a jump and its effect [s]."""
     names, delay = problem.coordinates.names, abs(float(np.max(np.asarray(problem.base.rig.delay))))
     if DELAY not in names:
@@ -206,7 +208,7 @@ def _late(problem: Problem) -> float:
 
 
 def _jumps(observe: Any, run: int) -> np.ndarray:
-    """Times at which an imposed quantity of a run jumps [s]."""
+    """Times of jumps of a run's imposed quantities [s]."""
     conditions, times = observe.conditions, np.asarray(observe.times[run])
     jumps = np.zeros(len(times) - 1, bool)
     imposed = "voltage", "motor_current", "duty", "open", "load_torque", "slope_deg", "payload", "total_mass"
@@ -218,8 +220,10 @@ def _jumps(observe: Any, run: int) -> np.ndarray:
     return times[1:][jumps]
 
 
-def ways_of(problem: Problem, plan: Plan, measured: np.ndarray, sd: np.ndarray, rate: np.ndarray) -> np.ndarray:
-    """Direction of travel at every row, 0 where the robot may be at rest."""
+def travel_directions(
+    problem: Problem, plan: Plan, measured: np.ndarray, sd: np.ndarray, rate: np.ndarray
+) -> np.ndarray:
+    """Direction of travel at each row, 0 if the robot may be at rest."""
     if plan.imposed == "motor_speed":
         speed = np.asarray(problem.observe.of_rows.motor_speed)  # type: ignore[attr-defined]
         return np.where(np.abs(speed) > REST * np.abs(speed).max(initial=0.0), np.sign(speed), 0.0)
@@ -229,8 +233,8 @@ def ways_of(problem: Problem, plan: Plan, measured: np.ndarray, sd: np.ndarray, 
     return np.where(np.abs(speed) > limit, np.sign(speed), 0.0)
 
 
-def rates_of(problem: Problem, plan: Plan) -> np.ndarray:
-    """Rate of the channel of the motion at every row: the slope of a cubic over a window [unit / s]."""
+def motion_rates(problem: Problem, plan: Plan) -> np.ndarray:
+    """Rate of the channel of the motion at each row: the slope of a cubic over a window [unit / s]."""
     observe: Any = problem.observe
     time, measured = np.asarray(observe.time), np.asarray(problem.data.measured)
     out = np.zeros(len(time))
@@ -247,7 +251,7 @@ def rates_of(problem: Problem, plan: Plan) -> np.ndarray:
     return out
 
 
-def rows_of(problem: Problem, plan: Plan, rate: np.ndarray) -> Rows:
+def states_by_row(problem: Problem, plan: Plan, rate: np.ndarray) -> Rows:
     """Returns conditions, readings and states of each row."""
     observe: Any = problem.observe
     time, measured = np.asarray(observe.time), np.asarray(problem.data.measured)
@@ -264,7 +268,9 @@ def rows_of(problem: Problem, plan: Plan, rate: np.ndarray) -> Rows:
             wheel = (rate if plan.angle else measured[:, plan.motion])[rows] * _wheel_per_unit(problem, plan)
         steps = 0.5 * (wheel[1:] + wheel[:-1]) * np.diff(time[rows])
         angle[rows[1:]] = np.cumsum(steps)
-    arrays = [jnp.asarray(x) for x in (measured, rate, ways_of(problem, plan, measured, sd, rate), angle, since)]
+    arrays = [
+        jnp.asarray(x) for x in (measured, rate, travel_directions(problem, plan, measured, sd, rate), angle, since)
+    ]
     return Rows(jax.tree.map(jnp.asarray, conditions), *arrays)
 
 
@@ -273,4 +279,4 @@ def _wheel_per_unit(problem: Problem, plan: Plan) -> float:
     robot, none = problem.base, jnp.zeros(())
     chassis = robot.configurations.members[0]
     rolling = State(none, robot.gearbox.ratio, chassis.radius, none, distance=chassis.radius)
-    return 1 / float(problem.channels[plan.motion].read(robot, balances.begin(robot, Conditions(0), rolling)))
+    return 1 / float(problem.channels[plan.motion].read(robot, balances.begin_signals(robot, Conditions(0), rolling)))

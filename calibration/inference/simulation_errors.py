@@ -1,4 +1,4 @@
-"""How far a simulation is from measurements: equation (35), its summary per channel, and R² of (A1)."""
+"""Errors of a simulation: equation (35), its summary per channel, and R² of (A1)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def relative_error(simulated: np.ndarray, measured: np.ndarray) -> np.ndarray:
     return 100.0 * (simulated - measured) / simulated
 
 
-#: What errors in percent of fits are of. A simulated size would make a model that overshoots look better.
+#: Reference of percent errors of fits. A simulated size would make a model that overshoots look better.
 OF_SIZE = "channel's measured root mean square"
 
 
@@ -25,14 +25,15 @@ def sized_error(simulated: np.ndarray, measured: np.ndarray) -> np.ndarray:
         simulated, measured: shape (rows, ...).
     """
     both = np.isfinite(simulated) & np.isfinite(measured)
-    with np.errstate(divide="ignore", invalid="ignore"):  # nothing of a channel without readings
+    with np.errstate(divide="ignore", invalid="ignore"):  # NaN for a channel without readings
         size = np.sqrt(np.sum(np.square(measured), 0, where=both) / both.sum(0))
         return np.asarray(100.0 * (simulated - measured) / size)
 
 
 def share_of_measured(simulated: np.ndarray, measured: np.ndarray) -> np.ndarray:
-    """rms of simulated less measured over the rms of what is measured [-], by channel over the rows that have both;
-    NaN without such a row; shape (channels,).
+    """rms error over the rms of the measured values [-], by channel over the rows with both; shape (channels,).
+
+    NaN without such a row.
 
     Args:
         simulated, measured: shape (rows, channels).
@@ -44,13 +45,13 @@ def share_of_measured(simulated: np.ndarray, measured: np.ndarray) -> np.ndarray
 
 
 def root_mean_square(errors: np.ndarray) -> float:
-    """Of those that there are; NaN where there is none."""
+    """Root mean square of the finite errors; NaN without any."""
     finite = errors[np.isfinite(errors)]
     return float(np.sqrt(np.mean(finite**2))) if finite.size else float("nan")
 
 
-def summary(errors: np.ndarray) -> dict[str, float | int]:
-    """Root mean square and worst of the errors (35) [%] over the rows that have one, and their count."""
+def error_summary(errors: np.ndarray) -> dict[str, float | int]:
+    """Root mean square and largest magnitude of finite errors (35) [%], and their count."""
     finite = errors[np.isfinite(errors)]
     if finite.size == 0:
         return {"rows": 0, "rms_percent": float("nan"), "max_percent": float("nan")}
@@ -61,10 +62,10 @@ def summary(errors: np.ndarray) -> dict[str, float | int]:
     }
 
 
-def certainty(measured: np.ndarray, approximated: np.ndarray) -> float:
+def r_squared(measured: np.ndarray, approximated: np.ndarray) -> float:
     """R² of eq. (A1) [-]: 1 - Σ(y - Y)² / (ΣY² - (ΣY)²/n), Y measured, y the approximation.
 
-    NaN where the measured values do not vary, or fewer than two rows have both.
+    NaN if the measured values do not vary, or if fewer than two rows have both.
     """
     both = np.isfinite(measured) & np.isfinite(approximated)
     y, approximation = measured[both], approximated[both]
@@ -81,12 +82,12 @@ def channel_errors(
     sd: np.ndarray,
     percent: np.ndarray | None = None,
 ) -> dict[str, dict[str, float | int]]:
-    """Errors of every channel over the rows that have a simulated and a measured value: in percent, in sigmas and, as
+    """Errors of each channel over the rows with a simulated and a measured value: in percent, in sigmas and, as
     `rms`, in the channel's unit.
 
     Args:
         shown: the channels.
-        simulated, measured, sd: [SI], NaN where there is none, shape (rows, channels).
+        simulated, measured, sd: [SI], NaN if missing, shape (rows, channels).
         percent: errors of the same shape; None takes `sized_error`.
     """
     percent = sized_error(simulated, measured) if percent is None else percent
@@ -94,7 +95,7 @@ def channel_errors(
     answer = {}
     for k, channel in enumerate(shown):
         answer[channel.name] = {
-            **summary(percent[:, k]),
+            **error_summary(percent[:, k]),
             "rms_sigma": root_mean_square(off[:, k] / sd[:, k]),
             "rms": root_mean_square(off[:, k]) / channel.factor,
         }

@@ -1,10 +1,10 @@
-"""Solvers of optimistix and optax by the names that `calibrate --solver` takes. Importable without jax."""
+"""Solvers of optimistix and optax by the names in `calibrate --solver`. Importable without jax."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from calibration.data.input_errors import BadConfiguration, choices
+from calibration.data.input_errors import BadConfiguration, allowed_words
 
 if TYPE_CHECKING:
     import optimistix as optx
@@ -28,14 +28,14 @@ TOLERANCE = 1e-6
 RATE = 0.02
 
 
-def solver(name: str) -> optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser:
+def solver_by_name(name: str) -> optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser:
     """Returns the solver of a name, one of `NAMES`.
 
     Raises:
         BadConfiguration: an unknown name.
     """
     if name not in NAMES:
-        raise BadConfiguration(f"solver: got {name}; {choices(name, NAMES)}")
+        raise BadConfiguration(f"solver: got {name}; {allowed_words(name, NAMES)}")
     import optax
     import optimistix as optx
 

@@ -1,4 +1,4 @@
-"""Tables of settled runs that tell nothing: of one condition, or with a channel that is computed from another."""
+"""Uninformative tables of settled runs: of one condition, or with a channel computed from another."""
 
 from __future__ import annotations
 
@@ -15,18 +15,20 @@ from calibration.inference.unused import unused_columns
 from mmrjax.model.channels import Channel
 from mmrjax.model.robot import Robot
 
-#: Fewest rows and different readings from which a line through all of them is no chance.
+#: Fewest rows and distinct readings for a line through all of them to be significant.
 ROWS, LEVELS = 8, 4
-#: Share of the range of a channel that rounding in a file leaves, and steps of a display in the range from which on
-#: a line through all readings is more than the display's rounding.
+#: Rounding error in a file as a share of a channel's range; fewest steps of a display within the range for a line
+#: through all readings to be more than the display's rounding.
 ROUNDED, STEPS = 2e-6, 40.0
-#: Range of readings that differ by their noise alone, in its sds: of a hundred rows 5 in the mean.
+#: Range of readings that differ only by noise, in its sds: on average 5 for a hundred rows.
 RANGE = 8.0
 
 
 def nothing_varies(runs: Runs, robot: Robot, noise: Noise) -> NothingVaries | None:
-    """The note that robot and readings are the same in all rows, within the noise; None where a channel differs by
-    more, or where the robot of the file does not reach a row."""
+    """Note that readings and predictions are the same in all rows within the noise.
+
+    None if a channel differs by more, or if the file's robot does not reach a row.
+    """
     if len(runs) < 2 or any(float(c.torque_gravity) > 0 for c in robot.configurations.members):
         return None
     foreseen = operating_readings(robot, runs.conditions(robot))
@@ -39,9 +41,9 @@ def nothing_varies(runs: Runs, robot: Robot, noise: Noise) -> NothingVaries | No
     return NothingVaries(runs.source, len(runs), runs.layout.imposed_column, unused_columns(runs))
 
 
-def copied(runs: Runs, robot: Robot) -> list[Copied]:
-    """The channels that are a line of another channel in every row, to the digits of the file."""
-    found, copies = list[Copied](), set[str]()
+def copied_channels(runs: Runs, robot: Robot) -> list[Copied]:
+    """Channels that are a linear function of another channel in all rows, to the digits of the file."""
+    copied, copies = list[Copied](), set[str]()
     names = [c for c in runs.channels if runs.has(c.column)]
     for one, other in itertools.combinations(names, 2):
         if {one.name, other.name} & copies:
@@ -50,18 +52,18 @@ def copied(runs: Runs, robot: Robot) -> list[Copied]:
         both = np.isfinite(x) & np.isfinite(y)
         if (line := _line(x[both], y[both])) is not None:
             copies.add(other.name)
-            found.append(Copied(runs.source, other.column, one.column, *line, _tied(one, other, robot)))
-    return found
+            copied.append(Copied(runs.source, other.column, one.column, *line, _tied(one, other, robot)))
+    return copied
 
 
 def _tied(one: Channel, other: Channel, robot: Robot) -> bool:
-    """True if the rig ties two channels to one another: readings of one unit, or speeds where nothing slips."""
+    """True if the rig ties two channels to each other: readings of one unit, or speeds without slip."""
     same = (one.unit_si or one.unit) == (other.unit_si or other.unit)
     return same or (not robot.has_ground and one.zero_at_rest and other.zero_at_rest)
 
 
 def _line(x: np.ndarray, y: np.ndarray) -> tuple[float, float] | None:
-    """Intercept and slope of a line through all points, as far as their digits tell; None where there is none."""
+    """Intercept and slope of a line through all points, within their digits; None without such a line."""
     if len(x) < ROWS or min(len(np.unique(x)), len(np.unique(y))) < LEVELS:
         return None
     slope, intercept = np.polyfit(x - x.mean(), y, 1)

@@ -1,4 +1,4 @@
-"""Columns of a table that vary from row to row and are no conditions of its fit."""
+"""Columns of a table that vary from row to row but are no conditions of its fit."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from calibration.inference.fit_notes import NoLoadGives, Unused
 from calibration.inference.residual_clusters import TIMES
 from mmrjax.model import channels
 
-#: Share of a torque's variation that no load of a shaft explains from which a brake may set it, and share of its size
-#: that varies at least.
+#: Share of a torque's variation unexplained by any load of a shaft above which a brake may impose it; least variation
+#: of the torque as a share of its size.
 BRAKED, VARIES = 0.5, 0.2
 #: Channel of the torque at the output.
-TORQUE = channels.find("output_torque")
+TORQUE = channels.find_channel("output_torque")
 
 
-def unused(runs: Runs) -> tuple[Unused, ...]:
-    """A note on the columns of numbers that vary and have no role; row numbers and times are left out."""
+def unused_notes(runs: Runs) -> tuple[Unused, ...]:
+    """A note on the columns of numbers that vary and have no role, without row numbers and times."""
     columns = tuple((name, runs.layout.nearest(name, runs.columns)) for name in unused_columns(runs))
     return (Unused(runs.source, columns),) if columns else ()
 
@@ -39,11 +39,11 @@ def _varies(name: str, cells: np.ndarray) -> bool:
     return len(levels) > 1 and not counts
 
 
-def no_load_gives(runs: Runs) -> tuple[NoLoadGives, ...]:
-    """A note on a torque read at the output that varies as no load on a shaft makes it vary.
+def unexplained_torque_notes(runs: Runs) -> tuple[NoLoadGives, ...]:
+    """A note on a measured output torque with a variation that no load on a shaft causes.
 
-    A load takes M_0 sign ω + K ω + M_c with M_0 and K of at least 0; where more than `BRAKED` of the variance of the
-    readings is left by the best of those, in each configuration, a brake sets the torque.
+    A load takes M_0 sign ω + K ω + M_c with M_0 and K of at least 0. If the best such load in each configuration
+    leaves more than `BRAKED` of the variance of the readings, a brake imposes the torque.
     """
     column = TORQUE.column
     if runs.layout.has_ground or runs.has(LOAD) or not (runs.has(column) and TORQUE in runs.channels):
@@ -57,15 +57,15 @@ def no_load_gives(runs: Runs) -> tuple[NoLoadGives, ...]:
     for name in np.unique(runs["configuration"]):
         mine = read & (runs["configuration"] == name)
         if mine.sum() >= 4:
-            y, w, d = torque[mine], np.abs(speed[mine]), way[mine]  # meters may show magnitude alone
-            left += min(_left(y, w, d), _left(np.abs(y), w, np.abs(d)))
+            y, w, d = torque[mine], np.abs(speed[mine]), way[mine]  # a meter may show only magnitudes
+            left += min(_unexplained_torque(y, w, d), _unexplained_torque(np.abs(y), w, np.abs(d)))
             total += float(np.sum((y - y.mean()) ** 2))
     if left <= BRAKED * total or total < VARIES**2 * float(np.sum(torque[read] ** 2)):
         return ()
     return (NoLoadGives(runs.source, column, runs.headings.get(column, column), left / total),)
 
 
-def _left(torque: np.ndarray, speed: np.ndarray, way: np.ndarray) -> float:
-    """Sum of squares of a torque that the best load leaves, of sizes of a speed and the ways round."""
+def _unexplained_torque(torque: np.ndarray, speed: np.ndarray, way: np.ndarray) -> float:
+    """Sum of squared residuals of a torque after the best load, for magnitudes of a speed and its directions."""
     w, ones = speed / max(float(speed.max()), 1e-12), np.ones(len(speed))
     return float(nnls(np.stack([way, way * w, ones, -ones], 1), torque)[1] ** 2)

@@ -25,9 +25,17 @@ from jaxtyping import Array
 from scipy.linalg import solve_triangular
 from scipy.optimize import least_squares
 
-from calibration.inference.linearization import ScoredEffect, each_shape, probe, terms_of
+from calibration.inference.linearization import ScoredEffect, balance_probe, effect_terms, map_over_shapes
 from calibration.inference.problem import Problem
-from calibration.inference.shown_states import Plan, Rows, Windows, plan_of, rates_of, rows_of, windows_of
+from calibration.inference.shown_states import (
+    Plan,
+    Rows,
+    Windows,
+    motion_rates,
+    plan_of,
+    states_by_row,
+    windows_of_log,
+)
 from mmrjax.compile.compiling import SELDOM, compiled
 from mmrjax.effects import Effect
 from mmrjax.model import balances, channels
@@ -38,12 +46,12 @@ from mmrjax.model.signals import Signals, State
 
 #: Fewest windows for each base parameter of a regression that is used.
 ENOUGH = 4
-#: Variance added to the noise of a window, as a share of it: without it, differences between overlapping windows
+#: Variance added to the noise of a window, as a share of it. Without it, differences between overlapping windows
 #: would have no noise.
 FLOOR = 0.01
 #: Steps of Newton's method to the current that a voltage drives.
 CURRENT_STEPS = 3
-#: Most steps of the regression, and the relative change of its sum of squares below which it ends; change of a
+#: Most steps of the regression, and the relative change of its sum of squares at which it ends; change of a
 #: coordinate for the derivative of the noise, and the change after which that is computed again [prior sd].
 STEPS, SMALL, STEP, FAR = 10, 1e-3, 1e-4, 0.5
 
@@ -63,11 +71,11 @@ class Terms(eqx.Module):
 
 
 def _current(robot: Robot, conditions: Conditions, state: State, way: Scalar) -> Scalar:
-    """Current of the voltage balance by Newton's method; derivatives are those of the last step."""
+    """Current of the voltage balance by Newton's method; its derivatives are those of the last step."""
 
     def left(robot: Robot, state: State, current: Scalar) -> Scalar:
         at = dataclasses.replace(state, current=current)
-        return jnp.asarray(balances.driven(robot, conditions, at, way).voltage_left)
+        return jnp.asarray(balances.driven_signals(robot, conditions, at, way).voltage_left)
 
     fixed: Any = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if isinstance(x, jax.Array) else x, (robot, state))
     current = jnp.zeros(())
@@ -80,12 +88,12 @@ def _current(robot: Robot, conditions: Conditions, state: State, way: Scalar) ->
 
 def _at(plan: Plan, robot: Robot, row: Rows, shown: Array, probes: frozenset[str]) -> tuple[Array, Array, Signals]:
     """Returns terms f and y of a row's equations, and its signals; `probes`: effects that read no signal."""
-    conditions, names = row.conditions, channels.names(robot.channels)
+    conditions, names = row.conditions, channels.channel_names(robot.channels)
     chassis = robot.chassis(conditions.configuration)
     none, one = jnp.zeros(()), jnp.ones(())
 
     def per_unit(k: int, state: State) -> Scalar:
-        return channels.find(names[k]).read(robot, balances.begin(robot, conditions, state))
+        return channels.find_channel(names[k]).read(robot, balances.begin_signals(robot, conditions, state))
 
     if plan.imposed == "motor_speed":
         turning: Scalar = jnp.asarray(conditions.motor_speed)
@@ -110,28 +118,28 @@ def _at(plan: Plan, robot: Robot, row: Rows, shown: Array, probes: frozenset[str
         own: Scalar = current
         if plan.imposed == "voltage" and plan.current < 0:
             own = _current(robot, conditions, at, row.way)
-        return balances.rolling(robot, conditions, dataclasses.replace(at, current=own), row.way), own
+        return balances.rolling_signals(robot, conditions, dataclasses.replace(at, current=own), row.way), own
 
     if robot.has_ground and plan.mechanical and plan.travels:
-        # The wheels turn faster than the load travels by what slip takes.
-        first = balances.begin(robot, conditions, state_at(turning, current))
+        # The wheels turn faster than the load travels because of slip.
+        first = balances.begin_signals(robot, conditions, state_at(turning, current))
         if any(e.balance == "slip" and e.name not in probes for e in robot.effects):
             first = signals_at(turning)[0]
-        turning = turning + balances.added(robot, first, "slip") * robot.gearbox.ratio / chassis.radius
+        turning = turning + balances.effects_sum(robot, first, "slip") * robot.gearbox.ratio / chassis.radius
     signals, own = signals_at(turning)
     f, y = [], []
     if plan.electrical:
         # Divided by the inductance, the rate of the current would be mostly noise, and a large inductance fit best.
         f.append(signals.voltage_left)
         y.append(signals.inductance * own)
-    if plan.mechanical:  # in what the instrument shows: in what depends on a parameter, that would shrink it
+    if plan.mechanical:  # in the instrument's unit, because a unit that depends on a parameter would shrink with it
         rise = unit * (1 / robot.gearbox.ratio if plan.angle else 1.0)
         f.append(rise * signals.acceleration_wheel * robot.gearbox.ratio)
         y.append(shown[plan.motion] + (0.0 if plan.angle else unit * turning - read))
     if plan.others:
         if robot.has_ground:
             creep = chassis.ground.speed_creep(signals.traction, signals.normal, signals.adhesion)
-            lost = balances.added(robot, signals, "slip")
+            lost = balances.effects_sum(robot, signals, "slip")
             signals = dataclasses.replace(signals, speed=signals.speed_theoretical - creep - lost)
         says = balances.sensor(robot, signals)
         f += [says[names[k]] - shown[k] for k in plan.others]
@@ -141,10 +149,10 @@ def _at(plan: Plan, robot: Robot, row: Rows, shown: Array, probes: frozenset[str
 
 @functools.partial(compiled, options=SELDOM)
 def _terms(problem: Problem, plan: Plan, rows: Rows, z: Array, effects: tuple[ScoredEffect, ...]) -> Terms:
-    """Returns the terms of every row at coordinates z, with derivatives by base parameters, readings and effects."""
+    """Returns the terms of each row at coordinates z, with derivatives by base parameters, readings and effects."""
     entering = tuple(dict.fromkeys(e.effect.balance for e in effects if e.effect.balance != "sensor"))
-    probes = tuple(probe(b) for b in entering)
-    size, names = z.size, channels.names(problem.channels)
+    probes = tuple(balance_probe(b) for b in entering)
+    size, names = z.size, channels.channel_names(problem.channels)
 
     def one(row: Rows) -> tuple[Any, tuple[Any, Signals]]:
         def both(x: Array) -> tuple[Any, tuple[Any, Signals]]:
@@ -160,7 +168,7 @@ def _terms(problem: Problem, plan: Plan, rows: Rows, z: Array, effects: tuple[Sc
     slopes, (values, signals) = jax.vmap(one)(rows)
     base = problem.coordinates.robot(problem.base, z)
     memory = _remembered(base, rows, signals, effects)
-    entered = jax.vmap(lambda s, m: terms_of(base, s, effects, m))(signals, memory)
+    entered = jax.vmap(lambda s, m: effect_terms(base, s, effects, m))(signals, memory)
     # An effect changes an equation like a defect of its balance. An effect of an instrument changes it like a
     # negative reading, or like a defect of that equation if the reading follows from the states.
     counts = np.array([len(e.at) for e in effects], int)
@@ -191,7 +199,7 @@ def _terms(problem: Problem, plan: Plan, rows: Rows, z: Array, effects: tuple[Sc
 
 
 def _remembered(robot: Robot, rows: Rows, signals: Signals, effects: tuple[ScoredEffect, ...]) -> list[Array]:
-    """Returns the memory of each effect at every row and point of its grid, shape (rows, grid)."""
+    """Returns the memory of each effect at each row and point of its grid, shape (rows, grid)."""
     count = rows.since.shape[0]
     nothing = [jnp.zeros((count, len(e.at))) for e in effects]
 
@@ -201,13 +209,13 @@ def _remembered(robot: Robot, rows: Rows, signals: Signals, effects: tuple[Score
             return jnp.asarray(effect.rate(robot, known), float)
 
         def begun(angle: Array) -> Array:
-            return each_shape(
+            return map_over_shapes(
                 scored, lambda e, _: jnp.asarray(e.initial(robot, angle), float), jnp.zeros(len(scored.at))
             )
 
         def after(memory: Array, row: tuple[Array, Array, Signals]) -> tuple[Array, Array]:
             since, angle, signals = row
-            law = lambda m: each_shape(scored, lambda e, x: rate(e, x, signals), m)  # noqa: E731
+            law = lambda m: map_over_shapes(scored, lambda e, x: rate(e, x, signals), m)  # noqa: E731
             speed, slope = jax.jvp(law, (memory,), (jnp.ones_like(memory),))
             memory = jnp.where(since > 0, memory + since * speed / (1 - since * slope), begun(angle))
             return memory, memory
@@ -239,8 +247,9 @@ class WeakForm:
 
 
 def weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> WeakForm | None:
-    """Returns the regression of a log's base parameters on its equations in weak form; None if the log does not show
-    the states, or has too few windows.
+    """Returns the regression of a log's base parameters on its equations in weak form.
+
+    None if the log does not show the states, or has too few windows.
 
     Args:
         problem: of histories, without effects in its coordinates; effects: instances whose signatures are computed.
@@ -248,12 +257,12 @@ def weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> WeakF
     plan = plan_of(problem)
     if plan is None:
         return None
-    rate = rates_of(problem, plan)
-    cut = windows_of(problem, plan, rate)
+    rate = motion_rates(problem, plan)
+    cut = windows_of_log(problem, plan, rate)
     equations = plan.electrical + plan.mechanical + len(plan.others)
     if equations * sum(len(w.weight) for w in cut) < ENOUGH * len(problem.coordinates):
         return None
-    rows = rows_of(problem, plan, rate)
+    rows = states_by_row(problem, plan, rate)
 
     def terms_at(z: np.ndarray, effects: tuple[ScoredEffect, ...] = ()) -> Terms:
         return jax.device_get(_terms(problem, plan, rows, jnp.asarray(z), effects))
@@ -265,8 +274,10 @@ def weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> WeakF
     grown: list[tuple[np.ndarray, list[np.ndarray]]] = []
 
     def growth(z: np.ndarray, here: list[_Joined]) -> list[np.ndarray]:
-        """Returns the relative derivative of the sds by each coordinate, computed near z. Without it a larger inertia
-        would always fit better."""
+        """Returns the relative derivative of the sds by each coordinate, computed near z.
+
+        Without it a larger inertia would always fit better.
+        """
         if not grown or np.max(np.abs(grown[0][0] - z)) > FAR:
             moved = [terms_at(z + STEP * one) for one in np.eye(len(z))]
             sds = [[_sd(_noise(problem, plan, w, t)) for t in moved] for w in cut]
@@ -297,14 +308,18 @@ def weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> WeakF
             max_nfev=STEPS, xtol=SMALL, ftol=SMALL,
         )  # fmt: skip
         return made(found.x, effects)
-    except (np.linalg.LinAlgError, ValueError):  # of what is not finite
+    except (np.linalg.LinAlgError, ValueError):  # non-finite numbers
         return None
 
 
 @dataclasses.dataclass(frozen=True)
 class _Joined:
-    """Equations of the windows of a run: residual, derivatives and signatures, shape (windows, 1 + coordinates +
-    instances), and their change by one sd of each reading, shape (windows, readings)."""
+    """Equations of the windows of a run.
+
+    Attributes:
+        whole: residual, derivatives and signatures, shape (windows, 1 + coordinates + instances).
+        noise: their change by one sd of each reading, shape (windows, readings).
+    """
 
     whole: np.ndarray
     noise: np.ndarray
@@ -348,7 +363,7 @@ def _noise(problem: Problem, plan: Plan, w: Windows, terms: Terms) -> np.ndarray
 
 
 def _joined(problem: Problem, plan: Plan, w: Windows, terms: Terms) -> _Joined:
-    """The equations of the windows of a run."""
+    """Equations of the windows of a run."""
     slopes = _slopes(plan, w, terms.f.shape[1])
 
     def integrated(f: Any, y: Any) -> np.ndarray:

@@ -1,1 +1,1 @@
-"""Which inputs matter: derivatives, variance-based indices, screening, and which runs would tell most."""
+"""Sensitivity: derivatives, variance-based indices, screening, and the most informative next runs."""

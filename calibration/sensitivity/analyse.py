@@ -1,4 +1,4 @@
-"""A whole sensitivity study: what matters where, and what would tell more."""
+"""A whole sensitivity study: important inputs at each point, and the most informative next runs."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import numpy as np
 from calibration.data.input_errors import BadConfiguration
 from calibration.inference.fit_notes import Note, Step
 from calibration.inference.identifiability import Z95
-from calibration.sensitivity.local import Local, directions, inert, local
+from calibration.sensitivity.local import Local, correlated_directions, inert_inputs, local_derivatives
 from calibration.sensitivity.methods import (
     Part,
-    correlated,
+    correlated_inputs,
     derivative_bounds,
     morris_screening,
     shapley_effects,
@@ -26,54 +26,54 @@ from calibration.sensitivity.study import Study
 from calibration.sensitivity.uncertain_inputs import Inputs
 from mmrjax import derived, fidelities
 
-#: Model evaluations in all where none are stated: of solves, of solves for Shapley effects, whose design costs as
-#: much again, and where a run over time is among the outputs.
+#: Default number of model evaluations: of solves, of solves for Shapley effects, whose design costs as much again,
+#: and with a run over time among the outputs.
 EVALUATIONS, EVALUATIONS_SHAPLEY, EVALUATIONS_LONG = 1_000_000, 300_000, 100_000
-#: Fewest that may be asked for.
+#: Least number of evaluations.
 LEAST = 1_000
 
 
 def default_evaluations(outputs: tuple[OutputRow, ...], model: str, method: str) -> int:
-    """Model evaluations where none are stated."""
-    long = fidelities.facts(model).rollout or any(o in derived.OF_START for o in outputs)
+    """Default number of model evaluations."""
+    long = fidelities.fidelity_facts(model).rollout or any(o in derived.OF_START for o in outputs)
     return EVALUATIONS_LONG if long else EVALUATIONS_SHAPLEY if method == "shapley" else EVALUATIONS
 
 
-def analyse(
+def analyse_sensitivity(
     study: Study, method: str, evaluations: int | None = None, seed: int = 0, candidates: Candidates | None = None
 ) -> SensitivityResult:
-    """A whole study.
+    """Result of a whole study.
 
     Args:
         method: one of `METHODS`.
-        evaluations: at least so many of the model, in all; None takes the default.
+        evaluations: least number of model evaluations in all; None takes the default.
         seed: random seed.
-        candidates: runs that could be made; None proposes none.
+        candidates: possible next runs; None proposes none.
 
     Raises:
-        BadConfiguration: a method that is not known or that needs independent inputs, too few evaluations, inputs
-            none of which changes an output, or points none of which can be studied.
+        BadConfiguration: an unknown method, a method that needs independent inputs, too few evaluations, inputs
+            that change no output, or no point that can be studied.
     """
     inputs, model = study.inputs, study.model
     if method not in METHODS:
         raise BadConfiguration(f"--method: got {method}; expected one of {', '.join(METHODS)}")
     if inputs.is_posterior and method in ("sobol", "morris", "derivative"):
         raise BadConfiguration(
-            f"--method {method}: takes inputs for independent, and those of a posterior are not; "
-            "expected shapley, or local"
+            f"--method {method}: needs independent inputs, and those of a posterior are correlated; "
+            "expected shapley or local"
         )
     usual = default_evaluations(model.outputs, model.fidelity, method)
     evaluations = usual if evaluations is None else evaluations
     if evaluations < LEAST:
         raise BadConfiguration(f"--evaluations: got {evaluations}; expected {LEAST} or more")
     study.tell(Step("points"))
-    found = local(study)
-    if not any(np.isfinite(x).any() for x in found.value.values()):
-        raise BadConfiguration(_none_converges(study, found.statuses))
-    idle = inert(study, found, seed)
+    studies = local_derivatives(study)
+    if not any(np.isfinite(x).any() for x in studies.value.values()):
+        raise BadConfiguration(_none_converges(study, studies.statuses))
+    idle = inert_inputs(study, studies, seed)
     if idle.all():
         raise BadConfiguration(
-            "--parameters: the derivative of every output by every input is zero; choose others, or other --outputs"
+            "--parameters: the derivative of every output by every input is zero; choose others, or change --outputs"
         )
     parts = _by_method(study, method, ~idle, evaluations, seed)
     comparison: dict[str, dict[str, Any]] = {}
@@ -82,10 +82,10 @@ def analyse(
         study.tell(Step("sobol"))
         comparison = _compared(study, parts, sobol_indices(study, ~idle, evaluations, seed, second=False))
         study.evaluations, study.seconds, study.sampled = spent
-    outputs = {o.name: _study_of(o, study, found, parts.get(o.name)) for o in model.outputs}
+    outputs = {o.name: _study_of(o, study, studies, parts.get(o.name)) for o in model.outputs}
     if method != "local" and not any(s.studied.any() for s in outputs.values()):
         raise BadConfiguration(_none_converges(study, study.statuses()))
-    proposed = None if candidates is None else next_runs(study, found, candidates)
+    proposed = None if candidates is None else next_runs(study, studies, candidates)
     return SensitivityResult(
         method=method,
         model=model.fidelity,
@@ -94,7 +94,7 @@ def analyse(
         correlated=inputs.is_posterior,
         points=study.points,
         outputs=outputs,
-        statuses=found.statuses,
+        statuses=studies.statuses,
         sampled=study.statuses(),
         next_runs=proposed,
         evaluations=study.evaluations,
@@ -121,7 +121,7 @@ def _described(inputs: Inputs, idle: np.ndarray) -> dict[str, Input]:
     slope = inputs.slope[inputs.places]
     uniform = np.arange(len(inputs)) >= len(inputs.parameters)
     sd = np.where(uniform, np.abs(slope).sum(1) / np.sqrt(12), np.sqrt(np.sum(slope**2, 1)))
-    along = directions(inputs)
+    along = correlated_directions(inputs)
     p = len(inputs.parameters)
     rows = {q: np.tile(inputs.centre, (len(inputs), 1)) for q in (-1, 0, 1)}
     for side in (-1, 1):
@@ -132,13 +132,13 @@ def _described(inputs: Inputs, idle: np.ndarray) -> dict[str, Input]:
     at = {
         q: inputs.values(x)[:, inputs.places][np.arange(len(inputs)), np.arange(len(inputs))] for q, x in rows.items()
     }
-    found = {}
+    described = {}
     for k, name in enumerate(inputs.names):
         kind = "uniform" if uniform[k] else "posterior" if inputs.is_posterior else inputs.parameters.kinds[k]
         axis = inputs.axes[name]
         interval = (float(at[-1][k]), float(at[1][k]))
-        found[name] = Input(axis.unit, axis.meaning, kind, float(at[0][k]), interval, float(sd[k]), bool(idle[k]))
-    return found
+        described[name] = Input(axis.unit, axis.meaning, kind, float(at[0][k]), interval, float(sd[k]), bool(idle[k]))
+    return described
 
 
 def _study_of(row: OutputRow, study: Study, found: Local, part: Part | None) -> OutputStudy:
@@ -150,7 +150,7 @@ def _study_of(row: OutputRow, study: Study, found: Local, part: Part | None) -> 
     elasticity = np.where(np.isfinite(elasticity), elasticity, np.nan)
     # A condition's score is uniform in 0..1, of variance 1/12.
     weight = np.where(np.arange(len(study.inputs)) < len(study.inputs.parameters), 1.0, 1 / 12)
-    along = directions(study.inputs)
+    along = correlated_directions(study.inputs)
     moved = (scores @ along.T) ** 2 * weight if study.inputs.is_posterior else scores**2 * weight
     variance = np.sum(scores**2 * weight, 1)
     linear = moved / np.where(variance > 0, variance, 1.0)[:, None]
@@ -180,15 +180,15 @@ def _study_of(row: OutputRow, study: Study, found: Local, part: Part | None) -> 
 
 
 def _compared(study: Study, bounds: dict[str, Part], sampled: dict[str, Part]) -> dict[str, dict[str, Any]]:
-    """How the bounds of derivatives compare with Sobol indices of the same points, by output."""
-    found: dict[str, dict[str, Any]] = {}
+    """Comparison of derivative bounds with Sobol indices of the same points, by output."""
+    compared: dict[str, dict[str, Any]] = {}
     for name, bound in bounds.items():
         beside = sampled[name]
         if not bound.overall or not beside.overall:
             continue
         total, first = beside.overall["total"], beside.overall["first"]
         upper, lower = bound.overall["upper"], bound.overall["lower"]
-        found[name] = {
+        compared[name] = {
             "inputs": {
                 n: {
                     "lower": float(lower.value[k]),
@@ -202,14 +202,14 @@ def _compared(study: Study, bounds: dict[str, Part], sampled: dict[str, Part]) -
             "lower_holds": bool(np.all(lower.low <= first.high + 1e-12)),
             "largest_excess": float(np.max(upper.value - total.value)),
         }
-    return found
+    return compared
 
 
 def _none_converges(study: Study, statuses: dict[str, dict[str, int]]) -> str:
     said = "; ".join(f"{s}: " + ", ".join(f"{n} {w}" for w, n in by.items()) for s, by in statuses.items())
     return (
-        f"no operating point can be studied, since too many robots do not travel there ({said}); choose gentler "
-        "--slopes, another --voltages, or state what is known of the adhesion with --set or by calibrating"
+        f"no operating point can be studied, because too many robots do not travel there ({said}); choose smaller "
+        "--slopes, another --voltages, or reduce the uncertainty of the adhesion with --set or by calibrating"
     )
 
 
@@ -225,7 +225,7 @@ def _remarks(study: Study, method: str, outputs: dict[str, OutputStudy], idle: n
         some = o.studied & (o.lost >= 1e-3)
         if some.any():
             said.append(SampleLeftOut(int(some.sum()), float(o.lost[some].max()), names))
-    drawn = correlated(study.inputs, np.flatnonzero(~idle)) if method == "shapley" else ()
+    drawn = correlated_inputs(study.inputs, np.flatnonzero(~idle)) if method == "shapley" else ()
     for followed in (False, True):
         names = tuple(n for k, n in enumerate(study.inputs.names) if idle[k] and (k in drawn) == followed)
         if names:

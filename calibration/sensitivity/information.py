@@ -1,9 +1,9 @@
-"""Which runs would tell most of the inputs: Fisher information of readings, and D-optimal choices out of a list.
+"""Most informative runs: Fisher information of readings, and D-optimal choices from a list.
 
-In scores s the inputs are standard normal beforehand, with information I. A run adds JᵀJ, J the derivatives of its
-readings by s over their standard deviations. The choice maximises log det(I + Σ JᵀJ), twice what is expected to be
-learnt of all inputs together [nat] (Lindley 1956; Chaloner and Verdinelli, Statist. Sci. 10 (1995)): greedily, then
-by exchanges as long as one gains (Fedorov 1972).
+In scores s the inputs are standard normal before any run, with information I. A run adds JᵀJ, J the derivatives of
+its readings by s over their standard deviations. The choice maximises log det(I + Σ JᵀJ), twice the expected gain of
+information on all inputs together [nat] (Lindley 1956; Chaloner and Verdinelli, Statist. Sci. 10 (1995)). It is
+made greedily, then improved by exchanges (Fedorov 1972).
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ import numpy as np
 
 @dataclasses.dataclass(frozen=True)
 class Choice:
-    """Runs to make next, the one that tells most first.
+    """Runs to make next, the most informative first.
 
     Attributes:
         rows: of the candidates; gain: bits that each adds to those before it, shape (runs,).
-        covariance: of the scores after each run, the first before any; shape (runs + 1, inputs, inputs).
+        covariance: of the scores after each run, starting with no run; shape (runs + 1, inputs, inputs).
     """
 
     rows: tuple[int, ...]
@@ -27,24 +27,24 @@ class Choice:
     covariance: np.ndarray
 
 
-def fisher(jacobian: np.ndarray, sd: np.ndarray) -> np.ndarray:
+def fisher_information(jacobian: np.ndarray, sd: np.ndarray) -> np.ndarray:
     """Information of each run on the scores, shape (runs, inputs, inputs).
 
     Args:
-        jacobian: of its readings by the scores, shape (runs, channels, inputs), NaN where there is no reading.
+        jacobian: of its readings by the scores, shape (runs, channels, inputs), NaN for missing readings.
         sd: of the readings, shape (runs, channels).
     """
-    with np.errstate(divide="ignore", invalid="ignore"):  # a share of a reading of zero tells nothing
+    with np.errstate(divide="ignore", invalid="ignore"):  # a share of a reading of zero is no information
         whitened = jacobian / sd[..., None]
     whitened = np.where(np.isfinite(whitened), whitened, 0.0)
     return np.einsum("rci,rcj->rij", whitened, whitened)
 
 
-def choose(information: np.ndarray, count: int) -> Choice:
-    """The runs that together tell most, each candidate at most once.
+def choose_runs(information: np.ndarray, count: int) -> Choice:
+    """Runs that together are most informative, each candidate at most once.
 
     Args:
-        information: of each candidate, from `fisher`; count: how many runs.
+        information: of each candidate, from `fisher_information`; count: number of runs.
     """
     candidates, size, _ = information.shape
     count = min(count, candidates)
@@ -61,7 +61,7 @@ def choose(information: np.ndarray, count: int) -> Choice:
                 chosen = [*others, best]
                 improved = True
     ordered: list[int] = []
-    for _ in range(count):  # of the set, the most telling first
+    for _ in range(count):  # of the set, the most informative first
         left = [k for k in chosen if k not in ordered]
         ordered.append(max(left, key=lambda k: _value(information, [*ordered, k])))
     values = [_value(information, ordered[:k]) for k in range(count + 1)]
@@ -76,7 +76,7 @@ def _value(information: np.ndarray, rows: list[int]) -> float:
 
 
 def _best(information: np.ndarray, rows: list[int]) -> int:
-    """The candidate, not among `rows`, that adds most to them."""
+    """Candidate outside `rows` that adds most information to them."""
     total = np.eye(information.shape[1]) + information[rows].sum(0)
     value = np.linalg.slogdet(total + information)[1]
     value[rows] = -np.inf

@@ -1,4 +1,4 @@
-"""Exact derivatives at the medians of the inputs, what each input alone does, and which do nothing at all."""
+"""Exact derivatives at the medians of the inputs, effects of single inputs, and inert inputs."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from calibration.sensitivity import derivative
 from calibration.sensitivity.study import Study, source_words
 from calibration.sensitivity.uncertain_inputs import Inputs
 
-#: Random robots at which derivatives are looked at before an input is taken for inert, and at how many points.
+#: Number of random robots, and of points, at which derivatives are computed before an input is called inert.
 LOOKS, PLACES = 4, 12
 
 
 @dataclasses.dataclass(frozen=True)
 class Local:
-    """At the medians of the inputs; arrays over (points, inputs), NaN at points without numbers.
+    """Values and derivatives at the medians of the inputs; arrays over (points, inputs), NaN without a value.
 
     Attributes:
         value: [SI], shape (points,); derivative: by each input [SI per unit]; by_score: by its score [SI].
-        swing: with each input alone at the ends of its 95 % interval [SI], shape (2, points, inputs).
+        swing: with each single input at the ends of its 95 % interval [SI], shape (2, points, inputs).
     """
 
     value: dict[str, np.ndarray]
@@ -32,9 +32,11 @@ class Local:
     statuses: dict[str, dict[str, int]]
 
 
-def directions(inputs: Inputs) -> np.ndarray:
-    """Directions in scores along which each input moves by one sd, the others following as they are correlated with
-    it; rows, each of length 1 (conditions: along their own score)."""
+def correlated_directions(inputs: Inputs) -> np.ndarray:
+    """Directions in scores along which each input moves by one sd and the others follow by their correlation.
+
+    Each row has length 1; a condition moves along its own score.
+    """
     p = len(inputs.parameters)
     whole = np.eye(len(inputs))
     root = inputs.parameters.root
@@ -43,8 +45,8 @@ def directions(inputs: Inputs) -> np.ndarray:
     return whole
 
 
-def local(study: Study) -> Local:
-    """Values, exact derivatives and swings at every point."""
+def local_derivatives(study: Study) -> Local:
+    """Values, exact derivatives and swings at each point."""
     inputs, points = study.inputs, len(study.points)
     d, centre = len(inputs), np.tile(study.inputs.centre, (points, 1))
     values = study.values_at(centre)
@@ -55,7 +57,7 @@ def local(study: Study) -> Local:
         finite = np.isfinite(answer.values[name])[:, None]
         derivative[name] = np.where(finite, _by_inputs(inputs, moved), np.nan)
         by_score[name] = np.where(finite, moved @ inputs.slope, np.nan)
-    along = directions(inputs)
+    along = correlated_directions(inputs)
     p = len(inputs.parameters)
     ends = []
     for side in (-1, 1):
@@ -72,22 +74,22 @@ def local(study: Study) -> Local:
 
 
 def _by_inputs(inputs: Inputs, by_columns: np.ndarray) -> np.ndarray:
-    """Derivatives by inputs, shape (points, inputs), from those by columns: what follows a parameter goes with it."""
-    own = by_columns[:, inputs.places].copy()
+    """Derivatives by inputs, shape (points, inputs), from those by columns; tied parameters follow their leader."""
+    by_inputs = by_columns[:, inputs.places].copy()
     for j, (_, leader, ratio) in enumerate(inputs.parameters.tied):
-        own[:, leader] += ratio * by_columns[:, len(inputs.parameters) + j]
-    return own
+        by_inputs[:, leader] += ratio * by_columns[:, len(inputs.parameters) + j]
+    return by_inputs
 
 
 def _in_words(counts: dict[str, dict[str, int]]) -> dict[str, dict[str, int]]:
     return {source_words(source): by for source, by in counts.items()}
 
 
-def inert(study: Study, found: Local, seed: int) -> np.ndarray:
-    """Inputs by which the derivative of every output is exactly zero wherever it was taken, shape (inputs,)."""
-    scores = study.inputs.scores(derivative.design(len(study.inputs), 1, seed, LOOKS))
+def inert_inputs(study: Study, found: Local, seed: int) -> np.ndarray:
+    """True for inputs with exactly zero derivatives of all outputs at all tested points, shape (inputs,)."""
+    scores = study.inputs.scores(derivative.derivative_design(len(study.inputs), 1, seed, LOOKS))
     moving = np.zeros(len(study.inputs), bool)
-    for g in found.derivative.values():  # not by scores: those of a posterior mix its parameters
+    for g in found.derivative.values():  # not by scores, because those of a posterior mix its parameters
         moving |= (np.nan_to_num(g) != 0).any(0)
     if moving.all():
         return ~moving

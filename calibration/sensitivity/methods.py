@@ -1,4 +1,4 @@
-"""The methods, over all operating points of a study: each gives a part of what is said of every output."""
+"""Methods over all operating points of a study; each gives a part of every output's result."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from calibration.sensitivity.replicates import REPLICATES, Estimate
 from calibration.sensitivity.study import Study
 from calibration.sensitivity.uncertain_inputs import Inputs
 
-#: Largest share of base points that may be without numbers for a point to be studied.
+#: Largest share of base points without a value for a point to be studied.
 MOST_LOST = 0.5
 #: Replicates of the derivative method, and points of each.
 GRADIENTS = (8, 8)
-#: Correlation above which inputs are drawn together.
+#: Least correlation of inputs that are drawn together.
 LINKED = 1e-6
 
 
 @dataclasses.dataclass(frozen=True)
 class Part:
-    """What a method found of one output: as fields of `OutputStudy`."""
+    """Result of a method for one output, as fields of `OutputStudy`."""
 
     overall: dict[str, Estimate]
     at_points: dict[str, Estimate]
@@ -44,31 +44,31 @@ def _sampled(study: Study, unit: np.ndarray, which: np.ndarray) -> np.ndarray:
     return study.inputs.scores(whole)
 
 
-def groups(study: Study, moving: np.ndarray) -> dict[tuple[int, ...], list[int]]:
-    """Points by the inputs that act there."""
-    found: dict[tuple[int, ...], list[int]] = {}
+def group_points(study: Study, moving: np.ndarray) -> dict[tuple[int, ...], list[int]]:
+    """Points grouped by the inputs that act there."""
+    groups: dict[tuple[int, ...], list[int]] = {}
     for k in range(len(study.points)):
         which = tuple(i for i in study.acting(k) if moving[i])
         if which:
-            found.setdefault(which, []).append(k)
-    return found
+            groups.setdefault(which, []).append(k)
+    return groups
 
 
-def correlated(inputs: Inputs, which: Sequence[int] | np.ndarray) -> tuple[int, ...]:
+def correlated_inputs(inputs: Inputs, which: Sequence[int] | np.ndarray) -> tuple[int, ...]:
     """These inputs and all that are correlated with one of them, directly or through others.
 
-    Knowing any of them tells something of what these do, so that by definition it has a Shapley effect, also where
-    it does nothing itself.
+    An inert input that is correlated with these has, by definition, a Shapley effect, because its value is
+    informative about theirs.
     """
     p = len(inputs.parameters)
     covariance = inputs.parameters.covariance
     sd = np.sqrt(np.diagonal(covariance))
     linked = np.eye(len(inputs), dtype=bool)
     linked[:p, :p] |= np.abs(covariance) > LINKED * np.outer(sd, sd)
-    found = np.asarray(np.isin(np.arange(len(inputs)), which))
-    while (more := np.asarray(linked[found].any(0))).sum() > found.sum():
-        found = more
-    return tuple(map(int, np.flatnonzero(found)))
+    correlated = np.asarray(np.isin(np.arange(len(inputs)), which))
+    while (more := np.asarray(linked[correlated].any(0))).sum() > correlated.sum():
+        correlated = more
+    return tuple(map(int, np.flatnonzero(correlated)))
 
 
 def _blank(points: int, size: int) -> Estimate:
@@ -82,40 +82,40 @@ def _put(into: Estimate, k: int, found: Estimate) -> None:
 def sobol_indices(
     study: Study, moving: np.ndarray, evaluations: int, seed: int, second: bool = True
 ) -> dict[str, Part]:
-    """First, total and second-order indices at every point, and over all of them."""
+    """First, total and second-order indices at each point, and over all of them."""
     points, d = len(study.points), len(study.inputs)
     names = [o.name for o in study.model.outputs]
     terms: dict[str, dict[int, sobol.Terms]] = {name: {} for name in names}
     lost = {name: np.zeros(points) for name in names}
     spent = {}
-    for which, group in groups(study, moving).items():
-        size = sobol.size_of(evaluations / points, len(which), second)
-        design = sobol.design(len(which), size, seed, second)
+    for which, group in group_points(study, moving).items():
+        size = sobol.base_points(evaluations / points, len(which), second)
+        design = sobol.sobol_design(len(which), size, seed, second)
         scores = _sampled(study, design.points, np.array(which))
         for k, made in study.sample(study.values_at(scores), group):
             spent[k] = len(design.points)
             for name in names:
-                found = sobol.terms(design, made[name])
+                output_terms = sobol.sobol_terms(design, made[name])
                 rows = design.size * design.replicates
-                lost[name][k] = 1.0 if found is None else found.lost / rows
-                if found is not None and lost[name][k] <= MOST_LOST:
-                    terms[name][k] = found.widened(which, d)
+                lost[name][k] = 1.0 if output_terms is None else output_terms.lost / rows
+                if output_terms is not None and lost[name][k] <= MOST_LOST:
+                    terms[name][k] = output_terms.widened(which, d)
     answer = {}
     for name in names:
         first, total, sd = _blank(points, d), _blank(points, d), np.full(points, np.nan)
         whole: sobol.Terms | None = None
-        for k, found in terms[name].items():
-            at = sobol.indices(found)
-            _put(first, k, at.first)
-            _put(total, k, at.total)
-            sd[k] = np.sqrt(at.variance)
-            whole = found if whole is None else whole + found
+        for k, output_terms in terms[name].items():
+            indices = sobol.indices_of_terms(output_terms)
+            _put(first, k, indices.first)
+            _put(total, k, indices.total)
+            sd[k] = np.sqrt(indices.variance)
+            whole = output_terms if whole is None else whole + output_terms
         studied = np.array([k in terms[name] for k in range(points)])
         if whole is None:
             answer[name] = Part({}, {}, None, None, None, (), lost[name], studied)
             continue
-        overall = sobol.indices(whole)
-        stages = [(r, sobol.indices(whole, r).total) for r in sobol.STAGES]
+        overall = sobol.indices_of_terms(whole)
+        stages = [(r, sobol.indices_of_terms(whole, r).total) for r in sobol.STAGES]
         count = sum(spent[k] for k in terms[name])
         answer[name] = Part(
             {"first": overall.first, "total": overall.total},
@@ -131,23 +131,23 @@ def sobol_indices(
 
 
 def morris_screening(study: Study, moving: np.ndarray, evaluations: int, seed: int) -> dict[str, Part]:
-    """Elementary effects over the 95 % range of every input, at every point."""
+    """Elementary effects over the 95 % range of each input, at each point."""
     points, d = len(study.points), len(study.inputs)
     names = [o.name for o in study.model.outputs]
     found: dict[str, dict[int, tuple[morris.Effects, tuple[int, ...]]]] = {name: {} for name in names}
     lost = {name: np.zeros(points) for name in names}
-    for which, group in groups(study, moving).items():
+    for which, group in group_points(study, moving).items():
         count = max(int(np.ceil(evaluations / points / (len(which) + 1))), 10)
-        unit = morris.design(len(which), count, seed)
+        unit = morris.morris_design(len(which), count, seed)
         scores = np.array(_sampled(study, 0.025 + 0.95 * unit, np.array(which)))
-        # Trajectories go in equal steps of the scores, whose ends are those of the 95 % interval.
+        # Trajectories have equal steps in the scores, between the ends of the 95 % interval.
         normal = np.arange(d) < len(study.inputs.parameters)
         for j, i in enumerate(which):
             if normal[i]:
                 scores[:, i] = Z95 * (2 * unit[:, j] - 1)
         for k, made in study.sample(study.values_at(scores), group):
             for name in names:
-                effects = morris.effects(unit, made[name])
+                effects = morris.elementary_effects(unit, made[name])
                 lost[name][k] = 1.0 if effects is None else effects.lost / count
                 if effects is not None and lost[name][k] <= MOST_LOST:
                     found[name][k] = effects, which
@@ -187,12 +187,12 @@ def morris_screening(study: Study, moving: np.ndarray, evaluations: int, seed: i
 
 
 def derivative_bounds(study: Study, moving: np.ndarray, seed: int) -> dict[str, Part]:
-    """Bounds of first-order and total indices from exact gradients, at every point."""
+    """Bounds of first-order and total indices from exact gradients, at each point."""
     points, d = len(study.points), len(study.inputs)
     names = [o.name for o in study.model.outputs]
     normal = np.arange(d) < len(study.inputs.parameters)
     replicates, size = GRADIENTS
-    unit = derivative.design(d, size, seed, replicates)
+    unit = derivative.derivative_design(d, size, seed, replicates)
     scores = study.inputs.scores(unit)
     rows = np.tile(scores, (points, 1))
     conditions = jax.tree.map(lambda x: np.repeat(np.asarray(x), len(scores)), study.conditions)
@@ -205,19 +205,19 @@ def derivative_bounds(study: Study, moving: np.ndarray, seed: int) -> dict[str, 
         whole: derivative.Terms | None = None
         studied = np.zeros(points, bool)
         for k in map(int, np.flatnonzero(lost <= MOST_LOST)):
-            found = derivative.terms(scores, y[k], g[k], normal, replicates)
-            if found is None:
+            output_terms = derivative.derivative_terms(scores, y[k], g[k], normal, replicates)
+            if output_terms is None:
                 continue
-            at = derivative.bounds(found)
-            _put(lower, k, at.lower)
-            _put(upper, k, at.upper)
-            sd[k] = np.sqrt(at.variance)
+            bounds = derivative.index_bounds(output_terms)
+            _put(lower, k, bounds.lower)
+            _put(upper, k, bounds.upper)
+            sd[k] = np.sqrt(bounds.variance)
             studied[k] = True
-            whole = found if whole is None else whole + found
+            whole = output_terms if whole is None else whole + output_terms
         if whole is None:
             answer[name] = Part({}, {}, None, None, None, (), lost, studied)
             continue
-        overall = derivative.bounds(whole)
+        overall = derivative.index_bounds(whole)
         share = np.where(np.isfinite(upper.value), np.clip(upper.value, 0.0, 1.0), np.nan)
         answer[name] = Part(
             {"lower": overall.lower, "upper": overall.upper},
@@ -228,9 +228,9 @@ def derivative_bounds(study: Study, moving: np.ndarray, seed: int) -> dict[str, 
 
 
 def shapley_effects(study: Study, moving: np.ndarray, evaluations: int, seed: int) -> dict[str, Part]:
-    """Shapley effects at every point, and over all of them.
+    """Shapley effects at each point, and over all of them.
 
-    Inputs that do nothing at a point are drawn with those that they are correlated with; the others have no effect.
+    Inputs that are inert at a point are drawn if they are correlated with active ones; the others have no effect.
     """
     points, d = len(study.points), len(study.inputs)
     names = [o.name for o in study.model.outputs]
@@ -240,35 +240,35 @@ def shapley_effects(study: Study, moving: np.ndarray, evaluations: int, seed: in
     mean = np.concatenate([study.inputs.parameters.mean, np.zeros(d - p)])
     terms: dict[str, dict[int, tuple[shapley.Terms, tuple[int, ...]]]] = {name: {} for name in names}
     lost = {name: np.zeros(points) for name in names}
-    for acting, group in groups(study, moving).items():
-        which = correlated(study.inputs, acting)
+    for acting, group in group_points(study, moving).items():
+        which = correlated_inputs(study.inputs, acting)
         places = np.array(which)
-        pairs = shapley.pairs_of(evaluations / points, len(which))
-        design = shapley.design(mean[places], covariance[np.ix_(places, places)], pairs, seed)
+        pairs = shapley.pairs_of_orders(evaluations / points, len(which))
+        design = shapley.shapley_design(mean[places], covariance[np.ix_(places, places)], pairs, seed)
         z = np.tile(mean, (len(design.points), 1))
         z[:, places] = design.points
         values = _at_coordinates(study.inputs, z)
         for k, made in study.sample(values, group):
             for name in names:
-                found = shapley.terms(design, made[name])
-                lost[name][k] = 1.0 if found is None else found.lost
-                if found is not None and lost[name][k] <= MOST_LOST:
-                    terms[name][k] = found, which
+                output_terms = shapley.shapley_terms(design, made[name])
+                lost[name][k] = 1.0 if output_terms is None else output_terms.lost
+                if output_terms is not None and lost[name][k] <= MOST_LOST:
+                    terms[name][k] = output_terms, which
     answer = {}
     for name in names:
         shown, sd = _blank(points, d), np.full(points, np.nan)
         studied = np.zeros(points, bool)
         widened = []
-        for k, (found, which) in terms[name].items():
-            wide = np.zeros((len(found.parts), d))
-            wide[:, list(which)] = found.parts
-            widened.append(dataclasses.replace(found, parts=wide))
-            _put(shown, k, shapley.effects(widened[-1]))
-            sd[k], studied[k] = np.sqrt(found.variance), True
+        for k, (output_terms, which) in terms[name].items():
+            wide = np.zeros((len(output_terms.parts), d))
+            wide[:, list(which)] = output_terms.parts
+            widened.append(dataclasses.replace(output_terms, parts=wide))
+            _put(shown, k, shapley.effects_of_terms(widened[-1]))
+            sd[k], studied[k] = np.sqrt(output_terms.variance), True
         if not studied.any():
             answer[name] = Part({}, {}, None, None, None, (), lost[name], studied)
             continue
-        overall = shapley.effects(shapley.of_vector(widened))
+        overall = shapley.effects_of_terms(shapley.terms_of_vector(widened))
         answer[name] = Part(
             {"shapley": overall},
             {"shapley": shown},

@@ -1,4 +1,4 @@
-"""A robot's outputs as functions of inputs, over many points at once: values, and exact derivatives."""
+"""A robot's outputs as functions of inputs, over many points at once: values and exact derivatives."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from calibration.data.contradictions import cannot_stand
-from calibration.data.input_errors import BadConfiguration, choices
+from calibration.data.input_errors import BadConfiguration, allowed_words
 from mmrjax import derived, fidelities
 from mmrjax.compile.compiling import compiled
 from mmrjax.derived import Derived
 from mmrjax.fidelities import outputs as table_of_outputs
 from mmrjax.fidelities.outputs import Output
-from mmrjax.fidelities.variation import STATUS, Variation, evaluate
+from mmrjax.fidelities.variation import STATUS, Variation, evaluate_points
 from mmrjax.model import channels
 from mmrjax.model.conditions import OF_SIDES, Conditions
 from mmrjax.model.robot import Robot
-from mmrjax.model.signals import STATUSES, done
+from mmrjax.model.signals import STATUSES, is_done
 
-#: Points of one call of few, and of many: solves, runs over time, and the derivatives of both. All calls have one of
-#: these shapes, so that every study of the same inputs and outputs shares what is compiled.
+#: Points in one call for few and for many points: solves, runs over time, and the derivatives of both. All calls have
+#: one of these shapes, so that all studies of the same inputs and outputs share compiled programs.
 CHUNKS = {"solves": (512, 32_768), "runs": (64, 2_048), "derivatives": (512, 512), "derivatives of runs": (64, 64)}
-#: Studied where no outputs are named, beside every channel.
+#: Default outputs, in addition to every channel.
 DEFAULT = ("slip", "power_supply", "efficiency_chassis", "steepest_slope")
 
 OutputRow = Output | Derived
@@ -38,7 +38,7 @@ class Answer:
     """Outputs of many points.
 
     Attributes:
-        values: of each output [SI], NaN where its run did not converge; shape (points,).
+        values: of each output [SI], NaN if its run did not converge; shape (points,).
         statuses: source (a fidelity, or a module of derived outputs) → codes, shape (points,).
     """
 
@@ -46,80 +46,88 @@ class Answer:
     statuses: dict[str, np.ndarray]
 
     def counts(self) -> dict[str, dict[str, int]]:
-        """Source → status → how many points."""
-        return {source: counted(codes) for source, codes in self.statuses.items()}
+        """Source → status → number of points."""
+        return {source: count_statuses(codes) for source, codes in self.statuses.items()}
 
 
-def counted(codes: np.ndarray) -> dict[str, int]:
-    """Status → how many, of those that occur."""
+def count_statuses(codes: np.ndarray) -> dict[str, int]:
+    """Status → number, without zeros."""
     each = np.bincount(codes, minlength=len(STATUSES))
     return {STATUSES[k]: int(n) for k, n in enumerate(each) if n}
 
 
 def known_outputs(robot: Robot) -> dict[str, OutputRow]:
     """Every output by name: those of a fidelity, then the derived ones."""
-    rows: tuple[OutputRow, ...] = (*table_of_outputs.table(robot.channels), *derived.TABLE)
+    rows: tuple[OutputRow, ...] = (*table_of_outputs.output_table(robot.channels), *derived.TABLE)
     return {o.name: o for o in rows}
 
 
 def default_outputs(robot: Robot, turns: bool) -> tuple[str, ...]:
-    """Names of the outputs that are studied where none are named: every channel, and what the robot's load has."""
+    """Names of the default outputs: every channel, and those defined for the robot's load."""
     beside: tuple[str, ...] = DEFAULT
     if turns:
         apart = {row.name for row in derived.OF_STRAIGHT}
-        return (*channels.names(robot.channels), *(n for n in DEFAULT if n not in apart), derived.OF_TURNS[0].name)
+        return (
+            *channels.channel_names(robot.channels),
+            *(n for n in DEFAULT if n not in apart),
+            derived.OF_TURNS[0].name,
+        )
     if not robot.has_ground:
         beside = ("power_supply",)
-    elif robot.rig.imposed == "motor_speed":  # that stalls on no slope
+    elif robot.rig.imposed == "motor_speed":  # it stalls on no slope
         beside = tuple(name for name in DEFAULT if name != "steepest_slope")
-    known = known_outputs(robot)
-    return tuple(n for n in (*channels.names(robot.channels), *beside) if robot.knows(known[n].rests_on))
+    outputs = known_outputs(robot)
+    return tuple(n for n in (*channels.channel_names(robot.channels), *beside) if robot.knows(outputs[n].rests_on))
 
 
 def chosen_outputs(words: tuple[str, ...], robot: Robot, turns: bool = False) -> tuple[OutputRow, ...]:
-    """The outputs of these names, the usual ones for none; `start` stands for all of the start.
+    """Outputs of these names, or the default ones for none; `start` means all outputs of a start.
 
     Args:
-        turns: whether the robot is free to turn, with the instruments of that.
+        turns: True if the robot is free to turn, with the instruments for it.
 
     Raises:
-        BadConfiguration: an unknown name; lists the choices; one of a ground or stance that the robot lacks, of turns
-            where it travels straight, or of straight travel where it turns.
+        BadConfiguration: an unknown name, with the choices; an output of a ground or stance that the robot lacks, of
+            turns if it travels straight, or of straight travel if it turns.
     """
-    known, found = known_outputs(robot), []
+    outputs, chosen = known_outputs(robot), []
     start = tuple(d.name for d in derived.OF_START)
     of_turns = {*(o.name for o in derived.OF_TURNS), *(c.name for c in channels.OF_TURNS if c.settled)}
     for word in words or default_outputs(robot, turns):
         for name in start if word == "start" else (word,):
-            if not turns and name in of_turns and name not in channels.names(robot.channels):
+            if not turns and name in of_turns and name not in channels.channel_names(robot.channels):
                 raise BadConfiguration(
-                    f"--outputs {name}: the robot travels straight; vary what drives its sides apart, as --vary "
-                    f"{OF_SIDES[0]}=0.2:0.8"
+                    f"--outputs {name}: the robot travels straight; vary the drive of its sides independently, e.g. "
+                    f"--vary {OF_SIDES[0]}=0.2:0.8"
                 )
-            if name not in known:
-                raise BadConfiguration(f"--outputs {name}: no such output; {choices(name, [*known, 'start'])}")
-            if (row := known[name]) in derived.OF_GROUND and not robot.has_ground:
-                raise BadConfiguration(f"--outputs {name}: the robot's load is a shaft, which stands on no ground")
+            if name not in outputs:
+                raise BadConfiguration(
+                    f"--outputs {name}: no such output; {allowed_words(name, [*outputs, 'start'])}"
+                )
+            if (row := outputs[name]) in derived.OF_GROUND and not robot.has_ground:
+                raise BadConfiguration(f"--outputs {name}: the robot's load is a shaft, which has no ground")
             if lacking := robot.unknown(row.rests_on):
                 raise BadConfiguration(
                     f"--outputs {name}: not known, as the robot's file does not state {' and '.join(lacking)}"
                 )
             if turns and row in derived.OF_STRAIGHT:
-                raise BadConfiguration(f"--outputs {word}: of straight travel, and what varies lets the robot turn")
+                raise BadConfiguration(
+                    f"--outputs {word}: only for straight travel; the varied inputs make the robot turn"
+                )
             if row in derived.OF_POSTURE and (why := cannot_stand(robot)):
                 raise BadConfiguration(f"--outputs {name}: {why}")
-            found.append(row)
-    return tuple(dict.fromkeys(found))
+            chosen.append(row)
+    return tuple(dict.fromkeys(chosen))
 
 
 @dataclasses.dataclass(frozen=True)
 class Model:
-    """Outputs of a robot of which some parameters and conditions vary.
+    """Outputs of a robot with some varying parameters and conditions.
 
     Attributes:
-        robot: that every point starts from; columns: names of what varies.
-        fidelity, options: that simulate what is not derived.
-        outputs: that are computed.
+        robot: start of every point; columns: names of the varying parameters and conditions.
+        fidelity, options: of the simulation of outputs that are not derived.
+        outputs: to be computed.
     """
 
     robot: Robot
@@ -130,15 +138,17 @@ class Model:
 
     @property
     def sources(self) -> dict[str, tuple[OutputRow, ...]]:
-        """Outputs by what computes them: the fidelity's name, or the module of derived ones."""
-        found: dict[str, list[OutputRow]] = {}
+        """Outputs by source: the fidelity's name, or the module of derived ones."""
+        rows_of_source: dict[str, list[OutputRow]] = {}
         for output in self.outputs:
-            found.setdefault(output.module if isinstance(output, Derived) else self.fidelity, []).append(output)
-        return {source: tuple(rows) for source, rows in found.items()}
+            rows_of_source.setdefault(output.module if isinstance(output, Derived) else self.fidelity, []).append(
+                output
+            )
+        return {source: tuple(rows) for source, rows in rows_of_source.items()}
 
     def chunk(self, source: str, points: int, differentiated: bool = False) -> int:
-        """Points of one call, of so many in all."""
-        long = source == derived.START or (source in fidelities.TABLE and fidelities.facts(source).rollout)
+        """Number of points in one call, for a number of all points."""
+        long = source == derived.START or (source in fidelities.TABLE and fidelities.fidelity_facts(source).rollout)
         kind = ("derivatives of runs" if long else "derivatives") if differentiated else "runs" if long else "solves"
         few, many = CHUNKS[kind]
         return few if points <= 4 * few else many
@@ -148,32 +158,32 @@ class Model:
 
         Args:
             values: a row a point, in the order of `columns`.
-            conditions: what does not vary, of shape () or (points,).
+            conditions: those that do not vary, of shape () or (points,).
         """
         return self.joined({source: self.of_source(source, values, conditions) for source in self.sources})
 
     def of_source(self, source: str, values: Float[np.ndarray, "points columns"], conditions: Conditions) -> Answer:
-        """The outputs of one source alone; see `sources`."""
+        """Outputs of one source; see `sources`."""
         made = self._chunked(self._function(source), self.chunk(source, len(values)), values, conditions)
         codes = made.pop(STATUS).astype(int)
         return Answer(made, {source: codes})
 
     def joined(self, parts: Mapping[str, Answer]) -> Answer:
-        """The outputs of all sources, in order."""
-        found = {name: x for part in parts.values() for name, x in part.values.items()}
+        """Outputs of all sources, in order."""
+        values = {name: x for part in parts.values() for name, x in part.values.items()}
         statuses = {source: codes for part in parts.values() for source, codes in part.statuses.items()}
-        return Answer({o.name: found[o.name] for o in self.outputs}, statuses)
+        return Answer({o.name: values[o.name] for o in self.outputs}, statuses)
 
     def ignores(self, source: str) -> tuple[str, ...]:
-        """Conditions on which no output of a source depends."""
+        """Conditions without influence on any output of a source."""
         each = [set(o.ignores) if isinstance(o, Derived) else set() for o in self.sources[source]]
         return tuple(sorted(set.intersection(*each)))
 
     def derivatives(
         self, values: Float[np.ndarray, "points columns"], conditions: Conditions
     ) -> dict[str, np.ndarray]:
-        """Exact derivatives of every output by every column [SI per unit], shape (points, columns); zeros where a
-        run has no numbers."""
+        """Exact derivatives of each output by each column [SI per unit], shape (points, columns); zeros for a run
+        without values."""
         found: dict[str, np.ndarray] = {}
         for source in self.sources:
             size = self.chunk(source, len(values), differentiated=True)
@@ -192,25 +202,25 @@ class Model:
     def _chunked(
         self, function: Callable[..., dict[str, Array]], size: int, values: Any, conditions: Conditions
     ) -> dict[str, np.ndarray]:
-        """A function over chunks of one shape, the last filled up with its last point."""
+        """A function over chunks of one shape; the last is padded by its last point."""
         points, values = len(values), np.asarray(values)
-        alike = conditions.shape == ()  # the program spreads them
+        alike = conditions.shape == ()  # the program broadcasts them
         spread = conditions if alike else jax.tree.map(np.asarray, conditions)
         parts = []
         for first in range(0, points, size):
             count = min(size, points - first)
             part, rows = values[first : first + count], spread
             if not alike:
-                rows = jax.tree.map(lambda x, f=first, n=count: _filled(x[f : f + n], size), spread)
-            part = function(jnp.asarray(_filled(part, size)), rows)
+                rows = jax.tree.map(lambda x, f=first, n=count: _padded(x[f : f + n], size), spread)
+            part = function(jnp.asarray(_padded(part, size)), rows)
             parts.append({name: np.asarray(x)[:count] for name, x in part.items()})
         if len(parts) == 1:
             return parts[0]
         return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
-def _filled(rows: np.ndarray, size: int) -> np.ndarray:
-    """Rows with repeats of the last behind them, up to a size."""
+def _padded(rows: np.ndarray, size: int) -> np.ndarray:
+    """Rows padded by repeats of the last to a given size."""
     if len(rows) == size:
         return rows
     return np.concatenate([rows, np.repeat(rows[-1:], size - len(rows), 0)])
@@ -224,12 +234,12 @@ def _outputs(
     values: Array,
     conditions: Conditions,
 ) -> dict[str, Array]:
-    """Outputs of a source, NaN where the run did not converge, and statuses."""
+    """Outputs of a source, NaN if the run did not converge, and statuses."""
     if source in fidelities.TABLE:
-        made = evaluate(variation, source, values, conditions, options, names)
+        made = evaluate_points(variation, source, values, conditions, options, names)
     else:
         made = _derived(variation, source, names, values, conditions)
-    solved = done(made[STATUS])
+    solved = is_done(made[STATUS])
     return {name: x if name == STATUS else jnp.where(solved, x, jnp.nan) for name, x in made.items()}
 
 
@@ -237,7 +247,7 @@ def _derived(
     variation: Variation, source: str, names: tuple[str, ...], values: Array, conditions: Conditions
 ) -> dict[str, Array]:
     conditions = jax.tree.map(lambda x: jnp.broadcast_to(x, values.shape[:1]), conditions)
-    compute = derived.compute(source)
+    compute = derived.compute_function(source)
     made = jax.vmap(lambda v, c: compute(*variation.at(v, c)))(values, conditions)
     return {name: made[name] for name in (*names, STATUS)}
 
@@ -254,7 +264,7 @@ def _derivatives(
     values: Array,
     conditions: Conditions,
 ) -> dict[str, Array]:
-    """Each point's outputs depend on its own row alone: one tangent a column is the Jacobian of all of them."""
+    """Jacobian of all points by one tangent a column, because each point's outputs depend only on its own row."""
 
     def numbers(values: Array) -> tuple[dict[str, Array], Array]:
         made = _outputs(variation, source, options, names, values, conditions)

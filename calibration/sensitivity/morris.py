@@ -1,7 +1,8 @@
-"""Screening by elementary effects: how much an output changes when one input alone moves (Morris 1991).
+"""Screening by elementary effects: changes of an output by single inputs (Morris 1991).
 
-μ* is the mean size of the change per whole range of the input (Campolongo et al., Environ. Model. Softw. 22 (2007)),
-σ how much it changes from place to place: non-linear, or together with others. Trajectories and measures are SALib's.
+μ* is the mean magnitude of the change per whole range of the input (Campolongo et al., Environ. Model. Softw. 22
+(2007)). σ is the variation of the change between places, by nonlinearity or interactions. Trajectories and measures
+are SALib's.
 """
 
 from __future__ import annotations
@@ -13,17 +14,17 @@ from scipy import stats
 
 from calibration.sensitivity.replicates import LEVEL, Estimate
 
-#: Levels of the grid on which trajectories go.
+#: Levels of the grid of the trajectories.
 LEVELS = 4
 
 
 @dataclasses.dataclass(frozen=True)
 class Effects:
-    """Elementary effects of every input on an output [its unit per range of the input], shape (inputs,) each.
+    """Elementary effects of each input on an output [its unit per range of the input], shape (inputs,) each.
 
     Attributes:
         mean: μ; size: μ* with its interval; spread: σ.
-        trajectories: that count; lost: those left out, because the model has no number at one of their points.
+        trajectories: number included; lost: number of those with a point without a value of the model.
     """
 
     mean: np.ndarray
@@ -33,11 +34,11 @@ class Effects:
     lost: int
 
 
-def design(inputs: int, trajectories: int, seed: int) -> np.ndarray:
+def morris_design(inputs: int, trajectories: int, seed: int) -> np.ndarray:
     """Points of the unit cube, shape (trajectories · (inputs + 1), inputs)."""
     from SALib.sample import morris as sampling
 
-    # The sampler draws from NumPy's global generator, whatever seed it is given; its state is put back.
+    # The sampler draws from NumPy's global generator, whatever its seed argument; its state is restored.
     state = np.random.get_state()  # noqa: NPY002
     try:
         return sampling.sample(_problem(inputs), trajectories, num_levels=LEVELS, seed=seed)
@@ -45,14 +46,14 @@ def design(inputs: int, trajectories: int, seed: int) -> np.ndarray:
         np.random.set_state(state)  # noqa: NPY002
 
 
-def effects(points: np.ndarray, values: np.ndarray) -> Effects | None:
+def elementary_effects(points: np.ndarray, values: np.ndarray) -> Effects | None:
     """Elementary effects of an output.
 
     Args:
-        points: from `design`; values: of the output there.
+        points: from `morris_design`; values: of the output there.
 
     Returns:
-        None where fewer than two trajectories have numbers all along.
+        None if fewer than two trajectories have values at all points.
     """
     from SALib.analyze.morris import analyze
 
@@ -64,30 +65,30 @@ def effects(points: np.ndarray, values: np.ndarray) -> Effects | None:
         return None
     state = np.random.get_state()  # noqa: NPY002
     try:
-        found = analyze(_problem(points.shape[1]), points[kept], values[kept], num_levels=LEVELS, seed=0)
+        analysis = analyze(_problem(points.shape[1]), points[kept], values[kept], num_levels=LEVELS, seed=0)
     finally:
         np.random.set_state(state)  # noqa: NPY002
-    size = np.asarray(found["mu_star"], float)
+    size = np.asarray(analysis["mu_star"], float)
     elementary = _elementary(points[kept].reshape(-1, steps, points.shape[1]), by[finite])
     width = float(stats.t.ppf(0.5 + LEVEL / 2, int(finite.sum()) - 1)) / np.sqrt(finite.sum())
     error = width * np.abs(elementary).std(0, ddof=1)
     return Effects(
-        np.asarray(found["mu"], float),
+        np.asarray(analysis["mu"], float),
         Estimate(size, size - error, size + error),
-        np.asarray(found["sigma"], float),
+        np.asarray(analysis["sigma"], float),
         int(finite.sum()),
         int(count - finite.sum()),
     )
 
 
 def _elementary(points: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Change of the output over that of the input that moved, shape (trajectories, inputs)."""
+    """Change of the output per change of the moved input, shape (trajectories, inputs)."""
     moved = np.diff(points, axis=1)
     which = np.abs(moved).argmax(-1)
     change = np.diff(values, axis=1) / np.take_along_axis(moved, which[..., None], -1)[..., 0]
-    found = np.zeros_like(change)
-    np.put_along_axis(found, which, change, 1)
-    return found
+    effects = np.zeros_like(change)
+    np.put_along_axis(effects, which, change, 1)
+    return effects
 
 
 def _problem(inputs: int) -> dict[str, object]:

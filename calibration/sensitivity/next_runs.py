@@ -1,4 +1,4 @@
-"""Which of a list of runs would tell most of the inputs of a study."""
+"""The most informative ones of a list of runs, for the inputs of a study."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from calibration.sensitivity.result import NextRuns, Points
 from calibration.sensitivity.study import Study
 from mmrjax.model.conditions import Conditions
 
-#: Runs proposed.
+#: Number of proposed runs.
 RUNS = 5
 
 
 @dataclasses.dataclass(frozen=True)
 class Candidates:
-    """Runs that could be made.
+    """Possible next runs.
 
     Attributes:
-        points, conditions: of them; source: where they come from.
-        noise: channel's place → (number, whether it is a share of the reading), see `calibration.inference.noise`;
+        points, conditions: of them; source: of the list.
+        noise: channel's place → (number, True for a share of the reading), see `calibration.inference.noise`;
             words: the same for a person.
-        sd: that the candidates state themselves [SI], NaN where they do not; shape (candidates, channels).
-        count: how many to propose.
+        sd: stated by the candidates [SI], NaN if not; shape (candidates, channels).
+        count: number to propose.
     """
 
     points: Points
@@ -46,13 +46,13 @@ class Candidates:
 
 
 def next_runs(study: Study, found: Local, candidates: Candidates) -> NextRuns | None:
-    """The candidates that together tell most of the parameters, read with every channel.
+    """Candidates that together are most informative about the parameters, with readings of every channel.
 
     Args:
-        found: of the study's own points.
+        found: at the study's own points.
 
     Returns:
-        None where no candidate travels, or no parameter is uncertain.
+        None if no candidate travels, or no parameter is uncertain.
     """
     points, conditions = candidates.points, candidates.conditions
     known = known_outputs(study.robot)
@@ -63,8 +63,8 @@ def next_runs(study: Study, found: Local, candidates: Candidates) -> NextRuns | 
         return None
     rows = np.tile(study.inputs.centre, (len(points), 1))
     values = np.array(study.values_at(rows))
-    # A condition is set as a candidate says, whatever range it has in the study; what it leaves open stays in the
-    # middle of that range.
+    # A condition that a candidate states is set, whatever its range in the study; others stay in the middle of their
+    # range.
     first = len(study.inputs.columns) - len(study.inputs.conditions)
     for j, name in enumerate(study.inputs.conditions):
         stated = getattr(conditions, name)
@@ -78,8 +78,8 @@ def next_runs(study: Study, found: Local, candidates: Candidates) -> NextRuns | 
     finite = np.isfinite(reading).all(1)
     if not finite.any():
         return None
-    information_of = information.fisher(jacobian[finite], candidates.deviations(reading)[finite])
-    choice = information.choose(information_of, candidates.count)
+    information_of = information.fisher_information(jacobian[finite], candidates.deviations(reading)[finite])
+    choice = information.choose_runs(information_of, candidates.count)
     picked = np.flatnonzero(finite)[list(choice.rows)]
     slope = study.inputs.slope[study.inputs.places][:, :p]
     after = np.sqrt(np.einsum("ij,kjl,il->ki", slope, choice.covariance, slope))

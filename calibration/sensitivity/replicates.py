@@ -1,9 +1,9 @@
-"""Estimates from independent replicates of a randomised design, with intervals that hold what they say.
+"""Estimates from independent replicates of a randomised design, with valid intervals.
 
 Every index here is a ratio of means: of a numerator over a variance. A bootstrap over the points of a scrambled Sobol
-sequence would take them for independent, which they are not: their whole point is that they are not. Whole replicates
-are, each of them scrambled anew (Owen, Monte Carlo variance of scrambled net quadrature, SIAM J. Numer. Anal. 34
-(1997)), so their spread is that of the estimate, and Student's t of their number gives the interval.
+sequence would treat them as independent, but they are correlated by construction. Whole replicates with
+scramblings of their own are independent (Owen, Monte Carlo variance of scrambled net quadrature, SIAM J. Numer.
+Anal. 34 (1997)). So their spread is that of the estimate, and Student's t for their number gives the interval.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from scipy import stats
 
 #: Replicates of a design.
 REPLICATES = 32
-#: What intervals hold.
+#: Probability of the intervals.
 LEVEL = 0.95
 
 
@@ -36,17 +36,18 @@ class Estimate:
         return Estimate(self.value[k], self.low[k], self.high[k])
 
 
-def ratio(numerator: np.ndarray, denominator: np.ndarray) -> Estimate:
+def ratio_estimate(numerator: np.ndarray, denominator: np.ndarray) -> Estimate:
     """Ratio of the means of two quantities over replicates, and its interval.
 
     Its variance is that of the linearised ratio, e = (numerator - ratio · denominator) / mean denominator (Cochran,
-    Sampling Techniques (1977), eq. 6.9): the bias of a ratio falls with all points, not with those of a replicate.
+    Sampling Techniques (1977), eq. 6.9). The bias of a ratio decreases with the number of all points, not of a
+    replicate's points.
 
     Args:
         numerator: shape (replicates, ...); denominator: shape (replicates,), not negative.
 
     Returns:
-        NaN where the denominator is 0: nothing varies, and nothing has a share in it.
+        NaN if the denominator is 0: without variance there are no shares.
     """
     count = len(numerator)
     below = float(np.mean(denominator))

@@ -1,4 +1,4 @@
-"""What a sensitivity study found: typed, by name; JSON, tables, terminal and report only read it."""
+"""Result of a sensitivity study: typed, by name; JSON, tables, terminal and report are made from it."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from calibration.sensitivity.replicates import LEVEL, REPLICATES, Estimate
 SCHEMA = "mmrjax.sensitivity/1"
 #: Methods.
 METHODS = ("local", "sobol", "morris", "derivative", "shapley")
-#: Share of an output's variance below which an input does not matter, whatever the output and the point [-].
+#: Share of an output's variance below which an input is negligible, for all outputs and points [-].
 NEGLIGIBLE = 0.01
 
 
 @dataclasses.dataclass(frozen=True)
 class Points:
-    """Operating points; arrays of shape (points,). Their voltage is NaN on the battery.
+    """Operating points; arrays of shape (points,). With a battery their voltage is NaN.
 
     Attributes:
-        motor_speed: imposed [rpm], in the place of the voltage, which is 0 then; None where the voltage is imposed.
-        has_ground: whether payload and slope act, which are 0 else.
+        motor_speed: imposed [rpm] instead of the voltage, which is 0 then; None if the voltage is imposed.
+        has_ground: True if payload and slope act; else they are 0.
     """
 
     configuration: np.ndarray
@@ -42,7 +42,7 @@ class Points:
 
     @classmethod
     def of(cls, runs: Runs) -> Points:
-        """Those of a table of runs."""
+        """Operating points of a table of runs."""
         layout, nothing = runs.layout, np.zeros(len(runs))
         payload, slope = (runs[c] if c in runs.axes else nothing for c in ("payload_kg", "slope_deg"))
         imposed = runs[layout.imposed_column]
@@ -57,21 +57,21 @@ class Points:
         )
 
     def at(self, rows: np.ndarray) -> Points:
-        """Some of them, by a mask or an index."""
+        """Some of the points, by a mask or an index."""
         speed = None if self.motor_speed is None else self.motor_speed[rows]
         voltage, payload, slope = (x[rows] for x in (self.voltage, self.payload, self.slope_deg))
         return Points(self.configuration[rows], voltage, payload, slope, speed, self.has_ground)
 
     @property
     def imposed(self) -> tuple[str, np.ndarray, str]:
-        """What is imposed on the motors: words, values, unit."""
+        """Imposed quantity of the motors: words, values, unit."""
         if self.motor_speed is None:
             return "voltage", self.voltage, "V"
         return "motor speed", self.motor_speed, "rpm"
 
     @property
     def ground(self) -> tuple[tuple[str, np.ndarray, str], ...]:
-        """What acts by the ground: columns, values, units; nothing where there is none."""
+        """Conditions of the ground: columns, values, units; empty without a ground."""
         found = ("payload_kg", self.payload, " kg"), ("slope_deg", self.slope_deg, "°")
         return found if self.has_ground else ()
 
@@ -82,7 +82,7 @@ class Points:
         return ", ".join((f"{self.configuration[k]}, {supply}", *(f"{x[k]:g}{unit}" for _, x, unit in self.ground)))
 
     def columns(self) -> dict[str, np.ndarray]:
-        """As in tables of runs."""
+        """Columns as in tables of runs."""
         own = (
             {"supply_voltage_V": self.voltage} if self.motor_speed is None else {"motor_speed_rpm": self.motor_speed}
         )
@@ -95,9 +95,9 @@ class Input:
 
     Attributes:
         unit, meaning: of its field; distribution: log-normal, normal, uniform or posterior.
-        median: [unit]; interval: that holds 95 % [unit]; sd: to first order [unit].
-        inert: whether every output's derivative by it was exactly zero wherever one was taken, so that it was left
-            out of the sampling; Shapley effects draw it still where it is correlated with inputs that act.
+        median: [unit]; interval: of 95 % [unit]; sd: to first order [unit].
+        inert: True if all computed derivatives of all outputs by it were exactly zero. It is then not sampled,
+            except for Shapley effects if it is correlated with active inputs.
     """
 
     unit: str
@@ -111,21 +111,21 @@ class Input:
 
 @dataclasses.dataclass(frozen=True)
 class OutputStudy:
-    """What was found for one output; arrays over (points, inputs), NaN at points without numbers.
+    """Results for one output; arrays over (points, inputs), NaN at points without a value.
 
     Attributes:
         row: name, unit, label.
         value: at the medians of the inputs [SI], shape (points,).
         derivative: by each input [SI per its unit]; elasticity: (x / y) ∂y/∂x [-].
-        swing: the output with each input alone at the lower and upper end of its 95 % interval [SI], shape
+        swing: output with each single input at the lower and upper end of its 95 % interval [SI], shape
             (2, points, inputs).
-        sd: of the output over all inputs [SI], shape (points,): to first order, or of the sample where there is one.
-        share: of the variance that an input has a part in, as the method measures it [-].
-        overall: what the method says of each input over all points together, name → Estimate of shape (inputs,).
+        sd: of the output over all inputs [SI], shape (points,): to first order, or of the sample if there is one.
+        share: of the variance that involves an input, as the method defines it [-].
+        overall: indices of each input over all points together, name → Estimate of shape (inputs,).
         at_points: the same at each point, name → Estimate of shape (points, inputs).
         second: interactions over all points, Estimate of shape (inputs, inputs); None without.
         convergence: (model evaluations, Estimate of the main index) at stages.
-        lost: share of base points left out at each point, shape (points,); studied: whether the point counts.
+        lost: share of base points without a value at each point, shape (points,); studied: True for included points.
     """
 
     row: OutputRow
@@ -144,7 +144,7 @@ class OutputStudy:
 
     @property
     def overall_share(self) -> np.ndarray:
-        """Share over all points together, shape (inputs,): that of the method, else the mean of the points."""
+        """Share over all points together, shape (inputs,): of the method, else the mean over the points."""
         main = next((self.overall[k].value for k in ("total", "shapley", "upper") if k in self.overall), None)
         if main is not None and np.isfinite(main).any():
             return np.clip(np.nan_to_num(main), 0.0, 1.0)
@@ -157,8 +157,12 @@ class OutputStudy:
 
 @dataclasses.dataclass(frozen=True)
 class Interaction:
-    """What two inputs do together beyond what each does: second-order index with its own 95 % interval; sure: whether
-    it is above zero also with an interval that allows for all pairs that were looked at."""
+    """Interaction of two inputs, in addition to their single effects.
+
+    Attributes:
+        second: second-order index; interval: its 95 % interval.
+        sure: True if it is also above zero with an interval that allows for all tested pairs.
+    """
 
     pair: tuple[str, str]
     second: float
@@ -166,7 +170,7 @@ class Interaction:
     sure: bool
 
     def to_json(self) -> dict[str, Any]:
-        """As in result.json."""
+        """Entry of result.json."""
         return {
             "pair": list(self.pair),
             "second": self.second,
@@ -177,10 +181,10 @@ class Interaction:
 
 @dataclasses.dataclass(frozen=True)
 class NextRuns:
-    """Runs that would tell most of the inputs.
+    """Most informative next runs.
 
     Attributes:
-        candidates: how many were looked at; source: where they come from.
+        candidates: number of candidates; source: of their list.
         points: those chosen, in order; gain: bits that each adds, shape (runs,).
         noise: channel → sd as a share of the reading [-], and words for a person.
         sd: of each input after so many runs, over that before any; shape (runs + 1, inputs).
@@ -202,13 +206,13 @@ class SensitivityResult:
 
     Attributes:
         method: one of `METHODS`; model: fidelity; seed: random seed.
-        inputs: by name, in order; correlated: whether they are a posterior.
+        inputs: by name, in order; correlated: True for inputs of a posterior.
         points: operating points; outputs: by name.
         statuses: source → status → points, at the medians; sampled: the same over the sample.
-        next_runs: None where there is no candidate that converges.
-        evaluations: of the model, in all; seconds: that these took, with what was compiled for them.
+        next_runs: None without a candidate that converges.
+        evaluations: number of model evaluations; seconds: their duration, including compilation.
         comparison: of bounds with sampled indices, by output; empty for other methods.
-        remarks: what is worth reading.
+        remarks: notes on the result.
     """
 
     method: str
@@ -228,7 +232,7 @@ class SensitivityResult:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the inputs."""
+        """Names of the inputs."""
         return tuple(self.inputs)
 
     def importance(self) -> np.ndarray:
@@ -247,16 +251,16 @@ class SensitivityResult:
 
     @property
     def negligible(self) -> tuple[str, ...]:
-        """Inputs that have less than `NEGLIGIBLE` of the variance of every output at every point."""
+        """Inputs with less than `NEGLIGIBLE` of the variance of every output at every point."""
         return tuple(n for n, x in zip(self.names, self.importance(), strict=True) if x < NEGLIGIBLE)
 
     @property
     def solved(self) -> bool:
-        """Whether the solver gave an answer at every point."""
+        """True if the solver found a solution at each point."""
         return not any(counts.get("failed") for counts in self.statuses.values())
 
     def leaders(self) -> dict[str, list[tuple[str, float]]]:
-        """Input → label and share [-] of each output that it decides more than any other does."""
+        """Input → label and share [-] of each output that depends on it more than on any other."""
         found: dict[str, list[tuple[str, float]]] = {}
         for study in self.outputs.values():
             share = study.overall_share
@@ -271,11 +275,11 @@ class SensitivityResult:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Sentences worth reading."""
+        """Remarks as sentences."""
         return sentences(self.remarks)
 
     def to_json(self) -> dict[str, Any]:
-        """As in result.json, docs/schemas/sensitivity.schema.json."""
+        """Entries of result.json, docs/schemas/sensitivity.schema.json."""
         names = self.names
         return {
             "schema": SCHEMA,
@@ -323,7 +327,7 @@ class SensitivityResult:
         return _by_input(self.names, study.overall)
 
     def tables(self) -> dict[str, dict[str, np.ndarray]]:
-        """CSV tables by file name: derivatives and swings at every point, indices over all and at every point."""
+        """CSV tables by file name: derivatives and swings at each point, indices over all and at each point."""
         names = np.array(self.names)
         found: dict[str, list[dict[str, np.ndarray]]] = {"points.csv": [], "indices.csv": []}
         for name, study in self.outputs.items():
@@ -382,14 +386,14 @@ def _by_input(names: tuple[str, ...], estimates: dict[str, Estimate]) -> dict[st
 
 
 def interactions(study: OutputStudy, names: tuple[str, ...]) -> list[Interaction]:
-    """Pairs of the inputs that have a part in an output, the strongest first."""
+    """Pairs of the relevant inputs of an output, the strongest first."""
     second = study.second
     if second is None:
         return []
     part = np.flatnonzero(np.nan_to_num(study.overall["total"].value) >= NEGLIGIBLE / 10)
     pairs = [(int(i), int(j)) for n, i in enumerate(part) for j in part[n + 1 :]]
     wider = 1.0
-    if pairs:  # so that of all pairs none is called sure by chance, in 95 of 100 studies (Bonferroni)
+    if pairs:  # so that in 95 of 100 studies no pair is called sure by chance (Bonferroni)
         one, all_ = (stats.t.ppf(1 - (1 - LEVEL) / 2 / n, REPLICATES - 1) for n in (1, len(pairs)))
         wider = float(all_ / one)
     found = []

@@ -6,15 +6,15 @@ from calibration.inference.fit_notes import Note
 
 
 class Sampling(Note):
-    """A method that goes over so many operating points now."""
+    """Progress of a method over a number of operating points."""
 
     method: str
     points: int
 
 
 class PointsLeftOut(Note):
-    """Operating points of outputs that are left out, of how many: the robot does not travel there, or too many of the
-    sample do not."""
+    """Number of omitted operating points of outputs, and of all: the robot does not travel there, or too much of the
+    sample does not."""
 
     points: int
     of: int
@@ -23,7 +23,7 @@ class PointsLeftOut(Note):
 
 
 class SampleLeftOut(Note):
-    """Operating points of outputs at which up to a share of the sample does not travel, and is left out."""
+    """Operating points of outputs where up to a share of the sample does not travel and is omitted."""
 
     points: int
     share: float
@@ -31,13 +31,13 @@ class SampleLeftOut(Note):
 
 
 class Inert(Note):
-    """Inputs by which every derivative is zero: they are not sampled, or they are `correlated` with others."""
+    """Inputs with zero derivatives: they are not sampled, or they are `correlated` with others."""
 
     inputs: tuple[str, ...]
     correlated: bool
 
 
 class Tied(Note):
-    """Inputs that are kept at their ratio to another one."""
+    """Inputs kept at their ratio to another one."""
 
     inputs: tuple[str, ...]

@@ -1,9 +1,9 @@
-"""Shapley effects: shares of the variance that add up to one also where inputs are correlated.
+"""Shapley effects: shares of the variance that add up to one even for correlated inputs.
 
-The share of x_j is the mean, over all orders in which inputs could become known, of what knowing x_j takes off the
-variance that is left (Owen, SIAM/ASA J. Uncertain. Quantif. 2 (2014)). Estimated by random orders, each with its
-reverse, and the cost E[Var(y | all but J)] by three draws of x_J at one of the rest (Song, Nelson and Staum, ibid. 4
-(2016)); inputs are normal in their coordinates, so conditional draws are exact.
+The share of x_j is the mean reduction of the remaining variance when x_j becomes known, over all orders of the inputs
+(Owen, SIAM/ASA J. Uncertain. Quantif. 2 (2014)). It is estimated by random orders, each with its
+reverse. The cost E[Var(y | all but J)] is estimated by three draws of x_J for one draw of the rest (Song, Nelson and
+Staum, ibid. 4 (2016)). Inputs are normal in their coordinates, so conditional draws are exact.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ import numpy as np
 from scipy.special import ndtri
 from scipy.stats import qmc
 
-from calibration.sensitivity.replicates import Estimate, ratio
+from calibration.sensitivity.replicates import Estimate, ratio_estimate
 
-#: Draws of what is unknown for each draw of what is known.
+#: Draws of unknown inputs for each draw of known ones.
 INNER = 3
 #: Draws for the variance, a power of 2.
 DRAWS = 4096
@@ -38,11 +38,11 @@ class Design:
 
 @dataclasses.dataclass(frozen=True)
 class Terms:
-    """What effects are ratios of: parts of the variance [output's unit²].
+    """Parts of the variance whose ratios are the effects [output's unit²].
 
     Attributes:
-        variance: of the output; parts: shape (pairs, inputs), NaN in rows of pairs that are left out.
-        lost: share of points at which the model has no number [-].
+        variance: of the output; parts: shape (pairs, inputs), NaN in rows of omitted pairs.
+        lost: share of points without a value of the model [-].
     """
 
     variance: float
@@ -50,13 +50,13 @@ class Terms:
     lost: float
 
 
-def pairs_of(evaluations: float, inputs: int) -> int:
-    """Pairs of orders for at least so many evaluations."""
+def pairs_of_orders(evaluations: float, inputs: int) -> int:
+    """Number of pairs of orders for at least so many evaluations."""
     return max(int(np.ceil((evaluations - DRAWS) / (2 * INNER * max(inputs - 1, 1)))), 50)
 
 
-def design(mean: np.ndarray, covariance: np.ndarray, pairs: int, seed: int) -> Design:
-    """A design for inputs that are jointly normal.
+def shapley_design(mean: np.ndarray, covariance: np.ndarray, pairs: int, seed: int) -> Design:
+    """Design for jointly normal inputs.
 
     Args:
         mean, covariance: of z.
@@ -90,7 +90,7 @@ def design(mean: np.ndarray, covariance: np.ndarray, pairs: int, seed: int) -> D
 
 
 def _conditional(covariance: np.ndarray, drawn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """How the mean of z_J follows the rest, and a root of its covariance given the rest."""
+    """Matrix of the conditional mean of z_J given the rest, and a root of its conditional covariance."""
     rest = np.setdiff1d(np.arange(len(covariance)), drawn, assume_unique=True)
     across = covariance[np.ix_(drawn, rest)]
     pull = across @ np.linalg.pinv(covariance[np.ix_(rest, rest)], hermitian=True)
@@ -99,13 +99,13 @@ def _conditional(covariance: np.ndarray, drawn: np.ndarray) -> tuple[np.ndarray,
     return pull, vectors * np.sqrt(np.maximum(values, 0.0))
 
 
-def terms(design: Design, values: np.ndarray) -> Terms | None:
+def shapley_terms(design: Design, values: np.ndarray) -> Terms | None:
     """Parts of an output's variance from its values at the design's points.
 
-    A pair of orders at one of whose points the output is not finite is left out.
+    A pair of orders is omitted if the output is not finite at one of its points.
 
     Returns:
-        None where fewer than ten pairs are left.
+        None if fewer than ten pairs remain.
     """
     pairs, _, size = design.orders.shape
     whole, rest = values[:DRAWS], values[DRAWS:].reshape(pairs, 2, size - 1, INNER)
@@ -123,12 +123,12 @@ def terms(design: Design, values: np.ndarray) -> Terms | None:
     return Terms(variance, parts, float(1 - np.isfinite(values).mean()))
 
 
-def of_vector(found: Sequence[Terms]) -> Terms:
-    """Of several outputs, as of a vector (Gamboa et al., Electron. J. Stat. 8 (2014)), whose pairs of orders are the
-    same, row by row.
+def terms_of_vector(found: Sequence[Terms]) -> Terms:
+    """Terms of several outputs as of a vector (Gamboa et al., Electron. J. Stat. 8 (2014)), with the same pairs of
+    orders, row by row.
 
-    A pair that one output lacks counts there as the mean of those it has, which weigh so much more that the mean over
-    all rows and its variance are those of the output's own.
+    A pair missing in one output is replaced by the mean of that output's other pairs. The other pairs get a larger
+    weight, so that the mean over all rows and its variance are the output's own.
     """
     rows = max(len(terms.parts) for terms in found)
     whole = np.zeros((rows, found[0].parts.shape[1]))
@@ -141,7 +141,7 @@ def of_vector(found: Sequence[Terms]) -> Terms:
     return Terms(sum(t.variance for t in found), whole, max(t.lost for t in found))
 
 
-def effects(terms: Terms) -> Estimate:
+def effects_of_terms(terms: Terms) -> Estimate:
     """Shapley effects [-], shape (inputs,)."""
     kept = terms.parts[np.isfinite(terms.parts).all(1)]
-    return ratio(kept, np.full(len(kept), terms.variance))
+    return ratio_estimate(kept, np.full(len(kept), terms.variance))

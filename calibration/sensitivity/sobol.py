@@ -1,11 +1,11 @@
 """Variance-based indices of independent inputs: first, total and second order (Sobol' 1993, Homma and Saltelli 1996).
 
-S_i = Var(E[y | x_i]) / Var y is the share of the variance that goes away, on average, once x_i is known; T_i =
-E[Var(y | all but x_i)] / Var y is what is left when all but x_i are known; T_i - S_i acts only together with others.
-S_ij is what x_i and x_j do together beyond what each does. Designs are SALib's (Saltelli's scheme on a scrambled
-Sobol sequence), and the estimators are those of SALib: Saltelli et al., Comput. Phys. Commun. 181 (2010) for first
+S_i = Var(E[y | x_i]) / Var y is the mean share of the variance that is removed if x_i is known. T_i =
+E[Var(y | all but x_i)] / Var y is the share that remains if all but x_i are known; T_i - S_i is due to interactions.
+S_ij is the joint effect of x_i and x_j in addition to their single effects. Designs are SALib's (Saltelli's scheme on
+a scrambled Sobol sequence), and so are the estimators: Saltelli et al., Comput. Phys. Commun. 181 (2010) for first
 order and, after Jansen (1999), for the total; Saltelli, ibid. 145 (2002) for second order, the mean of both orders.
-Intervals are of whole replicates.
+Intervals are from whole replicates.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from calibration.sensitivity.replicates import REPLICATES, Estimate, ratio
+from calibration.sensitivity.replicates import REPLICATES, Estimate, ratio_estimate
 
 #: Fewest points of a replicate.
 FEWEST = 4
@@ -32,7 +32,7 @@ class Design:
         points: shape (replicates · size · blocks, inputs), a block after the other: A, A with the k-th column of B
             for each k, with `second` B with the k-th column of A for each k, B.
         size: base points of a replicate, a power of 2.
-        second: whether second-order indices can be had.
+        second: True for designs with second-order indices.
     """
 
     points: np.ndarray
@@ -42,7 +42,7 @@ class Design:
 
     @property
     def inputs(self) -> int:
-        """How many inputs there are."""
+        """Number of inputs."""
         return self.points.shape[1]
 
     @property
@@ -51,14 +51,14 @@ class Design:
         return (2 * self.inputs if self.second else self.inputs) + 2
 
 
-def size_of(evaluations: float, inputs: int, second: bool, replicates: int = REPLICATES) -> int:
+def base_points(evaluations: float, inputs: int, second: bool, replicates: int = REPLICATES) -> int:
     """Base points of a replicate for at least so many evaluations in all: the next power of 2."""
     blocks = (2 * inputs if second else inputs) + 2
     return 2 ** max(math.ceil(math.log2(max(evaluations / (replicates * blocks), FEWEST))), 0)
 
 
-def design(inputs: int, size: int, seed: int, second: bool = True, replicates: int = REPLICATES) -> Design:
-    """A design of independent replicates, each a Sobol sequence of its own scrambling.
+def sobol_design(inputs: int, size: int, seed: int, second: bool = True, replicates: int = REPLICATES) -> Design:
+    """Design of independent replicates, each a Sobol sequence with its own scrambling.
 
     Args:
         size: base points of a replicate, a power of 2.
@@ -78,12 +78,12 @@ def design(inputs: int, size: int, seed: int, second: bool = True, replicates: i
 
 @dataclasses.dataclass(frozen=True)
 class Terms:
-    """What the indices of an output are ratios of, by replicate: parts of the variance [output's unit²].
+    """Parts of the variance of an output, by replicate, whose ratios are the indices [output's unit²].
 
     Attributes:
         variance: shape (replicates,); first, total: shape (replicates, inputs).
-        second: of every pair, closed (with what each does alone), shape (replicates, inputs, inputs); None without.
-        rows: base points that count; lost: those left out, because the model has no number at one of their points.
+        second: of each pair, closed (with the single effects), shape (replicates, inputs, inputs); None without.
+        rows: number of included base points; lost: number of those with a missing value of the model.
     """
 
     variance: np.ndarray
@@ -94,7 +94,7 @@ class Terms:
     lost: int
 
     def __add__(self, other: Terms) -> Terms:
-        """Of both outputs together, as of a vector (Gamboa et al., Electron. J. Stat. 8 (2014))."""
+        """Terms of both outputs together, as of a vector (Gamboa et al., Electron. J. Stat. 8 (2014))."""
         second = None if self.second is None or other.second is None else self.second + other.second
         return Terms(
             self.variance + other.variance,
@@ -106,29 +106,30 @@ class Terms:
         )
 
     def widened(self, places: Sequence[int], inputs: int) -> Terms:
-        """Of more inputs, of which these are at `places`; the others do nothing."""
+        """Terms for more inputs, with these at `places` and the others inert."""
 
         first, total = (np.zeros((len(self.variance), inputs)) for _ in range(2))
         first[:, places], total[:, places] = self.first, self.total
         second = None
-        at = np.asarray(places)
+        columns = np.asarray(places)
         if self.second is not None:
-            second = first[:, :, None] + first[:, None, :]  # what two do that do nothing together
-            second[np.ix_(np.arange(len(second)), at, at)] = self.second
+            second = first[:, :, None] + first[:, None, :]  # without interaction
+            second[np.ix_(np.arange(len(second)), columns, columns)] = self.second
         return dataclasses.replace(self, first=first, total=total, second=second)
 
 
-def terms(design: Design, values: np.ndarray) -> Terms | None:
+def sobol_terms(design: Design, values: np.ndarray) -> Terms | None:
     """Parts of an output's variance.
 
-    A base point at one of whose blocks the output is not finite is left out whole. Where whether it is depends on one
-    input (an adhesion that is too small), the indices are then exactly those of that input cut there; else nearly.
+    A base point is omitted if the output is not finite in one of its blocks. If that depends on one
+    input only (an adhesion that is too small), the indices are exactly those of that input truncated there; otherwise
+    approximately.
 
     Args:
         values: of the output at the design's points.
 
     Returns:
-        None where fewer than two base points of some replicate are left.
+        None if fewer than two base points of some replicate remain.
     """
     d = design.inputs
     by = np.reshape(values, (design.replicates, design.size, design.blocks))
@@ -141,12 +142,12 @@ def terms(design: Design, values: np.ndarray) -> Terms | None:
     centre = (a + b)[finite].mean() / 2
     by = np.where(finite[..., None], by - centre, 0.0)
     a, b, ab = by[..., 0], by[..., -1], by[..., 1 : d + 1]
-    # A replicate with more rows weighs more: sums over the mean number of rows, not means of each.
+    # A replicate with more rows has a larger weight: sums over the mean number of rows, not means of each.
     weight = 1.0 / count.mean()
     second = None
     if design.second:
         ba = by[..., d + 1 : 2 * d + 1]
-        # Var E[y | x_j, x_k]: what B with A's x_j and A with B's x_k share, in both orders.
+        # Var E[y | x_j, x_k]: common to B with A's x_j and A with B's x_k, in both orders.
         mixed = np.einsum("rnj,rnk->rjk", ba, ab)
         alone = np.einsum("rn,rn->r", a, b)[:, None, None]
         closed = weight * (mixed - alone)
@@ -163,7 +164,7 @@ def terms(design: Design, values: np.ndarray) -> Terms | None:
 
 @dataclasses.dataclass(frozen=True)
 class Indices:
-    """Of one output: shape (inputs,) each; second: shape (inputs, inputs), None without; variance [unit²]."""
+    """Indices of one output: shape (inputs,) each; second: shape (inputs, inputs), None without; variance [unit²]."""
 
     first: Estimate
     total: Estimate
@@ -171,12 +172,14 @@ class Indices:
     variance: float
 
 
-def indices(terms: Terms, replicates: int | None = None) -> Indices:
-    """Indices from parts of the variance; from the first so many replicates, where stated."""
+def indices_of_terms(terms: Terms, replicates: int | None = None) -> Indices:
+    """Indices from parts of the variance, or from a first number of replicates."""
     kept = slice(replicates)
     variance, first = terms.variance[kept], terms.first[kept]
     second = None
     if terms.second is not None:
         beyond = terms.second[kept] - first[:, :, None] - first[:, None, :]
-        second = ratio(beyond, variance)
-    return Indices(ratio(first, variance), ratio(terms.total[kept], variance), second, float(variance.mean()))
+        second = ratio_estimate(beyond, variance)
+    return Indices(
+        ratio_estimate(first, variance), ratio_estimate(terms.total[kept], variance), second, float(variance.mean())
+    )

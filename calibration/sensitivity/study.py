@@ -1,4 +1,4 @@
-"""What is studied: one robot, its uncertain inputs, operating points and outputs."""
+"""Object of a study: one robot, its uncertain inputs, operating points and outputs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibration.inference.fit_notes import Note, Step
-from calibration.sensitivity.model import Answer, Model, OutputRow, counted
+from calibration.sensitivity.model import Answer, Model, OutputRow, count_statuses
 from calibration.sensitivity.result import Points
 from calibration.sensitivity.uncertain_inputs import Inputs
 from mmrjax import fidelities
@@ -21,13 +21,13 @@ from mmrjax.model.robot import Robot
 from mmrjax.model.signals import STATUSES
 
 Tell = Callable[[Note | str], None]
-#: After so long a time it says how far it is [s].
+#: Longest time without a progress message [s].
 SILENCE = 10.0
 
 
 @dataclasses.dataclass(frozen=True)
 class Supply:
-    """What feeds the motors at every point: the battery (1) or not (0), charge taken [C], adhesion ratio at each."""
+    """Supply of the motors at each point: battery (1) or not (0), charge taken [C]; and the adhesion ratio there."""
 
     battery: float = 0.0
     discharge: float = 0.0
@@ -35,7 +35,7 @@ class Supply:
 
 
 class Study:
-    """One robot, its uncertain inputs, operating points and outputs; methods are functions of it."""
+    """One robot, its uncertain inputs, operating points and outputs; methods are functions of a study."""
 
     def __init__(
         self,
@@ -50,7 +50,7 @@ class Study:
     ) -> None:
         supply = Supply() if supply is None else supply
         self.robot, self.inputs, self.points, self.tell = robot, inputs, points, tell
-        options = fidelities.facts(model).resolved() if options is None else options
+        options = fidelities.fidelity_facts(model).resolved() if options is None else options
         self.model = Model(robot, inputs.columns, model, options, outputs)
         names = robot.configurations.names
         self.conditions = Conditions(
@@ -72,7 +72,7 @@ class Study:
         return jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[k]), self.conditions)
 
     def acting(self, k: int) -> np.ndarray:
-        """Inputs that are not of another configuration than that of a point."""
+        """Inputs that act at a point: all except those of other configurations."""
         return self.inputs.acting(str(self.points.configuration[k]), self.robot.configurations.names)
 
     def values_at(self, scores: np.ndarray) -> np.ndarray:
@@ -80,9 +80,9 @@ class Study:
         return np.asarray(self.inputs.values(scores))
 
     def sample(self, values: np.ndarray, points: Sequence[int]) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
-        """Outputs at the same values of the model's columns, at one point after the other; counted and timed.
+        """Outputs at the same values of the model's columns, one point at a time; counted and timed.
 
-        What a source says where only conditions differ that it ignores is not computed again.
+        A source is not computed again if only conditions differ that it ignores.
         """
         kept: dict[tuple[str, tuple[float, ...]], Answer] = {}
         for k in points:
@@ -94,7 +94,7 @@ class Study:
                 fields = {f.name: getattr(conditions, f.name) for f in dataclasses.fields(conditions)}
                 mark = tuple(float(x) for name, x in fields.items() if x is not None and name not in ignored)
                 if (source, mark) not in kept:
-                    if not ignored:  # and so for no other point
+                    if not ignored:  # so no other point can reuse it
                         parts[source] = self.model.of_source(source, values, conditions)
                         continue
                     kept[source, mark] = self.model.of_source(source, values, conditions)
@@ -114,14 +114,14 @@ class Study:
             self.sampled[source] = self.sampled.get(source, 0) + np.bincount(codes, minlength=len(STATUSES))
 
     def statuses(self) -> dict[str, dict[str, int]]:
-        """Source → status → how many of the sample."""
+        """Source → status → number in the sample."""
         return {
-            source_words(source): counted(np.repeat(np.arange(len(whole)), whole))
+            source_words(source): count_statuses(np.repeat(np.arange(len(whole)), whole))
             for source, whole in self.sampled.items()
         }
 
     def gradients(self, scores: np.ndarray, conditions: Conditions) -> tuple[dict[str, np.ndarray], ...]:
-        """Outputs, and their derivatives by the scores of all inputs; each row has its own conditions, or all one.
+        """Outputs and their derivatives by the scores of all inputs, for conditions of each row or common ones.
 
         Counted and timed.
         """
@@ -137,5 +137,5 @@ class Study:
 
 
 def source_words(source: str) -> str:
-    """What computes outputs, in words: the fidelity, or the derived output's module."""
+    """Source of outputs in words: the fidelity, or the derived output's module."""
     return source.rpartition(".")[2].replace("_", " ") if "." in source else source

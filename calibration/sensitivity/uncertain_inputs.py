@@ -1,4 +1,4 @@
-"""The uncertain inputs of a study: which, how they are distributed, and what values their scores stand for."""
+"""Uncertain inputs of a study: names, distributions, and values as functions of their scores."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import ndtri
 
-from calibration.data.input_errors import BadConfiguration, choices
+from calibration.data.input_errors import BadConfiguration, allowed_words
 from calibration.data.posterior_file import Posterior
 from calibration.inference import priors
-from calibration.inference.fit_posterior import of_coordinates
+from calibration.inference.fit_posterior import posterior_of_coordinates
 from mmrjax import fidelities
 from mmrjax.errors import UsageError
 from mmrjax.fidelities.variation import CONDITIONS, Axis, Variation
 from mmrjax.model.robot import Robot
 
-#: Nearest to an end of the unit interval that a normal score is taken of: 6 sds.
+#: Least distance from an end of the unit interval for a normal score: 6 sds.
 EDGE = 1e-9
 
-#: The distribution of no parameter.
+#: Distribution of no parameter.
 NOTHING = Posterior(
     coordinates=(), units=(), mean=np.zeros(0), covariance=np.zeros((0, 0)), location=np.zeros(0), spread=np.zeros(0),
     low=np.zeros(0), high=np.zeros(0), softness=np.zeros(0), kinds=(),
@@ -38,10 +38,10 @@ class Inputs:
     """Parameters, normal in their coordinates, and conditions, uniform in their ranges.
 
     Attributes:
-        parameters: distribution of the parameters; independent but for a posterior.
+        parameters: distribution of the parameters; independent except for a posterior.
         low, high: ranges of the conditions, in their units; conditions: their names.
-        axes: what is known of each input, by name.
-        is_posterior: whether the parameters are those of a fit, and correlated.
+        axes: facts about each input, by name.
+        is_posterior: True for the correlated parameters of a fit.
     """
 
     parameters: Posterior
@@ -53,7 +53,7 @@ class Inputs:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the inputs: parameters, then conditions."""
+        """Names of the inputs: parameters, then conditions."""
         return (*self.parameters.coordinates, *self.conditions)
 
     def __len__(self) -> int:
@@ -61,7 +61,7 @@ class Inputs:
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """What the values of a point set: inputs, and parameters tied to one."""
+        """Columns of a point's values: inputs, and parameters tied to one."""
         return (*self.parameters.names, *self.conditions)
 
     @cached_property
@@ -69,8 +69,9 @@ class Inputs:
         return self.parameters.root
 
     def values(self, scores: Any) -> Any:
-        """Values of `columns` at independent scores: standard normal for parameters, in 0..1 for conditions; in NumPy
-        of an array of NumPy, which compiles nothing, else traceable.
+        """Values of `columns` at independent scores: standard normal for parameters, in 0..1 for conditions.
+
+        NumPy in, NumPy out, without compilation; else traceable.
 
         Args:
             scores: shape (..., inputs).
@@ -89,7 +90,7 @@ class Inputs:
 
     @cached_property
     def slope(self) -> Float[np.ndarray, "columns inputs"]:
-        """The same in the middle."""
+        """d values / d scores at the medians."""
         return self.jacobian(self.centre[None])[0]
 
     def scores(self, unit: Float[np.ndarray, "... inputs"]) -> Float[np.ndarray, "... inputs"]:
@@ -99,77 +100,81 @@ class Inputs:
 
     @property
     def centre(self) -> np.ndarray:
-        """Scores in the middle: medians."""
+        """Scores of the medians."""
         return np.concatenate([np.zeros(len(self.parameters)), np.full(len(self.conditions), 0.5)])
 
     @property
     def places(self) -> np.ndarray:
-        """Which of `columns` each input is."""
+        """Index of each input in `columns`."""
         p, tied = len(self.parameters), len(self.parameters.tied)
         return np.concatenate([np.arange(p), np.arange(p + tied, p + tied + len(self.conditions))])
 
     def acting(self, configuration: str, others: Sequence[str]) -> np.ndarray:
-        """Indices of the inputs that are not of another configuration."""
+        """Indices of the inputs that do not belong to another configuration."""
         foreign = tuple(f"{name}." for name in others if name != configuration)
         return np.array([k for k, name in enumerate(self.names) if not name.startswith(foreign)], int)
 
 
-#: Parameters that a rig has where its file states a prior of them, else they are another robot's.
+#: Parameters that belong to a rig only if its file states a prior for them.
 _OTHERS = ("driver.", "rig.", "motor.resistance_thermal_", "motor.time_constant_", "motor.temperature_ambient")
 
 
-def default_names(
+def default_input_names(
     robot: Robot, configurations: Sequence[str], battery: bool, model: str = "steady", turns: bool = False
 ) -> tuple[str, ...]:
-    """The robot's parameters that have a prior of some width, of these configurations and what all share.
+    """Parameters of the robot with a prior of nonzero width, for these configurations and those common to all.
 
-    Left out: the battery's where it does not feed the motors, what guides carry where there are none, and what the
+    Omitted are the battery's if it does not feed the motors, guides' on wheels, and parameters that the
     fidelity does not read, in straight travel or in turns.
     """
     absent = [name for name in robot.configurations if name not in configurations]
     wheels = [name for name in configurations if float(robot.configurations[name].on_tracks) < 0.5]
     out = tuple(f"{name}." for name in absent) + (() if battery else ("battery.",))
     guides = {f"{name}.{g}" for name in wheels for g in (priors.GUIDE_SHARE, priors.GUIDE_FRICTION)}
-    known = priors.known(robot)
-    left_out = {*guides, *fidelities.unread(model, known, turns), *robot.rig.exact}
-    if not robot.rig.inherits:  # what another robot has is none of its own
+    by_name = priors.parameters_by_name(robot)
+    left_out = {*guides, *fidelities.unread_parameters(model, by_name, turns), *robot.rig.exact}
+    if not robot.rig.inherits:  # parameters of another robot are not its own
         stated = {name for name, _, _ in robot.rig.priors}
-        left_out |= {name for name in known if name.startswith(_OTHERS) and name not in stated} | {*robot.rig.unknown}
+        left_out |= {name for name in by_name if name.startswith(_OTHERS) and name not in stated} | {
+            *robot.rig.unknown
+        }
     return tuple(
         name
-        for name, p in known.items()
+        for name, p in by_name.items()
         if not name.startswith(out) and name not in left_out and p.spec.prior_sd(float(p.value)) > 0
     )
 
 
-def of_priors(robot: Robot, words: Sequence[str], ranges: Mapping[str, tuple[float, float]]) -> Inputs:
+def inputs_from_priors(robot: Robot, words: Sequence[str], ranges: Mapping[str, tuple[float, float]]) -> Inputs:
     """Inputs from the priors of the parameters' fields, around the robot's values, and from stated ranges.
 
     Args:
         words: parameters, `motor.*` a group; ranges: of conditions.
 
     Raises:
-        BadConfiguration: an unknown name, one without a prior of some width, a range that is none; said with choices.
+        BadConfiguration: an unknown name, with the choices; one with a prior of zero width; or an invalid range.
     """
-    everything = list(priors.known(robot))
-    names = list(dict.fromkeys(name for word in words for name in priors.expand(word, everything, "--parameters")))
-    known = priors.known(robot)
+    everything = list(priors.parameters_by_name(robot))
+    names = list(
+        dict.fromkeys(name for word in words for name in priors.expand_name(word, everything, "--parameters"))
+    )
+    by_name = priors.parameters_by_name(robot)
     for name in names:
-        if not known[name].spec.prior_sd(float(known[name].value)) > 0:
+        if not by_name[name].spec.prior_sd(float(by_name[name].value)) > 0:
             raise BadConfiguration(
                 f"--parameters {name}: its prior has no width (nominal value 0 with a relative sd), so nothing "
                 "depends on it; give it a value with --set, or leave it out"
             )
     try:
-        coordinates = priors.coordinates(robot, names) if names else None
+        coordinates = priors.parameter_coordinates(robot, names) if names else None
     except BadConfiguration as error:
         raise BadConfiguration(str(error).replace("--prior", "--parameters")) from None
     size = len(names)
-    parameters = of_coordinates(coordinates, np.zeros(size), np.eye(size)) if coordinates else NOTHING
+    parameters = posterior_of_coordinates(coordinates, np.zeros(size), np.eye(size)) if coordinates else NOTHING
     return _inputs(robot, parameters, ranges, posterior=False)
 
 
-def of_posterior(robot: Robot, posterior: Posterior, ranges: Mapping[str, tuple[float, float]]) -> Inputs:
+def inputs_from_posterior(robot: Robot, posterior: Posterior, ranges: Mapping[str, tuple[float, float]]) -> Inputs:
     """Inputs from the posterior of a calibrated robot, and from stated ranges of conditions."""
     return _inputs(robot, posterior, ranges, posterior=True)
 
@@ -180,7 +185,7 @@ def _inputs(
     for name in ranges:
         if name not in CONDITIONS or name == "configuration":
             allowed = [n for n in CONDITIONS if n != "configuration"]
-            raise BadConfiguration(f"--vary {name}: no such condition; {choices(name, allowed)}")
+            raise BadConfiguration(f"--vary {name}: no such condition; {allowed_words(name, allowed)}")
     try:
         axes = Variation(robot, (*parameters.names, *ranges)).axes
     except UsageError as error:

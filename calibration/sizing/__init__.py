@@ -1,1 +1,1 @@
-"""Sizing: robots held against requirements, and searched for so that they meet them."""
+"""Sizing: checks of robots against requirements, and the search for a robot that meets them."""

@@ -1,4 +1,4 @@
-"""The chart of a robot's use: over payload and slope, which limit is nearest and what it leaves."""
+"""Chart of a robot's use: over payload and slope, the nearest limit and its margin."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from jaxtyping import Array
 from calibration.data.requirements_file import Requirement, Requirements
 from calibration.sizing import sheet
 from mmrjax.compile.compiling import compiled
-from mmrjax.derived.requirements import Point, Ratings, heat_left, ratings, travel
+from mmrjax.derived.requirements import EnvelopePoint, Ratings, heat_left, ratings, travel_quantities
 from mmrjax.model import params
 from mmrjax.model.robot import Robot
 
-#: What can end a use, in the order of the chart.
+#: Limits of a use, in the order of the chart.
 LIMITS = (
     "adhesion",
     "stall",
@@ -27,16 +27,16 @@ LIMITS = (
     "cell cut-off",
     "speed",
 )
-#: Points along payload and slope, and how far beyond the envelope the chart goes.
+#: Number of points along payload and slope, and the chart's extent over the envelope's.
 POINTS, BEYOND = 33, 1.6
 
 
 @dataclasses.dataclass(frozen=True)
 class Chart:
-    """Which limit is nearest, shape (slopes, payloads).
+    """Nearest limit, shape (slopes, payloads).
 
     Attributes:
-        payload, slope: axes [kg], [deg]; nearest: index into `LIMITS`; margin: what that leaves, negative beyond it.
+        payload, slope: axes [kg], [deg]; nearest: index into `LIMITS`; margin: to it, negative beyond it.
     """
 
     payload: np.ndarray
@@ -46,37 +46,37 @@ class Chart:
 
 
 @compiled
-def _left(robot: Robot, rated: Ratings, points: Point, speeds: Array, wanted: Array) -> Array:
+def _margins(robot: Robot, rated: Ratings, points: EnvelopePoint, speeds: Array, wanted: Array) -> Array:
     """Margins by limit, shape (points, limits)."""
 
-    def one(point: Point, wanted: Array) -> Array:
-        found, _ = travel(robot, point, rated)
-        turns = found["motor_speed_rpm"]
+    def one(point: EnvelopePoint, wanted: Array) -> Array:
+        state, _ = travel_quantities(robot, point, rated)
+        turns = state["motor_speed_rpm"]
         each = [
-            found["adhesion"], jnp.clip(found["left"], -1.0, 1.0),
-            heat_left(robot, point, found["current"], rated.temperature),
-            1 - turns / speeds[0], 1 - turns / speeds[1], 1 - found["gearbox_Nm"] / rated.torque,
-            jnp.minimum(found["cell"] / rated.voltage_cutoff, 1.0),
-            jnp.where(wanted > 0, found["speed_m_s"] / jnp.where(wanted > 0, wanted, 1.0) - 1, 1.0),
+            state["adhesion"], jnp.clip(state["left"], -1.0, 1.0),
+            heat_left(robot, point, state["current"], rated.temperature),
+            1 - turns / speeds[0], 1 - turns / speeds[1], 1 - state["gearbox_Nm"] / rated.torque,
+            jnp.minimum(state["cell"] / rated.voltage_cutoff, 1.0),
+            jnp.where(wanted > 0, state["speed_m_s"] / jnp.where(wanted > 0, wanted, 1.0) - 1, 1.0),
         ]  # fmt: skip
-        # A robot at the limit of adhesion has its margin of both; it is adhesion's.
+        # At the limit of adhesion both margins are zero; it is assigned to adhesion.
         each[1] = jnp.where(each[0] <= each[1], 1.0, each[1])
         return jnp.stack([jnp.asarray(x, float) for x in each])
 
     return jax.vmap(one)(points, wanted)
 
 
-def chart(robot: Robot, asked: Requirements, most: tuple[float, float]) -> Chart:
-    """Of a robot, at the worse of the ends of charge, in the warmest ambient of the envelope.
+def margin_chart(robot: Robot, asked: Requirements, most: tuple[float, float]) -> Chart:
+    """Chart of a robot, at the worse end of charge, in the warmest ambient of the envelope.
 
-    A required speed counts within the payloads and slopes that it is required at.
+    A required speed applies only within its own payloads and slopes.
 
     Args:
-        most: payload [kg] and slope [deg] to which the chart goes.
+        most: largest payload [kg] and slope [deg] of the chart.
     """
     payload, slope = np.linspace(0, most[0], POINTS), np.linspace(0, most[1], POINTS)
     e = asked.envelope
-    base = sheet.points(robot, Requirement("speed_m_s", 0.0, True, e))
+    base = sheet.envelope_points(robot, Requirement("speed_m_s", 0.0, True, e))
     first = jax.tree.map(lambda x: np.asarray(x)[-1], base)
     s, p = (x.ravel() for x in np.meshgrid(slope, payload, indexing="ij"))
     speeds = [r for r in asked.each if r.quantity.group == "travel" and r.name.startswith("speed") and r.least]
@@ -85,7 +85,7 @@ def chart(robot: Robot, asked: Requirements, most: tuple[float, float]) -> Chart
         v = r.envelope
         inside = (p >= v.payload_kg[0]) & (p <= v.payload_kg[1]) & (s >= v.slope_deg[0]) & (s <= v.slope_deg[1])
         wanted = np.where(inside, np.maximum(wanted, r.limit or 0.0), wanted)
-    robot = params.strong(robot)
+    robot = params.without_weak_types(robot)
     permitted = jnp.asarray([robot.motor.speed_limit, robot.gearbox.speed_limit])
     margins = None
     for charge in e.charge:
@@ -93,7 +93,7 @@ def chart(robot: Robot, asked: Requirements, most: tuple[float, float]) -> Chart
         points = dataclasses.replace(
             points, payload=jnp.asarray(p), slope_deg=jnp.asarray(s), charge=jnp.full(len(p), charge)
         )
-        left = np.asarray(_left(robot, ratings(robot), points, permitted, jnp.asarray(wanted)))
+        left = np.asarray(_margins(robot, ratings(robot), points, permitted, jnp.asarray(wanted)))
         margins = left if margins is None else np.minimum(margins, left)
     assert margins is not None
     margins = np.where(np.isfinite(margins), margins, -1.0)
@@ -101,8 +101,8 @@ def chart(robot: Robot, asked: Requirements, most: tuple[float, float]) -> Chart
     return Chart(payload, slope, np.argmin(margins, 1).reshape(shape), margins.min(1).reshape(shape))
 
 
-def extent(asked: Requirements) -> tuple[float, float]:
-    """Payload [kg] and slope [deg] to which a chart of these requirements goes."""
+def chart_extent(asked: Requirements) -> tuple[float, float]:
+    """Largest payload [kg] and slope [deg] of a chart of these requirements."""
     payloads = [asked.envelope.payload_kg[1], *(r.limit or 0.0 for r in asked.each if r.name == "payload_kg")]
     slopes = [asked.envelope.slope_deg[1], *(r.limit or 0.0 for r in asked.each if r.name == "slope_deg")]
     return BEYOND * max(*payloads, 2.0), min(BEYOND * max(*slopes, 10.0), 40.0)

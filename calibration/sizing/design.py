@@ -1,4 +1,4 @@
-"""A design as numbers, the robot that it makes, and what requirements and parts leave of it."""
+"""A design as numbers, its robot, and its margins to requirements and ratings of parts."""
 
 from __future__ import annotations
 
@@ -15,22 +15,31 @@ from jaxtyping import Array, Float
 from calibration.data.requirements_file import Envelope, Requirement, Requirements
 from calibration.sizing import sheet
 from calibration.sizing.part_options import Options
-from mmrjax.derived.requirements import CHARGE, NODES, QUANTITIES, SLOPE, Point, Ratings, heat_left, travel
-from mmrjax.derived.requirements import evaluate as requirement
+from mmrjax.derived.requirements import (
+    CHARGE,
+    NODES,
+    QUANTITIES,
+    SLOPE,
+    EnvelopePoint,
+    Ratings,
+    heat_left,
+    travel_quantities,
+)
+from mmrjax.derived.requirements import evaluate_requirement as requirement
 from mmrjax.model import params
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import CONVERGED
 
-#: Continuous numbers of a design, of which the search takes logarithms: total ratio, rolling radius [m], cells in
+#: Continuous numbers of a design, for which the search uses logarithms: total ratio, rolling radius [m], cells in
 #: parallel.
 CONTINUOUS = ("ratio", "radius", "parallel")
-#: What can be made small: name, unit and words.
+#: Quantities that can be minimised: name, unit and words.
 OBJECTIVES = {
     "mass": ("kg", "mass without payload"),
     "energy": ("Wh/m", "energy per metre"),
     "cost": ("EUR", "price of motors and gearboxes"),
 }
-#: Requirements that are about lasting travel: at their points the ratings of the parts hold.
+#: Requirements on lasting travel: at their points the ratings of the parts apply.
 LASTING = tuple(q.name for q in QUANTITIES.values() if q.group in ("travel", "payload"))
 #: Ratings of parts: name and words.
 RATED = {
@@ -52,11 +61,11 @@ class Design(eqx.Module):
     cells: Array
 
 
-def build(robot: Robot, base_mass: float, configuration: str, design: Design) -> tuple[Robot, Ratings]:
-    """The robot that a design makes of a robot, with its ratings; traceable.
+def build_robot(robot: Robot, base_mass: float, configuration: str, design: Design) -> tuple[Robot, Ratings]:
+    """Robot of a design, from an initial robot, with its ratings; traceable.
 
-    Motors, gearboxes and cells take the place of the robot's own in its mass. The cell's voltage falls over the share
-    of its capacity that is taken as the robot's cell's does; cells in parallel share the resistance.
+    Motors, gearboxes and cells replace the robot's own in its mass. The cell's voltage depends on the used share
+    of its capacity as for the robot's cell; cells in parallel share the resistance.
     """
     ratio, radius, parallel = (jnp.exp(design.continuous[..., k]) for k in range(3))
     d, c = design.drive, design.cell
@@ -78,11 +87,11 @@ def build(robot: Robot, base_mass: float, configuration: str, design: Design) ->
 
 @dataclasses.dataclass(frozen=True)
 class Demand:
-    """What one requirement asks of its points.
+    """One requirement, with its points.
 
     Attributes:
         requirement: as stated; None: the ratings of the parts. label: words.
-        rows: of the points that it is read at.
+        rows: of its points.
     """
 
     requirement: Requirement | None
@@ -91,10 +100,10 @@ class Demand:
 
 
 class Task(eqx.Module):
-    """Requirements as points and what is asked there: one solution of the balances a point and design.
+    """Requirements as points and demands; each point needs one solution of the balances for each design.
 
     Attributes:
-        robot: that is changed, with one cell (see `sheet`); configuration: that is sized.
+        robot: to be changed, with one cell (see `sheet`); configuration: to be sized.
         base_mass: of the parts in the robot's mass [kg].
         points: shape (points,); middle: row of the middle of the envelope, for the energy.
         demands: in order.
@@ -103,27 +112,27 @@ class Task(eqx.Module):
     robot: Robot
     configuration: str = eqx.field(static=True)
     base_mass: float = eqx.field(static=True)
-    points: Point
+    points: EnvelopePoint
     middle: int = eqx.field(static=True)
     demands: tuple[Demand, ...] = eqx.field(static=True)
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """What each margin of `evaluate` is of."""
+        """Label of each margin of `evaluate_design`."""
         return tuple(d.label for d in self.demands)
 
 
-def task(robot: Robot, asked: Requirements, options: Options) -> Task:
-    """The points of requirements: corners of each envelope, each point once.
+def sizing_task(robot: Robot, asked: Requirements, options: Options) -> Task:
+    """Points of requirements: corners of each envelope, each point once.
 
-    Slope and payload required are taken as conditions in which the robot has to travel. Ratings of the parts hold
-    where it is to travel for long: in the middle of the envelope if no requirement says where.
+    A required slope or payload is a condition in which the robot has to travel. Ratings of the parts apply to
+    points of lasting travel: the middle of the envelope if no requirement states any.
     """
     name = asked.envelope.configuration or robot.configurations.names[0]
     index: dict[tuple[float, ...], int] = {}
-    kept: list[Point] = []
+    kept: list[EnvelopePoint] = []
 
-    def row(point: Point) -> int:
+    def row(point: EnvelopePoint) -> int:
         key = tuple(float(np.asarray(x)) for x in jax.tree.leaves(point))
         if key not in index:
             index[key] = len(kept)
@@ -132,26 +141,28 @@ def task(robot: Robot, asked: Requirements, options: Options) -> Task:
 
     demands = []
     for r in asked.each:
-        at = sheet.points(robot, r)
-        rows = [tuple(row(p) for p in corner) for corner in _corners(robot, r, at)]
-        demands.append(Demand(r, label(r), tuple(k for corner in dict.fromkeys(rows) for k in corner)))
+        envelope = sheet.envelope_points(robot, r)
+        rows = [tuple(row(p) for p in corner) for corner in _corners(robot, r, envelope)]
+        demands.append(Demand(r, requirement_label(r), tuple(k for corner in dict.fromkeys(rows) for k in corner)))
     middle = row(_middle(robot, asked.envelope))
     travelling = sorted({k for d in demands if d.requirement and d.requirement.name in LASTING for k in d.rows})
     demands += [Demand(None, words, tuple(travelling) or (middle,)) for words in RATED.values()]
-    points: Point = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v) for v in x]), *kept)
-    one_cell = params.strong(dataclasses.replace(robot, battery=dataclasses.replace(robot.battery, cells=1)))
+    points: EnvelopePoint = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v) for v in x]), *kept)
+    one_cell = params.without_weak_types(
+        dataclasses.replace(robot, battery=dataclasses.replace(robot.battery, cells=1))
+    )
     return Task(one_cell, name, options.base_mass, points, middle, tuple(demands))
 
 
-def label(r: Requirement) -> str:
+def requirement_label(r: Requirement) -> str:
     extra = ""
     if r.name == "endurance_min":
         extra = f" driving {100 * r.share:g} % of the time" if r.share else " standing still"
     return f"{r.quantity.label}{extra}"
 
 
-def _corners(robot: Robot, r: Requirement, at: Point) -> list[tuple[Point, ...]]:
-    """The points at which a requirement is read, those of each corner of its envelope together."""
+def _corners(robot: Robot, r: Requirement, at: EnvelopePoint) -> list[tuple[EnvelopePoint, ...]]:
+    """Points of a requirement, grouped by the corners of its envelope."""
     count = len(np.asarray(at.payload))
     points = [jax.tree.map(lambda x, k=k: x[k], at) for k in range(count)]
     if r.name == "mass_kg" or (r.name == "endurance_min" and not r.share):
@@ -177,25 +188,25 @@ def _corners(robot: Robot, r: Requirement, at: Point) -> list[tuple[Point, ...]]
     return [(p,) for p in chosen]
 
 
-def _middle(robot: Robot, e: Envelope) -> Point:
+def _middle(robot: Robot, e: Envelope) -> EnvelopePoint:
     middle = Requirement("speed_m_s", 0.0, True, dataclasses.replace(
         e, payload_kg=(sum(e.payload_kg) / 2,) * 2, slope_deg=(sum(e.slope_deg) / 2,) * 2,
         state_of_charge=(sum(e.state_of_charge) / 2,) * 2,
         supply_voltage_V=None if e.supply_voltage_V is None else (sum(e.supply_voltage_V) / 2,) * 2,
     ))  # fmt: skip
-    return jax.tree.map(lambda x: x[0], sheet.points(robot, middle))
+    return jax.tree.map(lambda x: x[0], sheet.envelope_points(robot, middle))
 
 
-def evaluate(asked: Task, design: Design) -> tuple[Array, Array]:
+def evaluate_design(asked: Task, design: Design) -> tuple[Array, Array]:
     """Objectives (as `OBJECTIVES`) and margins (as `Task.labels`) of one design; traceable.
 
-    Margins are shares of what is required or permitted; met where not negative.
+    Margins are shares of the required or permitted value; a requirement is met if its margin is not negative.
     """
-    robot, ratings = build(asked.robot, asked.base_mass, asked.configuration, design)
-    found = jax.vmap(lambda p: travel(robot, p, ratings)[0])(asked.points)
+    robot, ratings = build_robot(asked.robot, asked.base_mass, asked.configuration, design)
+    states = jax.vmap(lambda p: travel_quantities(robot, p, ratings)[0])(asked.points)
     mass = jnp.asarray(robot.configurations[asked.configuration].mass)
-    energy = found["energy_per_metre_Wh"][asked.middle] / 3600.0
-    margins = [_margin(asked, d, design, robot, ratings, found) for d in asked.demands]
+    energy = states["energy_per_metre_Wh"][asked.middle] / 3600.0
+    margins = [_margin(asked, d, design, robot, ratings, states) for d in asked.demands]
     objectives = jnp.stack([mass, energy, jnp.asarray(design.drive["cost"])])
     return objectives, jnp.stack(margins)
 
@@ -204,18 +215,18 @@ def _margin(
     asked: Task, d: Demand, design: Design, robot: Robot, ratings: Ratings, found: Mapping[str, Array]
 ) -> Array:
     rows = np.array(d.rows, int)
-    at = {key: x[rows] for key, x in found.items()}
+    states = {key: x[rows] for key, x in found.items()}
     points = jax.tree.map(lambda x: x[rows], asked.points)
-    travels = jnp.min(jnp.minimum(at["left"], 1.0))
-    above = jnp.min(jnp.minimum(at["cell"] / ratings.voltage_cutoff, 1.0))
+    travels = jnp.min(jnp.minimum(states["left"], 1.0))
+    above = jnp.min(jnp.minimum(states["cell"] / ratings.voltage_cutoff, 1.0))
     r = d.requirement
     if r is None:
         most = {
-            "winding": jnp.min(_heat(robot, points, at["current"], design.drive["temperature"])),
-            "motor_speed": 1 - jnp.max(at["motor_speed_rpm"]) / design.drive["speed_motor"],
-            "gearbox_speed": 1 - jnp.max(at["motor_speed_rpm"]) / design.drive["speed_gearbox"],
-            "gearbox_torque": 1 - jnp.max(at["gearbox_Nm"]) / design.drive["torque"],
-            "cell_current": 1 - jnp.max(jnp.where(points.battery > 0.5, at["battery"], 0.0))
+            "winding": jnp.min(_heat(robot, points, states["current"], design.drive["temperature"])),
+            "motor_speed": 1 - jnp.max(states["motor_speed_rpm"]) / design.drive["speed_motor"],
+            "gearbox_speed": 1 - jnp.max(states["motor_speed_rpm"]) / design.drive["speed_gearbox"],
+            "gearbox_torque": 1 - jnp.max(states["gearbox_Nm"]) / design.drive["torque"],
+            "cell_current": 1 - jnp.max(jnp.where(points.battery > 0.5, states["battery"], 0.0))
             / (jnp.exp(design.continuous[..., 2]) * design.cell["current"]),
         }  # fmt: skip
         return most[next(key for key, words in RATED.items() if words == d.label)]
@@ -225,22 +236,22 @@ def _margin(
     if r.name == "slope_deg":
         return jnp.minimum(travels, above)
     if r.name == "payload_kg":
-        hot = jnp.min(_heat(robot, points, at["current"], jnp.asarray(ratings.temperature)))
-        torque = 1 - jnp.max(at["gearbox_Nm"]) / ratings.torque
+        hot = jnp.min(_heat(robot, points, states["current"], jnp.asarray(ratings.temperature)))
+        torque = 1 - jnp.max(states["gearbox_Nm"]) / ratings.torque
         return jnp.min(jnp.stack([travels, above, hot, torque]))
     if r.name == "endurance_min":
-        return _endurance(r, robot, ratings, at)
-    if r.limit is None:  # as the parts are rated, which is asked of every design
+        return _endurance(r, robot, ratings, states)
+    if r.limit is None:  # the rating of the parts, a demand on every design
         return jnp.minimum(travels, above)
-    if r.name not in at:  # not of straight travel
+    if r.name not in states:  # a quantity that is not of straight travel
         found_here = jax.vmap(lambda p: requirement(robot, p, ratings, r.name))(points)
         counts = jnp.where(found_here.outcome == CONVERGED, 1.0, -1.0)
         value, travels = found_here.value / r.quantity.factor, jnp.min(counts)
     else:
-        value = at[r.name] / r.quantity.factor
+        value = states[r.name] / r.quantity.factor
     share = jnp.min(value / _limit(r) - 1) if r.least else jnp.min(1 - value / _limit(r))
     if r.name == "winding_C":
-        share = jnp.min(_heat(robot, points, at["current"], jnp.asarray(_limit(r))))
+        share = jnp.min(_heat(robot, points, states["current"], jnp.asarray(_limit(r))))
     return jnp.min(jnp.stack([share, travels, above]))
 
 
@@ -248,12 +259,12 @@ def _limit(r: Requirement) -> float:
     return max(float(r.limit or 0.0), 1e-9)
 
 
-def _heat(robot: Robot, points: Point, current: Array, limit: Array) -> Array:
+def _heat(robot: Robot, points: EnvelopePoint, current: Array, limit: Array) -> Array:
     return jax.vmap(lambda p, i: jnp.asarray(heat_left(robot, p, i, limit)))(points, current)
 
 
 def _endurance(r: Requirement, robot: Robot, ratings: Ratings, at: Mapping[str, Array]) -> Array:
-    """Of the time until the end of the charge, which the cells have to reach above their cut-off."""
+    """Margin of the time until the end of the charge, with the cells above their cut-off."""
     battery = robot.battery
     used = battery.capacity * (r.envelope.charge[1] - r.envelope.charge_end)
     limit = r.quantity.factor * _limit(r)

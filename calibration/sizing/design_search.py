@@ -1,4 +1,4 @@
-"""The search for a size: parts enumerated, the rest by gradients from many starts in one batch."""
+"""Search for a size: parts are enumerated, the other numbers found by gradients from many starts in one batch."""
 
 from __future__ import annotations
 
@@ -15,44 +15,45 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float
 
-from calibration.data.input_errors import BadConfiguration, choices
+from calibration.data.input_errors import BadConfiguration, allowed_words
 from calibration.data.parts import CellSheet
 from calibration.data.requirements_file import Requirements
 from calibration.inference.fit_notes import Note, Step
 from calibration.sizing import sheet
-from calibration.sizing.design import CONTINUOUS, OBJECTIVES, Design, Task, build, evaluate, task
-from calibration.sizing.part_options import Drive, Options, options
+from calibration.sizing.design import CONTINUOUS, OBJECTIVES, Design, Task, build_robot, evaluate_design, sizing_task
+from calibration.sizing.part_options import Drive, Options, options_for_robot
 from mmrjax.compile.compiling import compiled
 from mmrjax.model.robot import Robot
 
-#: Cells in series that are tried, cells in parallel, and the radius as a multiple of the robot's (on tracks 1.3 is as
-#: much as the height of 100 mm of Section 2.2 allows).
+#: Ranges of cells in series, cells in parallel, and the radius as a multiple of the robot's (on tracks the height of
+#: 100 mm of Section 2.2 allows 1.3).
 CELLS, PARALLEL, RADIUS = (3, 14), (1.0, 12.0), (0.6, 1.3)
-#: Random designs of each enumerated choice, among which the starts are; starts of each motor at least; of one choice
-#: at most.
+#: Random designs of each enumerated choice, from which the starts are taken; least number of starts for each motor;
+#: largest number for one choice.
 TRIES, OF_MOTOR, OF_CHOICE = 6, 6, 3
-#: Rows of one call of `_measured`.
+#: Rows of one call of `_evaluate_designs`.
 ROWS = 8192
-#: Steps of each start; after how many the multipliers follow; first and last length in the logarithms.
+#: Steps of each start; steps between updates of the multipliers; first and last step length in the logarithms.
 STEPS, EVERY, RATE = 120, 12, (0.06, 0.003)
-#: Weight of a violated margin: at first, factor each time, at most.
+#: Weight of a violated margin: initial, factor of each update, largest.
 WEIGHT, GROWTH, HEAVIEST = 5.0, 1.7, 500.0
-#: Designs that are then refined, points along each of their axes, rounds, and how the box shrinks.
+#: Number of designs that are then refined, points along each of their axes, rounds, and shrinkage of the box.
 REFINED, ALONG, ROUNDS, SHRINK = 24, 7, 7, 0.45
-#: Choices of which every ratio of the sheets is tried with whole cells, the most in parallel, and how many are kept.
+#: Number of choices for which all ratios of the sheets are tried with whole cells, most cells in parallel, and number
+#: of designs that are kept.
 WHOLE, MOST_WHOLE, KEPT_WHOLE = 600, 8, 192
-#: Margin of a limit that binds.
+#: Largest margin of an active limit.
 BINDS = 0.01
 
 
 @dataclasses.dataclass(frozen=True)
-class Found:
+class SizedDesign:
     """One design.
 
     Attributes:
         drive, cell: sheets; ratio, radius: total ratio and rolling radius [m]; in_series, parallel: cells.
         objectives: by name of `OBJECTIVES`; margins: by label, shares of what is required or permitted.
-        bounds: of the search that it is at; robot: that it makes.
+        bounds: active bounds of the search; robot: of the design.
     """
 
     drive: Drive
@@ -68,17 +69,17 @@ class Found:
 
     @property
     def feasible(self) -> bool:
-        """Whether every margin holds."""
+        """True if all margins are met."""
         return all(m >= 0 for m in self.margins.values())
 
     @property
     def binds(self) -> list[str]:
-        """The limits that it is at, or violates, the nearest first; then the bounds of the search."""
+        """Active or violated limits, the nearest first; then active bounds of the search."""
         order = sorted(self.margins.items(), key=lambda item: item[1])
         return [*(label for label, m in order if m < BINDS), *self.bounds]
 
     def to_json(self) -> dict[str, Any]:
-        """As in `result.json`."""
+        """Entry of `result.json`."""
         return {
             "motor": self.drive.motor.name, "gearbox": f"{self.drive.family}, stages {self.drive.stages}",
             "ratio": self.ratio, "radius_m": self.radius, "cell": self.cell.name, "cells": self.in_series,
@@ -89,40 +90,40 @@ class Found:
 
 @dataclasses.dataclass(frozen=True)
 class Sizing:
-    """What a search found.
+    """Result of a search.
 
     Attributes:
-        task, options: of the search; objective: that was made small, of a Pareto front the first.
-        unmeetable: labels that no design of the choice meets, which were left out.
-        ideal: the best with any ratio and part of a cell; None where there is none.
-        best: the best with a ratio of the sheets and whole cells; alternatives: the next best, of other motors or
+        task, options: of the search; objective: that is minimised, of a Pareto front the first.
+        unmeetable: labels that no choice of parts meets, which were dropped.
+        ideal: the best with any ratio and fraction of a cell; None without one.
+        best: the best with a ratio of the sheets and whole cells; alternatives: the next best, with other motors or
             cells.
         motors: by motor, its best design, feasible or the nearest to it.
-        front: designs of which none is better in both objectives; empty unless asked for.
-        starts, evaluated: how many searches, and designs in all.
+        front: designs of the Pareto front of two objectives; empty unless requested.
+        starts, evaluated: number of searches, and of all designs.
     """
 
     task: Task
     options: Options
     objective: str
     unmeetable: tuple[str, ...]
-    ideal: Found | None
-    best: Found | None
-    alternatives: tuple[Found, ...]
-    motors: dict[str, Found]
-    front: tuple[Found, ...]
+    ideal: SizedDesign | None
+    best: SizedDesign | None
+    alternatives: tuple[SizedDesign, ...]
+    motors: dict[str, SizedDesign]
+    front: tuple[SizedDesign, ...]
     starts: int
     evaluated: int
 
 
 @compiled
-def _measured(problem: Task, designs: Design) -> tuple[Array, Array]:
+def _evaluate_designs(problem: Task, designs: Design) -> tuple[Array, Array]:
     """Objectives and margins of designs, shapes (designs, objectives), (designs, margins)."""
-    return jax.vmap(lambda d: evaluate(problem, d))(designs)
+    return jax.vmap(lambda d: evaluate_design(problem, d))(designs)
 
 
 @compiled
-def _descended(
+def _descend(
     problem: Task,
     designs: Design,
     low: Float[Array, "designs 3"],
@@ -130,19 +131,19 @@ def _descended(
     weights: Float[Array, "designs objectives"],
     kept: Float[Array, " margins"],
 ) -> Float[Array, "designs 3"]:
-    """Where searches end that start at designs: the best they passed that meets every margin, or their last.
+    """Ends of searches that start at designs: the best feasible point on the way, or the last point.
 
-    An augmented Lagrangian, f + Σ (max(0, λ - w g)² - λ²) / 2w over the logarithms of the continuous numbers, its
-    steps by Adam and held within bounds.
+    The objective is an augmented Lagrangian, f + Σ (max(0, λ - w g)² - λ²) / 2w over the logarithms of the continuous
+    numbers. Steps are Adam's, clipped to bounds.
 
     Args:
-        weights: of the logarithms of the objectives in f; kept: 1 for margins that count, 0 for those left out.
+        weights: of the logarithms of the objectives in f; kept: 1 for included margins, 0 for others.
     """
     rate = optax.cosine_decay_schedule(RATE[0], STEPS, RATE[1] / RATE[0])
     adam = optax.adam(rate, b1=0.8, b2=0.95)
 
     def value(x: Array, d: Design, w: Array, multipliers: Array, weight: Array) -> tuple[Array, tuple[Array, Array]]:
-        objectives, margins = evaluate(problem, dataclasses.replace(d, continuous=x))
+        objectives, margins = evaluate_design(problem, dataclasses.replace(d, continuous=x))
         f = jnp.sum(jnp.where(w > 0, w * jnp.log(jnp.where(w > 0, objectives, 1.0)), 0.0))
         g = jnp.where(kept > 0, jnp.clip(margins, -5.0, 5.0), 1.0)
         short = jnp.maximum(multipliers - weight * (g - 1e-3), 0.0)
@@ -171,7 +172,7 @@ def _descended(
 
 @dataclasses.dataclass(frozen=True)
 class Space:
-    """Every enumerated choice, a row each, with the bounds of the continuous numbers.
+    """All enumerated choices, a row each, with the bounds of the continuous numbers.
 
     Attributes:
         drive, cell, in_series: of each choice; low, high: logarithms, shape (choices, 3).
@@ -195,8 +196,8 @@ class Space:
         )
 
 
-def space(robot: Robot, problem: Task, options: Options) -> Space:
-    """The choices for a robot."""
+def choice_space(robot: Robot, problem: Task, options: Options) -> Space:
+    """Choices for a robot."""
     n_drives, n_cells = len(options.drives), len(options.cells)
     every = list(itertools.product(range(n_drives), range(n_cells), range(CELLS[0], CELLS[1] + 1)))
     drive, cell, series = (np.array(x) for x in zip(*every, strict=True))
@@ -217,19 +218,19 @@ def space(robot: Robot, problem: Task, options: Options) -> Space:
     return Space(options, drive, cell, series, bounds(0, "ratio_least"), bounds(1, "ratio_most"))
 
 
-def measured(problem: Task, choice: Space, rows: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def evaluate_designs(problem: Task, choice: Space, rows: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Objectives and margins of many designs, in calls of one size."""
     parts = []
     for first in range(0, len(rows), ROWS):
         some = np.minimum(np.arange(first, first + ROWS), len(rows) - 1)
-        f, g = jax.device_get(_measured(problem, choice.designs(rows[some], x[some])))
+        f, g = jax.device_get(_evaluate_designs(problem, choice.designs(rows[some], x[some])))
         parts.append((f[: len(rows) - first], g[: len(rows) - first]))
     f, g = (np.concatenate(p) for p in zip(*parts, strict=True))
-    f = np.where(f > 0, f, np.inf)  # not moving, or no price: worse than any
+    f = np.where(f > 0, f, np.inf)  # no motion, or no price: worse than any
     return f, np.where(np.isfinite(g), g, -5.0)
 
 
-def size(
+def size_robot(
     robot: Robot,
     asked: Requirements,
     objectives: tuple[str, ...] = ("mass",),
@@ -247,18 +248,18 @@ def size(
         tell: callback for progress.
 
     Raises:
-        BadConfiguration: what `sheet.refuse` raises; an unknown objective or motor.
+        BadConfiguration: any raised by `sheet.refuse_impossible`; an unknown objective or motor.
     """
     for name in objectives:
         if name not in OBJECTIVES:
-            raise BadConfiguration(f"objective: got {name}; {choices(name, OBJECTIVES)}")
-    sheet.refuse(robot, asked)
-    chosen = options(robot, motors)
-    problem = task(robot, asked, chosen)
-    choice = space(robot, problem, chosen)
+            raise BadConfiguration(f"objective: got {name}; {allowed_words(name, OBJECTIVES)}")
+    sheet.refuse_impossible(robot, asked)
+    chosen = options_for_robot(robot, motors)
+    problem = sizing_task(robot, asked, chosen)
+    choice = choice_space(robot, problem, chosen)
     columns = [list(OBJECTIVES).index(name) for name in objectives]
     tell(Step("designs"))
-    drawn = _drawn(problem, choice, "cost" in objectives, np.random.default_rng(seed))
+    drawn = _random_designs(problem, choice, "cost" in objectives, np.random.default_rng(seed))
     kept = drawn.g.max(axis=0) >= 0
     unmeetable = tuple(label for label, k in zip(problem.labels, kept, strict=True) if not k)
     search = _Search(problem, choice, kept, columns)
@@ -273,14 +274,14 @@ def size(
     free = free + search.refined(real.rows[top], real.x[top], search.first(len(top)), np.ones(3))
     evaluated = len(drawn.rows) + starts * STEPS + search.evaluated
 
-    def found(designs: _Designs, k: int) -> Found:
+    def found(designs: _Designs, k: int) -> SizedDesign:
         margins = np.where(kept, designs.g[k], np.nan)
-        return _found(robot, problem, choice, designs.rows[k], designs.x[k], designs.f[k], margins)
+        return _sized_design(robot, problem, choice, designs.rows[k], designs.x[k], designs.f[k], margins)
 
-    everything, by_motor = free + real, dict[str, Found]()
+    everything, by_motor = free + real, dict[str, SizedDesign]()
     for k in np.argsort(search.cost(everything)):
         name = chosen.drives[choice.drive[everything.rows[k]]].motor.name
-        if name not in by_motor:  # a design is a robot to build, and these are a thousand
+        if name not in by_motor:  # building a robot takes time, and there are a thousand designs
             by_motor[name] = found(everything, int(k))
     good = [k for k in range(len(real.rows)) if np.all(real.g[k][kept] >= 0)]
     different: dict[tuple[int, int], int] = {}
@@ -298,8 +299,13 @@ def size(
 
 @dataclasses.dataclass(frozen=True)
 class _Designs:
-    """Designs: rows of the choice of parts, shape (designs,); logarithms of ratio, radius and cells in parallel,
-    shape (designs, 3); objectives and margins, shapes (designs, objectives) and (designs, limits)."""
+    """Designs with their objectives and margins.
+
+    Attributes:
+        rows: of the choice of parts, shape (designs,).
+        x: logarithms of ratio, radius and cells in parallel, shape (designs, 3).
+        f, g: objectives and margins, shapes (designs, objectives) and (designs, limits).
+    """
 
     rows: np.ndarray
     x: np.ndarray
@@ -313,26 +319,26 @@ class _Designs:
         return iter((self.rows, self.x, self.f, self.g))
 
 
-def _drawn(problem: Task, choice: Space, costed: bool, rng: np.random.Generator) -> _Designs:
-    """Random designs of every choice of parts: what can be met at all, and where to start.
+def _random_designs(problem: Task, choice: Space, costed: bool, rng: np.random.Generator) -> _Designs:
+    """Random designs of every choice of parts: they show which limits can be met, and give the starts.
 
     Args:
-        costed: whether only drives count whose price is known.
+        costed: True to include only drives with a known price.
     """
     rows = np.repeat(np.arange(len(choice.drive)), TRIES)
     if costed:
         rows = rows[np.isfinite(choice.options.drive["cost"][choice.drive[rows]])]
     low, high = choice.low[rows], choice.high[rows]
     x = low + (high - low) * rng.random((len(rows), 3)) ** np.array([1.0, 1.0, 2.0])
-    return _Designs(rows, x, *measured(problem, choice, rows, x))
+    return _Designs(rows, x, *evaluate_designs(problem, choice, rows, x))
 
 
 @dataclasses.dataclass
 class _Search:
-    """The steps of a search.
+    """Steps of a search.
 
     Attributes:
-        kept: which limits some design meets; columns: of the objectives; evaluated: designs so far.
+        kept: True for limits that some design meets; columns: of the objectives; evaluated: designs so far.
     """
 
     problem: Task
@@ -343,10 +349,10 @@ class _Search:
 
     def designs(self, rows: np.ndarray, x: np.ndarray) -> _Designs:
         """Designs with their objectives and margins."""
-        return _Designs(rows, x, *measured(self.problem, self.choice, rows, x))
+        return _Designs(rows, x, *evaluate_designs(self.problem, self.choice, rows, x))
 
     def first(self, count: int) -> np.ndarray:
-        """Weights of the first objective alone, shape (count, objectives)."""
+        """Weights of only the first objective, shape (count, objectives)."""
         return np.tile(np.eye(len(OBJECTIVES))[self.columns[0]], (count, 1))
 
     def weights(self, starts: int) -> np.ndarray:
@@ -359,21 +365,21 @@ class _Search:
         return weights
 
     def cost(self, designs: _Designs) -> np.ndarray:
-        """What is to be small by the first objective, shape (designs,)."""
+        """Cost by the first objective, shape (designs,)."""
         return _cost(designs.f, designs.g, self.kept, self.first(len(designs.rows)))
 
     def misses(self, drawn: _Designs) -> np.ndarray:
-        """How far designs are from the limits that can be met, shape (designs,)."""
+        """Violation of the limits that can be met, shape (designs,)."""
         return 5 * np.sum(np.maximum(-drawn.g[:, self.kept], 0.0), axis=1)
 
     def refined(self, rows: np.ndarray, x: np.ndarray, weights: np.ndarray, free: np.ndarray) -> _Designs:
-        """Designs after a search on shrinking boxes around them, see `_refine`."""
+        """Designs refined on shrinking boxes around them, see `_refine`."""
         x, count = _refine(self.problem, self.choice, rows, x, self.kept, weights, free)
         self.evaluated += count
         return self.designs(rows, x)
 
     def descended(self, drawn: _Designs, weights: np.ndarray) -> _Designs:
-        """Designs with any ratio and parts of a cell, by gradients from the best of those drawn."""
+        """Designs with any ratio and fraction of a cell, by gradients from the best random ones."""
         choice, misses = self.choice, self.misses(drawn)
         shares = [len(s) for s in np.array_split(np.arange(len(weights)), len(self.columns))]
         picked = [
@@ -381,32 +387,32 @@ class _Search:
             for c, n in zip(self.columns, shares, strict=True)
         ]
         rows, x = drawn.rows[np.concatenate(picked)], drawn.x[np.concatenate(picked)]
-        x = np.array(_descended(
+        x = np.array(_descend(
             self.problem, choice.designs(rows, x), jnp.asarray(choice.low[rows]), jnp.asarray(choice.high[rows]),
             jnp.asarray(weights), jnp.asarray(self.kept, float),
         ))  # fmt: skip
-        found = self.designs(rows, x)
-        best = np.argsort(_cost(found.f, found.g, self.kept, weights))[: REFINED * len(self.columns)]
+        designs = self.designs(rows, x)
+        best = np.argsort(_cost(designs.f, designs.g, self.kept, weights))[: REFINED * len(self.columns)]
         x[best] = self.refined(rows[best], x[best], weights[best], np.ones(3)).x
         return self.designs(rows, x)
 
     def real(self, drawn: _Designs, free: _Designs, weights: np.ndarray) -> _Designs:
         """Designs with ratios of the sheets and whole cells: those near `free`, and the best of every choice."""
-        rows, x, w = _real(self.choice, free.rows, free.x, weights, np.argsort(self.cost(free)))
+        rows, x, w = _nearest_buildable(self.choice, free.rows, free.x, weights, np.argsort(self.cost(free)))
         misses = self.misses(drawn)
         for c in self.columns:
             merit = np.where(np.isfinite(drawn.f[:, c]), np.log(drawn.f[:, c]) + misses, np.inf)
             ranked = np.array(list(dict.fromkeys(drawn.rows[np.argsort(merit)]))[:WHOLE])
-            own = np.eye(len(OBJECTIVES))[c]
-            more_rows, more_x, count = _enumerated(self.problem, self.choice, ranked, self.kept, own)
+            one_objective = np.eye(len(OBJECTIVES))[c]
+            more_rows, more_x, count = _best_buildable(self.problem, self.choice, ranked, self.kept, one_objective)
             self.evaluated += count
             rows, x = np.concatenate([rows, more_rows]), np.concatenate([x, more_x])
-            w = np.concatenate([w, np.tile(own, (len(more_rows), 1))])
+            w = np.concatenate([w, np.tile(one_objective, (len(more_rows), 1))])
         return self.refined(rows, x, w, np.array([0.0, 1.0, 0.0]))
 
 
 def _starts(choice: Space, rows: np.ndarray, merit: np.ndarray, count: int) -> np.ndarray:
-    """The best designs to start from: some of each motor, then the best of all, few of one choice."""
+    """Best designs as starts: some of each motor, then the best of all, few of one choice."""
     order = np.argsort(np.where(np.isfinite(merit), merit, 1e9))
     motor = [choice.options.drives[d].motor.name for d in choice.drive]
     taken: list[int] = []
@@ -426,7 +432,7 @@ def _starts(choice: Space, rows: np.ndarray, merit: np.ndarray, count: int) -> n
 
 
 def _cost(f: np.ndarray, g: np.ndarray, kept: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """What is to be small: logarithm of the objective, above any feasible one where a margin is violated."""
+    """Cost of designs: logarithm of the objective; with a violated margin it is above that of any feasible design."""
     value = np.sum(np.where(weights > 0, weights * np.log(np.where(weights > 0, f, 1.0)), 0.0), axis=1)
     short = np.sum(np.maximum(-g[:, kept], 0.0), axis=1)
     return np.where(np.isfinite(value), value + np.where(short > 0, 100 + short, 0.0), 1e6)
@@ -441,7 +447,7 @@ def _refine(
     weights: np.ndarray,
     free: np.ndarray,
 ) -> tuple[np.ndarray, int]:
-    """Designs after a search on shrinking boxes around them, and how many were evaluated.
+    """Designs refined on shrinking boxes around them, and the number of evaluations.
 
     Args:
         free: 1 for continuous numbers that may move.
@@ -452,17 +458,17 @@ def _refine(
     for _ in range(ROUNDS):
         tried = np.clip(x[:, None] + width * box, choice.low[rows][:, None], choice.high[rows][:, None])
         n = tried.shape[1]
-        f, g = measured(problem, choice, np.repeat(rows, n), tried.reshape(-1, 3))
+        f, g = evaluate_designs(problem, choice, np.repeat(rows, n), tried.reshape(-1, 3))
         cost = _cost(f, g, kept, np.repeat(weights, n, axis=0)).reshape(-1, n)
         x = tried[np.arange(len(rows)), np.argmin(cost, axis=1)]
         width, count = width * SHRINK, count + len(f)
     return x, count
 
 
-def _real(
+def _nearest_buildable(
     choice: Space, rows: np.ndarray, x: np.ndarray, weights: np.ndarray, order: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Designs near those found with ratios of the sheets and whole cells: the two nearest of each."""
+    """Designs near the given ones with ratios of the sheets and whole cells: the two nearest of each."""
     made: dict[tuple, tuple] = {}
     for k in order:
         drive = choice.options.drives[choice.drive[rows[k]]]
@@ -477,11 +483,11 @@ def _real(
     return np.array(chosen), np.array(points), np.array(w)
 
 
-def _enumerated(
+def _best_buildable(
     problem: Task, choice: Space, rows: np.ndarray, kept: np.ndarray, weights: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, int]:
-    """The best designs of choices with every ratio of their sheets, few whole cells in parallel and three radii, and
-    how many were evaluated."""
+    """Best designs of choices with every ratio of their sheets, few whole cells in parallel and three radii, and
+    the number of evaluations."""
     of_row, points = [], []
     for row in rows:
         low, high = choice.low[row, 1], choice.high[row, 1]
@@ -490,13 +496,13 @@ def _enumerated(
             of_row.append(row)
             points.append([math.log(ratio), low + share * (high - low), math.log(p)])
     every, x = np.array(of_row), np.array(points)
-    f, g = measured(problem, choice, every, x)
+    f, g = evaluate_designs(problem, choice, every, x)
     best = np.argsort(_cost(f, g, kept, np.tile(weights, (len(every), 1))))[:KEPT_WHOLE]
     return every[best], x[best], len(every)
 
 
 def _undominated(f: np.ndarray, among: list[int]) -> list[int]:
-    """Those of which none other is at least as good in both and better in one, by the first objective."""
+    """Pareto front of two objectives, sorted by the first."""
     order = sorted(among, key=lambda k: (f[k, 0], f[k, 1]))
     front: list[int] = []
     for k in order:
@@ -505,14 +511,14 @@ def _undominated(f: np.ndarray, among: list[int]) -> list[int]:
     return front
 
 
-def _found(
+def _sized_design(
     robot: Robot, problem: Task, choice: Space, row: int, x: np.ndarray, f: np.ndarray, g: np.ndarray
-) -> Found:
+) -> SizedDesign:
     drive, cell = choice.options.drives[choice.drive[row]], choice.options.cells[choice.cell[row]]
     series = int(choice.in_series[row])
     ratio, radius, parallel = (float(v) for v in np.exp(x))
     design = jax.tree.map(lambda v: v[0], choice.designs(np.array([row]), x[None]))
-    made, _ = build(problem.robot, problem.base_mass, problem.configuration, design)
+    made, _ = build_robot(problem.robot, problem.base_mass, problem.configuration, design)
     made = jax.tree.map(lambda v: np.asarray(v) if eqx.is_array(v) else v, made)
 
     def rated(key: str) -> float:
@@ -539,4 +545,4 @@ def _found(
         if abs(v - b) < 1e-6 and (word, name) != ("least", "parallel")
     )
     values = {name: float(v) for name, v in zip(OBJECTIVES, f, strict=True) if np.isfinite(v)}
-    return Found(drive, cell, ratio, radius, series, parallel, values, margins, at_bound, made)
+    return SizedDesign(drive, cell, ratio, radius, series, parallel, values, margins, at_bound, made)

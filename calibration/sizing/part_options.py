@@ -1,4 +1,4 @@
-"""What a search may choose from: drives (motor and gearbox) and cells, from the packaged sheets, as arrays.
+"""Options of a search: drives (motor and gearbox) and cells, from the packaged sheets, as arrays.
 
 Where a sheet lacks a number that the model needs, the paper's robot is scaled (docs/howto/size.md):
 friction of a motor by its no-load torque, efficiency of a gearbox by the sheet's largest, resistance and mass of a
@@ -20,12 +20,12 @@ from mmrjax.model.robot import Robot
 MOTOR, GEARBOX, CELL = "RE 30 24 V", "GP 32 C 23:1", "XP2200SL"
 #: Ratio of the belt stage between gearbox and driving wheel, which is kept (docs/explanation/paper-notes.md).
 BELT_STAGE = 25 / 12
-#: A current that limits nothing [A].
+#: A current above any limit [A].
 FREE = 1e9
 
 
 class Drive(NamedTuple):
-    """A motor with one size of gearbox (a family with so many stages), of which the ratio can be chosen.
+    """A motor with one size of gearbox (a family with so many stages), with a choice of ratios.
 
     Attributes:
         motor: its sheet; family, stages: of the gearbox; ratios: total ones, ascending; gearbox: any of its sheets.
@@ -39,13 +39,13 @@ class Drive(NamedTuple):
 
     @property
     def name(self) -> str:
-        """As people read it."""
+        """Name for people."""
         return f"{self.motor.name}, {self.family}, {self.stages} stage{'s' if self.stages > 1 else ''}"
 
 
-def drives(names: tuple[str, ...] = ()) -> tuple[Drive, ...]:
-    """Every motor of the sheets (or those named) with every size of gearbox that its source combines it with."""
-    found = []
+def drive_options(names: tuple[str, ...] = ()) -> tuple[Drive, ...]:
+    """All motors of the sheets (or those named) with all sizes of gearbox that their source combines them with."""
+    options = []
     for motor in motors():
         if names and motor.name not in names:
             continue
@@ -55,17 +55,17 @@ def drives(names: tuple[str, ...] = ()) -> tuple[Drive, ...]:
                     (g for g in gearboxes() if (g.family, g.stages) == (family, stages)), key=lambda g: g.ratio
                 )
                 ratios = tuple(BELT_STAGE * g.ratio for g in ranked)
-                found.append(Drive(motor, family, int(stages), ratios, ranked[0]))
-    return tuple(found)
+                options.append(Drive(motor, family, int(stages), ratios, ranked[0]))
+    return tuple(options)
 
 
-def packable() -> tuple[CellSheet, ...]:
-    """The cells that a pack can be computed of: capacity, full voltage and cut-off are stated, or are the paper's."""
+def packable_cells() -> tuple[CellSheet, ...]:
+    """Cells with all data for a pack: capacity, full voltage and cut-off are stated, or are the paper's."""
     return tuple(c for c in cells() if c.cells == 1 and (c.name == CELL or not math.isnan(c.voltage_cut_off)))
 
 
 def mass_per_charge() -> float:
-    """Mass of lithium-polymer cells [kg/C], of the one pack whose label states it."""
+    """Mass of lithium-polymer cells [kg/C], from the only pack with a mass on its label."""
     return next(c.mass / (c.cells * c.capacity) for c in cells() if not math.isnan(c.mass) and c.chemistry == _LIPO)
 
 
@@ -78,7 +78,7 @@ class Options:
 
     Attributes:
         drives, cells: the sheets; drive, cell: columns, shapes (drives,) and (cells,); base_mass: of the paper's two
-            motors, two gearboxes and cells, which a robot's mass holds [kg].
+            motors, two gearboxes and cells, which a robot's mass includes [kg].
     """
 
     drives: tuple[Drive, ...]
@@ -92,13 +92,13 @@ def _stated(value: float, otherwise: float) -> float:
     return otherwise if math.isnan(value) else value
 
 
-def options(robot: Robot, names: tuple[str, ...] = ()) -> Options:
-    """What can be chosen for a robot.
+def options_for_robot(robot: Robot, names: tuple[str, ...] = ()) -> Options:
+    """Options for a robot.
 
     Args:
-        robot: whose friction, efficiencies and cells stand in where sheets are silent; names: of motors, empty: all.
+        robot: source of friction, efficiencies and cells missing in sheets; names: of motors, empty: all.
     """
-    chosen, packs = drives(names), packable()
+    chosen, packs = drive_options(names), packable_cells()
     paper_motor = next(m for m in motors() if m.name == MOTOR)
     paper_gear = next(g for g in gearboxes() if g.name == GEARBOX)
     paper_cell = next(c for c in cells() if c.name == CELL)

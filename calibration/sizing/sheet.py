@@ -1,4 +1,4 @@
-"""The sheet of requirements: each at the worst corner of its envelope, with margin, and what would meet it."""
+"""Sheet of requirements: each at the worst corner of its envelope, with its margin and changes that would meet it."""
 
 from __future__ import annotations
 
@@ -13,20 +13,30 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from calibration.data.contradictions import cannot_stand
-from calibration.data.input_errors import BadConfiguration, choices
+from calibration.data.input_errors import BadConfiguration, allowed_words
 from calibration.data.requirements_file import STAIRS, TREAD, Envelope, Requirement, Requirements
 from calibration.inference.fit_notes import Note, Step
 from mmrjax.compile.compiling import compiled
-from mmrjax.derived.requirements import AMBIENT, AXES, CHARGE, PAYLOAD, SLOPE, Point, Ratings, evaluate, ratings
+from mmrjax.derived.requirements import (
+    AMBIENT,
+    AXES,
+    CHARGE,
+    PAYLOAD,
+    SLOPE,
+    EnvelopePoint,
+    Ratings,
+    evaluate_requirement,
+    ratings,
+)
 from mmrjax.model import params
 from mmrjax.model.paper_tables import adhesion_ratio, lateral_ratio
 from mmrjax.model.quantities import MM
-from mmrjax.model.robot import Robot, cannot_turn
+from mmrjax.model.robot import Robot, turn_error
 from mmrjax.model.signals import CONVERGED, STATUSES
 
-#: Values along each axis of an envelope: its ends, and between them where an output may turn.
+#: Number of values along each axis of an envelope: its ends, and between them if an output may have an extremum.
 VALUES = {PAYLOAD: 3, SLOPE: 5, CHARGE: 5, AMBIENT: 2}
-#: Of what a designer can change, the parameters; those of a configuration without its name. `battery.cells` is whole.
+#: Parameters that a designer can change; those of a configuration without its name. `battery.cells` is an integer.
 CELLS = "battery.cells"
 CHANGEABLE = (
     "gearbox.ratio", "gearbox.efficiency_load", "motor.resistance", "motor.torque_constant",
@@ -35,22 +45,22 @@ CHANGEABLE = (
 )  # fmt: skip
 OF_CONFIGURATION = ("mass", "radius", "ground.friction.static", "ground.rolling_resistance", "track.loss_coulomb",
                     "turning.width")  # fmt: skip
-#: The same of what a posture allows.
+#: Parameters that a designer can change for a posture.
 OF_LEVERS = ("running_gear.lever_length", "running_gear.levers.roller")
-#: Bounds within which a change is looked for, beside those of the field: least and greatest multiple of what it is.
+#: Range of a change, in addition to the field's bounds: least and greatest multiple of the present value.
 REACH = (0.1, 10.0)
-#: Values of a parameter in one call, calls along a ladder, and digits that a stated change has.
+#: Values of a parameter in one call, values along a ladder, and digits of a stated change.
 ROWS, LADDER, DIGITS = 32, 24, 4
 
 
 @dataclasses.dataclass(frozen=True)
 class Change:
-    """A change of one parameter, everything else as it is, that meets a requirement.
+    """A change of a single parameter that meets a requirement.
 
     Attributes:
         parameter: by dotted name; before, after: [unit]; unit: of its field.
         gradient: derivative of the quantity by the parameter at the worst corner [unit of quantity / unit].
-        breaks: names of requirements that are met now and would not be.
+        breaks: names of requirements that are met now and would be violated.
     """
 
     parameter: str
@@ -61,7 +71,7 @@ class Change:
     breaks: tuple[str, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
-        """As in `result.json`."""
+        """Entry of `result.json`."""
         return {
             "parameter": self.parameter, "from": self.before, "to": self.after, "unit": self.unit,
             "gradient": self.gradient, "breaks": list(self.breaks),
@@ -70,15 +80,15 @@ class Change:
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """A requirement held against a robot.
+    """Result of a requirement for a robot.
 
     Attributes:
-        requirement: as stated, its rating in place.
-        value: of the quantity at the worst corner, in the unit of its name; None where it has none there.
-        margin: by how much it is met, negative where it is missed; None where there is no value.
+        requirement: as stated, with its rating filled in.
+        value: of the quantity at the worst corner, in the unit of its name; None without a value there.
+        margin: to the limit, negative if it is missed; None without a value.
         status: of the worst corner, of `STATUSES`.
         at: the worst corner.
-        change: what single change would meet it, the smallest first; empty where it is met or nothing does.
+        change: single changes that would meet it, the smallest first; empty if it is met or none does.
     """
 
     requirement: Requirement
@@ -90,11 +100,11 @@ class Outcome:
 
     @property
     def met(self) -> bool:
-        """Whether the requirement holds."""
+        """True if the requirement is met."""
         return self.margin is not None and self.margin >= 0
 
     def to_json(self) -> dict[str, Any]:
-        """As in `result.json`."""
+        """Entry of `result.json`."""
         r = self.requirement
         return {
             "name": r.name, "required": r.limit, "sense": r.sense, "value": self.value, "margin": self.margin,
@@ -103,13 +113,13 @@ class Outcome:
         }  # fmt: skip
 
 
-def rated(robot: Robot, asked: Requirements) -> Requirements:
-    """Requirements with the robot's own ratings where they state no number.
+def with_ratings(robot: Robot, asked: Requirements) -> Requirements:
+    """Requirements with the robot's own ratings for those without a number.
 
     Raises:
         BadConfiguration: the robot states no such rating.
     """
-    known = {
+    ratings_by_name = {
         "winding_C": robot.motor.temperature_limit, "motor_speed_rpm": robot.motor.speed_limit,
         "gearbox_speed_rpm": robot.gearbox.speed_limit, "gearbox_Nm": robot.gearbox.torque_limit,
     }  # fmt: skip
@@ -117,7 +127,7 @@ def rated(robot: Robot, asked: Requirements) -> Requirements:
     for r in asked.each:
         limit = r.limit
         if limit is None:
-            stated = known[r.name]
+            stated = ratings_by_name[r.name]
             if stated is None:
                 raise BadConfiguration(f"{asked.source}, {r.name}: the robot states no rating; state a number")
             limit = stated / r.quantity.factor
@@ -125,13 +135,13 @@ def rated(robot: Robot, asked: Requirements) -> Requirements:
     return dataclasses.replace(asked, each=tuple(each))
 
 
-def refuse(robot: Robot, asked: Requirements) -> None:
-    """Refuse requirements that no robot of these configurations could be held against.
+def refuse_impossible(robot: Robot, asked: Requirements) -> None:
+    """Refuse requirements that cannot be evaluated for a robot of these configurations.
 
     Raises:
         BadConfiguration: a configuration that the robot does not have; a turn that it cannot make; a posture of a
-            robot that does not state how it stands; an
-            envelope with a slope that the surface does not hold, whatever drives the robot: tan α above μ_s.
+            robot without a stated stance; an envelope with a slope that the surface does not hold, whatever drives
+            the robot: tan α above μ_s.
     """
     for r in asked.each:
         e = r.envelope
@@ -139,10 +149,10 @@ def refuse(robot: Robot, asked: Requirements) -> None:
         if e.configuration and e.configuration not in robot.configurations:
             raise BadConfiguration(
                 f"{where}: the robot has no configuration {e.configuration}; "
-                f"{choices(e.configuration, robot.configurations)}"
+                f"{allowed_words(e.configuration, robot.configurations)}"
             )
         turns = r.quantity.group in ("turn", "across")
-        if turns and (why := cannot_turn(robot, (_configuration(robot, e),))):
+        if turns and (why := turn_error(robot, (_configuration(robot, e),))):
             raise BadConfiguration(f"{where}: {why}")
         if r.quantity.group == "posture" and (why := cannot_stand(robot)):
             raise BadConfiguration(f"{where}: {why}")
@@ -161,10 +171,10 @@ def _configuration(robot: Robot, envelope: Envelope) -> str:
     return envelope.configuration or robot.configurations.names[0]
 
 
-def points(robot: Robot, requirement: Requirement) -> Point:
-    """The points of a requirement's envelope: ends of each range and values between, shape (points,).
+def envelope_points(robot: Robot, requirement: Requirement) -> EnvelopePoint:
+    """Points of a requirement's envelope: ends of each range and values between, shape (points,).
 
-    An axis on which the quantity does not depend has one value. The number of points depends on the quantity alone.
+    An axis without influence on the quantity has one value. The number of points depends only on the quantity.
     """
     e, axes = requirement.envelope, requirement.quantity.axes
     ambient = e.ambient_C or (float(robot.motor.temperature_ambient),) * 2
@@ -177,7 +187,7 @@ def points(robot: Robot, requirement: Requirement) -> Point:
     def same(x: float) -> Float[Array, " points"]:
         return jnp.full(len(payload), x, float)
 
-    return Point(
+    return EnvelopePoint(
         configuration=jnp.full(len(payload), robot.configurations.index(name)),
         adhesion=same(adhesion_ratio(e.surface, on_tracks)),
         adhesion_lateral=same(lateral_ratio(e.surface, on_tracks)), battery=same(float(e.battery)),
@@ -188,16 +198,16 @@ def points(robot: Robot, requirement: Requirement) -> Point:
 
 
 def _changed(robot: Robot, rated: Ratings, names: tuple[str, ...], theta: Array) -> tuple[Robot, Ratings]:
-    """The robot with parameters from a vector, and its ratings; `battery.cells` is among the latter."""
+    """Robot with parameters from a vector, and its ratings, which include `battery.cells`."""
     values = dict(zip(names, theta, strict=True))
     cells = values.pop(CELLS)
     return params.replace(robot, values), dataclasses.replace(rated, cells=cells)
 
 
 def _unrated(robot: Robot) -> Robot:
-    """The robot with one cell and the ratings that a robot has where none are stated.
+    """Robot with one cell and default ratings.
 
-    Cells and ratings come beside it, as numbers: one program for robots of any.
+    Cells and ratings are separate numbers, so that all robots share one program.
     """
     usual, shaft, gear = type(robot.battery)(), type(robot.motor)(), type(robot.gearbox)()
     limits = ("voltage_charge", "voltage_cutoff", "delay_cutoff", "current_limit", "current_charge")
@@ -212,63 +222,67 @@ def _unrated(robot: Robot) -> Robot:
             robot.gearbox, **{name: getattr(gear, name) for name in ("speed_limit", "torque_limit")}
         ),
     )
-    return params.strong(robot)
+    return params.without_weak_types(robot)
 
 
 @compiled
-def _over(
+def _quantity_over(
     robot: Robot,
     rated: Ratings,
     names: tuple[str, ...],
     rows: Float[Array, "rows parameters"],
-    at: Point,
+    at: EnvelopePoint,
     name: str,
 ) -> tuple[Array, Array]:
     """Values and outcomes of a quantity over robots (rows of parameters) and points, shape (rows, points)."""
 
-    def one(theta: Array, point: Point) -> tuple[Array, Array]:
+    def one(theta: Array, point: EnvelopePoint) -> tuple[Array, Array]:
         changed, changed_ratings = _changed(robot, rated, names, theta)
-        found = evaluate(changed, point, changed_ratings, name)
-        return found.value, found.outcome
+        quantity = evaluate_requirement(changed, point, changed_ratings, name)
+        return quantity.value, quantity.outcome
 
     return jax.vmap(lambda theta: jax.vmap(lambda p: one(theta, p))(at))(rows)
 
 
 @compiled
-def _gradient(robot: Robot, rated: Ratings, names: tuple[str, ...], theta: Array, at: Point, name: str) -> Array:
+def _gradient(
+    robot: Robot, rated: Ratings, names: tuple[str, ...], theta: Array, at: EnvelopePoint, name: str
+) -> Array:
     """Derivative of a quantity at one point by the parameters."""
 
     def value(theta: Array) -> Array:
         changed, changed_ratings = _changed(robot, rated, names, theta)
-        return evaluate(changed, at, changed_ratings, name).value
+        return evaluate_requirement(changed, at, changed_ratings, name).value
 
     return jax.grad(value)(theta)
 
 
 @dataclasses.dataclass(frozen=True)
-class _Held:
-    """A requirement's quantity over its envelope, as a function of what a designer can change."""
+class _QuantityOfRobot:
+    """A requirement's quantity over its envelope, as a function of the designer's parameters."""
 
     robot: Robot
     requirement: Requirement
     names: tuple[str, ...]
 
     @property
-    def at(self) -> Point:
-        return points(self.robot, self.requirement)
+    def at(self) -> EnvelopePoint:
+        return envelope_points(self.robot, self.requirement)
 
     def over(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Values in the unit of the name, outcomes, and margins (-inf without value), shape (rows, points)."""
+        """Values in the unit of the name, outcomes, and margins (-inf without a value), shape (rows, points)."""
         r, at, parts = self.requirement, self.at, []
         robot, rated = _unrated(self.robot), ratings(self.robot)
         for first in range(0, len(rows), ROWS):
             chosen = rows[np.minimum(np.arange(first, first + ROWS), len(rows) - 1)]
-            found = jax.device_get(_over(robot, rated, self.names, jnp.asarray(chosen), at, _computed(r)))
+            found = jax.device_get(
+                _quantity_over(robot, rated, self.names, jnp.asarray(chosen), at, _computed_name(r))
+            )
             parts.append([x[: len(rows) - first] for x in found])
         value, outcome = (np.concatenate(x) for x in zip(*parts, strict=True))
         value = value / r.quantity.factor
         counts = (outcome == CONVERGED) & np.isfinite(value)
-        assert r.limit is not None  # see `rated`
+        assert r.limit is not None  # see `with_ratings`
         margin = (value - r.limit) * (1 if r.least else -1)
         return value, outcome, np.where(counts, margin, -np.inf)
 
@@ -277,19 +291,19 @@ class _Held:
         return self.over(rows)[2].min(axis=1)
 
 
-def _computed(requirement: Requirement) -> str:
+def _computed_name(requirement: Requirement) -> str:
     """Name by which a quantity is computed; the same for several names of one quantity, to share a program."""
     return "speed_m_s" if requirement.name == "speed_end_of_charge_m_s" else requirement.name
 
 
-def parameters(robot: Robot, configuration: str) -> dict[str, params.Parameter]:
-    """What a designer can change of a robot, by name, cells left out."""
-    known = {p.name: p for p in params.walk(robot)}
+def changeable_parameters(robot: Robot, configuration: str) -> dict[str, params.Parameter]:
+    """Parameters of a robot that a designer can change, by name, without cells."""
+    by_name = {p.name: p for p in params.walk_parameters(robot)}
     names = (*CHANGEABLE, *(f"{configuration}.{n}" for n in OF_CONFIGURATION))
-    return {name: known[name] for name in names if name in known}
+    return {name: by_name[name] for name in names if name in by_name}
 
 
-def check(
+def check_requirements(
     robot: Robot,
     asked: Requirements,
     *,
@@ -303,15 +317,15 @@ def check(
         tell: callback for progress.
 
     Raises:
-        BadConfiguration: see `refuse` and `rated`.
+        BadConfiguration: see `refuse_impossible` and `with_ratings`.
     """
-    refuse(robot, asked)
-    asked = rated(robot, asked)
+    refuse_impossible(robot, asked)
+    asked = with_ratings(robot, asked)
     held = []
     for r in asked.each:
         configuration = _configuration(robot, r.envelope)
         of_levers = OF_LEVERS if r.quantity.group == "posture" else ()
-        held.append(_Held(robot, r, (*parameters(robot, configuration), *of_levers, CELLS)))
+        held.append(_QuantityOfRobot(robot, r, (*changeable_parameters(robot, configuration), *of_levers, CELLS)))
     found = []
     for k, h in enumerate(held, 1):
         tell(Step("requirement", (k, len(held), h.requirement.quantity.label)))
@@ -325,15 +339,15 @@ def check(
     return tuple(answer)
 
 
-def _now(held: _Held) -> np.ndarray:
-    known = {p.name: float(p.value) for p in params.walk(held.robot)}
-    return np.array([held.robot.battery.cells if n == CELLS else known[n] for n in held.names], float)
+def _present_values(held: _QuantityOfRobot) -> np.ndarray:
+    value_of_name = {p.name: float(p.value) for p in params.walk_parameters(held.robot)}
+    return np.array([held.robot.battery.cells if n == CELLS else value_of_name[n] for n in held.names], float)
 
 
-def _outcome(held: _Held) -> Outcome:
+def _outcome(held: _QuantityOfRobot) -> Outcome:
     r = held.requirement
-    value, outcome, margin = (x[0] for x in held.over(_now(held)[None]))
-    # A point without value is worse than any; the most of those with the same outcome is at its worst corner.
+    value, outcome, margin = (x[0] for x in held.over(_present_values(held)[None]))
+    # A point without a value is worse than any; the largest of those with the same outcome is at its worst corner.
     k = int(np.argmin(margin))
     status = STATUSES[outcome[k]]
     counts = np.isfinite(margin[k])
@@ -344,96 +358,108 @@ def _outcome(held: _Held) -> Outcome:
     )
 
 
-def _corner(held: _Held, k: int) -> dict[str, Any]:
-    """A point in the words of a file."""
+def _corner(held: _QuantityOfRobot, k: int) -> dict[str, Any]:
+    """A point in the names of a file."""
     r, at = held.requirement, held.at
     e = r.envelope
     known = {
         PAYLOAD: ("payload_kg", at.payload), SLOPE: ("slope_deg", at.slope_deg), AMBIENT: ("ambient_C", at.ambient),
         CHARGE: ("state_of_charge" if e.battery else "supply_voltage_V", at.charge),
     }  # fmt: skip
-    found: dict[str, Any] = {known[a][0]: round(float(np.asarray(known[a][1])[k]), 9) for a in r.quantity.axes}
+    corner: dict[str, Any] = {known[a][0]: round(float(np.asarray(known[a][1])[k]), 9) for a in r.quantity.axes}
     if r.name == "endurance_min":
         low = e.charge_end
-        found |= {
+        corner |= {
             "duty": "driving" if r.share else "standing",
             "share": r.share,
             "state_of_charge": [low, e.charge[1]],
         }
     if r.name == STAIRS:
-        found[TREAD] = r.tread_mm
-    return {"configuration": _configuration(held.robot, e), "surface": e.surface, **found}
+        corner[TREAD] = r.tread_mm
+    return {"configuration": _configuration(held.robot, e), "surface": e.surface, **corner}
 
 
-def _with_changes(held: _Held, outcome: Outcome, every: Sequence[_Held], now: Sequence[Outcome]) -> Outcome:
-    found = _changes(held, outcome)
-    if not found:
+def _with_changes(
+    held: _QuantityOfRobot, outcome: Outcome, every: Sequence[_QuantityOfRobot], now: Sequence[Outcome]
+) -> Outcome:
+    changes = _changes(held, outcome)
+    if not changes:
         return outcome
-    rows = np.stack([_with(held, c.parameter, c.after) for c in found])
-    broken: list[list[str]] = [[] for _ in found]
+    rows = np.stack([_with_value(held, c.parameter, c.after) for c in changes])
+    broken: list[list[str]] = [[] for _ in changes]
     for other, before in zip(every, now, strict=True):
         if other is held or not before.met:
             continue
-        # Another configuration has other names: those that both have are changed.
-        own = np.tile(_now(other), (len(rows), 1))
+        # Another configuration has other names; names in common are changed.
+        present = np.tile(_present_values(other), (len(rows), 1))
         for k, name in enumerate(held.names):
             if name in other.names:
-                own[:, other.names.index(name)] = rows[:, k]
-        for names, margin in zip(broken, other.worst(own), strict=True):
+                present[:, other.names.index(name)] = rows[:, k]
+        for names, margin in zip(broken, other.worst(present), strict=True):
             names += [other.requirement.name] if margin < 0 else []
-    with_breaks = [dataclasses.replace(c, breaks=tuple(dict.fromkeys(b))) for c, b in zip(found, broken, strict=True)]
+    with_breaks = [
+        dataclasses.replace(c, breaks=tuple(dict.fromkeys(b))) for c, b in zip(changes, broken, strict=True)
+    ]
     order = sorted(with_breaks, key=lambda c: (len(c.breaks) > 0, abs(math.log(c.after / c.before))))
     return dataclasses.replace(outcome, change=tuple(order))
 
 
-def _with(held: _Held, name: str, value: float) -> np.ndarray:
-    row = _now(held)
+def _with_value(held: _QuantityOfRobot, name: str, value: float) -> np.ndarray:
+    row = _present_values(held)
     row[held.names.index(name)] = value
     return row
 
 
-def _changes(held: _Held, outcome: Outcome) -> list[Change]:
-    """What single changes meet a requirement: direction by the derivative at the worst corner, then the nearest value
-    that meets it at every corner, on a ladder and by division of its interval; each stated value is verified."""
-    now, names = _now(held), held.names
+def _changes(held: _QuantityOfRobot, outcome: Outcome) -> list[Change]:
+    """Single changes that meet a requirement.
+
+    The direction is that of the derivative at the worst corner. The nearest value that meets the requirement at every
+    corner is found on a ladder and by division of its interval. Each stated value is verified.
+    """
+    now, names = _present_values(held), held.names
     worst = int(np.argmin(held.over(now[None])[2][0]))
     point = jax.tree.map(lambda x: x[worst], held.at)
     slopes = np.asarray(
         _gradient(
-            _unrated(held.robot), ratings(held.robot), names, jnp.asarray(now), point, _computed(held.requirement)
+            _unrated(held.robot),
+            ratings(held.robot),
+            names,
+            jnp.asarray(now),
+            point,
+            _computed_name(held.requirement),
         )
     )
     slopes = slopes / held.requirement.quantity.factor * (1 if held.requirement.least else -1)
-    known = {p.name: p for p in params.walk(held.robot)}
-    found = []
+    by_name = {p.name: p for p in params.walk_parameters(held.robot)}
+    changes = []
     for k, name in enumerate(names):
         if name == CELLS:
             bounds, unit = (1.0, 100.0), "-"
         else:
-            bounds, unit = known[name].spec.bounds, known[name].spec.unit
+            bounds, unit = by_name[name].spec.bounds, by_name[name].spec.unit
         if now[k] <= 0:
             continue
         low, high = max(bounds[0], REACH[0] * now[k]), min(bounds[1], REACH[1] * now[k])
         uphill = slopes[k] if np.isfinite(slopes[k]) else 0.0
         if outcome.margin is not None and uphill == 0:
             continue  # the quantity does not depend on it
-        # Where there is no value the derivative says nothing: both ways.
+        # Without a value the derivative is not informative, so both directions are tried.
         ends = (low, high) if outcome.margin is None or uphill == 0 else (high if uphill > 0 else low,)
         options = [v for end in ends if (v := _nearest(held, name, now[k], end)) is not None]
         if options:
             after = min(options, key=lambda v: abs(math.log(v / now[k])))
             sense = 1 if held.requirement.least else -1
-            found.append(Change(name, float(now[k]), after, unit, float(sense * slopes[k])))
-    return found
+            changes.append(Change(name, float(now[k]), after, unit, float(sense * slopes[k])))
+    return changes
 
 
-def _nearest(held: _Held, name: str, begin: float, end: float) -> float | None:
-    """The value of a parameter nearest `begin` towards `end` that meets the requirement, None: there is none."""
+def _nearest(held: _QuantityOfRobot, name: str, begin: float, end: float) -> float | None:
+    """Value of a parameter nearest to `begin` towards `end` that meets the requirement; None without one."""
     if begin == end:
         return None
 
     def meets(values: np.ndarray) -> np.ndarray:
-        return held.worst(np.stack([_with(held, name, v) for v in values])) >= 0
+        return held.worst(np.stack([_with_value(held, name, v) for v in values])) >= 0
 
     def steps(a: float, b: float, count: int) -> np.ndarray:
         if name == CELLS:
@@ -454,7 +480,7 @@ def _nearest(held: _Held, name: str, begin: float, end: float) -> float | None:
         inside = np.flatnonzero(meets(finer))
         k = int(inside[0]) if inside.size else len(finer) - 1
         a, b = (a if k == 0 else finer[k - 1]), finer[k]
-    # As few digits as a person would write, away from where it began; each is tried.
+    # Rounded to few digits, away from `begin`; each rounding is tested.
     for digits in (DIGITS, DIGITS + 2, DIGITS + 4):
         rounded = _rounded(b, digits, up=end > begin)
         if min(begin, end) <= rounded <= max(begin, end) and meets(np.array([rounded]))[0]:
@@ -467,7 +493,7 @@ def _rounded(value: float, digits: int, up: bool) -> float:
     return float(f"{(math.ceil if up else math.floor)(value / step - (1e-9 if up else -1e-9)) * step:.{digits}g}")
 
 
-def counts(outcomes: Sequence[Outcome]) -> Mapping[str, int]:
-    """How many are met and missed."""
+def count_outcomes(outcomes: Sequence[Outcome]) -> Mapping[str, int]:
+    """Number of met and of missed requirements."""
     met = sum(o.met for o in outcomes)
     return {"met": met, "missed": len(outcomes) - met}

@@ -95,7 +95,7 @@ class Loop(eqx.Module):
         )
         radius = jnp.where(first, self.first, self.second)
         centre = jnp.stack([jnp.where(first, 0.0, self.distance), jnp.zeros_like(place)], axis=-1)
-        return centre + radius[..., None] * normal + along[..., None] * tangent(normal)
+        return centre + radius[..., None] * normal + along[..., None] * running_direction(normal)
 
     def places(self, drawn: Scalar) -> Float[Array, " grousers"]:
         """Positions of the grousers after the belt has moved by `drawn` [m]."""
@@ -135,13 +135,13 @@ class Tips(NamedTuple):
     rate: Array
 
 
-def tips(loop: Loop, place: Float[Array, " n"]) -> Tips:
-    """Tips of the grousers at `place` [m along the path]; see `belt.tips` for their rigid bases."""
+def grouser_tips(loop: Loop, place: Float[Array, " n"]) -> Tips:
+    """Tips of the grousers at `place` [m along the path]; see `belt.tips_on_path` for their rigid bases."""
     tilt, rise = loop.tilt(place)
     normal = loop.normal(tilt)
     height = loop.grouser_height
-    run = tangent(loop.normal(loop.turned(place)))
-    return Tips(loop.point(place) + height * normal, run + height * rise[:, None] * tangent(normal))
+    run = running_direction(loop.normal(loop.turned(place)))
+    return Tips(loop.point(place) + height * normal, run + height * rise[:, None] * running_direction(normal))
 
 
 class Corners(NamedTuple):
@@ -158,31 +158,31 @@ class Corners(NamedTuple):
     place: Array
 
 
-def surface(loop: Loop, at: Float[Array, "n 2"]) -> Corners:
+def gaps_to_belt(loop: Loop, at: Float[Array, "n 2"]) -> Corners:
     """Distance of points from the belt between its grousers."""
     height, place = loop.project(at)
     normal = loop.normal(loop.turned(place))
-    return Corners(height, normal, tangent(normal), place)
+    return Corners(height, normal, running_direction(normal), place)
 
 
-def teeth(loop: Loop, drawn: Scalar, at: Float[Array, "n 2"]) -> Corners:
+def gaps_to_grousers(loop: Loop, drawn: Scalar, at: Float[Array, "n 2"]) -> Corners:
     """Distance of points from the nearest grouser, a rigid tooth with flanks across its base."""
     under = loop.project(at)[1]
     ahead = jnp.mod(under - drawn + loop.pitch / 2, loop.pitch) - loop.pitch / 2
     place = jnp.mod(under - ahead, loop.length)
     tilt, rise = loop.tilt(place)
     normal = loop.normal(tilt)
-    along = tangent(normal)
+    along = running_direction(normal)
     arm = at - loop.point(place)
     u, w = jnp.sum(arm * along, axis=-1), jnp.sum(arm * normal, axis=-1)
     flank, top = jnp.abs(u) - loop.grouser_length / 2, w - loop.grouser_height
     outward = jnp.where((flank > top)[:, None], jnp.sign(u)[:, None] * along, normal)
-    run = tangent(loop.normal(loop.turned(place)))
+    run = running_direction(loop.normal(loop.turned(place)))
     rate = run + rise[:, None] * (w[:, None] * along - u[:, None] * normal)
     return Corners(jnp.maximum(flank, top), outward, rate, place)
 
 
-def tangent(normal: Array) -> Array:
+def running_direction(normal: Array) -> Array:
     """Running direction of the belt at its outward `normal`."""
     return jnp.stack([normal[..., 1], -normal[..., 0]], axis=-1)
 

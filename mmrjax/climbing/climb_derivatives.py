@@ -18,7 +18,16 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mmrjax.climbing import climb_simulation as climb
-from mmrjax.climbing.climb_simulation import OVER, RISES, SETTLES, TURNED_OVER, UNFINISHED, Climb, Passed, Sequence
+from mmrjax.climbing.climb_simulation import (
+    OVER,
+    RISES,
+    SETTLES,
+    TURNED_OVER,
+    UNFINISHED,
+    Climb,
+    ClimbRecord,
+    Sequence,
+)
 from mmrjax.climbing.footing import PITCH
 from mmrjax.climbing.terrain import Terrain
 from mmrjax.compile.compiling import SELDOM, compiled
@@ -50,7 +59,7 @@ OUTPUTS: dict[str, tuple[str, str]] = {
 }
 
 
-class Given(NamedTuple):
+class ClimbInputs(NamedTuple):
     """One run, fields without a leading axis."""
 
     robot: Robot
@@ -59,23 +68,23 @@ class Given(NamedTuple):
     sequence: Sequence
 
 
-def least(values: Float[Array, " n"]) -> Scalar:
+def smooth_minimum(values: Float[Array, " n"]) -> Scalar:
     """Smoothed minimum of values, -τ log mean exp(-x / τ) with τ = `SMOOTH`: between the minimum and the mean."""
     lowest = jax.lax.stop_gradient(jnp.min(values))
     return lowest - SMOOTH * jnp.log(jnp.mean(jnp.exp(-(values - lowest) / SMOOTH)))
 
 
-def crest(terrain: Terrain, record: Passed, over: bool) -> int | None:
+def crest_sample(terrain: Terrain, record: ClimbRecord, over: bool) -> int | None:
     """The first sample with the centre of mass past the obstacle, for a robot that gets over; else None."""
     return int(jnp.argmax(record.centre > terrain.finish)) if over else None
 
 
-def outputs(robot: Robot, terrain: Terrain, record: Passed, crest: int | None) -> dict[str, Scalar]:
+def climb_outputs(robot: Robot, terrain: Terrain, record: ClimbRecord, crest: int | None) -> dict[str, Scalar]:
     """`OUTPUTS` of a run until its verdict, from its record of shape (samples,)."""
     reach = jnp.asarray((record.centre - terrain.finish) / (robot.running_gear.wheelbase / 2))
     # the crest is between two samples
     share = jnp.ones(()) if crest is None else -reach[crest - 1] / (reach[crest] - reach[crest - 1])
-    until: Passed = jax.tree.map(lambda x: x[: None if crest is None else crest + 1], record)
+    until: ClimbRecord = jax.tree.map(lambda x: x[: None if crest is None else crest + 1], record)
 
     def end(x: Scalar) -> Scalar:
         x = jnp.asarray(x)
@@ -85,13 +94,13 @@ def outputs(robot: Robot, terrain: Terrain, record: Passed, crest: int | None) -
     stall = jnp.where(driven, until.voltage, 1.0) / robot.motor.resistance
     margins = {
         "margin_reach": reach[-1] if crest is None else jnp.ones(()),
-        "margin_upright": least(1 - jnp.abs(until.motion.q[:, PITCH]) / TURNED_OVER),
-        "margin_grip": least(jnp.asarray(1 - until.grip)),
-        "margin_torque": least(1 - jnp.where(driven, until.current, 0.0) / stall),
+        "margin_upright": smooth_minimum(1 - jnp.abs(until.motion.q[:, PITCH]) / TURNED_OVER),
+        "margin_grip": smooth_minimum(jnp.asarray(1 - until.grip)),
+        "margin_torque": smooth_minimum(1 - jnp.where(driven, until.current, 0.0) / stall),
     }
     levers = jnp.max(jnp.abs(until.lever_current), axis=0)
     return {
-        "margin_success": least(jnp.stack(list(margins.values()))),
+        "margin_success": smooth_minimum(jnp.stack(list(margins.values()))),
         **margins,
         "crest_time_s": end(until.time),
         "crest_energy_J": end(until.energy["supply"] + until.energy["levers"]),
@@ -118,7 +127,7 @@ class Derivatives(NamedTuple):
 
 
 def climb_derivatives(
-    given: Callable[[Float[Array, " values"]], Given],
+    given: Callable[[Float[Array, " values"]], ClimbInputs],
     values: Float[Array, " values"],
     widths: Float[Array, " values"],
     *,
@@ -134,7 +143,7 @@ def climb_derivatives(
     `climb_batch`.
     """
     directions = jnp.eye(len(values))
-    parts, samples, steps = climb.divided(duration, step, sample, part)
+    parts, samples, steps = climb.divide_run(duration, step, sample, part)
     interval, each = jnp.asarray(step, float), jnp.asarray(steps)
     run, turned = _along(given, values, directions)
     state, moved = _along(functools.partial(_initial, step=interval), run, turned)
@@ -154,9 +163,9 @@ def climb_derivatives(
     whole = Climb(*jax.tree.map(lambda x: np.asarray(x)[None], (*last, record)))
     ran = jax.tree.map(jnp.asarray, whole.run(0))
     count = len(ran.time)
-    top = crest(run.terrain, ran, verdict == OVER)
+    top = crest_sample(run.terrain, ran, verdict == OVER)
     found, by = _along(
-        lambda run_of: outputs(run_of[0].robot, run_of[0].terrain, run_of[1], top),
+        lambda run_of: climb_outputs(run_of[0].robot, run_of[0].terrain, run_of[1], top),
         (run, ran),
         (turned, jax.tree.map(lambda x: x[:, :count], changed)),
     )
@@ -185,7 +194,7 @@ def climb_derivatives(
 def outputs_of_run(robot: Robot, terrain: Terrain, ended: Climb, k: int) -> dict[str, Scalar]:
     """`OUTPUTS` of run `k` of a batch."""
     record = jax.tree.map(jnp.asarray, ended.run(k))
-    return outputs(robot, terrain, record, crest(terrain, record, bool(ended.verdict[k] == OVER)))
+    return climb_outputs(robot, terrain, record, crest_sample(terrain, record, bool(ended.verdict[k] == OVER)))
 
 
 def _along(function: Callable[[Any], Any], at: Any, directions: Any) -> tuple[Any, Any]:
@@ -206,13 +215,13 @@ def _along(function: Callable[[Any], Any], at: Any, directions: Any) -> tuple[An
     return eqx.combine(found, arrays, further[-1]), changed
 
 
-def _initial(run: Given, step: Scalar) -> Any:
-    return climb.begin(climb.system(*run, step))
+def _initial(run: ClimbInputs, step: Scalar) -> Any:
+    return climb.begin_climb(climb.climb_system(*run, step))
 
 
-def _sampled(at: tuple[Given, Any], first: Scalar, step: Scalar, steps: Scalar, samples: int) -> Any:
+def _sampled(at: tuple[ClimbInputs, Any], first: Scalar, step: Scalar, steps: Scalar, samples: int) -> Any:
     run, state = at
-    return climb.sampled(climb.system(*run, step), state, first, steps, samples)
+    return climb.advance_samples(climb.climb_system(*run, step), state, first, steps, samples)
 
 
 @functools.partial(compiled, options=SELDOM)

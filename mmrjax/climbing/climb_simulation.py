@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 
 from mmrjax.climbing import footing
 from mmrjax.climbing.footing import COORDINATES, FRONT, PITCH, REAR, SHAFT, Footing, Shape
-from mmrjax.climbing.lever_drives import LeverDrive, Swing, lever_drive, swing
+from mmrjax.climbing.lever_drives import LeverDrive, Swing, lever_drive, step_levers
 from mmrjax.climbing.terrain import Terrain
 from mmrjax.compile.compiling import SMALL, compiled
 from mmrjax.model import balances, contact
@@ -31,7 +31,7 @@ from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import GRAVITY, Signals, State
 from mmrjax.model.track_friction import Track
-from mmrjax.numerics.linear_equations import factorise, solution
+from mmrjax.numerics.linear_equations import factorise, solve_factorised
 from mmrjax.undercarriage.half_robot import contacts_resist, current_after
 from mmrjax.undercarriage.running_gear import RunningGear
 
@@ -96,7 +96,7 @@ def _turned(front: Array, rear: Array) -> Float[Array, " 2"]:
     return jnp.stack([front, jnp.pi - rear])
 
 
-def still(front: Scalar, rear: Scalar) -> Sequence:
+def constant_angles(front: Scalar, rear: Scalar) -> Sequence:
     """Levers that stay at their angles [rad]."""
     one = jnp.zeros(1)
     return Sequence(one, one + front, one + rear)
@@ -124,7 +124,7 @@ LOSSES = ("winding", "motor", "gearbox", "track", "sliding", "contact", "rolling
 Energy = dict[str, Any]
 
 
-class Passed(eqx.Module):
+class ClimbRecord(eqx.Module):
     """An instant or a sample: means over it, and energy since the start of the run.
 
     Attributes:
@@ -184,13 +184,15 @@ class System(eqx.Module):
     step: Scalar
 
 
-def system(robot: Robot, conditions: Conditions, terrain: Terrain, sequence: Sequence, step: Scalar = STEP) -> System:
+def climb_system(
+    robot: Robot, conditions: Conditions, terrain: Terrain, sequence: Sequence, step: Scalar = STEP
+) -> System:
     """Constants of one run (scalar conditions); the robot may hold tracers."""
     zero = jnp.zeros_like(conditions.voltage)
-    mass = balances.begin(robot, conditions, State(zero, zero, zero, zero)).mass
+    mass = balances.begin_signals(robot, conditions, State(zero, zero, zero, zero)).mass
     robot, gear = robot.within(conditions.configuration), robot.running_gear
     chassis = robot.chassis(conditions.configuration)
-    half, shape = without_levers(robot, conditions, mass), footing.shape_of(chassis, gear, robot.radius_pulley)
+    half, shape = without_levers(robot, conditions, mass), footing.contact_shape(chassis, gear, robot.radius_pulley)
     none = jnp.zeros_like(chassis.on_tracks)
     lever = jnp.stack([gear.lever_mass, gear.lever_centre, gear.lever_inertia]) * jnp.stack(
         [chassis.on_tracks, jnp.ones(()), chassis.on_tracks]
@@ -211,14 +213,14 @@ def system(robot: Robot, conditions: Conditions, terrain: Terrain, sequence: Seq
     )
 
 
-def inertia(run: System, q: Array, v: Array) -> tuple[Float[Array, "6 6"], Float[Array, " 6"], Scalar]:
+def mass_matrix_and_bias(run: System, q: Array, v: Array) -> tuple[Float[Array, "6 6"], Float[Array, " 6"], Scalar]:
     """Mass matrix M without rotors, bias c (centrifugal forces and gravity) and potential energy, per side.
 
     M v' + c = Q. Each body's centre of mass moves by its arm about the middle of the wheelbase and, of a lever, about
     its axle; gravity is tilted by the slope of the conditions.
     """
     half, shape = run.half, run.shape
-    body, *levers = footing.frames(shape, q)
+    body, *levers = footing.part_frames(shape, q)
     down = GRAVITY * jnp.stack([jnp.sin(run.conditions.slope), jnp.cos(run.conditions.slope)])
     zero, one = jnp.zeros(()), jnp.ones(())
 
@@ -255,7 +257,7 @@ def inertia(run: System, q: Array, v: Array) -> tuple[Float[Array, "6 6"], Float
 
 
 class _Pull(eqx.Module):
-    """Forces of the contacts, in the form that `balances.resolved` expects."""
+    """Forces of the contacts, in the form that `balances.resolved_signals` expects."""
 
     traction: Scalar
     guide: Scalar
@@ -287,23 +289,23 @@ def _sliding(at: Footing, v: Array, signals: Signals) -> Array:
     return -(at.along @ v) - signals.speed_slip_terms
 
 
-def carried(at: Footing, v: Array) -> tuple[Array, Scalar]:
+def load_shares(at: Footing, v: Array) -> tuple[Array, Scalar]:
     """Share of each rolling contact in the load, and the robot's speed along the ground, their load-weighted mean."""
     bears = at.force * at.rolls
     share = bears / jnp.maximum(jnp.sum(bears), 1e-9)
     return share, share @ (at.carried @ v)
 
 
-def instant(run: System, motion: Motion, on: Scalar) -> tuple[Signals, Footing, _Pull, Array]:
+def climb_instant(run: System, motion: Motion, on: Scalar) -> tuple[Signals, Footing, _Pull, Array]:
     """All signals, contacts, forces and load shares of an instant; `on`: share of their voltage at the motors."""
     at = footing.footing(run.shape, run.terrain, motion.q, motion.v)
-    share, speed = carried(at, motion.v)
+    share, speed = load_shares(at, motion.v)
     conditions = _driven(run, on)
 
     ratio = run.robot.gearbox.ratio
     state = State(motion.current, ratio * motion.v[SHAFT], speed, motion.discharge)
     mover = _Mover(at, motion.v, run.shape.main.first, jnp.sum(_lever_loss(run, motion.v[SHAFT] + motion.v[LED])))
-    signals, pulled = balances.resolved(run.robot, conditions, state, mover, 2 * run.half.inertia_pulley)
+    signals, pulled = balances.resolved_signals(run.robot, conditions, state, mover, 2 * run.half.inertia_pulley)
     return signals, at, pulled, share
 
 
@@ -313,7 +315,7 @@ def _driven(run: System, on: Scalar) -> Conditions:
 
 def _lever_loss(run: System, speed: Array) -> Array:
     """Loss torques of the levers' tracks (24) [N·m] at the speeds of their pulleys on their levers [rad/s]."""
-    rolls = contact.direction(run.shape.main.first * speed, run.chassis.speed_still)
+    rolls = contact.smooth_sign(run.shape.main.first * speed, run.chassis.speed_still)
     return jnp.asarray(run.lever_track.torque_loss(speed, rolls))
 
 
@@ -324,7 +326,7 @@ def _loaded(run: System, motion: Motion) -> System:
     return dataclasses.replace(run, robot=dataclasses.replace(run.robot, battery=battery))
 
 
-def asked(run: System, motion: Motion, time: Scalar) -> Float[Array, " 2"]:
+def demanded_lever_rates(run: System, motion: Motion, time: Scalar) -> Float[Array, " 2"]:
     """Demanded angular speeds of the levers after a step [rad/s].
 
     They lead to the sequence's angles, limited by the levers' rate; levers at their angle stand.
@@ -341,7 +343,7 @@ def _swung(run: System, motion: Motion, time: Scalar, source: Scalar, free: Arra
     most = jnp.abs(source) if sequence.supply is None else sequence.supply
     high = jnp.stack([most, most])
     low = -high
-    aims = asked(run, motion, time)
+    aims = demanded_lever_rates(run, motion, time)
     if sequence.begins is not None:
         aims = jnp.zeros_like(aims)
         front, rear = sequence.asked(motion.q[0], time)
@@ -351,10 +353,10 @@ def _swung(run: System, motion: Motion, time: Scalar, source: Scalar, free: Arra
     above, below = angles > levers.angle_most + 1e-3, angles < levers.angle_least - 1e-3
     up, down = jnp.stack([above[0], below[1]]), jnp.stack([below[0], above[1]])
     low, high = (jnp.where(up, jnp.minimum(x, 0.0), jnp.where(down, jnp.maximum(x, 0.0), x)) for x in (low, high))
-    return swing(run.drive, run.step, motion.v[LED], free, yields, aims, low, high)
+    return step_levers(run.drive, run.step, motion.v[LED], free, yields, aims, low, high)
 
 
-def advance(run: System, motion: Motion, time: Scalar, energy: Energy) -> tuple[Motion, Energy, Passed]:
+def advance_climb(run: System, motion: Motion, time: Scalar, energy: Energy) -> tuple[Motion, Energy, ClimbRecord]:
     """One step, linearly implicit in the forces of contacts and drive, as `half_robot.advance`.
 
     (M + Δt K) Δv = Δt (Q - c). The drives' torques on the levers and the levers' rates are solved together within
@@ -365,9 +367,9 @@ def advance(run: System, motion: Motion, time: Scalar, energy: Energy) -> tuple[
         Motion and energy after the step, and the record of the instant before it.
     """
     run, on = _loaded(run, motion), jnp.clip((time - SETTLES) / RISES, 0.0, 1.0)
-    signals, at, pulled, share = instant(run, motion, on)
+    signals, at, pulled, share = climb_instant(run, motion, on)
     robot, step, radius = run.robot, run.step, run.shape.main.first
-    matrix, bias, height = inertia(run, motion.q, motion.v)
+    matrix, bias, height = mass_matrix_and_bias(run, motion.q, motion.v)
     ratio, rotor = robot.gearbox.ratio, robot.motor.inertia
     armature = rotor * ratio**2 * signals.efficiency_load + signals.inertia_added
     resisted = signals.resistance * (share @ at.carried)
@@ -389,7 +391,7 @@ def advance(run: System, motion: Motion, time: Scalar, energy: Energy) -> tuple[
     whole = whole.at[LED, LED].add(1 - run.chassis.on_tracks)
     pushed = step * (force - bias)
     factors = factorise(whole[:4, :4])
-    moved, *coupled = (solution(factors, x) for x in (pushed[:4], whole[:4, 4], whole[:4, 5]))
+    moved, *coupled = (solve_factorised(factors, x) for x in (pushed[:4], whole[:4, 4], whole[:4, 5]))
     coupling = jnp.stack(coupled, axis=1)
     left = whole[4:, 4:] - whole[4:, :4] @ coupling
     inverse = jnp.array([[left[1, 1], -left[0, 1]], [-left[1, 0], left[0, 0]]]) / (
@@ -440,7 +442,7 @@ def advance(run: System, motion: Motion, time: Scalar, energy: Energy) -> tuple[
     total = jnp.sum(at.force)
     held = run.chassis.ground.force_adhesion(jnp.sum(at.force * at.rolls), signals.adhesion)
     centre = motion.q[0] - matrix[1, PITCH] / matrix[0, 0]
-    passed = Passed(
+    passed = ClimbRecord(
         time=time,
         motion=motion,
         current=signals.current,
@@ -477,7 +479,7 @@ def _shaft_loss(run: System, motion: Motion, signals: Signals, at: Footing) -> S
     force = jnp.sum(run.chassis.track.guide_friction * at.guided * at.force) * run.shape.main.first
 
     def loss(speed: Scalar) -> Scalar:
-        direction = contact.direction(run.chassis.radius * speed, run.chassis.speed_still)
+        direction = contact.smooth_sign(run.chassis.radius * speed, run.chassis.speed_still)
         motor = speed * run.robot.gearbox.ratio
         own = run.robot.motor.torque_loss(motor, direction) + run.robot.gearbox.torque_idle(motor, direction)
         track = run.chassis.track.torque_loss(speed, direction)
@@ -496,7 +498,7 @@ class Progress(eqx.Module):
     belt: Scalar
 
 
-def stand(run: System, clear: float = 0.1) -> Motion:
+def stand_before_obstacle(run: System, clear: float = 0.1) -> Motion:
     """At rest on the ground before the obstacle, with its foremost point `clear` [m] from it."""
     shape = run.shape
     angles = run.sequence.first
@@ -514,7 +516,7 @@ def stand(run: System, clear: float = 0.1) -> Motion:
 
 
 def _judged(
-    run: System, before: Motion, passed: Passed, motion: Motion, progress: Progress
+    run: System, before: Motion, passed: ClimbRecord, motion: Motion, progress: Progress
 ) -> tuple[Motion, Progress]:
     """Updates the verdict of a run after a sample; a run that has ended keeps its state."""
     q, v = motion.q, motion.v
@@ -547,37 +549,37 @@ def _judged(
     return motion, dataclasses.replace(progress, verdict=verdict)
 
 
-def begin(run: System, motion: Motion | None = None) -> tuple[Motion, Energy, Progress]:
+def begin_climb(run: System, motion: Motion | None = None) -> tuple[Motion, Energy, Progress]:
     """Initial motion (None: at rest before the obstacle), zero energy, and the initial verdict.
 
     The verdict is `failed` if the levers would begin below the ground, else the run goes on.
     """
     angles, gear = _turned(*run.sequence.first), run.shape.gear
-    under = clearance(run.shape.main.first + gear.grouser_height, gear, angles) < -ON_GROUND
+    under = roller_clearance(run.shape.main.first + gear.grouser_height, gear, angles) < -ON_GROUND
     buried = jnp.any(under & (run.shape.on_tracks > 0.5)) & (motion is None)
-    motion = stand(run) if motion is None else motion
+    motion = stand_before_obstacle(run) if motion is None else motion
     zero = jnp.zeros_like(motion.q[0])
     energy = dict.fromkeys((*SOURCES, *LOSSES), zero)
     return motion, energy, Progress(jnp.where(buried, FAILED, _RUNNING), zero, motion.q[0], zero, zero)
 
 
-def clearance(axle: Scalar, gear: RunningGear, angles: Float[Array, " levers"]) -> Float[Array, " levers"]:
+def roller_clearance(axle: Scalar, gear: RunningGear, angles: Float[Array, " levers"]) -> Float[Array, " levers"]:
     """Height of the rollers of levers at `angles` [rad] above level ground [m], for axles at height `axle` [m]."""
     return axle + gear.lever_length * jnp.sin(angles) - gear.levers.roller
 
 
-def sampled(run: System, state: Any, first: Scalar, steps: Scalar, samples: int) -> tuple[Any, Passed]:
+def advance_samples(run: System, state: Any, first: Scalar, steps: Scalar, samples: int) -> tuple[Any, ClimbRecord]:
     """A part of a run with `samples` samples of `steps` steps each, from time `first` [s]: its end and its record."""
 
-    def sample(state: Any, k: Array) -> tuple[Any, Passed]:
+    def sample(state: Any, k: Array) -> tuple[Any, ClimbRecord]:
         motion, energy, progress = state
 
         def small(j: Array, carry: Any) -> Any:
-            *after, passed = advance(run, carry[0], first + (k * steps + j) * run.step, carry[1])
+            *after, passed = advance_climb(run, carry[0], first + (k * steps + j) * run.step, carry[1])
             base = jnp.maximum(passed.base, carry[2].base)
             return (*after, dataclasses.replace(passed, base=base))
 
-        nothing = jax.eval_shape(lambda: advance(run, motion, first, energy)[2])
+        nothing = jax.eval_shape(lambda: advance_climb(run, motion, first, energy)[2])
         nothing = jax.tree.map(lambda x: jnp.full(x.shape, -jnp.inf, x.dtype), nothing)
         after, spent, passed = jax.lax.fori_loop(0, steps, small, (motion, energy, nothing))
         ended = progress.verdict != _RUNNING
@@ -588,7 +590,7 @@ def sampled(run: System, state: Any, first: Scalar, steps: Scalar, samples: int)
     return jax.lax.scan(sample, state, jnp.arange(samples))
 
 
-def divided(duration: float, step: float, sample: float, part: float) -> tuple[int, int, int]:
+def divide_run(duration: float, step: float, sample: float, part: float) -> tuple[int, int, int]:
     """Division of a run of a `duration`: parts no longer than `part`, samples per part, steps per sample.
 
     A sample has a whole number of steps and all parts are equal, so the run may be a few samples longer.
@@ -603,7 +605,7 @@ class Climb(eqx.Module):
     verdict: np.ndarray
     ended: np.ndarray
     furthest: np.ndarray
-    record: Passed
+    record: ClimbRecord
 
     @property
     def names(self) -> list[str]:
@@ -615,7 +617,7 @@ class Climb(eqx.Module):
         """Mask of the samples before a run's verdict, after which its state is constant; shape (runs, samples)."""
         return np.asarray(self.record.time) <= np.asarray(self.ended)[:, None] + 1e-9
 
-    def run(self, k: int) -> Passed:
+    def run(self, k: int) -> ClimbRecord:
         """The record of run `k` until its verdict, shape (samples,)."""
         count = int(np.sum(self.during[k]))
         return jax.tree.map(lambda x: x[k, :count], self.record)
@@ -631,7 +633,7 @@ def _begin(
     robot: Robot, conditions: Conditions, terrain: Terrain, sequence: Sequence, step: Scalar, motion: Motion | None
 ) -> Any:
     def one(robot: Robot, conditions: Conditions, terrain: Terrain, sequence: Sequence, motion: Motion | None) -> Any:
-        return begin(system(robot, conditions, terrain, sequence, step), motion)
+        return begin_climb(climb_system(robot, conditions, terrain, sequence, step), motion)
 
     return jax.vmap(one, in_axes=(_alike(robot), 0, 0, 0, 0))(robot, conditions, terrain, sequence, motion)
 
@@ -639,12 +641,12 @@ def _begin(
 def _part(
     robot: Robot, conditions: Conditions, terrain: Terrain, sequence: Sequence, state: Any, first: Scalar,
     step: Scalar, steps: Scalar, samples: int,
-) -> tuple[Any, Passed]:  # fmt: skip
+) -> tuple[Any, ClimbRecord]:  # fmt: skip
     def one(robot: Robot, conditions: Conditions, terrain: Terrain, sequence: Sequence, state: Any) -> Any:
-        return sampled(system(robot, conditions, terrain, sequence, step), state, first, steps, samples)
+        return advance_samples(climb_system(robot, conditions, terrain, sequence, step), state, first, steps, samples)
 
     each = (_alike(robot), 0, 0, 0, 0)
-    found: tuple[Any, Passed] = jax.vmap(one, in_axes=each)(robot, conditions, terrain, sequence, state)
+    found: tuple[Any, ClimbRecord] = jax.vmap(one, in_axes=each)(robot, conditions, terrain, sequence, state)
     return found
 
 
@@ -675,10 +677,10 @@ def climb_batch(
         start: initial motions; None: at rest before the obstacle.
         progress: called with the finished share of the time.
     """
-    parts, samples, steps = divided(duration, step, sample, part)
+    parts, samples, steps = divide_run(duration, step, sample, part)
     interval, each = jnp.asarray(step, float), jnp.asarray(steps)  # arrays: one program for all lengths of a step
     state = _begin(robot, conditions, terrain, sequence, interval, start)
-    kept: list[Passed] = []
+    kept: list[ClimbRecord] = []
     for k in range(parts):
         first = jnp.asarray(k * samples * steps * step)
         state, passed = _compiled(robot, conditions, terrain, sequence, state, first, interval, each, samples)

@@ -120,7 +120,7 @@ class _Group(NamedTuple):
     rolls: float = 1.0
 
 
-def frames(shape: Shape, q: Sequence[Scalar] | Array) -> tuple[Frame, Frame, Frame]:
+def part_frames(shape: Shape, q: Sequence[Scalar] | Array) -> tuple[Frame, Frame, Frame]:
     """Chassis, front and rear lever."""
     body = Frame(jnp.stack([q[0], q[1]]), -q[PITCH])
     levers = [
@@ -131,17 +131,17 @@ def frames(shape: Shape, q: Sequence[Scalar] | Array) -> tuple[Frame, Frame, Fra
 
 
 def _guided(shape: Shape, place: Array) -> Array:
-    """Share of a load on the main belt at `place` that passes to the lower guide [-], as in `belt.tips`."""
+    """Share of a load on the main belt at `place` that passes to the lower guide [-], as in `belt.tips_on_path`."""
     run, length = shape.main.run, shape.main.length
     off = jnp.minimum(place, length - place)  # from the middle of the lower run
-    return jnp.asarray(contact.step(run / 2 - off, 0.0, 0.0, shape.gear.guide_gap, 1.0))
+    return jnp.asarray(contact.cubic_step(run / 2 - off, 0.0, 0.0, shape.gear.guide_gap, 1.0))
 
 
 def _belt(shape: Shape, terrain: Terrain, belt: Loop, frame: Frame, drawn: Scalar, bears: Scalar) -> list[_Group]:
     """Grousers on the ground, and corners of the ground on the belt between grousers and on their flanks."""
     radius, main = shape.main.first, frame.turns is None
     place = belt.places(drawn)
-    tips = belt_loop.tips(belt, place)
+    tips = belt_loop.grouser_tips(belt, place)
     at = frame.world(tips.at)
     gap, normal = terrain.distance(at)
 
@@ -152,7 +152,7 @@ def _belt(shape: Shape, terrain: Terrain, belt: Loop, frame: Frame, drawn: Scala
     groups = [group(at, gap, normal, frame.along(tips.rate), place)]
     corners = terrain.corners
     local = frame.within(corners)
-    for near in (belt_loop.surface(belt, local), belt_loop.teeth(belt, drawn, local)):
+    for near in (belt_loop.gaps_to_belt(belt, local), belt_loop.gaps_to_grousers(belt, drawn, local)):
         normal = -frame.along(near.normal)
         at = corners + terrain.nose * -normal
         groups.append(group(at, near.gap - terrain.nose, normal, frame.along(near.rate), near.place))
@@ -178,7 +178,7 @@ def _wheels(shape: Shape, terrain: Terrain, body: Frame) -> list[_Group]:
         normal = jnp.concatenate([normals, arm / to_corner[:, None]])
         at = centre - (shape.wheel + jnp.minimum(gap, 0.0))[:, None] * normal
         none = jnp.zeros_like(gap)
-        rate = shape.wheel * belt_loop.tangent(-normal)
+        rate = shape.wheel * belt_loop.running_direction(-normal)
         groups.append(_Group(at, gap, normal, rate, None, none, none + 1 - shape.on_tracks))
     return groups
 
@@ -199,7 +199,7 @@ def _body(shape: Shape, terrain: Terrain, body: Frame) -> _Group:
 
 def footing(shape: Shape, terrain: Terrain, q: Array, v: Array) -> Footing:
     """Pairs that may touch and their normal forces (27) at coordinates `q`, velocities `v`."""
-    body, front, rear = frames(shape, q)
+    body, front, rear = part_frames(shape, q)
     radius = shape.main.first
     rear_axle = body._replace(origin=rear.origin)  # origin of the main belt's loop
     groups = _belt(shape, terrain, shape.main, rear_axle, radius * q[SHAFT], jnp.ones(()))
@@ -213,7 +213,7 @@ def footing(shape: Shape, terrain: Terrain, q: Array, v: Array) -> Footing:
     at, normal, rate = (jnp.concatenate([getattr(g, name) for g in groups]) for name in ("at", "normal", "rate"))
     gap, guided, bears = (jnp.concatenate([getattr(g, name) for g in groups]) for name in ("gap", "guided", "bears"))
     rolls = np.concatenate([np.full(len(g.gap), g.rolls) for g in groups])
-    along = belt_loop.tangent(normal)
+    along = belt_loop.running_direction(normal)
     carried, own = [], []
     for direction in (normal, along):
         columns = [direction[:, 0], direction[:, 1], _turned(direction, at - body.origin)]
@@ -254,7 +254,7 @@ def _turned(direction: Array, arm: Array) -> Array:
     return direction[:, 0] * arm[:, 1] - direction[:, 1] * arm[:, 0]
 
 
-def shape_of(chassis: Chassis, gear: RunningGear, radius: Scalar) -> Shape:
+def contact_shape(chassis: Chassis, gear: RunningGear, radius: Scalar) -> Shape:
     """Shapes of one side of a robot, from its parameters."""
     main = Loop(radius, radius, gear.wheelbase, gear.grouser_height, gear.grouser_length, GROUSERS)
     lever = Loop(

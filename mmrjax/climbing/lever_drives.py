@@ -93,7 +93,7 @@ class Swing(NamedTuple):
     holds: Bool[Array, " 2"]
 
 
-def swing(
+def step_levers(
     drive: LeverDrive,
     step: Scalar,
     rate: Float[Array, " 2"],

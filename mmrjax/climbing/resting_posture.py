@@ -58,8 +58,8 @@ class Outline(eqx.Module):
 
     def pitched(self, pitch: Scalar) -> Outline:
         """Same outline with its nose raised by `pitch` [rad], about the middle of the wheelbase."""
-        forward, up = turned(self.forward, self.up, jnp.asarray(pitch)[..., None])
-        at, high = turned(self.centre_forward, self.centre_up, pitch)
+        forward, up = rotate_to_ground(self.forward, self.up, jnp.asarray(pitch)[..., None])
+        at, high = rotate_to_ground(self.centre_forward, self.centre_up, pitch)
         return dataclasses.replace(self, forward=forward, up=up, centre_forward=at, centre_up=high)
 
     @property
@@ -73,13 +73,13 @@ class Outline(eqx.Module):
         return jnp.max(self.up + self.radius, -1) - jnp.min(self.up - self.radius, -1)
 
 
-def turned(forward: Scalar, up: Scalar, pitch: Scalar) -> tuple[Array, Array]:
+def rotate_to_ground(forward: Scalar, up: Scalar, pitch: Scalar) -> tuple[Array, Array]:
     """Coordinates of a point of the robot's frame along and above the ground, about mid-wheelbase [m]."""
     sine, cosine = jnp.sin(pitch), jnp.cos(pitch)
     return jnp.asarray(forward * cosine - up * sine), jnp.asarray(forward * sine + up * cosine)
 
 
-def parts(robot: Robot, conditions: Conditions, mass: Scalar | None = None) -> masses.Masses:
+def posture_masses(robot: Robot, conditions: Conditions, mass: Scalar | None = None) -> masses.Masses:
     """Masses of half a robot with the levers at the angles of the conditions.
 
     Args:
@@ -88,10 +88,10 @@ def parts(robot: Robot, conditions: Conditions, mass: Scalar | None = None) -> m
     if mass is None:
         stated = robot.chassis(conditions.configuration).mass + conditions.payload
         mass = stated if conditions.total_mass is None else conditions.total_mass
-    return masses.masses(robot, conditions, mass)
+    return masses.masses_of_parts(robot, conditions, mass)
 
 
-def outline(robot: Robot, conditions: Conditions, mass: Scalar | None = None) -> Outline:
+def side_outline(robot: Robot, conditions: Conditions, mass: Scalar | None = None) -> Outline:
     """Side view of a robot with the levers at the angles of the conditions.
 
     Args:
@@ -99,7 +99,7 @@ def outline(robot: Robot, conditions: Conditions, mass: Scalar | None = None) ->
     """
     chassis, gear = robot.chassis(conditions.configuration), robot.running_gear
     tracked = jnp.asarray(chassis.on_tracks)
-    ahead, high = parts(robot, conditions, mass).centre
+    ahead, high = posture_masses(robot, conditions, mass).centre
     front, rear = masses.lever_angles(gear, conditions)
     half, reach = gear.wheelbase / 2, gear.lever_length * tracked
     axle, roller = chassis.radius + tracked * gear.grouser_height, gear.levers.roller * tracked
@@ -163,16 +163,16 @@ def posture(robot: Robot, conditions: Conditions, mass: Scalar | None = None) ->
     Args:
         mass: with payload [kg]; None: as stated.
     """
-    inertia = robot.sides * parts(robot, conditions, mass).inertia_pitch(robot.running_gear.wheelbase)
-    return rest(outline(robot, conditions, mass), conditions.slope, inertia)
+    inertia = robot.sides * posture_masses(robot, conditions, mass).inertia_pitch(robot.running_gear.wheelbase)
+    return rest_outline(side_outline(robot, conditions, mass), conditions.slope, inertia)
 
 
-def level(robot: Robot, conditions: Conditions, mass: Scalar | None = None) -> Posture:
+def level_posture(robot: Robot, conditions: Conditions, mass: Scalar | None = None) -> Posture:
     """The posture of a robot at rest on level ground, see `posture`."""
     return posture(robot, dataclasses.replace(conditions, slope_deg=jnp.zeros_like(conditions.slope_deg)), mass)
 
 
-def rest(side: Outline, slope: Scalar, inertia: Scalar) -> Posture:
+def rest_outline(side: Outline, slope: Scalar, inertia: Scalar) -> Posture:
     """The posture of an outline on a slope [rad]; see `posture`."""
     tail, nose = EDGES.T
     ahead, rise = side.forward[nose] - side.forward[tail], side.up[nose] - side.up[tail]

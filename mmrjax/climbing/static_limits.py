@@ -27,7 +27,7 @@ _PITCHES, _POSTURES = (181, 33, 4), (13, 9, 1)
 _BESIDE = 1e-5
 
 
-class Step(eqx.Module):
+class StepLimit(eqx.Module):
     """The highest step that carries a robot with its centre of mass over the edge.
 
     Attributes:
@@ -42,7 +42,7 @@ class Step(eqx.Module):
     base: Scalar
 
 
-class Limits(eqx.Module):
+class StaticLimits(eqx.Module):
     """Static limits of a robot at its lever angles.
 
     Attributes:
@@ -66,7 +66,7 @@ class Limits(eqx.Module):
     height: Scalar
 
 
-def lowest(side: Outline) -> tuple[Scalar, Scalar]:
+def lowest_points(side: Outline) -> tuple[Scalar, Scalar]:
     """Lowest points of a pitched outline behind the line through its centre of mass and ahead of it [m]."""
     line = side.centre_forward
     # circles: the bottom if it is on that side, else the intersection of the line with the arc
@@ -92,7 +92,7 @@ def lowest(side: Outline) -> tuple[Scalar, Scalar]:
     return jnp.minimum(jnp.min(behind), belt), jnp.minimum(jnp.min(ahead), belt)
 
 
-def step_at(side: Outline, pitch: Scalar) -> Scalar:
+def step_height_at(side: Outline, pitch: Scalar) -> Scalar:
     """Height of the step [m] under an outline at a pitch [rad] with its centre of mass over the edge.
 
     The lowest point behind the centre of mass stands on the lower ground, the lowest point ahead of it on the step:
@@ -101,7 +101,7 @@ def step_at(side: Outline, pitch: Scalar) -> Scalar:
 
         H = R (1 - cos θ) + (ℓ - (h + R) tan θ) sin θ.
     """
-    behind, ahead = lowest(side.pitched(pitch))
+    behind, ahead = lowest_points(side.pitched(pitch))
     return ahead - behind
 
 
@@ -116,8 +116,8 @@ def _highest(height: Callable[[Scalar], Scalar], count: int, near: int, rounds: 
     return best, apart
 
 
-def step(side: Outline, pitch: Scalar | None = None) -> Step:
-    """The maximum of `step_at`, nose up, for one outline.
+def find_highest_step(side: Outline, pitch: Scalar | None = None) -> StepLimit:
+    """The maximum of `step_height_at`, nose up, for one outline.
 
     If two parts of the outline meet at the highest step, its derivatives are those of both, weighted by their
     slopes s over pitch on the other side: dH = (s_1 dH_2 - s_2 dH_1) / (s_1 - s_2).
@@ -126,14 +126,16 @@ def step(side: Outline, pitch: Scalar | None = None) -> Step:
         pitch: of the highest step [rad]; None: it is searched.
     """
     still = jax.lax.stop_gradient(side)
-    best = _highest(lambda pitch: step_at(still, pitch), *_PITCHES)[0] if pitch is None else pitch
+    best = _highest(lambda pitch: step_height_at(still, pitch), *_PITCHES)[0] if pitch is None else pitch
     beside = best + jnp.array([-_BESIDE, _BESIDE])
-    rises = jax.vmap(lambda pitch: jax.jvp(lambda x: step_at(still, x), (pitch,), (jnp.ones_like(pitch),))[1])(beside)
+    rises = jax.vmap(lambda pitch: jax.jvp(lambda x: step_height_at(still, x), (pitch,), (jnp.ones_like(pitch),))[1])(
+        beside
+    )
     share = jnp.clip(-rises[1] / jnp.maximum(rises[0] - rises[1], 1e-12), 0.0, 1.0)
-    moved = jnp.asarray(jax.vmap(lambda pitch: step_at(side, pitch) - step_at(still, pitch))(beside))
+    moved = jnp.asarray(jax.vmap(lambda pitch: step_height_at(side, pitch) - step_height_at(still, pitch))(beside))
     pitched = side.pitched(best)
-    height = step_at(still, best) + share * moved[0] + (1 - share) * moved[1]
-    return Step(height, best, pitched, -lowest(pitched)[0])
+    height = step_height_at(still, best) + share * moved[0] + (1 - share) * moved[1]
+    return StepLimit(height, best, pitched, -lowest_points(pitched)[0])
 
 
 def with_levers(conditions: Conditions, front: Scalar, rear: Scalar) -> Conditions:
@@ -142,7 +144,7 @@ def with_levers(conditions: Conditions, front: Scalar, rear: Scalar) -> Conditio
     return dataclasses.replace(conditions, levers_front_deg=front, levers_rear_deg=rear)
 
 
-def flush(robot: Robot) -> Scalar:
+def flush_lever_angle(robot: Robot) -> Scalar:
     """Lever angle for a lower run in line with the main belt [rad], downward."""
     gear = robot.running_gear
     return -jnp.arcsin((robot.radius_pulley + gear.grouser_height - gear.levers.roller) / gear.lever_length)
@@ -159,14 +161,14 @@ def best_levers(robot: Robot, conditions: Conditions, pitch: Scalar) -> tuple[Sc
     They would be upright without their mass, a share μ of the total with its centre c from their axle, which
     favours a position further ahead. Both angles are limited to the levers' range.
     """
-    gear, half = robot.running_gear, resting_posture.parts(robot, conditions)
+    gear, half = robot.running_gear, resting_posture.posture_masses(robot, conditions)
     moved = gear.lever_mass * gear.lever_centre / (half.chassis + 2 * half.pulley)
     rear = pitch - jnp.pi / 2 - jnp.arctan2(moved * jnp.sin(pitch), gear.lever_length * jnp.cos(pitch))
     least, most = gear.levers.angle_least, gear.levers.angle_most
     return jnp.clip(-pitch, least, most), jnp.clip(rear, least, most)
 
 
-def best_step(robot: Robot, conditions: Conditions) -> tuple[Step, Scalar, Scalar]:
+def best_step(robot: Robot, conditions: Conditions) -> tuple[StepLimit, Scalar, Scalar]:
     """The highest step of one run in any posture within the levers' range, and the angles of front and rear levers.
 
     The derivatives are those at these angles [rad]. The step is a limit for any slow sequence of postures if the wall
@@ -177,7 +179,9 @@ def best_step(robot: Robot, conditions: Conditions) -> tuple[Step, Scalar, Scala
     still, run = jax.lax.stop_gradient((robot, conditions))
 
     def height(pitch: Scalar) -> Scalar:
-        return step_at(resting_posture.outline(still, with_levers(run, *best_levers(still, run, pitch))), pitch)
+        return step_height_at(
+            resting_posture.side_outline(still, with_levers(run, *best_levers(still, run, pitch))), pitch
+        )
 
     best, apart = _highest(height, *_POSTURES)
     for _ in range(2):  # smooth here: vertices of parabolas
@@ -189,7 +193,11 @@ def best_step(robot: Robot, conditions: Conditions) -> tuple[Step, Scalar, Scala
         )
         apart = apart / 16
     front, rear = best_levers(still, run, best)
-    return step(resting_posture.outline(robot, with_levers(conditions, front, rear)), best), front, rear
+    return (
+        find_highest_step(resting_posture.side_outline(robot, with_levers(conditions, front, rear)), best),
+        front,
+        rear,
+    )
 
 
 def stairs_rise(robot: Robot, conditions: Conditions, tread: Scalar, friction: Scalar) -> Scalar:
@@ -201,8 +209,8 @@ def stairs_rise(robot: Robot, conditions: Conditions, tread: Scalar, friction: S
     the centre of mass ℓ ahead of the tail and h above the belt. The result is 0 if even noses without rise are too
     far apart. Grousers that catch a nose hold more, and a robot that rocks may still climb.
     """
-    angle = flush(robot)
-    rests = resting_posture.level(robot, with_levers(conditions, angle, angle))
+    angle = flush_lever_angle(robot)
+    rests = resting_posture.level_posture(robot, with_levers(conditions, angle, angle))
     tail, nose = rests.centre_ahead - rests.rear, rests.front - rests.centre_ahead
     # ℓ cos α - h sin α = t
     reach = jnp.sqrt(tail**2 + rests.centre_height**2)
@@ -212,14 +220,14 @@ def stairs_rise(robot: Robot, conditions: Conditions, tread: Scalar, friction: S
     return jnp.where(bridged, tread * jnp.tan(steepest), 0.0) * rests.line
 
 
-def limits(robot: Robot, conditions: Conditions) -> Limits:
+def posture_limits(robot: Robot, conditions: Conditions) -> StaticLimits:
     """The static limits of a robot, for one run on level ground, with its tipping slopes."""
-    side, rests = resting_posture.outline(robot, conditions), resting_posture.level(robot, conditions)
-    highest, lies = step(side), side.pitched(rests.pitch)
+    side, rests = resting_posture.side_outline(robot, conditions), resting_posture.level_posture(robot, conditions)
+    highest, lies = find_highest_step(side), side.pitched(rests.pitch)
     tops, tracked = lies.up + lies.radius + rests.height, jnp.asarray(side.tracked) > 0.5
     bridged: Scalar = jnp.minimum(rests.front - rests.centre_ahead, rests.centre_ahead - rests.rear)
     width = robot.chassis(conditions.configuration).turning.width
-    return Limits(
+    return StaticLimits(
         step=highest.height,
         gap=jnp.maximum(bridged, 0.0) * rests.line,
         contact=rests.length,
@@ -234,18 +242,18 @@ def limits(robot: Robot, conditions: Conditions) -> Limits:
 
 
 @jax.jit
-def _over_levers(robot: Robot, conditions: Conditions, angles: Float[Array, "n 2"]) -> tuple[Step, Array]:
-    def at(pair: Array) -> tuple[Step, Array]:
+def _over_levers(robot: Robot, conditions: Conditions, angles: Float[Array, "n 2"]) -> tuple[StepLimit, Array]:
+    def at(pair: Array) -> tuple[StepLimit, Array]:
         here = dataclasses.replace(conditions, levers_front_deg=pair[0], levers_rear_deg=pair[1])
-        side = resting_posture.outline(robot, here)
-        return step(side), jnp.asarray(resting_posture.rest(side, here.slope, 0.0).margin)
+        side = resting_posture.side_outline(robot, here)
+        return find_highest_step(side), jnp.asarray(resting_posture.rest_outline(side, here.slope, 0.0).margin)
 
     return jax.lax.map(at, angles, batch_size=256)
 
 
-def over_levers(
+def steps_over_lever_angles(
     robot: Robot, conditions: Conditions, front_deg: Float[np.ndarray, " n"], rear_deg: Float[np.ndarray, " m"]
-) -> tuple[Step, Float[Array, "n m"]]:
+) -> tuple[StepLimit, Float[Array, "n m"]]:
     """The highest step for each pair of lever angles [deg], for one run, and the tipping margin at rest.
 
     The margin is on the slope of the run [m] (see `Posture`). Leaves have shape (n, m, ...).
@@ -256,14 +264,14 @@ def over_levers(
 
 
 @jax.jit
-def standing(robot: Robot, conditions: Conditions) -> tuple[Posture, Limits, Outline, Step]:
+def postures_of_runs(robot: Robot, conditions: Conditions) -> tuple[Posture, StaticLimits, Outline, StepLimit]:
     """Posture, limits, outline at rest and highest step of the robot in each run of a batch.
 
     Leaves have shape (runs, ...).
     """
 
-    def of_one(one: Conditions) -> tuple[Posture, Limits, Outline, Step]:
-        side, rests = resting_posture.outline(robot, one), resting_posture.posture(robot, one)
-        return rests, limits(robot, one), side.pitched(rests.pitch), step(side)
+    def of_one(one: Conditions) -> tuple[Posture, StaticLimits, Outline, StepLimit]:
+        side, rests = resting_posture.side_outline(robot, one), resting_posture.posture(robot, one)
+        return rests, posture_limits(robot, one), side.pitched(rests.pitch), find_highest_step(side)
 
     return jax.vmap(of_one)(conditions)

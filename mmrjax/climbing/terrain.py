@@ -92,18 +92,18 @@ def _terrain(points: Sequence[tuple[Scalar, Scalar]], finish: Scalar, nose: Scal
     return Terrain(rows, nose + zero, finish + zero)
 
 
-def flat(size: int = 0) -> Terrain:
+def flat_ground(size: int = 0) -> Terrain:
     """Level ground."""
     return _terrain([(-FAR, 0.0), (FAR, 0.0)], 0.0, size=size)
 
 
-def slope(angle: Scalar, size: int = 0) -> Terrain:
+def inclined_ground(angle: Scalar, size: int = 0) -> Terrain:
     """Ground that rises at a constant `angle` [rad], through the origin."""
     x, z = FAR * jnp.cos(angle), FAR * jnp.sin(angle)
     return _terrain([(-x, -z), (x, z)], 0.0, size=size)
 
 
-def step(height: Scalar, nose: Scalar = 0.0, size: int = 0) -> Terrain:
+def single_step(height: Scalar, nose: Scalar = 0.0, size: int = 0) -> Terrain:
     """A step up (or down) by `height` [m], its corner rounded by `nose` [m]."""
     return _terrain([(-FAR, 0.0), (0.0, 0.0), (0.0, height), (FAR, height)], 0.0, nose, size)
 

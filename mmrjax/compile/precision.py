@@ -69,7 +69,7 @@ def in_double(function: Callable[P, T]) -> Callable[P, T]:
     return call
 
 
-def at_once(function: Callable[P, T]) -> Callable[P, T]:
+def computed_outside_trace(function: Callable[P, T]) -> Callable[P, T]:
     """Decorator like `in_double` for functions of concrete numbers, computed at once even inside a trace."""
     double = in_double(function)
 
@@ -97,7 +97,7 @@ def _widened(argument: Any) -> Any:
     return as_floats(argument) if isinstance(argument, eqx.Module) else argument
 
 
-def ambient(tree: T) -> T:
+def as_jax_arrays(tree: T) -> T:
     """Returns a tree with JAX arrays for NumPy arrays, in JAX's current precision and as constants of a trace."""
     with jax.ensure_compile_time_eval():
         return jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, np.ndarray | np.generic) else x, tree)

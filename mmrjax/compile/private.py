@@ -7,7 +7,7 @@ import stat
 from pathlib import Path
 
 
-def exposure(folder: Path) -> str:
+def exposure_reason(folder: Path) -> str:
     """Reason why another user could place files in a folder; empty if only the user and root can.
 
     The folder and its files have to belong to the user, and neither the group nor others may write to it. Each folder
@@ -24,7 +24,7 @@ def exposure(folder: Path) -> str:
             if part.exists() and (reason := _reason(part, part == place)):
                 return reason
         if place.resolve() != place:
-            return exposure(place.resolve())
+            return exposure_reason(place.resolve())
         for entry in place.iterdir() if place.is_dir() else ():
             if entry.lstat().st_uid != os.geteuid():
                 return f"{entry} belongs to another user"

@@ -36,7 +36,7 @@ import jax.monitoring
 import jax.numpy as jnp
 from jax.experimental import serialize_executable
 
-from mmrjax.compile.private import exposure
+from mmrjax.compile.private import exposure_reason
 
 #: Environment variable with the folder for programs; if it is unset or empty, none are stored.
 VARIABLE = "MMRJAX_PROGRAMS"
@@ -83,7 +83,7 @@ class Program:
         return jax.tree.map(lambda x: next(found) if isinstance(x, _Place) else x, self.result)
 
 
-def compile_by(lowered: Any, options: dict[str, Any]) -> Any:
+def compile_with_options(lowered: Any, options: dict[str, Any]) -> Any:
     """Compiles with those options that this version of XLA supports.
 
     Args:
@@ -93,7 +93,7 @@ def compile_by(lowered: Any, options: dict[str, Any]) -> Any:
         return lowered.compile(options)
     except jax.errors.JaxRuntimeError as error:
         known = {k: v for k, v in options.items() if f"No such compile option: '{k}'" not in str(error)}
-        return compile_by(lowered, known) if len(known) < len(options) else lowered.compile()
+        return compile_with_options(lowered, known) if len(known) < len(options) else lowered.compile()
 
 
 class Programs:
@@ -160,7 +160,7 @@ class Programs:
             found = executable
             if found is None:
                 with _read_from_cache() as read:
-                    found = compile_by(lowered, self.options)
+                    found = compile_with_options(lowered, self.options)
                 # A program that JAX has read from its cache loses functions when it is written again (XLA on a CPU),
                 # and one with callbacks into Python holds addresses of this process.
                 if read or "callback" in text:
@@ -216,7 +216,7 @@ def _arrays(leaves: list[Any]) -> list[Any]:
 @functools.cache
 def _private(folder: str) -> bool:
     """True if nobody but the user can change a folder and its files, as checked at first use."""
-    return not exposure(Path(folder))
+    return not exposure_reason(Path(folder))
 
 
 def _keeps() -> bool:
@@ -276,7 +276,7 @@ def _name(function: Callable[..., Any], arguments: Any) -> str:
         raise Unnamed
     file = io.BytesIO()
     _Describer(file).dump((named, _settings(), arguments))
-    return hashlib.sha256(sources().encode() + file.getvalue()).hexdigest()
+    return hashlib.sha256(source_hash().encode() + file.getvalue()).hexdigest()
 
 
 def _settings() -> tuple[tuple[str, str], ...]:
@@ -287,7 +287,7 @@ def _settings() -> tuple[tuple[str, str], ...]:
 
 
 @functools.cache
-def sources(root: Path = Path(__file__).resolve().parents[1]) -> str:  # noqa: B008 (a constant)
+def source_hash(root: Path = Path(__file__).resolve().parents[1]) -> str:  # noqa: B008 (a constant)
     """A hash of the source of our packages in a folder, of the versions of the libraries and of Python."""
     digest = hashlib.sha256(sys.version.encode())
     for library in LIBRARIES:

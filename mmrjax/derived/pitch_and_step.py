@@ -21,7 +21,7 @@ def compute(robot: Robot, conditions: Conditions) -> dict[str, Array]:
     """
     found = {
         "pitch": resting_posture.posture(robot, conditions).pitch,
-        "highest_step": static_limits.step(resting_posture.outline(robot, conditions)).height,
+        "highest_step": static_limits.find_highest_step(resting_posture.side_outline(robot, conditions)).height,
         "best_step": static_limits.best_step(robot, conditions)[0].height,
     }
     return {name: jnp.asarray(x) for name, x in found.items()} | {"status": jnp.asarray(CONVERGED)}

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int
 
 from mmrjax.climbing import static_limits
 from mmrjax.derived import steepest_slope
-from mmrjax.fidelities.steady import operating
+from mmrjax.fidelities.steady import operating_state
 from mmrjax.model import balances, energy
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.motor import TEMPERATURE_REFERENCE
@@ -22,7 +22,7 @@ from mmrjax.model.params import Index, Scalar
 from mmrjax.model.quantities import CONDITIONS, MM, RPM
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import CONVERGED, CUT_OFF, Signals
-from mmrjax.turning.circling import circling
+from mmrjax.turning.circling import circling_signals
 
 #: Axes of an envelope, which each of its points states.
 AXES = ("payload_kg", "slope_deg", "charge", "ambient_C")
@@ -108,7 +108,7 @@ def ratings(robot: Robot) -> Ratings:
     )
 
 
-class Point(eqx.Module):
+class EnvelopePoint(eqx.Module):
     """A point of the envelope; every field differentiable and batchable.
 
     Attributes:
@@ -133,7 +133,7 @@ class Point(eqx.Module):
     tread: Scalar
 
 
-class Found(eqx.Module):
+class QuantityValue(eqx.Module):
     """Value of a quantity at one point.
 
     Attributes:
@@ -144,7 +144,7 @@ class Found(eqx.Module):
     outcome: Int[Array, "..."]
 
 
-def packed(robot: Robot, cells: Scalar) -> Robot:
+def with_cells(robot: Robot, cells: Scalar) -> Robot:
     """The robot with this number of cells in series, which may be traced; voltages scale with the number."""
     battery = robot.battery
     more = cells / battery.cells
@@ -155,11 +155,11 @@ def packed(robot: Robot, cells: Scalar) -> Robot:
     return dataclasses.replace(robot, battery=battery)
 
 
-def _at(robot: Robot, point: Point, rated: Ratings) -> tuple[Robot, Conditions]:
+def _at(robot: Robot, point: EnvelopePoint, rated: Ratings) -> tuple[Robot, Conditions]:
     """The robot with its winding at ambient temperature, as at the start of a run, and the conditions of a point."""
     copper = 1 + robot.motor.temperature_coefficient * (point.ambient - TEMPERATURE_REFERENCE)
     motor = dataclasses.replace(robot.motor, resistance=robot.motor.resistance * copper)
-    robot = packed(dataclasses.replace(robot, motor=motor), rated.cells)
+    robot = with_cells(dataclasses.replace(robot, motor=motor), rated.cells)
     return robot, Conditions(
         configuration=jnp.asarray(point.configuration),
         voltage=jnp.where(point.battery > 0.5, 1.0, point.charge),
@@ -173,12 +173,12 @@ def _discharge(robot: Robot, charge: Scalar) -> Scalar:
     return robot.battery.capacity * (1 - jnp.maximum(charge, 1e-9))
 
 
-def _temperature(robot: Robot, point: Point, current: Scalar) -> Scalar:
+def _temperature(robot: Robot, point: EnvelopePoint, current: Scalar) -> Scalar:
     """Winding temperature after long running [°C]; `robot` as stated, not as returned by `_at`."""
     return dataclasses.replace(robot.motor, temperature_ambient=point.ambient).temperature_settled(current)
 
 
-def heat_left(robot: Robot, point: Point, current: Scalar, limit: Scalar) -> Scalar:
+def heat_left(robot: Robot, point: EnvelopePoint, current: Scalar, limit: Scalar) -> Scalar:
     """Relative thermal margin of a winding for continuous `current` [-]: 0 if it settles at `limit` [°C].
 
     1 - I² R_th R (1 + α (T - 25 °C)) / (T - T_a); `robot` as stated, not as returned by `_at`.
@@ -188,19 +188,19 @@ def heat_left(robot: Robot, point: Point, current: Scalar, limit: Scalar) -> Sca
     return 1 - current**2 * motor.resistance_thermal * hot / jnp.maximum(limit - point.ambient, 1.0)
 
 
-def _cell(rated: Ratings, signals: Signals, point: Point) -> Scalar:
+def _cell(rated: Ratings, signals: Signals, point: EnvelopePoint) -> Scalar:
     """Margin of a cell above its cut-off voltage [V]; inf on an external supply."""
     return jnp.where(point.battery > 0.5, signals.voltage_source / rated.cells - rated.voltage_cutoff, jnp.inf)
 
 
-def travel(robot: Robot, point: Point, rated: Ratings) -> tuple[dict[str, Array], Array]:
-    """Every quantity of group `travel` in steady travel by name [SI], and the outcome.
+def travel_quantities(robot: Robot, point: EnvelopePoint, rated: Ratings) -> tuple[dict[str, Array], Array]:
+    """Every quantity of group `travel_quantities` in steady travel by name [SI], and the outcome.
 
     Further entries are the `current` of one motor and of the `battery` [A] and three margins: `left` of traction and
     speed, `adhesion` alone [-], and `cell`, above the cut-off voltage [V].
     """
     here, conditions = _at(robot, point, rated)
-    signals, status, _ = operating(here, conditions)
+    signals, status, _ = operating_state(here, conditions)
     outcome = jnp.where((status == CONVERGED) & (_cell(rated, signals, point) < 0), CUT_OFF, status)
     moving = jnp.where(jnp.abs(signals.speed) > 1e-6, signals.speed, 1e-6)
     turns = jnp.abs(signals.speed_motor)
@@ -212,7 +212,7 @@ def travel(robot: Robot, point: Point, rated: Ratings) -> tuple[dict[str, Array]
         "gearbox_speed_rpm": turns,
         "motor_speed_rpm": turns,
         "current_A": signals.total_current,
-        "energy_per_metre_Wh": energy.source(here, conditions, signals) / moving,
+        "energy_per_metre_Wh": energy.source_power(here, conditions, signals) / moving,
         "current": signals.current,
         "battery": here.battery.current(signals.total_current),
         "adhesion": 1 - signals.demand / signals.adhesion_limit,
@@ -222,23 +222,23 @@ def travel(robot: Robot, point: Point, rated: Ratings) -> tuple[dict[str, Array]
     return {name: jnp.asarray(x) for name, x in found.items()}, outcome
 
 
-def _travel(robot: Robot, point: Point, rated: Ratings, name: str) -> Found:
-    values, outcome = travel(robot, point, rated)
-    return Found(values[name], outcome)
+def _travel(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> QuantityValue:
+    values, outcome = travel_quantities(robot, point, rated)
+    return QuantityValue(values[name], outcome)
 
 
-def _slope(robot: Robot, point: Point, rated: Ratings, name: str) -> Found:
+def _slope(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> QuantityValue:
     here, conditions = _at(robot, point, rated)
     answer = steepest_slope.compute(here, conditions)
     held = jnp.isfinite(answer["steepest_slope"])
-    return Found(jnp.where(held, answer["steepest_slope"], 0.0), answer["status"])
+    return QuantityValue(jnp.where(held, answer["steepest_slope"], 0.0), answer["status"])
 
 
 #: Halvings of a bracket; a Newton step removes the remaining error.
 HALVINGS = 26
 
 
-def _payload(robot: Robot, point: Point, rated: Ratings, name: str) -> Found:
+def _payload(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> QuantityValue:
     """The largest payload for continuous travel.
 
     The robot travels, its winding settles at a permissible temperature, its gearboxes stay within their torque limit
@@ -249,7 +249,7 @@ def _payload(robot: Robot, point: Point, rated: Ratings, name: str) -> Found:
     def left(robot: Robot, payload: Scalar) -> Scalar:
         at = dataclasses.replace(point, payload=payload)
         here, conditions = _at(robot, at, rated)
-        signals, _, _ = operating(here, conditions)
+        signals, _, _ = operating_state(here, conditions)
         hot = heat_left(robot, at, signals.current, rated.temperature)
         torque = 1 - jnp.abs(signals.torque_gear) / rated.torque
         each = [steepest_slope.travel_margin(here, signals), hot, torque, _cell(rated, signals, point)]
@@ -257,9 +257,9 @@ def _payload(robot: Robot, point: Point, rated: Ratings, name: str) -> Found:
 
     found, holds = _edge(left, robot, jnp.zeros(()), jnp.asarray(most))
     here, conditions = _at(robot, dataclasses.replace(point, payload=jnp.zeros(())), rated)
-    signals, status, _ = operating(here, conditions)
+    signals, status, _ = operating_state(here, conditions)
     outcome = jnp.where((status == CONVERGED) & (_cell(rated, signals, point) < 0), CUT_OFF, status)
-    return Found(jnp.where(holds, found, 0.0), outcome)
+    return QuantityValue(jnp.where(holds, found, 0.0), outcome)
 
 
 def _edge(left, robot: Robot, low: Array, high: Array) -> tuple[Array, Array]:  # type: ignore[no-untyped-def]
@@ -291,7 +291,7 @@ def _edge(left, robot: Robot, low: Array, high: Array) -> tuple[Array, Array]:  
 NODES = 8
 
 
-def _endurance(robot: Robot, point: Point, rated: Ratings, name: str) -> Found:
+def _endurance(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> QuantityValue:
     """Endurance on the battery [s]: t = ∫ dC / (s I_Σ(C) + I_p) over the usable charge, Gauss-Legendre.
 
     The robot drives at full voltage for a share s of the time and stands otherwise. It ends when a cell reaches its
@@ -303,7 +303,7 @@ def _endurance(robot: Robot, point: Point, rated: Ratings, name: str) -> Found:
         """Mean battery current [A], margin above the cut-off [V], status."""
         here, conditions = _at(robot, point, rated)
         conditions = dataclasses.replace(conditions, discharge=jnp.asarray(discharge))
-        signals, status, _ = operating(here, conditions)
+        signals, status, _ = operating_state(here, conditions)
         stands = point.share <= 0
         motors = jnp.where(stands, 0.0, signals.total_current)
         cell = here.battery.voltage(motors, discharge) / rated.cells - rated.voltage_cutoff
@@ -318,35 +318,35 @@ def _endurance(robot: Robot, point: Point, rated: Ratings, name: str) -> Found:
     time = (end - first) * jnp.sum(jnp.asarray(weights / 2) / flowing)
     worst = status[jnp.argmax(status != CONVERGED)]
     outcome = jnp.where(begins, worst, CUT_OFF)
-    return Found(time, outcome)
+    return QuantityValue(time, outcome)
 
 
-def _mass(robot: Robot, point: Point, rated: Ratings, name: str) -> Found:
+def _mass(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> QuantityValue:
     mass = jnp.asarray(robot.chassis(point.configuration).mass)
-    return Found(mass, jnp.full(mass.shape, CONVERGED))
+    return QuantityValue(mass, jnp.full(mass.shape, CONVERGED))
 
 
 #: Duty of the left side, while the right side's is 1.
 DUTY_LEFT = {"turn_in_place_rad_s": -1.0, "turning_radius_mm": 0.0}
 
 
-def _turn(robot: Robot, point: Point, rated: Ratings, name: str) -> Found:
+def _turn(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> QuantityValue:
     """A settled turn on level ground at full voltage: on the spot with opposite sides, or around a braked side."""
     here, conditions = _at(robot, point, rated)
     conditions = dataclasses.replace(
         conditions, slope_deg=jnp.zeros(()), adhesion_lateral=jnp.asarray(point.adhesion_lateral),
         duty_left=jnp.asarray(DUTY_LEFT[name]), duty_right=jnp.asarray(1.0),
     )  # fmt: skip
-    found, motion, status = circling(here, conditions)
+    found, motion, status = circling_signals(here, conditions)
     low = jnp.any(jnp.asarray(_cell(rated, found.signals, point)) < 0)
     turns = jnp.where(jnp.abs(motion.yaw_rate) > 1e-6, motion.yaw_rate, 1e-6)
     rolls = motion.speed**2 + motion.speed_lateral**2
     # A root of 0 has no derivative.
     value = motion.yaw_rate if name == "turn_in_place_rad_s" else jnp.sqrt(jnp.maximum(rolls, 1e-24)) / jnp.abs(turns)
-    return Found(jnp.asarray(value), jnp.where((status == CONVERGED) & low, CUT_OFF, status))
+    return QuantityValue(jnp.asarray(value), jnp.where((status == CONVERGED) & low, CUT_OFF, status))
 
 
-def _across(robot: Robot, point: Point, rated: Ratings, name: str) -> Found:
+def _across(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> QuantityValue:
     """Steepest side slope [deg] that a robot travels across without sliding or tipping.
 
     Rolling resistance takes a share f/φ_x of the friction ellipse: tan α = φ_y √(1 - (f/φ_x)²). It tips at
@@ -361,10 +361,10 @@ def _across(robot: Robot, point: Point, rated: Ratings, name: str) -> Found:
     # A root of 0 has no derivative.
     slides = friction * stands.lateral * jnp.sqrt(jnp.maximum(1 - taken**2, 1e-12))
     tips = stands.width / (2 * stands.height)
-    return Found(jnp.degrees(jnp.arctan(jnp.minimum(slides, tips))), jnp.asarray(CONVERGED))
+    return QuantityValue(jnp.degrees(jnp.arctan(jnp.minimum(slides, tips))), jnp.asarray(CONVERGED))
 
 
-def _posture(robot: Robot, point: Point, rated: Ratings, name: str) -> Found:
+def _posture(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> QuantityValue:
     """Geometric limits of a robot on level ground, see `static_limits`.
 
     The highest step in any posture of its levers, stairs and gaps with its levers flush, its size with them folded.
@@ -376,10 +376,10 @@ def _posture(robot: Robot, point: Point, rated: Ratings, name: str) -> Found:
         friction = robot.chassis(point.configuration).ground.friction.static * point.adhesion
         value = static_limits.stairs_rise(robot, conditions, point.tread, friction)
     else:
-        angle = static_limits.flush(robot) if name == "gap_mm" else jnp.pi
-        found = static_limits.limits(robot, static_limits.with_levers(conditions, angle, angle))
+        angle = static_limits.flush_lever_angle(robot) if name == "gap_mm" else jnp.pi
+        found = static_limits.posture_limits(robot, static_limits.with_levers(conditions, angle, angle))
         value = {"gap_mm": found.gap, "length_mm": found.length, "height_mm": found.height}[name]
-    return Found(jnp.asarray(value), jnp.asarray(CONVERGED))
+    return QuantityValue(jnp.asarray(value), jnp.asarray(CONVERGED))
 
 
 #: Function of each group of quantities: (robot, point, ratings, name) -> Found.
@@ -387,7 +387,7 @@ GROUPS = {"travel": _travel, "slope": _slope, "payload": _payload, "endurance": 
           "turn": _turn, "across": _across, "posture": _posture}  # fmt: skip
 
 
-def evaluate(robot: Robot, point: Point, rated: Ratings, name: str) -> Found:
+def evaluate_requirement(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> QuantityValue:
     """Value of one quantity at one point.
 
     Args:

@@ -21,13 +21,13 @@ INRUSH, EARLIEST, LATEST, REST = 250, 2e-5, 0.02, 800
 TOLERANCE = 1e-7
 
 
-def instants() -> np.ndarray:
+def start_times() -> np.ndarray:
     """Times of a start [s]: spaced by 3 % while the current rises to its peak, then by 5 ms."""
     early = np.geomspace(EARLIEST, LATEST, INRUSH, endpoint=False)
     return np.concatenate([[0.0], early, np.linspace(LATEST, TIME_SETTLED, REST)])
 
 
-def peak(times: Float[Array, " times"], x: Float[Array, " times"]) -> Float[Array, ""]:
+def curve_peak(times: Float[Array, " times"], x: Float[Array, " times"]) -> Float[Array, ""]:
     """Largest value of a sampled curve: the vertex of the parabola through its largest sample and both neighbours.
 
     Args:
@@ -44,7 +44,7 @@ def peak(times: Float[Array, " times"], x: Float[Array, " times"]) -> Float[Arra
     return jnp.where(inside, x[k] - slope**2 / (4 * jnp.where(inside, bend, -1.0)), known[jnp.argmax(known)])
 
 
-def crossing(
+def first_crossing(
     times: Float[Array, " times"], x: Float[Array, " times"], rate: Float[Array, " times"], level: Array
 ) -> tuple[Array, Array]:
     """First crossing of a level by a sampled curve: index of the sample before, and share of the way to the next.
@@ -77,17 +77,17 @@ def compute(robot: Robot, conditions: Conditions) -> dict[str, Array]:
         ∫ U_e I_s dt until then [J]; `status` of the run. Numbers are NaN unless it is `converged`: a run that slides,
         stalls or has not settled has no final speed. Derivatives are forward.
     """
-    times = jnp.asarray(instants())
+    times = jnp.asarray(start_times())
     run = drive(robot, conditions, times, TOLERANCE)
     signals = run.signals
     speed, rate, current = (jnp.asarray(x) for x in (signals.speed, signals.acceleration, signals.total_current))
     power = jnp.asarray(signals.voltage) * current
-    k, share = crossing(times, speed, rate, SHARE * speed[-1])
+    k, share = first_crossing(times, speed, rate, SHARE * speed[-1])
     width = jnp.diff(times)
     whole = jnp.concatenate([jnp.zeros(1), jnp.cumsum(width * (power[1:] + power[:-1]) / 2)])
     here = power[k] + share * (power[k + 1] - power[k])
     found = {
-        "peak_current": peak(times, jnp.asarray(robot.sides * signals.current)),
+        "peak_current": curve_peak(times, jnp.asarray(robot.sides * signals.current)),
         "time_to_speed": times[k] + share * width[k],
         "energy_start": whole[k] + share * width[k] * (power[k] + here) / 2,
     }

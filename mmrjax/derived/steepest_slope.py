@@ -10,7 +10,7 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from mmrjax.compile.compiling import compiled
-from mmrjax.fidelities.steady import operating, operating_point
+from mmrjax.fidelities.steady import operating_point, operating_state
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar
 from mmrjax.model.quantities import CONDITIONS
@@ -23,10 +23,10 @@ STEEPEST = CONDITIONS["slope_deg"].range[1]
 HALVINGS = 24
 
 
-def margin(robot: Robot, conditions: Conditions, slope_deg: Scalar) -> Float[Array, ""]:
+def slope_margin(robot: Robot, conditions: Conditions, slope_deg: Scalar) -> Float[Array, ""]:
     """Smaller of the margins of adhesion and speed on a slope [-], see `travel_margin`."""
     conditions = dataclasses.replace(conditions, slope_deg=jnp.asarray(slope_deg))
-    return travel_margin(robot, operating(robot, conditions)[0])
+    return travel_margin(robot, operating_state(robot, conditions)[0])
 
 
 def travel_margin(robot: Robot, signals: Signals) -> Float[Array, ""]:
@@ -43,7 +43,7 @@ def travel_margin(robot: Robot, signals: Signals) -> Float[Array, ""]:
 def compute(robot: Robot, conditions: Conditions) -> dict[str, Array]:
     """Steepest slope that one run's voltage and payload allow; the run's own slope has no influence.
 
-    The root of `margin` between level ground and `STEEPEST`, by bisection. Derivatives are implicit,
+    The root of `slope_margin` between level ground and `STEEPEST`, by bisection. Derivatives are implicit,
     dα = -(∂margin/∂α)⁻¹ ∂margin/∂θ dθ, forward and reverse.
 
     Returns:
@@ -54,7 +54,7 @@ def compute(robot: Robot, conditions: Conditions) -> dict[str, Array]:
     still_robot, still = jax.lax.stop_gradient((robot, conditions))
 
     found: optx.Solution = optx.root_find(
-        lambda slope, _: margin(still_robot, still, slope),
+        lambda slope, _: slope_margin(still_robot, still, slope),
         optx.Bisection(rtol=0.0, atol=0.0, flip=True),  # type: ignore[call-arg]  # its norm is no field
         jnp.full_like(conditions.slope_deg, STEEPEST / 2),
         options={"lower": 0.0, "upper": STEEPEST},
@@ -62,8 +62,10 @@ def compute(robot: Robot, conditions: Conditions) -> dict[str, Array]:
         throw=False,
     )
     at = jax.lax.stop_gradient(found.value)
-    slope = jax.lax.stop_gradient(jax.jvp(lambda a: margin(still_robot, still, a), (at,), (jnp.ones_like(at),))[1])
-    held = at - margin(robot, conditions, at) / slope
-    holds_all = margin(still_robot, still, jnp.full_like(at, STEEPEST)) > 0
+    slope = jax.lax.stop_gradient(
+        jax.jvp(lambda a: slope_margin(still_robot, still, a), (at,), (jnp.ones_like(at),))[1]
+    )
+    held = at - slope_margin(robot, conditions, at) / slope
+    holds_all = slope_margin(still_robot, still, jnp.full_like(at, STEEPEST)) > 0
     held = jnp.where(holds_all, STEEPEST, jnp.clip(held, 0.0, STEEPEST))
     return {"steepest_slope": jnp.where(flat.status == CONVERGED, held, jnp.nan), "status": flat.status}

@@ -58,7 +58,7 @@ def compute(robot: Robot, conditions: Conditions) -> dict[str, Array]:
     return {"turning_radius": jnp.where(jnp.isnan(point.speed), jnp.nan, found), "status": point.status}
 
 
-def by_itself(robot: Robot, imposed: float) -> Result:
+def turns_under_equal_commands(robot: Robot, imposed: float) -> Result:
     """Settled turns on level ground of a robot with unequal sides under equal commands, one for each configuration.
 
     Args:
@@ -70,7 +70,7 @@ def by_itself(robot: Robot, imposed: float) -> Result:
     return jax.device_get(steady_batch(robot, asked))
 
 
-def columns(robot: Robot, reading: Mapping[str, Any], radius: np.ndarray) -> dict[str, np.ndarray]:
+def turning_columns(robot: Robot, reading: Mapping[str, Any], radius: np.ndarray) -> dict[str, np.ndarray]:
     """The columns of settled turns, from the readings of their channels [SI]; arrays of one shape.
 
     Args:

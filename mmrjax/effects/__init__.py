@@ -14,7 +14,7 @@ from mmrjax.effects import (
     track_effects,
     turning_effects,
 )
-from mmrjax.effects.base import Effect, amplitude, defined_in
+from mmrjax.effects.base import Effect, amplitude, effects_of_module
 from mmrjax.effects.curve import CURVES, CURVES_ROUND, CURVES_SHOWN, WAVES
 from mmrjax.effects.sensor_effects import OF_CHANNELS
 
@@ -34,7 +34,7 @@ _FILES = (
 
 #: All effects of the library by balance, in the order of each file. Tables of scores and the random numbers of a
 #: bootstrap depend on the position: add a new effect at the end of its file.
-ALL: tuple[type[Effect], ...] = tuple(effect for file in _FILES for effect in defined_in(file))
+ALL: tuple[type[Effect], ...] = tuple(effect for file in _FILES for effect in effects_of_module(file))
 
 BY_NAME: dict[str, type[Effect]] = {effect.name: effect for effect in ALL}
 
@@ -42,12 +42,12 @@ BY_NAME: dict[str, type[Effect]] = {effect.name: effect for effect in ALL}
 UNNAMED: dict[str, type[Effect]] = {**CURVES, **WAVES, **CURVES_ROUND, **CURVES_SHOWN}
 
 #: Effects of a robot that turns; robot files accept them, and the loop tries them on tables of turns.
-OF_TURNS: dict[str, type[Effect]] = {effect.name: effect for effect in defined_in(turning_effects)}
+OF_TURNS: dict[str, type[Effect]] = {effect.name: effect for effect in effects_of_module(turning_effects)}
 
 #: Further effects that robot files accept. The loop tries those of a channel if the robot has the channel.
 BESIDE: dict[str, type[Effect]] = {**UNNAMED, **OF_TURNS, **OF_CHANNELS}
 
 __all__ = [
     "ALL", "BESIDE", "BY_NAME", "CURVES", "CURVES_ROUND", "CURVES_SHOWN", "OF_CHANNELS", "OF_TURNS", "UNNAMED",
-    "WAVES", "Effect", "amplitude", "defined_in",
+    "WAVES", "Effect", "amplitude", "effects_of_module",
 ]  # fmt: skip

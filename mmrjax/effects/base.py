@@ -177,13 +177,13 @@ class Effect(eqx.Module):
         return math.inf
 
 
-def made(kind: type[Effect], name: str) -> type[Effect]:
+def name_class(kind: type[Effect], name: str) -> type[Effect]:
     """Names a class made by a function; pickle finds it by that name in `Made` of its module."""
     kind.__name__, kind.__qualname__ = name, f"Made.{name}"
     return kind
 
 
-def defined_in(module: ModuleType) -> tuple[type[Effect], ...]:
+def effects_of_module(module: ModuleType) -> tuple[type[Effect], ...]:
     """The effects that a module defines, in its order; classes without a `term` are left out."""
     own = [v for v in vars(module).values() if inspect.isclass(v) and v.__module__ == module.__name__]
     return tuple(v for v in own if issubclass(v, Effect) and not inspect.isabstract(v))

@@ -27,18 +27,18 @@ def _witness(place: str, whose: str, seen: list[Signals]) -> Effect:
     return Witness()
 
 
-def readable(
+def readable_signals(
     robot: Robot, conditions: Conditions, state: State, balance: str, channel: str = "", *, settled: bool = False
 ) -> Signals:
     """The signals that an effect of this balance may read: those computed before it; the others are `UNSET`.
 
     Args:
         conditions, state: one run at one instant, scalars; not traced.
-        settled: in steady forward travel (`balances.settled`), else in motion (`balances.moving`).
+        settled: in steady forward travel (`balances.settled_signals`), else in motion (`balances.moving_signals`).
     """
     seen: list[Signals] = []
     watched = dataclasses.replace(robot, effects=(_witness(balance, channel, seen),))
-    order = balances.settled if settled else balances.moving
+    order = balances.settled_signals if settled else balances.moving_signals
     signals = order(watched, conditions, state)
     balances.sensor(watched, signals[0] if isinstance(signals, tuple) else signals)
     return seen[0]

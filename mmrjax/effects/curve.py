@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mmrjax.effects.base import THE_SIDE, Effect, amplitude, made
+from mmrjax.effects.base import THE_SIDE, Effect, amplitude, name_class
 from mmrjax.effects.periodic import Periodic, phase_parameter
 from mmrjax.model import channels
 from mmrjax.model.params import Index, Scalar, parameter
@@ -104,12 +104,12 @@ LEVEL = 0.05
 WAYS = ("direction", "direction_travel", "direction_turn")
 
 
-def acts_along(place: str) -> str:
+def direction_signal(place: str) -> str:
     """The signal of `WAYS` that gives the direction of a discrepancy in a place."""
     return PLACES[place][2]
 
 
-def counted_by(place: str, way: Callable[[str], Any], magnitudes: Container[str] = ()) -> Any:
+def sign_factor(place: str, way: Callable[[str], Any], magnitudes: Container[str] = ()) -> Any:
     """Sign factor of a discrepancy in a place: a run in mirror image shows it in mirror image.
 
     For instruments that show only magnitudes the factor is 1.
@@ -117,26 +117,26 @@ def counted_by(place: str, way: Callable[[str], Any], magnitudes: Container[str]
     Args:
         way: returns the signal of `WAYS` of a name; magnitudes: channels of such instruments.
     """
-    counts = way(acts_along(place))
+    counts = way(direction_signal(place))
     return abs(counts) if place in magnitudes else counts
 
 
-def in_travel(
+def in_travel_frame(
     place: str, variable: str, x: Any, way: Callable[[str], Any], magnitudes: Container[str] = ()
 ) -> tuple[Any, Any]:
-    """A variable of a curve in the frame of travel, and its sign factor, see `counted_by`.
+    """A variable of a curve in the frame of travel, and its sign factor, see `sign_factor`.
 
     A variable that is not in `VARIABLES`, such as the angle of a wave, is returned unchanged.
 
     Args:
-        x: the variable [its unit], an array of NumPy or JAX; way, magnitudes: as for `counted_by`.
+        x: the variable [its unit], an array of NumPy or JAX; way, magnitudes: as for `sign_factor`.
     """
     if variable not in EVERY_VARIABLE:
         return x, 1.0
-    counts, sign = counted_by(place, way, magnitudes), EVERY_VARIABLE[variable].sign
+    counts, sign = sign_factor(place, way, magnitudes), EVERY_VARIABLE[variable].sign
     if not sign:
         return x, counts
-    along = "direction_turn" if sign == TURN else "direction" if place in ROUND else acts_along(place)
+    along = "direction_turn" if sign == TURN else "direction" if place in ROUND else direction_signal(place)
     return x * way(along), counts
 
 
@@ -155,7 +155,7 @@ def _level(u: Scalar) -> Float[Array, "..."]:
     return jnp.maximum(u, 0.0) + below + below**2 / (2 * width)
 
 
-def weights(x: Scalar, low: Scalar, high: Scalar) -> Float[Array, "... 6"]:
+def ordinate_weights(x: Scalar, low: Scalar, high: Scalar) -> Float[Array, "... 6"]:
     """Weights of the ordinates at x: cubic convolution, Keys (1981) eq. (15); they sum to 1.
 
     Args:
@@ -241,9 +241,9 @@ def _curve(place: str, over: str) -> type[Effect]:
         def term(self, robot: Robot, signals: Signals) -> Scalar:
             x = self.recall(robot, signals) if over == "time" else getattr(signals, over)
             ways = lambda name: jnp.asarray(getattr(signals, name))  # noqa: E731
-            x, way = in_travel(place, over, x, ways, robot.rig.magnitudes)
+            x, way = in_travel_frame(place, over, x, ways, robot.rig.magnitudes)
             y = jnp.stack(jnp.broadcast_arrays(*(getattr(self, n) for n in ORDINATES)), -1)
-            return self.amplitude * jnp.sum(weights(x, self.low, self.high) * y, -1) * way
+            return self.amplitude * jnp.sum(ordinate_weights(x, self.low, self.high) * y, -1) * way
 
         def rate(self, robot: Robot, signals: Signals) -> Scalar:
             """Rate of time [s/s]; only a curve over time has a memory."""
@@ -254,7 +254,7 @@ def _curve(place: str, over: str) -> type[Effect]:
             return self.high + jnp.zeros_like(signals.speed_motor)
 
     Curve.__doc__ = _description(place, over)
-    return made(Curve, "".join(w.capitalize() for w in Curve.name.split("_")))
+    return name_class(Curve, "".join(w.capitalize() for w in Curve.name.split("_")))
 
 
 def _wave(place: str) -> type[Effect]:
@@ -293,7 +293,7 @@ def _wave(place: str) -> type[Effect]:
 
     Source: none, a discrepancy without a name that repeats with the angle of a shaft.
     """
-    return made(Wave, f"Wave{place.capitalize()}")
+    return name_class(Wave, f"Wave{place.capitalize()}")
 
 
 #: The wave of every balance that has curves; a time series shows it as an order.

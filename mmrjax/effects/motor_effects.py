@@ -181,7 +181,7 @@ class Cogging(Periodic, MotorEffect):
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         share = self.ripples * signals.speed_motor / self.rate_fade
-        fade = contact.step(share**2, 1.0, 1.0, 4.0, 0.0)
+        fade = contact.cubic_step(share**2, 1.0, 1.0, 4.0, 0.0)
         return self.amplitude * self.wave(signals) * fade
 
     def step_longest(self, robot: Robot, conditions: Conditions) -> float:

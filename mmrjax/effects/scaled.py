@@ -17,19 +17,19 @@ Factors = tuple[float, float, float]
 
 def amplitude_of(effect: Effect) -> Parameter:
     """The amplitude of an effect."""
-    return next(p for p in params.walk(effect) if p.spec.amplitude)
+    return next(p for p in params.walk_parameters(effect) if p.spec.amplitude)
 
 
 def shape_of(effect: Effect) -> Parameter | None:
     """The shape parameter that a fit frees: the first phase or scale after the amplitude; None without one."""
-    for p in params.walk(effect):
+    for p in params.walk_parameters(effect):
         if not p.spec.amplitude and (p.name == "phase" or (p.spec.relative_sd and float(p.value) > 0)):
             return p
     return None
 
 
 @functools.lru_cache(maxsize=4096)
-def scaled(kind: type[Effect], factors: Factors) -> type[Effect]:
+def scaled_effect(kind: type[Effect], factors: Factors) -> type[Effect]:
     """A class of the same effect with the amplitude's sd and limits and the shape multiplied by factors.
 
     Equal factors return the same class.
@@ -70,4 +70,4 @@ def _reduced(effect: Effect) -> tuple[Any, ...]:
 
 def _made(kind: type[Effect], factors: Factors, values: Mapping[str, Any]) -> Effect:
     """Restores an effect from its pickled values, because its class cannot be found by name."""
-    return scaled(kind, factors)(**values)
+    return scaled_effect(kind, factors)(**values)

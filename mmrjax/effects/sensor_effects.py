@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import jax.numpy as jnp
 
-from mmrjax.effects.base import Effect, amplitude, made
+from mmrjax.effects.base import Effect, amplitude, name_class
 from mmrjax.model import channels
 from mmrjax.model.channels import Channel
 from mmrjax.model.params import Scalar
@@ -27,7 +27,7 @@ class SensorEffect(Effect):
         """True if the error does not depend on the value shown."""
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
-        shown = robot.rig.instrument(self.channel).shows(channels.find(self.channel).read(robot, signals))
+        shown = robot.rig.instrument(self.channel).shows(channels.find_channel(self.channel).read(robot, signals))
         # A factor 1 of the signals' shape keeps a batch a batch.
         return self.amplitude * (jnp.ones_like(shown) if self.of_zero else shown)
 
@@ -140,7 +140,7 @@ def _error(read: Channel, of_zero: bool) -> type[Effect]:
 
     Source: {source[0]}.
     """
-    return made(Error, "".join(word.capitalize() for word in Error.name.split("_")))
+    return name_class(Error, "".join(word.capitalize() for word in Error.name.split("_")))
 
 
 def _errors() -> Iterator[type[Effect]]:
@@ -149,7 +149,7 @@ def _errors() -> Iterator[type[Effect]]:
     First those of scale, except of temperatures, whose zero is a convention; then those of zero. Random numbers
     depend on the position: add new ones at the end.
     """
-    own = [c for c in channels.EVERY if c not in channels.usual()]
+    own = [c for c in channels.EVERY if c not in channels.usual_channels()]
     yield from (_error(c, of_zero=c.unit_shown == "°C") for c in own)
     yield from (_error(c, of_zero=True) for c in own if c.misses_zero)
 

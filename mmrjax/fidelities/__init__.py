@@ -159,7 +159,7 @@ TABLE: dict[str, Facts] = {
 NAMES: tuple[str, ...] = tuple(TABLE)
 
 
-def facts(name: str) -> Facts:
+def fidelity_facts(name: str) -> Facts:
     """Facts about a fidelity that are known without importing it.
 
     Raises:
@@ -174,16 +174,16 @@ def facts(name: str) -> Facts:
 OF_TURNS = ".turning."
 
 
-def unread(name: str, parameters: Iterable[str], turns: bool = False) -> tuple[str, ...]:
+def unread_parameters(name: str, parameters: Iterable[str], turns: bool = False) -> tuple[str, ...]:
     """Parameters among `parameters` (dotted) that a fidelity does not read in straight travel, or in turns."""
-    of_others = {head for other in TABLE.values() for head in other.resolves} - set(facts(name).resolves)
+    of_others = {head for other in TABLE.values() for head in other.resolves} - set(fidelity_facts(name).resolves)
     return tuple(p for p in parameters if p.startswith(tuple(of_others)) or (OF_TURNS in p and not turns))
 
 
-def get(name: str) -> Fidelity:
+def get_fidelity(name: str) -> Fidelity:
     """Imports and returns a fidelity by its name.
 
     Raises:
         KeyError: no such fidelity; the message lists the valid names.
     """
-    return importlib.import_module(facts(name).module).FIDELITY
+    return importlib.import_module(fidelity_facts(name).module).FIDELITY

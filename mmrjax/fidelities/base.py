@@ -57,7 +57,7 @@ class History(eqx.Module):
         Signals with a further axis of left and right side are averaged over it.
         """
         if jnp.ndim(signals.current) > jnp.ndim(time):
-            reading, signals = _shown(robot, signals, apart=True), balances.together(signals)
+            reading, signals = _shown(robot, signals, apart=True), balances.mean_of_sides(signals)
         else:
             reading = _shown(robot, signals)
         if not robot.knows(channels.VOLTAGE):
@@ -65,13 +65,13 @@ class History(eqx.Module):
             volts = ("voltage", "voltage_source", "voltage_drop", "voltage_left", "inductance")
             unknown: dict[str, Any] = dict.fromkeys(volts, nan)
             signals = dataclasses.replace(signals, **unknown)
-        clock, (distance, signals, reading, reactions) = as_tables(
+        clock, (distance, signals, reading, reactions) = in_table_time(
             robot.rig, time, (distance, signals, reading, reactions)
         )
         return History(clock, distance, signals, reading, reactions)
 
 
-def as_tables(rig: Rig, time: Float[Array, "runs samples"], values: T) -> tuple[Float[Array, "runs samples"], T]:
+def in_table_time(rig: Rig, time: Float[Array, "runs samples"], values: T) -> tuple[Float[Array, "runs samples"], T]:
     """Runs over time in the clock of tables, which the rig's `delay` shifts.
 
     Args:
@@ -91,7 +91,7 @@ def as_tables(rig: Rig, time: Float[Array, "runs samples"], values: T) -> tuple[
 @compiled
 def _shown(robot: Robot, signals: Signals, apart: bool = False) -> dict[str, Scalar]:
     """Readings of the channels that change in a history; `apart`: from signals of left and right side."""
-    every = balances.shown(robot, signals) if apart else balances.sensor(robot, signals)
+    every = balances.readings_of_sides(robot, signals) if apart else balances.sensor(robot, signals)
     return {c.name: every[c.name] for c in channels.EVERY if c.over_time}
 
 
@@ -172,8 +172,8 @@ class Fidelity:
             differentiate it (forward).
         implicit: the same in two halves; None if it is not the root of equations.
         run: results of a batch, as in a sweep.
-        outputs: only the named outputs of a batch [SI], of `outputs.table`, and `status`; quicker than `run`. None if
-            it would not be. A fidelity with it has no options.
+        outputs: only the named outputs of a batch [SI], of `outputs.output_table`, and `status`; quicker than `run`.
+            None if it would not be. A fidelity with it has no options.
         columns: names of further columns of its runs (`Run.columns`).
         histories: a batch from standstill over time; None for a fidelity without time.
         check: raises ValueError before the first simulation if it cannot compute some run of a batch.
@@ -193,4 +193,4 @@ class Fidelity:
     @property
     def facts(self) -> Facts:
         """Facts about it that are known without importing it."""
-        return fidelities.facts(self.name)
+        return fidelities.fidelity_facts(self.name)

@@ -13,8 +13,8 @@ from jaxtyping import Array, Float
 
 from mmrjax.compile.compiling import compiled
 from mmrjax.fidelities.base import Fidelity, History, Progress, Run
-from mmrjax.fidelities.rest import HELD, holds, standing, status_moving, voltage_at_rest
-from mmrjax.fidelities.result import result, withhold
+from mmrjax.fidelities.rest import HELD, holds, standing_signals, status_moving, voltage_at_rest
+from mmrjax.fidelities.result import result_of_signals, withhold_numbers
 from mmrjax.fidelities.steady import operating_signals
 from mmrjax.model import balances
 from mmrjax.model.conditions import Conditions
@@ -30,7 +30,7 @@ from mmrjax.model.signals import (
     Signals,
     State,
 )
-from mmrjax.numerics.rosenbrock import norm, step_longest
+from mmrjax.numerics.rosenbrock import error_norm, step_longest
 from mmrjax.turning import circling
 
 # Units of the unknowns (current, motor speed, speed, distance, discharge), which scale them to the order of one.
@@ -63,29 +63,31 @@ class Trajectory(eqx.Module):
     result: Result
 
 
-def units(robot: Robot) -> tuple[float, ...]:
+def drive_units(robot: Robot) -> tuple[float, ...]:
     """Units of the unknowns."""
     return _UNITS + tuple(effect.memory_size or 1.0 for effect in robot.remembering) + (_GAP,) * robot.loose
 
 
-def state_of(robot: Robot, y: Float[Array, " unknowns"]) -> State:
+def state_of_unknowns(robot: Robot, y: Float[Array, " unknowns"]) -> State:
     """The state of a vector of unknowns."""
-    y = y * jnp.asarray(units(robot), y.dtype)
+    y = y * jnp.asarray(drive_units(robot), y.dtype)
     memory = {effect.name: y[len(_UNITS) + k] for k, effect in enumerate(robot.remembering)}
     return State(y[0], y[1], y[2], y[4], memory, distance=y[3], gap=y[-1] if robot.loose else None)
 
 
 #: The signals of an instant, traced once for each kind of robot and shared within a program.
-moving = compiled(balances.moving)
+moving = compiled(balances.moving_signals)
 
 
 @compiled
-def rates(
+def drive_rates(
     robot: Robot, conditions: Conditions, y: Float[Array, " unknowns"], way: Scalar | None = None
 ) -> Float[Array, " unknowns"]:
-    """Rates of the unknowns, in their units [1/s]; `way` as in `balances.moving`, or `HELD`."""
+    """Rates of the unknowns, in their units [1/s]; `way` as in `balances.moving_signals`, or `HELD`."""
     held = jnp.asarray(False if way is None else way == HELD)
-    signals = moving(robot, conditions, state_of(robot, y), None if way is None else jnp.where(held, 0.0, way))
+    signals = moving(
+        robot, conditions, state_of_unknowns(robot, y), None if way is None else jnp.where(held, 0.0, way)
+    )
     winding = signals.voltage_left / signals.inductance
     shaft, moves = (
         jnp.where(held, 0.0, x)
@@ -103,25 +105,25 @@ def rates(
         *(jnp.asarray(effect.rate(robot, signals), y.dtype) for effect in robot.remembering),
         *[signals.speed_wheel - signals.speed_output] * robot.loose,
     ]
-    return jnp.stack(rates) / jnp.asarray(units(robot), y.dtype)
+    return jnp.stack(rates) / jnp.asarray(drive_units(robot), y.dtype)
 
 
-def winding(robot: Robot, conditions: Conditions, y: Float[Array, " unknowns"]) -> Array:
+def winding_rate(robot: Robot, conditions: Conditions, y: Float[Array, " unknowns"]) -> Array:
     """Rate of the current only, in its unit, without an imposed speed [1/s]."""
-    state = state_of(robot, y)
-    signals = balances.driven(robot, conditions, state, None)
+    state = state_of_unknowns(robot, y)
+    signals = balances.driven_signals(robot, conditions, state, None)
     return jnp.asarray(signals.voltage_left / signals.inductance / _UNITS[CURRENT])
 
 
-_norm = functools.partial(norm, own=len(_UNITS))
+_norm = functools.partial(error_norm, own=len(_UNITS))
 
 
-def start(robot: Robot, conditions: Conditions, rolling: bool = False) -> Float[Array, " unknowns"]:
+def drive_start(robot: Robot, conditions: Conditions, rolling: bool = False) -> Float[Array, " unknowns"]:
     """Unknowns at rest, or for `rolling` those of the steady fidelity with settled memories of effects.
 
     At rest too if the steady fidelity has no root.
     """
-    size = jnp.asarray(units(robot), jnp.result_type(conditions.voltage))
+    size = jnp.asarray(drive_units(robot), jnp.result_type(conditions.voltage))
     rest = jnp.zeros_like(size).at[4].set(conditions.discharge / size[4])
     if conditions.motor_speed is not None:
         rest = rest.at[1].set(conditions.motor_speed / size[1])
@@ -195,19 +197,25 @@ def drive(
     """
     if conditions.turns:
         return _turning(robot, conditions, times, tolerance, max_steps, rolling)
-    y0 = start(robot, conditions, rolling)
+    y0 = drive_start(robot, conditions, rolling)
     imposed = conditions.motor_speed is not None
     parked = jnp.asarray(False) if rolling or imposed else holds(robot, conditions)
     moves = jnp.where(parked, jnp.zeros_like(y0).at[jnp.asarray([0, 4])].set(1.0), 1.0)
-    ys, went = _integrated(rates, _norm, robot, conditions, moves, y0, times, tolerance, max_steps)
-    signals = jax.vmap(lambda y: balances.moving(robot, conditions, state_of(robot, y)))(ys)
+    ys, went = _integrated(drive_rates, _norm, robot, conditions, moves, y0, times, tolerance, max_steps)
+    signals = jax.vmap(lambda y: balances.moving_signals(robot, conditions, state_of_unknowns(robot, y)))(ys)
     if not imposed:
-        static = jax.vmap(lambda y: standing(robot, conditions, state_of(robot, y)))(ys)
+        static = jax.vmap(lambda y: standing_signals(robot, conditions, state_of_unknowns(robot, y)))(ys)
         signals = jax.tree.map(lambda rest, travel: jnp.where(parked, rest, travel), static, signals)
     end = jax.tree.map(lambda x: x[-1], signals)
     status = _status(robot, conditions, end, parked, went)
     return _kept(
-        robot, conditions, times, ys[:, 3] * _UNITS[3], signals, signals.discharge, result(robot, end, status)
+        robot,
+        conditions,
+        times,
+        ys[:, 3] * _UNITS[3],
+        signals,
+        signals.discharge,
+        result_of_signals(robot, end, status),
     )
 
 
@@ -223,7 +231,7 @@ def _kept(
         lambda x: jnp.where(going.reshape(-1, *[1] * (x.ndim - 1)), x, jnp.nan), (signals, away)
     )
     valid = (end.status != BATTERY_EMPTY) & (end.status != FAILED)
-    answer = withhold(end, valid, end.status != FAILED)
+    answer = withhold_numbers(end, valid, end.status != FAILED)
     return Trajectory(times, away, signals, answer)
 
 
@@ -271,12 +279,14 @@ def _turning(
     robot: Robot, conditions: Conditions, times: Array, tolerance: float, max_steps: int, rolling: bool
 ) -> Trajectory:
     """`drive` for a robot with independently driven sides; its signals have a last axis of left and right side."""
-    y0 = circling.start(robot, conditions, rolling)
+    y0 = circling.turning_start(robot, conditions, rolling)
     parked = jnp.asarray(False) if rolling else circling.holds(robot, conditions)
-    moves = jnp.where(parked, circling.at_rest(y0), 1.0)
-    ys, went = _integrated(circling.rates, circling.norm, robot, conditions, moves, y0, times, tolerance, max_steps)
+    moves = jnp.where(parked, circling.changing_at_rest(y0), 1.0)
+    ys, went = _integrated(
+        circling.turning_rates, circling.norm, robot, conditions, moves, y0, times, tolerance, max_steps
+    )
     motion = jax.vmap(lambda y: circling.motion_of(robot, y))(ys)
-    travel = jax.vmap(lambda m: balances.turning(robot, conditions, m))(motion)
+    travel = jax.vmap(lambda m: balances.turning_signals(robot, conditions, m))(motion)
     end = jax.tree.map(lambda x: x[-1], (travel, motion))
     status = jnp.where(parked, STALLED, circling.status_moving(robot, conditions, *end))
     status = jnp.where(went, status, FAILED)

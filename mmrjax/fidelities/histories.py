@@ -26,15 +26,25 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from mmrjax.fidelities.drive import CURRENT, GROUND, MOTOR, moving, rates, start, state_of, units, winding
-from mmrjax.fidelities.rest import HELD, standing, turning_way
+from mmrjax.fidelities.drive import (
+    CURRENT,
+    GROUND,
+    MOTOR,
+    drive_rates,
+    drive_start,
+    drive_units,
+    moving,
+    state_of_unknowns,
+    winding_rate,
+)
+from mmrjax.fidelities.rest import HELD, shaft_direction, standing_signals
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar
-from mmrjax.model.rig import on_line
+from mmrjax.model.rig import interpolate
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Signals
-from mmrjax.numerics.linear_equations import inverted, solved
-from mmrjax.numerics.rarely import rarely
+from mmrjax.numerics.linear_equations import invert, solve
+from mmrjax.numerics.rarely import compute_rarely
 
 T = TypeVar("T")
 
@@ -59,7 +69,7 @@ TURNS = 2
 BLOCK = 32
 
 
-def grid(
+def time_grid(
     times: Float[np.ndarray, " times"],
     changes: Float[np.ndarray, " changes"] | None = None,
     sizes: Float[np.ndarray, " changes"] | None = None,
@@ -109,14 +119,14 @@ def _in_time(conditions: Conditions) -> tuple[Conditions, Conditions]:
     return eqx.partition(conditions, lambda x: jnp.ndim(x) > 0)
 
 
-def at_first(robot: Robot, conditions: Conditions) -> tuple[Conditions, Float[Array, " unknowns"]]:
+def first_instant(robot: Robot, conditions: Conditions) -> tuple[Conditions, Float[Array, " unknowns"]]:
     """Conditions and state of a run at its first instant."""
     changing, constant = _in_time(conditions)
     held = eqx.combine(jax.tree.map(lambda x: x[0], changing), constant)
-    return held, start(robot, held)
+    return held, drive_start(robot, held)
 
 
-class Followed(eqx.Module):
+class LinearisedRun(eqx.Module):
     """A solved run and its equations linearised along it: the response of the run to a change of its rates.
 
     The change at the end of a step has three parts: `carries` times the change before the step, `gains` times the
@@ -125,7 +135,7 @@ class Followed(eqx.Module):
     Attributes:
         begins, ends: unknowns at the beginning and end of every step, shape (steps, unknowns).
         places: unknowns at both stages, where the equations are linearised, shape (steps, 2, unknowns); sides: see
-            `States`.
+            `RunStates`.
         clock: start of a step, and the times of its stages [s], shape (steps, 3).
     """
 
@@ -158,7 +168,7 @@ class Lag(eqx.Module):
     decay: Float[Array, ""]
 
 
-class Step(eqx.Module):
+class RunStep(eqx.Module):
     """A step of a run; or all of them, with fields of shape (steps, ...).
 
     Attributes:
@@ -197,7 +207,7 @@ class Step(eqx.Module):
         return jax.vmap(rate)(at, each)
 
 
-def steps_of(conditions: Conditions, times: Float[Array, " times"]) -> tuple[Step, Conditions]:
+def run_steps(conditions: Conditions, times: Float[Array, " times"]) -> tuple[RunStep, Conditions]:
     """Every step of a run, and the conditions that do not change."""
     changing, constant = _in_time(conditions)
     now = jax.tree.map(lambda x: x[:-1], changing)
@@ -210,10 +220,10 @@ def steps_of(conditions: Conditions, times: Float[Array, " times"]) -> tuple[Ste
     rests = conditions.begin is None
     begun = jnp.where((jump == 0) & rests, 0.0, 1.0).astype(times.dtype)
     since = times[:-1] - times[jump]
-    return Step(jnp.diff(times), since, begun, before if conditions.motor_speed is None else None, now), constant
+    return RunStep(jnp.diff(times), since, begun, before if conditions.motor_speed is None else None, now), constant
 
 
-def _lag(rate: Float[Array, " rates"], step: Step, current: Scalar, limit: Scalar) -> Lag:
+def _lag(rate: Float[Array, " rates"], step: RunStep, current: Scalar, limit: Scalar) -> Lag:
     """Lag of a step after the last jump, from the rates at its start: the remainder of its decay.
 
     None if the driver's limit acts on the `current`, which then follows the limit at once.
@@ -237,18 +247,20 @@ def _decaying(begin: Array, decay: Array, h: Array) -> Lag:
     return Lag(begin, means, begin * jnp.exp(-decay * h), decay)
 
 
-def _windings(robot: Robot, constant: Conditions, step: Step, y: Float[Array, " unknowns"]) -> Float[Array, " rates"]:
+def _windings(
+    robot: Robot, constant: Conditions, step: RunStep, y: Float[Array, " unknowns"]
+) -> Float[Array, " rates"]:
     """Rates that determine the lag of a step, see `Step.rates_at_start`."""
-    return step.rates_at_start(constant, lambda y, held: winding(robot, held, y), y)
+    return step.rates_at_start(constant, lambda y, held: winding_rate(robot, held, y), y)
 
 
-def _lag_of(robot: Robot, constant: Conditions, step: Step, y: Float[Array, " unknowns"]) -> Lag:
+def _lag_of(robot: Robot, constant: Conditions, step: RunStep, y: Float[Array, " unknowns"]) -> Lag:
     return _lag(_windings(robot, constant, step, y), step, y[CURRENT], _limit(robot))
 
 
 def _limit(robot: Robot) -> Scalar:
     """The driver's current limit in the unit of the current."""
-    return robot.driver.current_limit / units(robot)[CURRENT]
+    return robot.driver.current_limit / drive_units(robot)[CURRENT]
 
 
 def _stage(law: Callable[[Array], Array], known: Array, guess: Array, h: Array, mean: Array, decay: Array) -> Array:
@@ -261,7 +273,7 @@ def _stage(law: Callable[[Array], Array], known: Array, guess: Array, h: Array, 
     def newton(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         count, y, _ = state
         matrix, value = jax.jacfwd(lambda y: (left(y),) * 2, has_aux=True)(y)
-        step = solved(matrix, value)
+        step = solve(matrix, value)
         # Over a kink of the friction law full steps can alternate without end.
         tried = y - jnp.array([0.1, 0.4, 1.0], y.dtype)[:, None] * step
         over = jnp.max(jnp.abs(jax.vmap(left)(tried)), 1)
@@ -275,7 +287,7 @@ def _stage(law: Callable[[Array], Array], known: Array, guess: Array, h: Array, 
     return jnp.where(error <= SOLVED, y, jnp.nan)
 
 
-class States(eqx.Module):
+class RunStates(eqx.Module):
     """A solved run, step by step.
 
     Attributes:
@@ -297,7 +309,7 @@ class _Part(eqx.Module):
         turn: 0 for the whole step; 1 to `TURNS` for iterations of the part before rest; then the remaining part.
         begin: unknowns at its start; lag: of the current there; length: [s].
         side: direction in which a shaft turns.
-        stages, end: see `States`.
+        stages, end: see `RunStates`.
     """
 
     turn: Array
@@ -309,22 +321,22 @@ class _Part(eqx.Module):
     end: Float[Array, " unknowns"]
 
 
-def states(robot: Robot, conditions: Conditions, times: Float[Array, " times"]) -> States:
+def solve_states(robot: Robot, conditions: Conditions, times: Float[Array, " times"]) -> RunStates:
     """Solves one run from standstill.
 
     Friction jumps when a shaft turns through rest. Each step therefore uses the friction of one direction. A step in
     which the shaft stops is split at that moment (Filippov systems; Leine and Nijmeijer, Dynamics
     and Bifurcations of Non-Smooth Mechanical Systems, 2004).
 
-    Args: as for `histories`.
+    Args: as for `history_signals`.
     """
-    steps, constant = steps_of(conditions, times)
-    of_first, first_state = at_first(robot, conditions)
+    steps, constant = run_steps(conditions, times)
+    of_first, first_state = first_instant(robot, conditions)
     along = _with_motor(robot, of_first)
 
-    def taken(y: Array, step: Step) -> tuple[Array, States]:
+    def taken(y: Array, step: RunStep) -> tuple[Array, RunStates]:
         held, lag = step.held(constant), _lag_of(robot, constant, step, y)
-        law = functools.partial(rates, robot, held)
+        law = functools.partial(drive_rates, robot, held)
 
         def turned(part: _Part) -> _Part:
             mine = _decaying(part.lag, lag.decay, part.length)
@@ -355,26 +367,26 @@ def states(robot: Robot, conditions: Conditions, times: Float[Array, " times"]) 
         side = _side(robot, held, y)
         whole = _Part(jnp.asarray(0), y, lag.begin, step.length, side, jnp.stack([y, y]), y)
         found = jax.lax.while_loop(lambda part: part.turn < TURNS + 2, turned, whole)
-        return found.end, States(found.stages, found.end, jnp.stack([side, found.side]), found.length)
+        return found.end, RunStates(found.stages, found.end, jnp.stack([side, found.side]), found.length)
 
     return jax.lax.scan(taken, first_state, steps)[1]
 
 
 def _side(robot: Robot, conditions: Conditions, y: Array) -> Array:
     """`turning_way` of a step; 0 if shafts and load stop separately."""
-    return turning_way(robot, conditions, state_of(robot, y)) if robot.moves_as_one else jnp.zeros(())
+    return shaft_direction(robot, conditions, state_of_unknowns(robot, y)) if robot.moves_as_one else jnp.zeros(())
 
 
-def followed(
-    robot: Robot, conditions: Conditions, times: Float[Array, " times"], known: States | None = None
-) -> Followed:
+def linearise_run(
+    robot: Robot, conditions: Conditions, times: Float[Array, " times"], known: RunStates | None = None
+) -> LinearisedRun:
     """A run and its equations linearised along it.
 
-    Args: as for `histories`; known: its states, if computed.
+    Args: as for `history_signals`; known: its states, if computed.
     """
-    run = states(robot, conditions, times) if known is None else known
-    steps, constant = steps_of(conditions, times)
-    first_state = at_first(robot, conditions)[1]
+    run = solve_states(robot, conditions, times) if known is None else known
+    steps, constant = run_steps(conditions, times)
+    first_state = first_instant(robot, conditions)[1]
     begins = jnp.concatenate([first_state[None], run.ends[:-1]])
     # A step to rest and the one from it use an approximant of the exponential. For a current that lags by a quarter
     # of such a part, implicit Euler would keep a fifth of the decayed excess.
@@ -394,11 +406,11 @@ def followed(
         by_rate, lag = jax.jacfwd(lambda r: (_lag(r, step, begin[CURRENT], _limit(robot)),) * 2, has_aux=True)(rate)
         ends = jnp.stack([begin - lag.begin * current, end - lag.end * current])
         places = jnp.where(passes, ends, stages) + lag.means[:, None] * current
-        slopes = jax.vmap(jax.jacfwd(lambda y, way: rates(robot, held, y, way)))(places, sides)
+        slopes = jax.vmap(jax.jacfwd(lambda y, way: drive_rates(robot, held, y, way)))(places, sides)
         z = spans[:, None, None] * slopes
         weight = jnp.where(passes, one - z / 2 + z @ z / 6, one)  # Padé (0, 3): 1 / (1 - z + z²/2 - z³/6)
-        first, second = jax.vmap(inverted)(one - z @ weight)
-        jump = rarely(passes, _jump, (robot, held, places[1], sides), jnp.zeros_like(end))
+        first, second = jax.vmap(invert)(one - z @ weight)
+        jump = compute_rarely(passes, _jump, (robot, held, places[1], sides), jnp.zeros_like(end))
         # The start of the second stage depends on the first stage and on the change before the step.
         by_first = jnp.where(passes, one + jump[:, None] * one[MOTOR], (1 - _GAMMA) / _GAMMA * one)
         by_before = jnp.where(passes, 0.0, 1 - (1 - _GAMMA) / _GAMMA) * one
@@ -414,7 +426,7 @@ def followed(
 
     each = begins, run.ends, run.stages, run.sides, spans, passes, steps
     places, carries, gains, lags = _of_steps(jax.lax.map(jax.vmap(linear), _in_blocks(each)), len(h))
-    return Followed(begins, run.ends, places, run.sides, clock, carries, gains, lags)
+    return LinearisedRun(begins, run.ends, places, run.sides, clock, carries, gains, lags)
 
 
 @eqx.filter_custom_jvp
@@ -422,7 +434,7 @@ def _ends(
     robot: Robot,
     conditions: Conditions,
     times: Float[Array, " times"],
-    known: States | Followed,
+    known: RunStates | LinearisedRun,
 ) -> Array:
     """Unknowns at the end of every step of a solved run, with their derivatives with respect to the robot."""
     return known.ends
@@ -432,22 +444,22 @@ def _ends(
 def _response(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     """Tangents with respect to the robot's parameters."""
     (robot, conditions, times, known), moved = primals, tangents[0]
-    along = known if isinstance(known, Followed) else followed(robot, conditions, times, known)
+    along = known if isinstance(known, LinearisedRun) else linearise_run(robot, conditions, times, known)
 
     def change(law: Callable[[Robot], Array]) -> Array:
         value, moves = eqx.filter_jvp(law, (robot,), (moved,))
         return jnp.zeros_like(value) if moves is None else moves
 
     def source(_: Array, y: Array, held: Conditions, way: Array) -> Array:
-        return change(lambda r: rates(r, held, y, way))
+        return change(lambda r: drive_rates(r, held, y, way))
 
-    begin = change(lambda r: at_first(r, conditions)[1])
-    return known.ends, respond(conditions, along, source, lambda t, y, dy, _: dy, begin)
+    begin = change(lambda r: first_instant(r, conditions)[1])
+    return known.ends, run_response(conditions, along, source, lambda t, y, dy, _: dy, begin)
 
 
-def respond(
+def run_response(
     conditions: Conditions,
-    along: Followed,
+    along: LinearisedRun,
     source: Callable[[Array, Array, Conditions, Array], Array],
     seen: Callable[[Array, Array, Array, Conditions], Array],
     begin: Array,
@@ -455,16 +467,17 @@ def respond(
     """Response of a run to small changes of its rates.
 
     Args:
-        conditions: as for `histories`; along: the run.
-        source: (time, state, conditions, way of `balances.moving`) → change of the rates, shape (unknowns, ...).
+        conditions: as for `history_signals`; along: the run.
+        source: (time, state, conditions, `way` of `balances.moving_signals`) → change of the rates, shape
+            (unknowns, ...).
         seen: (time, state, its change, conditions) → quantity to return at the end of every step.
         begin: change of the state at the first instant.
 
     Sources within a block of steps are computed together; the sequential part is one product per step.
     """
-    steps, constant = steps_of(conditions, jnp.append(along.clock[:, 0], along.clock[-1, 2]))
+    steps, constant = run_steps(conditions, jnp.append(along.clock[:, 0], along.clock[-1, 2]))
 
-    def added(along: Followed, step: Step) -> Array:
+    def added(along: LinearisedRun, step: RunStep) -> Array:
         """Contribution of the sources of a step, at its end."""
         held = step.held(constant)
         both = jax.vmap(lambda t, y, way: source(t, y, held, way))(along.clock[1:], along.places, along.sides)
@@ -504,7 +517,7 @@ def _of_steps(blocks: T, count: int) -> T:
 
 def _with_motor(robot: Robot, conditions: Conditions) -> Array:
     """Change of the unknowns with motor speed when shafts and robot move as one, in their units."""
-    size, per_speed = units(robot), robot.chassis(conditions.configuration).radius / robot.gearbox.ratio
+    size, per_speed = drive_units(robot), robot.chassis(conditions.configuration).radius / robot.gearbox.ratio
     return jnp.zeros(len(size)).at[MOTOR].set(1.0).at[GROUND].set(per_speed * size[MOTOR] / size[GROUND])
 
 
@@ -515,15 +528,15 @@ def _jump(
 
     The moment of rest moves by -1 / f⁻ (Filippov systems; Leine and Nijmeijer 2004, Section 7.3).
     """
-    before, after = jax.vmap(lambda way: rates(robot, conditions, y, way))(sides)
+    before, after = jax.vmap(lambda way: drive_rates(robot, conditions, y, way))(sides)
     return (after - before) / before[MOTOR]
 
 
-def histories(
+def history_signals(
     robot: Robot,
     conditions: Conditions,
     times: Float[Array, " times"],
-    known: Followed | None = None,
+    known: LinearisedRun | None = None,
     at: Int[Array, " places"] | None = None,
 ) -> Signals:
     """Signals of one run on a time grid, from standstill or as in `Rig.begins`.
@@ -535,8 +548,8 @@ def histories(
             the robot.
         conditions: one run; each field scalar, or of shape (times,): the value of an instant acts until the next one,
             and the signals of that instant use it.
-        times: from 0 on, as from `grid` [s]; repeated instants are steps of no length.
-        known: the run, from `followed`, if computed.
+        times: from 0 on, as from `time_grid` [s]; repeated instants are steps of no length.
+        known: the run, from `linearise_run`, if computed.
         at: indices of the instants to return; None: all.
 
     A run whose equations could not be solved is not finite from there on. Shafts and a load that move as one rest if
@@ -552,25 +565,27 @@ def histories(
 
 
 def _nodes(
-    robot: Robot, conditions: Conditions, times: Float[Array, " times"], known: Followed | None
+    robot: Robot, conditions: Conditions, times: Float[Array, " times"], known: LinearisedRun | None
 ) -> tuple[Float[Array, "times unknowns"], Float[Array, "steps 2"]]:
     """Unknowns at every instant, and `sides` of every step."""
     still = jax.lax.stop_gradient(robot)
-    run = states(still, conditions, times) if known is None else known
+    run = solve_states(still, conditions, times) if known is None else known
     ends = _ends(robot, conditions, times, run)
-    return jnp.concatenate([at_first(robot, conditions)[1][None], ends]), run.sides
+    return jnp.concatenate([first_instant(robot, conditions)[1][None], ends]), run.sides
 
 
 def _shown(robot: Robot, conditions: Conditions, y: Array, way: Array) -> Signals:
     """Signals of an instant, in static equilibrium if friction holds shafts and load."""
-    state = state_of(robot, y)
+    state = state_of_unknowns(robot, y)
     signals = moving(robot, conditions, state)
     if not robot.moves_as_one or conditions.motor_speed is not None:
         return signals
-    return jax.tree.map(lambda a, b: jnp.where(way == HELD, a, b), standing(robot, conditions, state), signals)
+    return jax.tree.map(
+        lambda a, b: jnp.where(way == HELD, a, b), standing_signals(robot, conditions, state), signals
+    )
 
 
-class Within(eqx.Module):
+class StepCourse(eqx.Module):
     """Course of steps of a run between their instants; signals have fields of shape (steps,).
 
     Attributes:
@@ -592,38 +607,40 @@ class Within(eqx.Module):
         """
         first, begin, end, decays = steps
         left = jnp.reshape(jnp.exp(-decays * share), (*share.shape, *[1] * (first.ndim - share.ndim)))
-        return on_line(begin, end, share) + left * (first - begin)
+        return interpolate(begin, end, share) + left * (first - begin)
 
 
-def within(
+def course_between_instants(
     robot: Robot,
     conditions: Conditions,
     times: Float[Array, " times"],
-    known: Followed | None = None,
+    known: LinearisedRun | None = None,
     at: Int[Array, " places"] | None = None,
-) -> Within:
-    """Course of one run between its instants; the run is that of `histories`.
+) -> StepCourse:
+    """Course of one run between its instants; the run is that of `history_signals`.
 
-    Args: as for `histories`; at: steps to return, by the index of the instant at the start of each.
+    Args: as for `history_signals`; at: steps to return, by the index of the instant at the start of each.
     """
     ys, sides = _nodes(robot, conditions, times, known)
-    steps, constant = steps_of(conditions, times)
+    steps, constant = run_steps(conditions, times)
     then = jax.tree.map(lambda x: x[1:], _in_time(conditions)[0])
     each = ys[:-1], ys[1:], steps, then, sides
     if at is not None:
         each = jax.tree.map(lambda x: x[at], each)
 
-    def one(y: Array, after: Array, step: Step, then: Conditions, sides: Array) -> Within:
+    def one(y: Array, after: Array, step: RunStep, then: Conditions, sides: Array) -> StepCourse:
         held = step.held(constant)
         if step.before is None:  # the imposed quantity is itself linear
             first = _shown(robot, held, y, sides[0])
-            return Within(first, first, _shown(robot, eqx.combine(then, constant), after, sides[1]), jnp.zeros(()))
+            return StepCourse(
+                first, first, _shown(robot, eqx.combine(then, constant), after, sides[1]), jnp.zeros(())
+            )
         lag, current = _lag_of(robot, constant, step, y), _current(y)
         at = jnp.stack([y, y - lag.begin * current, after - lag.end * current])
         found = jax.vmap(lambda *at: jax.tree.map(jnp.asarray, _shown(robot, held, *at)))(
             at, sides[np.array([0, 0, 1])]
         )
         first, begin, end = (jax.tree.map(lambda x, k=k: x[k], found) for k in range(3))
-        return Within(first, begin, end, lag.decay * step.length)
+        return StepCourse(first, begin, end, lag.decay * step.length)
 
     return jax.vmap(one)(*each)

@@ -77,7 +77,7 @@ def _reading(channel: str) -> Callable[[Result], Any]:
     return lambda result: result.reading[channel]
 
 
-def table(shown: Iterable[Channel]) -> tuple[Output, ...]:
+def output_table(shown: Iterable[Channel]) -> tuple[Output, ...]:
     """Every output in the order of columns, the channels `shown` first."""
     read = tuple(
         Output(c.name, c.column, c.unit_shown, c.factor, c.label, _reading(c.name), c.resolution, c.rests_on)
@@ -86,12 +86,12 @@ def table(shown: Iterable[Channel]) -> tuple[Output, ...]:
     return read + FURTHER
 
 
-def names(shown: Iterable[Channel]) -> tuple[str, ...]:
+def output_names(shown: Iterable[Channel]) -> tuple[str, ...]:
     """Names of all outputs, the channels `shown` first."""
-    return tuple(output.name for output in table(shown))
+    return tuple(output.name for output in output_table(shown))
 
 
-def columns(
+def output_columns(
     result: Result, shown: Iterable[Channel], further: Mapping[str, Any] | None = None
 ) -> dict[str, np.ndarray]:
     """Results in the units and words of `runs.csv`.
@@ -100,15 +100,15 @@ def columns(
         shown: channels, of the robot.
         further: columns that a fidelity adds, in their units (`fidelities.base.Run.columns`).
     """
-    found = {output.column: np.asarray(output.get(result)) / output.factor for output in table(shown)}
+    found = {output.column: np.asarray(output.get(result)) / output.factor for output in output_table(shown)}
     return {
         **found,
-        **codes(result.status, result.flags),
+        **status_words(result.status, result.flags),
         **{name: np.asarray(values) for name, values in (further or {}).items()},
     }
 
 
-def codes(status: Any, flags: Any) -> dict[str, np.ndarray]:
+def status_words(status: Any, flags: Any) -> dict[str, np.ndarray]:
     """Statuses and flags as words of `runs.csv`, in the shape of the codes; flags separated by semicolons."""
     from mmrjax.model.signals import FLAGS, STATUSES
 

@@ -8,14 +8,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from mmrjax.fidelities.result import slips, travels
+from mmrjax.fidelities.result import movers_slip, travel_status
 from mmrjax.model import balances
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import NOT_SETTLED, SLIDES, STALLED, Signals, State
 from mmrjax.numerics import one_sided
-from mmrjax.numerics.rarely import rarely
+from mmrjax.numerics.rarely import compute_rarely
 
 #: Torque at the driving wheel equivalent to the whole weight of a side [N·m].
 TORQUE = 1.0
@@ -29,7 +29,7 @@ GAIN, STARTS = 1e-3, 1e-2
 HELD = 2.0
 
 
-def least(*values: Scalar) -> Array:
+def smallest(*values: Scalar) -> Array:
     """The smallest of some numbers, with the derivative of that number.
 
     The derivative of `jnp.minimum` is 0 if XLA computes an argument twice with different rounding, because it
@@ -41,7 +41,7 @@ def least(*values: Scalar) -> Array:
     return found
 
 
-def direction(robot: Robot, conditions: Conditions) -> Array:
+def travel_direction(robot: Robot, conditions: Conditions) -> Array:
     """Direction in which a robot can travel, 1 forward or -1 backward, from the torque on its shafts at rest.
 
     The torque is that of the motors at stall current less gravity's. Friction can hold the robot but not reverse it.
@@ -69,17 +69,17 @@ def voltage_at_rest(robot: Robot, conditions: Conditions) -> Array:
 
 
 def _carried(robot: Robot, conditions: Conditions, state: State, direction: Scalar) -> Signals:
-    """Signals of shafts that turn in `direction`, or are about to, under a standing robot.
+    """Signals of shafts that turn in `travel_direction`, or are about to, under a standing robot.
 
     Movers carry the robot's demand, up to the limit of the ground.
     """
-    signals = balances.settled(robot, conditions, state, direction)[0]
+    signals = balances.settled_signals(robot, conditions, state, direction)[0]
     limit = signals.adhesion_limit
     carried = dataclasses.replace(signals, traction=jnp.clip(signals.demand, -limit, limit))
     return balances.gearbox(robot, robot.chassis(conditions.configuration), carried)
 
 
-def standing(robot: Robot, conditions: Conditions, state: State) -> Signals:
+def standing_signals(robot: Robot, conditions: Conditions, state: State) -> Signals:
     """All signals of a robot that friction holds at rest, in static equilibrium.
 
     The loads alone do not determine static friction. Traction is the pull of gravity along the slope; rolling
@@ -92,7 +92,7 @@ def standing(robot: Robot, conditions: Conditions, state: State) -> Signals:
     robot = robot.within(conditions.configuration)
     chassis, gear, still = robot.chassis(conditions.configuration), robot.gearbox, _still(state)
     # About to turn forward and backward: the two limits of friction.
-    ends = [balances.settled(robot, conditions, still, way)[0] for way in (1.0, -1.0)]
+    ends = [balances.settled_signals(robot, conditions, still, way)[0] for way in (1.0, -1.0)]
     ahead, back = ends
     # Least and greatest torque through the gearbox, and least and greatest friction of the track.
     given = [
@@ -146,7 +146,7 @@ def holds(robot: Robot, conditions: Conditions) -> Array:
 
 def _ground_margin(forward: Signals, backward: Signals) -> Scalar:
     """Adhesion less the pull of gravity beyond rolling resistance [-], negative if a robot slides down."""
-    along = -least(-backward.demand, forward.demand)
+    along = -smallest(-backward.demand, forward.demand)
     return (forward.adhesion_limit - along) / forward.normal
 
 
@@ -158,8 +158,8 @@ def firmness(robot: Robot, conditions: Conditions, state: State) -> Scalar:
     below the ground's adhesion.
     """
     forward, backward = _about_to_turn(robot, conditions, state)
-    shafts = least(-forward.torque_net, backward.torque_net) / TORQUE
-    return least(shafts, _ground_margin(forward, backward)) if robot.has_ground else shafts
+    shafts = smallest(-forward.torque_net, backward.torque_net) / TORQUE
+    return smallest(shafts, _ground_margin(forward, backward)) if robot.has_ground else shafts
 
 
 def _about_to_turn(robot: Robot, conditions: Conditions, state: State) -> tuple[Signals, Signals]:
@@ -168,7 +168,7 @@ def _about_to_turn(robot: Robot, conditions: Conditions, state: State) -> tuple[
     return _carried(robot, conditions, still, 1.0), _carried(robot, conditions, still, -1.0)
 
 
-def turning_way(robot: Robot, conditions: Conditions, state: State) -> Array:
+def shaft_direction(robot: Robot, conditions: Conditions, state: State) -> Array:
     """Direction in which shafts and a load that move as one turn, or leave rest, ±1 [-].
 
     `HELD` if they rest and friction holds them by the test of `firmness`, both now and at the later current at rest.
@@ -189,7 +189,7 @@ def turning_way(robot: Robot, conditions: Conditions, state: State) -> Array:
         held = jnp.where(later != 0, 0.0, jnp.where(stands, HELD, moved))
         return jnp.where(turned == 0, held, jnp.where(stands, turned, moved))
 
-    return rarely(slow, leaving, (robot, conditions, state), jnp.sign(motor_speed))
+    return compute_rarely(slow, leaving, (robot, conditions, state), jnp.sign(motor_speed))
 
 
 def slides_in_place(robot: Robot, conditions: Conditions) -> Array:
@@ -198,7 +198,7 @@ def slides_in_place(robot: Robot, conditions: Conditions) -> Array:
     It slides down if gravity less rolling resistance exceeds the adhesion. It slides in place if the motors turn the
     movers faster than V_s; up to V_s the traction of the ground increases with sliding speed.
     """
-    chassis, sense = robot.chassis(conditions.configuration), direction(robot, conditions)
+    chassis, sense = robot.chassis(conditions.configuration), travel_direction(robot, conditions)
     none = jnp.zeros_like(conditions.voltage)
     still = State(none, none, none, conditions.discharge)
     turning = sense * chassis.ground.friction.speed_static * robot.gearbox.ratio / chassis.radius
@@ -208,7 +208,7 @@ def slides_in_place(robot: Robot, conditions: Conditions) -> Array:
     else:
         spun = dataclasses.replace(spun, current=current_settled(robot, conditions, spun))
         spins = sense * _carried(robot, conditions, spun, sense).torque_net > 0
-    forward, backward = (balances.demanded(robot, conditions, still, way + none) for way in (1.0, -1.0))
+    forward, backward = (balances.demanded_signals(robot, conditions, still, way + none) for way in (1.0, -1.0))
     return (_ground_margin(forward, backward) < 0) | spins
 
 
@@ -217,7 +217,7 @@ def current_settled(robot: Robot, conditions: Conditions, state: State) -> Scala
 
     def left(current: Scalar) -> Scalar:
         here = dataclasses.replace(state, current=current)
-        return balances.driven(robot, conditions, here, jnp.zeros_like(state.speed)).voltage_left
+        return balances.driven_signals(robot, conditions, here, jnp.zeros_like(state.speed)).voltage_left
 
     guess = left(jnp.zeros_like(state.current)) / robot.motor.resistance
     first, second = left(0.5 * guess), left(guess)
@@ -230,7 +230,7 @@ def current_at_rest(robot: Robot, conditions: Conditions, state: State) -> Scala
     return current_settled(robot, conditions, _still(state))
 
 
-def creeps(sense: Array, voltage: Scalar, theoretical: Scalar, speed: Scalar, rest: Scalar) -> Array:
+def is_at_rest(sense: Array, voltage: Scalar, theoretical: Scalar, speed: Scalar, rest: Scalar) -> Array:
     """True if a robot counts as at rest: slower than the resolution of static friction.
 
     A robot driven by its motors travels if both shafts and robot move in the motors' direction; on a slope the creep
@@ -256,15 +256,15 @@ def status_moving(robot: Robot, conditions: Conditions, end: Signals, voltage: S
         then loses speed or stands; `stalled` if it creeps; else the status of steady travel.
     """
     settling = jnp.abs(end.acceleration) * TIME > SHARE * jnp.abs(end.speed)
-    status = jnp.where(settling, NOT_SETTLED, travels(end.speed, voltage))
-    sense, rest = direction(robot, conditions), robot.chassis(conditions.configuration).speed_still
-    still = creeps(sense, voltage_at_rest(robot, conditions), end.speed_theoretical, end.speed, rest)
+    status = jnp.where(settling, NOT_SETTLED, travel_status(end.speed, voltage))
+    sense, rest = travel_direction(robot, conditions), robot.chassis(conditions.configuration).speed_still
+    still = is_at_rest(sense, voltage_at_rest(robot, conditions), end.speed_theoretical, end.speed, rest)
     status = jnp.where(still & (sense * end.acceleration < STARTS), STALLED, status)
     gain = end.acceleration * jnp.sign(end.speed_sliding)
-    return unless_slipping(status, robot, end, gain, GAIN, still)
+    return status_with_slip(status, robot, end, gain, GAIN, still)
 
 
-def unless_slipping(
+def status_with_slip(
     status: Array, robot: Robot, signals: Signals, gain: Scalar, least: float, stands: Array | bool
 ) -> Array:
     """Status of a run with slip taken into account, else `status`.
@@ -275,4 +275,4 @@ def unless_slipping(
         gain: acceleration of the robot [m/s²]; least: smallest that counts; stands: True if it does not travel.
     """
     loose = jnp.where(gain > least, NOT_SETTLED, jnp.where(jnp.asarray(gain < -least) | stands, SLIDES, status))
-    return jnp.where(slips(robot, signals), loose, status)
+    return jnp.where(movers_slip(robot, signals), loose, status)

@@ -15,14 +15,14 @@ from mmrjax.model import balances, channels, ground
 from mmrjax.model.motor import UNLIMITED
 from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
-from mmrjax.model.signals import CONVERGED, FLAGS, REVERSES, ROLLS_BACK, Result, Signals, quotient
+from mmrjax.model.signals import CONVERGED, FLAGS, REVERSES, ROLLS_BACK, Result, Signals, safe_quotient
 from mmrjax.numerics.one_sided import magnitude
 
 #: Current into a supply that counts as 0 [A]: rounding and the remainder of a converged search.
 CURRENT_SMALL = 1e-3
 
 
-def result(robot: Robot, signals: Signals, status: Int[Array, "..."]) -> Result:
+def result_of_signals(robot: Robot, signals: Signals, status: Int[Array, "..."]) -> Result:
     """Readings, power chain of Fig. 4 and warnings of one instant; numbers with unknown parameters are NaN."""
     sides = robot.sides
     power_supply = balances.power_drawn(robot, signals)
@@ -32,11 +32,11 @@ def result(robot: Robot, signals: Signals, status: Int[Array, "..."]) -> Result:
     temperature = robot.motor.temperature_settled(signals.current * robot.driver.ripple(signals.duty) ** 0.5)
     limit = robot.motor.temperature_limit
     hot = (temperature > limit) & (limit < UNLIMITED) & robot.knows(channels.HEAT)  # settled or not
-    flags = mask({**exceeded(robot, signals), "winding_hot": hot})
+    flags = flag_mask({**exceeded_limits(robot, signals), "winding_hot": hot})
     found = Result(
         reading=balances.sensor(robot, signals),
         theoretical_speed=signals.speed_theoretical,
-        slip=ground.slip(signals.speed, signals.speed_theoretical),
+        slip=ground.slip_ratio(signals.speed, signals.speed_theoretical),
         voltage=signals.voltage,
         mass=signals.mass,
         traction=sides * signals.traction,
@@ -46,25 +46,25 @@ def result(robot: Robot, signals: Signals, status: Int[Array, "..."]) -> Result:
         power_gear=power_gear,
         power_ground=power_ground,
         power_lift=sides * signals.gravity * signals.speed,
-        efficiency_motor=efficiency(power_motor, power_supply),
-        efficiency_gear=efficiency(power_gear, power_motor),
-        efficiency_chassis=efficiency(power_ground, power_gear),
+        efficiency_motor=power_ratio(power_motor, power_supply),
+        efficiency_gear=power_ratio(power_gear, power_motor),
+        efficiency_chassis=power_ratio(power_ground, power_gear),
         winding_settled=temperature,
         voltage_cell=jnp.where(signals.battery > 0.5, signals.voltage_source / robot.battery.cells, 0.0),
         status=status,
         flags=flags,
     )
-    return known(robot, found)
+    return mask_unknown(robot, found)
 
 
-def known(robot: Robot, found: Result) -> Result:
+def mask_unknown(robot: Robot, found: Result) -> Result:
     """`found` with NaN in numbers that depend on unknown parameters of a robot."""
     unknown = [output.name for output in outputs.FURTHER if not robot.knows(output.rests_on)]
     nan: dict[str, Any] = {name: jnp.full_like(getattr(found, name), jnp.nan) for name in unknown}
     return dataclasses.replace(found, **nan)
 
 
-def exceeded(robot: Robot, signals: Signals) -> dict[str, Scalar]:
+def exceeded_limits(robot: Robot, signals: Signals) -> dict[str, Scalar]:
     """Limits exceeded at an instant, by the flag's name."""
     battery, on_battery = robot.battery, signals.battery > 0.5
     cell, current = signals.voltage_source / battery.cells, battery.current(signals.total_current)
@@ -75,7 +75,7 @@ def exceeded(robot: Robot, signals: Signals) -> dict[str, Scalar]:
     return {
         "motor_overspeed": jnp.abs(signals.speed_motor) > robot.motor.speed_limit,
         "gearbox_overspeed": jnp.abs(signals.speed_motor) > robot.gearbox.speed_limit,
-        "slips": slips(robot, signals),
+        "slips": movers_slip(robot, signals),
         "overvoltage": on_battery & (overcharged | (current < -back)),
         "cut_off": on_battery & (cell < battery.voltage_cutoff),
         "battery_overcurrent": on_battery & (current > most),
@@ -86,36 +86,36 @@ def exceeded(robot: Robot, signals: Signals) -> dict[str, Scalar]:
     }
 
 
-def mask(over: Mapping[str, Scalar]) -> Array:
+def flag_mask(over: Mapping[str, Scalar]) -> Array:
     """Bit mask over `FLAGS`."""
     return jnp.asarray(sum(jnp.where(o, 1 << FLAGS.index(name), 0) for name, o in over.items()))
 
 
-def travels(speed: Scalar, voltage: Scalar) -> Array:
+def travel_status(speed: Scalar, voltage: Scalar) -> Array:
     """Status of steady travel at `speed` under a motor `voltage`: driven by the motors or by gravity."""
     backward = jnp.asarray(speed) < 0
     asked = jnp.where(backward, jnp.asarray(voltage) < 0, jnp.asarray(voltage) >= 0)
     return jnp.where(asked, jnp.where(backward, REVERSES, CONVERGED), ROLLS_BACK)
 
 
-def turned(status: Array) -> Array:
+def is_not_forward(status: Array) -> Array:
     """True if a run travels steadily, but not forward under motor power."""
     return (status == REVERSES) | (status == ROLLS_BACK)
 
 
-def slips(robot: Robot, signals: Signals) -> Array:
+def movers_slip(robot: Robot, signals: Signals) -> Array:
     """True if the movers slide over the ground faster than V_s."""
     return jnp.abs(signals.speed_sliding) > robot.chassis(signals.configuration).speed_grip
 
 
-def efficiency(out: Scalar, into: Scalar) -> Array:
+def power_ratio(out: Scalar, into: Scalar) -> Array:
     """Power out over power in [-]; 0 at rest and if power flows the other way."""
     # Power returned on a descent has no efficiency of forward travel.
     forward = (out >= 0) & (into >= out)
-    return jnp.where(forward, quotient(out, into), 0.0)
+    return jnp.where(forward, safe_quotient(out, into), 0.0)
 
 
-def withhold(answer: Result, valid: Array, sound: Array) -> Result:
+def withhold_numbers(answer: Result, valid: Array, sound: Array) -> Result:
     """Sets every number of `answer` to NaN if `valid` is false; keeps mass and adhesion used if `sound`.
 
     The flags of a withheld member are cleared; its status says why it has no numbers.

@@ -12,14 +12,14 @@ from jaxtyping import Array
 
 from mmrjax.compile.precision import on_host
 from mmrjax.compile.programs import has_tracer
-from mmrjax.errors import UsageError, choices, counted
+from mmrjax.errors import UsageError, allowed_words, count_noun
 from mmrjax.fidelities import outputs
 from mmrjax.fidelities.base import History
 from mmrjax.fidelities.run_batches import Pending
 from mmrjax.missions import mission_batch
 from mmrjax.missions.mission import Mission
-from mmrjax.model.channels import Channel, usual
-from mmrjax.model.channels import names as channel_names
+from mmrjax.model.channels import Channel, usual_channels
+from mmrjax.model.channels import channel_names as channel_names
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar
 from mmrjax.model.signals import CODES, STATUSES, Result
@@ -64,7 +64,7 @@ def _codes(words: Any) -> Any:
     if asked.dtype.kind != "U":
         return words
     if unknown := sorted(set(asked.ravel().tolist()) - set(STATUSES)):
-        raise UsageError(f"status: got {unknown[0]}; {choices(unknown[0], STATUSES)}")
+        raise UsageError(f"status: got {unknown[0]}; {allowed_words(unknown[0], STATUSES)}")
     return np.array([STATUSES.index(word) for word in asked.ravel().tolist()], int).reshape(asked.shape)
 
 
@@ -149,7 +149,7 @@ class Results(_Numbers):
     model: str
     mission: Mission | None = None
     stated: tuple[str, ...] = ()
-    channels: tuple[Channel, ...] = dataclasses.field(default_factory=usual)
+    channels: tuple[Channel, ...] = dataclasses.field(default_factory=usual_channels)
 
     def __post_init__(self) -> None:
         result = self.result
@@ -241,9 +241,12 @@ class Results(_Numbers):
         columns |= {as_table[name]: nan for name in self.stated if name in as_table}
         torque = nan if "load_torque" in self.stated else conditions.load_torque
         braked = {} if torque is None else {"load_torque_Nm": np.asarray(torque)}
-        found = outputs.columns(self.result, self.channels, self.further)
+        found = outputs.output_columns(self.result, self.channels, self.further)
         if self.mission is not None:
-            found = {name: found[name] for name in (*mission_batch.names("turned" in self.mission.total.of), *CODES)}
+            found = {
+                name: found[name]
+                for name in (*mission_batch.mission_columns("turned" in self.mission.total.of), *CODES)
+            }
         return {
             "configuration": self.configuration,
             "supply_voltage_V": columns["supply_voltage_V"],
@@ -262,8 +265,8 @@ class Results(_Numbers):
             rows: largest number of lines.
         """
         content = {name: np.ravel(values) for name, values in self.to_dict().items()}
-        rows_of: tuple[outputs.Output | mission_batch.Output, ...] = (
-            *outputs.table(self.channels), *mission_batch.OUTPUTS, *mission_batch.OF_TURNS,
+        rows_of: tuple[outputs.Output | mission_batch.MissionOutput, ...] = (
+            *outputs.output_table(self.channels), *mission_batch.OUTPUTS, *mission_batch.OF_TURNS,
         )  # fmt: skip
         about = {**_CONDITIONS, **_WORDS, **{o.column: (o.label, o.unit, o.resolution) for o in rows_of}}
         if columns is None and self.mission is not None:
@@ -271,7 +274,7 @@ class Results(_Numbers):
         elif columns is None:
             shown = [
                 output.column
-                for output in outputs.table(self.channels)
+                for output in outputs.output_table(self.channels)
                 if output.column in _SHOWN or output.name in self.reading
             ]
             columns = [
@@ -303,7 +306,7 @@ class Results(_Numbers):
     def __repr__(self) -> str:
         if has_tracer(self):
             return f"Results of {self.model}, traced"
-        return f"Results of {self.model}, {counted(max(self.status.size, 1), 'run')}\n{self.table()}"
+        return f"Results of {self.model}, {count_noun(max(self.status.size, 1), 'run')}\n{self.table()}"
 
 
 def _compared(status: Any) -> Any:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mmrjax.compile.compiling import compiled
-from mmrjax.compile.precision import at_once
+from mmrjax.compile.precision import computed_outside_trace
 from mmrjax.compile.programs import has_tracer
 from mmrjax.errors import UsageError
 from mmrjax.fidelities.base import Fidelity, Run
@@ -39,19 +39,19 @@ class Pending:
     conditions: Conditions
     fidelity: Fidelity
 
-    @at_once
+    @computed_outside_trace
     def shown(self) -> dict[str, jax.Array]:
         """Readings of the robot's instruments by channel, and the status codes as `status`."""
-        outputs, names = self.fidelity.outputs, (*channels.names(self.robot.channels), STATUS)
+        outputs, names = self.fidelity.outputs, (*channels.channel_names(self.robot.channels), STATUS)
         assert outputs is not None
         return _in_chunks(self.fidelity, lambda runs: outputs(self.robot, runs, names), self.conditions)
 
-    @at_once
+    @computed_outside_trace
     def result(self) -> Result:
         """All numbers of the results."""
         return run_batch(self.fidelity, self.robot, self.conditions, {}, history=False).result
 
-    @at_once
+    @computed_outside_trace
     def total_mass(self) -> jax.Array:
         """Mass of robot and payload, stated or the robot's own [kg]."""
         return total_mass(self.robot, self.conditions)
@@ -67,7 +67,7 @@ def run_batch(
     simulate = fidelity.histories if history else fidelity.run
     assert simulate is not None
     if has_tracer((robot, conditions)):
-        return shaped(simulate(robot, flat(conditions), options), conditions.shape)
+        return reshape_runs(simulate(robot, flatten_conditions(conditions), options), conditions.shape)
     return _in_chunks(fidelity, lambda runs: simulate(robot, runs, options), conditions)
 
 
@@ -90,14 +90,14 @@ def _in_chunks(fidelity: Fidelity, function: Callable[[Conditions], T], conditio
         return jax.device_put(
             jax.tree.map(lambda x: np.asarray(x)[:runs].reshape((*conditions.shape, *x.shape[1:])), found)
         )
-    every = flat(conditions)
+    every = flatten_conditions(conditions)
     if runs <= size:
-        return shaped(function(every), conditions.shape)
+        return reshape_runs(function(every), conditions.shape)
     parts = [function(_rows(every, np.asarray(first), size)) for first in range(0, runs, size)]
-    return shaped(_joined(parts, runs), conditions.shape)
+    return reshape_runs(_joined(parts, runs), conditions.shape)
 
 
-def flat(conditions: Conditions) -> Conditions:
+def flatten_conditions(conditions: Conditions) -> Conditions:
     """Conditions of shape (runs,)."""
     return conditions if len(conditions.shape) == 1 else _raveled(conditions)
 
@@ -107,7 +107,7 @@ def _raveled(conditions: Conditions) -> Conditions:
     return jax.tree.map(jnp.ravel, conditions)
 
 
-def shaped(tree: T, shape: tuple[int, ...]) -> T:
+def reshape_runs(tree: T, shape: tuple[int, ...]) -> T:
     """A tree with a leading axis of runs in its leaves, reshaped to the batch's own shape."""
     return tree if len(shape) == 1 else _reshaped(tree, shape)
 

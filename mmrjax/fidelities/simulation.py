@@ -13,19 +13,19 @@ import jax
 import numpy as np
 
 from mmrjax import fidelities
-from mmrjax.compile.precision import ambient, in_double, in_trace
+from mmrjax.compile.precision import as_jax_arrays, in_double, in_trace
 from mmrjax.compile.programs import has_tracer
-from mmrjax.errors import UsageError, choices
+from mmrjax.errors import UsageError, allowed_words
 from mmrjax.fidelities.base import History
 from mmrjax.fidelities.results import Results
-from mmrjax.fidelities.run_batches import Pending, flat, run_batch, shaped, total_mass
+from mmrjax.fidelities.run_batches import Pending, flatten_conditions, reshape_runs, run_batch, total_mass
 from mmrjax.missions import mission_batch
 from mmrjax.missions.mission import Start
 from mmrjax.missions.profile import Profile
 from mmrjax.model import params, power
-from mmrjax.model.conditions import OF_TURNS, Conditions, Named, sides_contradict
+from mmrjax.model.conditions import OF_TURNS, Conditions, Named, sides_contradiction
 from mmrjax.model.quantities import CONDITIONS
-from mmrjax.model.robot import NO_BRAKE, Robot, cannot_turn
+from mmrjax.model.robot import NO_BRAKE, Robot, turn_error
 from mmrjax.model.signals import CODES
 
 #: Warning about runs without data of each side, for a robot with unequal sides.
@@ -82,15 +82,15 @@ def simulate(
         raise UsageError(f"conditions: got {type(conditions).__name__}; expected mmrjax.Conditions(...)")
     model = model or (fidelities.NAMES[0] if profile is None else mission_batch.MODEL)
     if model not in fidelities.TABLE:
-        raise UsageError(f"model: got {model}; {choices(str(model), fidelities.TABLE)}")
+        raise UsageError(f"model: got {model}; {allowed_words(str(model), fidelities.TABLE)}")
     if profile is not None or start is not None:
         _check_profile(model, profile, {"duration": duration, "step": step, **options})
     try:
-        stated = fidelities.facts(model).resolved(duration=duration, step=step, **options)
+        stated = fidelities.fidelity_facts(model).resolved(duration=duration, step=step, **options)
     except ValueError as error:
         raise UsageError(f"model {model}, {error}") from error
     _check_robot(robot)
-    conditions = checked(robot, conditions)
+    conditions = check_conditions(robot, conditions)
     _check_battery(robot, conditions)
     _check_turning(robot, conditions, profile)
     _check_brake(robot, conditions, profile)
@@ -98,26 +98,26 @@ def simulate(
     if not (turns or has_tracer(robot.effects)) and (unlike := robot.unlike):
         warnings.warn(f"{', '.join(unlike)}: {STRAIGHT}; {OF_TURNS[0]}=1, {OF_TURNS[1]}=1 let it turn", stacklevel=2)
     if in_trace(robot, conditions, profile, start):
-        robot = ambient(robot)
+        robot = as_jax_arrays(robot)
         conditions, profile, start = jax.device_put((conditions, profile, start))
     if profile is not None:
         return _forward_alone(_missions(robot, conditions, profile, start, history))
     robot = robot.showing_turns() if conditions.turns else robot
-    fidelity, traced = fidelities.get(model), has_tracer((robot, conditions))
+    fidelity, traced = fidelities.get_fidelity(model), has_tracer((robot, conditions))
     if not traced:
         try:
-            fidelity.check(robot, flat(conditions), stated)
+            fidelity.check(robot, flatten_conditions(conditions), stated)
         except ValueError as error:
             raise UsageError(f"model {model}, {error}") from error
     names = robot.configurations.names
     if fidelity.outputs is not None and not traced:
         return Results.pending(Pending(robot, conditions, fidelity), names, model)
-    run = run_batch(fidelity, robot, conditions, stated, history and fidelities.facts(model).histories)
+    run = run_batch(fidelity, robot, conditions, stated, history and fidelities.fidelity_facts(model).histories)
     results = Results(
         conditions, total_mass(robot, conditions), run.result, run.columns, run.history, names, model,
         channels=robot.channels,
     )  # fmt: skip
-    return results if fidelities.facts(model).reverse else _forward_alone(results)
+    return results if fidelities.fidelity_facts(model).reverse else _forward_alone(results)
 
 
 def _forward_alone(results: Results) -> Results:
@@ -135,7 +135,7 @@ def _check_battery(robot: Robot, conditions: Conditions) -> None:
         return
     if any(np.ndim(x) for x in jax.tree.leaves(robot.battery)):  # a batch of robots
         return
-    if refused := power.cutoff_refused(robot.battery):
+    if refused := power.cutoff_error(robot.battery):
         raise UsageError(f"battery.voltage_cutoff: {refused}")
     if remark := power.cutoff_remark(robot.battery):
         warnings.warn(f"battery.voltage_cutoff: {remark}", stacklevel=3)
@@ -149,7 +149,7 @@ def _check_turning(robot: Robot, conditions: Conditions, profile: Profile | None
         return
     if any(np.ndim(x) for x in jax.tree.leaves((robot.sides, robot.configurations))):  # a batch of robots
         return
-    if why := cannot_turn(robot, [robot.configurations.names[k] for k in np.unique(conditions.configuration)]):
+    if why := turn_error(robot, [robot.configurations.names[k] for k in np.unique(conditions.configuration)]):
         raise UsageError(f"{freed[0]}: {why}")
 
 
@@ -174,9 +174,9 @@ def _check_profile(model: str, profile: Any, options: Mapping[str, float | None]
 
 def _missions(robot: Robot, conditions: Conditions, profile: Profile, start: Start | None, history: bool) -> Results:
     """Runs every member of a batch over the same profile."""
-    runs = flat(conditions)
+    runs = flatten_conditions(conditions)
     if not has_tracer((robot, runs, profile, start)):
-        cell = mission_batch.begins_below(robot, runs, profile, start)
+        cell = mission_batch.cell_below_cutoff(robot, runs, profile, start)
         if np.isfinite(cell).any():
             k = int(np.argmax(np.isfinite(cell)))
             at = f"[{k}]" if len(cell) > 1 else ""
@@ -184,12 +184,12 @@ def _missions(robot: Robot, conditions: Conditions, profile: Profile, start: Sta
                 f"discharge{at}: got {float(np.asarray(runs.discharge)[k]):g} C; a cell is then at {cell[k]:.4g} V, "
                 f"below its cut-off of {robot.battery.voltage_cutoff:g} V, before the mission begins"
             )
-    found = mission_batch.batch(robot, runs, profile, start, history=history)
-    further = mission_batch.columns(mission_batch.numbers(robot, runs, found))
+    found = mission_batch.missions_of_runs(robot, runs, profile, start, history=history)
+    further = mission_batch.numbers_by_column(mission_batch.mission_numbers(robot, runs, found))
     course = None
     if found.course is not None:
         course = History.of(robot, found.course.time, found.course.distance, found.course.signals)
-    found, further, course = shaped((found, further, course), conditions.shape)
+    found, further, course = reshape_runs((found, further, course), conditions.shape)
     names, mass = robot.configurations.names, total_mass(robot, conditions)
     return Results(
         conditions,
@@ -207,7 +207,7 @@ def _missions(robot: Robot, conditions: Conditions, profile: Profile, start: Sta
 
 def _check_robot(robot: Robot) -> None:
     """Raises for parameters outside the bounds of their fields."""
-    concrete = [p for p in params.walk(robot) if not isinstance(p.value, jax.core.Tracer)]
+    concrete = [p for p in params.walk_parameters(robot) if not isinstance(p.value, jax.core.Tracer)]
     for parameter, value in zip(concrete, jax.device_get([p.value for p in concrete]), strict=True):
         spec = parameter.spec
         wrong = _first_outside(value, *spec.bounds)
@@ -226,7 +226,7 @@ def _resolved(robot: Robot, conditions: Conditions) -> Conditions:
         try:
             return dataclasses.replace(conditions, configuration=which.among(names))
         except KeyError as error:
-            raise UsageError(f"configuration: got {error.args[0]}; {choices(error.args[0], names)}") from error
+            raise UsageError(f"configuration: got {error.args[0]}; {allowed_words(error.args[0], names)}") from error
     if not has_tracer(which) and which.size and not _within(_ends(which), 0, len(names) - 1):
         wrong = _first_outside(which, 0, len(names) - 1)
         assert wrong is not None
@@ -235,7 +235,7 @@ def _resolved(robot: Robot, conditions: Conditions) -> Conditions:
     return conditions
 
 
-def checked(robot: Robot, conditions: Conditions) -> Conditions:
+def check_conditions(robot: Robot, conditions: Conditions) -> Conditions:
     """Conditions with configuration names replaced by indices; values are checked unless they are tracers.
 
     Raises:
@@ -251,7 +251,7 @@ def _check_conditions(conditions: Conditions) -> None:
     # An unstated duty is 1, and under a transformation a tracer; neither counts as stated.
     if has_tracer(conditions.duty) or (np.asarray(conditions.duty) == 1).all():
         stated_names.remove("duty")
-    if why := sides_contradict(stated_names):
+    if why := sides_contradiction(stated_names):
         raise UsageError(why)
     ends: dict[int, tuple[float, float]] = {}  # by array: several fields may share one
     for field in dataclasses.fields(conditions):

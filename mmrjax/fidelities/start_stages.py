@@ -21,7 +21,7 @@ WITHIN, LAST = 0.01, 0.15
 
 
 @dataclasses.dataclass(frozen=True)
-class Stages:
+class StartStages:
     """The stages of one start; times since its first sample.
 
     Attributes:
@@ -87,14 +87,14 @@ def mean_slip(
     return float(1 - travelled / rolled) if abs(rolled) > 1e-9 else np.nan
 
 
-def stages(
+def stages_of_start(
     time: Float[np.ndarray, " times"],
     speed: Float[np.ndarray, " times"],
     theoretical: Float[np.ndarray, " times"],
     sliding: Float[np.ndarray, " times"],
     speed_static: float,
     way: float = 0.0,
-) -> Stages:
+) -> StartStages:
     """The stages of one start, from samples without gaps.
 
     Args:
@@ -108,41 +108,43 @@ def stages(
     sliding, even = (_smoothed(time, x, way / max(abs(float(theoretical[-1])), 1e-3)) for x in (sliding, speed))
     beyond = np.flatnonzero((sense * sliding > speed_static) & (time >= starting))
     slipping = float(time[min(int(beyond[-1]) + 1, len(time) - 1)]) if beyond.size else starting
-    last = speed[ending(time)].mean()
+    last = speed[last_samples(time)].mean()
     late = np.flatnonzero(np.abs(even - last) > WITHIN * abs(last))
     settled = float(time[min(int(late[-1]) + 1, len(time) - 1)]) if late.size else 0.0
     bounds = (0.0, starting, max(slipping, starting), float(time[-1]))
     each = [mean_slip(time, speed, theoretical, a, b) for a, b in itertools.pairwise(bounds)]
     over = mean_slip(time, speed, theoretical, 0.0, settled)
-    return Stages(sense, bounds[1], bounds[2], settled, bounds[3], (each[0], each[1], each[2]), over)
+    return StartStages(sense, bounds[1], bounds[2], settled, bounds[3], (each[0], each[1], each[2]), over)
 
 
-def of_histories(robot: Robot, history: History, which: Sequence[int] | np.ndarray) -> list[Stages | None]:
+def stages_of_histories(
+    robot: Robot, history: History, which: Sequence[int] | np.ndarray
+) -> list[StartStages | None]:
     """Stages of each run of a batch from standstill, up to its last number; None for a run without numbers.
 
     Args:
         which: index of each run's configuration in `robot`; its loads are vehicles.
     """
-    found: list[Stages | None] = []
+    found: list[StartStages | None] = []
     for k, index in enumerate(which):
         signals = history.signals
-        upto = numbers(np.asarray(signals.total_current)[k])
+        upto = count_finite_samples(np.asarray(signals.total_current)[k])
         of_run = (history.time, signals.speed, signals.speed_theoretical, signals.speed_sliding)
         time, *motion = (np.asarray(x)[k][:upto] for x in of_run)
         chassis = robot.configurations.members[int(index)]
         static, way = float(chassis.ground.friction.speed_static), 0.0
         if history.reactions is not None:  # from individual contacts
             way = PITCH_GROUSER if float(chassis.on_tracks) > 0.5 else PITCH_TOOTH
-        found.append(stages(time, motion[0], motion[1], motion[2], static, way) if upto else None)
+        found.append(stages_of_start(time, motion[0], motion[1], motion[2], static, way) if upto else None)
     return found
 
 
-def numbers(values: Float[np.ndarray, " times"]) -> int:
+def count_finite_samples(values: Float[np.ndarray, " times"]) -> int:
     """Number of samples of a run up to its last finite one."""
     finite = np.flatnonzero(np.isfinite(values))
     return int(finite[-1]) + 1 if finite.size else 0
 
 
-def ending(time: Float[np.ndarray, " times"]) -> np.ndarray:
+def last_samples(time: Float[np.ndarray, " times"]) -> np.ndarray:
     """Mask of the last 0.15 s, several pitches of the running gear; for a short run, of its last tenth."""
     return np.asarray(time >= time[-1] - min(LAST, 0.1 * float(time[-1])))

@@ -16,8 +16,8 @@ from jaxtyping import Array, Bool, Float
 from mmrjax.compile.compiling import SELDOM, compiled
 from mmrjax.fidelities import outputs
 from mmrjax.fidelities.base import Fidelity, Implicit, Progress, Run
-from mmrjax.fidelities.rest import creeps, direction, slides_in_place, standing, voltage_at_rest
-from mmrjax.fidelities.result import result, travels, turned, withhold
+from mmrjax.fidelities.rest import is_at_rest, slides_in_place, standing_signals, travel_direction, voltage_at_rest
+from mmrjax.fidelities.result import is_not_forward, result_of_signals, travel_status, withhold_numbers
 from mmrjax.model import balances, channels, ground, params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar
@@ -35,7 +35,7 @@ from mmrjax.model.signals import (
 )
 from mmrjax.numerics.linear_equations import Vector
 from mmrjax.numerics.newton import root
-from mmrjax.numerics.rarely import rarely
+from mmrjax.numerics.rarely import compute_rarely
 from mmrjax.turning import circling
 
 # Units of the unknowns and of the torque residual, which scale them to the order of one.
@@ -51,7 +51,7 @@ def _state(unknowns: Vector, discharge: Float[Array, ""]) -> State:
     return State(_CURRENT * current, _SPEED_MOTOR * speed_motor, _SPEED * speed, discharge)
 
 
-_balanced = compiled(balances.settled)
+_balanced = compiled(balances.settled_signals)
 
 
 @compiled
@@ -111,13 +111,13 @@ def _root(robot: Robot, conditions: Conditions, large: bool = True) -> tuple[Vec
     tolerance = float(jnp.finfo(jnp.result_type(conditions.voltage)).eps) ** 0.85
     sound = _sound(robot, conditions)[1]
     start = jax.lax.stop_gradient(_start(robot, sound))
-    own = conditions, direction(robot, sound)
+    own = conditions, travel_direction(robot, sound)
     return root(_residual, start, robot, own, tolerance, large and not robot.effects, large)
 
 
 @compiled
 def _circled(robot: Robot, conditions: Conditions) -> Signals:
-    return circling.circling(robot, conditions)[0].signals
+    return circling.circling_signals(robot, conditions)[0].signals
 
 
 def operating_signals(robot: Robot, conditions: Conditions) -> Signals:
@@ -129,7 +129,7 @@ def operating_signals(robot: Robot, conditions: Conditions) -> Signals:
         return _circled(robot, conditions)
     unknowns, _ = _root(robot, conditions)
     _, sound = _sound(robot, conditions)
-    return _balanced(robot, sound, _state(unknowns, sound.discharge), direction(robot, sound))[0]
+    return _balanced(robot, sound, _state(unknowns, sound.discharge), travel_direction(robot, sound))[0]
 
 
 def steady(robot: Robot, conditions: Conditions) -> Result:
@@ -164,13 +164,15 @@ def steady(robot: Robot, conditions: Conditions) -> Result:
     point = dataclasses.replace(
         point,
         reading=reading,
-        slip=jnp.where(parked, ground.slip(speed, point.theoretical_speed), point.slip),
+        slip=jnp.where(parked, ground.slip_ratio(speed, point.theoretical_speed), point.slip),
         adhesion_used=jnp.where(beyond, 1.0, point.adhesion_used),
         traction=point.traction / jnp.where(beyond, point.adhesion_used, 1.0),
         power_ground=jnp.where(parked, 0.0, point.power_ground),
         power_lift=jnp.where(parked, 0.0, point.power_lift),
     )
-    return withhold(point, (point.status == CONVERGED) | (point.status == STALLED) | turned(point.status), sound)
+    return withhold_numbers(
+        point, (point.status == CONVERGED) | (point.status == STALLED) | is_not_forward(point.status), sound
+    )
 
 
 @compiled
@@ -185,8 +187,8 @@ def operating_point(robot: Robot, conditions: Conditions) -> tuple[Result, Array
     """
     if conditions.turns:
         return circling.operating_point(robot, conditions)
-    signals, status, sound = operating(robot, conditions)
-    return result(robot.within(conditions.configuration), signals, status), sound
+    signals, status, sound = operating_state(robot, conditions)
+    return result_of_signals(robot.within(conditions.configuration), signals, status), sound
 
 
 def _slides_in_place(robot: Robot, conditions: Conditions) -> Array:
@@ -194,7 +196,7 @@ def _slides_in_place(robot: Robot, conditions: Conditions) -> Array:
     return slides_in_place(robot, _sound(robot, conditions)[1])
 
 
-def operating(robot: Robot, conditions: Conditions) -> tuple[Signals, Array, Array]:
+def operating_state(robot: Robot, conditions: Conditions) -> tuple[Signals, Array, Array]:
     """Every signal of `operating_point`, its status, and whether robot and conditions are sound."""
     unknowns, solved = _root(robot, conditions)
     return _operating_at(robot, conditions, unknowns, solved)[:3]
@@ -203,7 +205,7 @@ def operating(robot: Robot, conditions: Conditions) -> tuple[Signals, Array, Arr
 def _operating_at(
     robot: Robot, conditions: Conditions, unknowns: Vector, solved: Array, stands: bool = True
 ) -> tuple[Signals, Array, Array, Vector]:
-    """`operating` at given unknowns, and the residuals of the balances there.
+    """`operating_state` at given unknowns, and the residuals of the balances there.
 
     Args:
         stands: True to test whether a run beyond the limit of adhesion slides or stands; False: it `slides`.
@@ -211,22 +213,22 @@ def _operating_at(
     given = jax.lax.stop_gradient((robot, conditions))  # nothing is stored for a loop that rarely runs
     robot = robot.within(conditions.configuration)
     sound, conditions = _sound(robot, conditions)
-    sense = direction(robot, conditions)
+    sense = travel_direction(robot, conditions)
     signals, creep = _balanced(robot, conditions, _state(unknowns, conditions.discharge), sense)
     left = _left(unknowns, conditions, sense, signals, creep)
     rest = robot.chassis(conditions.configuration).speed_still
     voltage = voltage_at_rest(robot, conditions)
-    still = creeps(sense, voltage, signals.speed_theoretical, signals.speed, rest)
+    still = is_at_rest(sense, voltage, signals.speed_theoretical, signals.speed, rest)
     still |= sense * signals.speed_theoretical <= 1e-9
     # In the order in which they matter to a reader.
-    status = jnp.where(still, STALLED, travels(signals.speed, voltage))
+    status = jnp.where(still, STALLED, travel_status(signals.speed, voltage))
     if robot.has_ground:
         beyond = jnp.abs(signals.demand) > signals.adhesion_limit
-        slides = rarely(beyond, _slides_in_place, given, jnp.zeros_like(beyond)) if stands else beyond
+        slides = compute_rarely(beyond, _slides_in_place, given, jnp.zeros_like(beyond)) if stands else beyond
         status = jnp.where(beyond, jnp.where(slides, SLIDES, STALLED), status)
     if conditions.motor_speed is None:
         stands_still = (status == STALLED) & (jnp.abs(signals.speed_theoretical) < 1e-9)
-        static = standing(robot, conditions, _state(unknowns, conditions.discharge))
+        static = standing_signals(robot, conditions, _state(unknowns, conditions.discharge))
         signals = jax.tree.map(lambda rest, travel: jnp.where(stands_still, rest, travel), static, signals)
     status = jnp.where(solved, status, FAILED)
     empty = (conditions.battery > 0.5) & robot.battery.empty(conditions.discharge)
@@ -278,7 +280,7 @@ def steady_batch(robot: Robot, conditions: Conditions) -> Result:
 
 def _getters() -> dict[str, Callable[[Result], Array]]:
     codes = {name: operator.attrgetter(name) for name in CODES}
-    return {**{output.name: output.get for output in outputs.table(channels.EVERY)}, **codes}
+    return {**{output.name: output.get for output in outputs.output_table(channels.EVERY)}, **codes}
 
 
 def _check_outputs(names: Iterable[str]) -> None:
@@ -294,7 +296,7 @@ def steady_outputs(robot: Robot, conditions: Conditions, names: tuple[str, ...])
     Args:
         robot: one robot, or parameters of shape (points,) among its numbers.
         conditions: shape (points,).
-        names: of `outputs.table`, `status` (code into `STATUSES`) and `flags` (bit mask over `FLAGS`).
+        names: of `outputs.output_table`, `status` (code into `STATUSES`) and `flags` (bit mask over `FLAGS`).
 
     Returns:
         Arrays of shape (points,) by name [SI]; NaN if a point has no such number, see `steady`.
@@ -317,7 +319,7 @@ def _settled(robot: Robot, conditions: Conditions) -> Result:
 
 def _solve(robot: Robot, conditions: Conditions) -> tuple[Float[Array, " unknowns"], Bool[Array, ""]]:
     if conditions.turns:
-        return circling.solve(robot, conditions)
+        return circling.solve_turn(robot, conditions)
     unknowns, found = _root(robot, conditions, large=False)
     return jax.lax.stop_gradient((jnp.stack(unknowns), found))
 
@@ -326,9 +328,9 @@ def _shown(
     robot: Robot, conditions: Conditions, unknowns: Float[Array, " unknowns"], found: Bool[Array, ""]
 ) -> tuple[Result, Signals, Float[Array, " unknowns"]]:
     if conditions.turns:
-        return circling.shown(robot, conditions, unknowns, found)
+        return circling.turn_results(robot, conditions, unknowns, found)
     signals, status, _, left = _operating_at(robot, conditions, tuple(unknowns), found, stands=False)
-    return result(robot.within(conditions.configuration), signals, status), signals, jnp.stack(left)
+    return result_of_signals(robot.within(conditions.configuration), signals, status), signals, jnp.stack(left)
 
 
 #: `operating_point` in two halves.
@@ -340,9 +342,9 @@ IMPLICIT = Implicit(_solve, _shown)
 SIZES = (16, 24, 32, 48, 64, 96, 128, 192, 256)
 
 
-def shown_batch(robot: Robot, conditions: Conditions) -> tuple[Result, Signals]:
+def results_of_rows(robot: Robot, conditions: Conditions) -> tuple[Result, Signals]:
     """Results and signals of the rows of a table, with each half as a separate program."""
-    robot, rows = params.strong(robot), conditions.shape[0]
+    robot, rows = params.without_weak_types(robot), conditions.shape[0]
     size = next((s for s in SIZES if s >= rows), rows + -rows % SIZES[-1])
     index = np.concatenate([np.arange(rows), np.zeros(size - rows, int)])
     padded = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[index]), conditions)

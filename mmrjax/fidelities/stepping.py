@@ -19,15 +19,15 @@ from jaxtyping import Array, Float
 from mmrjax.compile.compiling import compiled
 from mmrjax.compile.precision import as_floats
 from mmrjax.compile.programs import has_tracer
-from mmrjax.errors import UsageError, choices
+from mmrjax.errors import UsageError, allowed_words
 from mmrjax.fidelities import drive
 from mmrjax.fidelities.rest import holds
-from mmrjax.fidelities.simulation import checked
+from mmrjax.fidelities.simulation import check_conditions
 from mmrjax.model.conditions import OF_TURNS, Conditions
 from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import State
-from mmrjax.numerics.rosenbrock import stages
+from mmrjax.numerics.rosenbrock import rosenbrock_stages
 
 #: Duty of the driver, or values of conditions by name.
 Command = Scalar | Mapping[str, Scalar] | None
@@ -51,7 +51,7 @@ def initial_state(robot: Robot, conditions: Conditions | None = None, *, rolling
         UsageError: an argument that `step` refuses too.
     """
     robot, conditions = as_floats((robot, _commanded(robot, None, conditions)))
-    return drive.state_of(robot, _begun(robot, conditions, rolling))
+    return drive.state_of_unknowns(robot, _begun(robot, conditions, rolling))
 
 
 def rates(robot: Robot, state: State, command: Command, conditions: Conditions | None = None) -> State:
@@ -66,7 +66,7 @@ def rates(robot: Robot, state: State, command: Command, conditions: Conditions |
         UsageError: an argument that `step` refuses too.
     """
     robot, conditions = as_floats((robot, _commanded(robot, command, conditions)))
-    return drive.state_of(robot, drive.rates(robot, conditions, _vector(robot, state)))
+    return drive.state_of_unknowns(robot, drive.drive_rates(robot, conditions, _vector(robot, state)))
 
 
 def step(robot: Robot, state: State, command: Command, dt: Scalar, conditions: Conditions | None = None) -> State:
@@ -93,12 +93,12 @@ def step(robot: Robot, state: State, command: Command, dt: Scalar, conditions: C
     """
     robot, conditions = as_floats((robot, _commanded(robot, command, conditions)))
     y = _vector(robot, state)
-    return drive.state_of(robot, _stepped(robot, conditions, y, _seconds(dt)))
+    return drive.state_of_unknowns(robot, _stepped(robot, conditions, y, _seconds(dt)))
 
 
 @compiled
 def _begun(robot: Robot, conditions: Conditions, rolling: bool) -> Float[Array, " unknowns"]:
-    return drive.start(robot, conditions, rolling)
+    return drive.drive_start(robot, conditions, rolling)
 
 
 @compiled
@@ -113,10 +113,10 @@ def _stepped(
     moves = jnp.where(stands, jnp.asarray(drawn, y.dtype), 1.0)
 
     def rate(y: Array) -> tuple[Array, Array]:
-        return drive.rates(robot, conditions, y) * moves, y[:0]
+        return drive.drive_rates(robot, conditions, y) * moves, y[:0]
 
     def part(y: Array, share: Array) -> tuple[Array, None]:
-        return stages(rate, y, y[:0], share * dt, looped=True)[0], None
+        return rosenbrock_stages(rate, y, y[:0], share * dt, looped=True)[0], None
 
     after = jax.lax.scan(part, y, jnp.asarray(PARTS, y.dtype))[0]
     rests = held & jnp.all(jnp.where(speeds, y * after, 0.0) <= 0)
@@ -135,7 +135,7 @@ def _commanded(robot: Robot, command: Command, conditions: Conditions | None) ->
         values = command if isinstance(command, Mapping) else {"duty": command}
     known = [field.name for field in dataclasses.fields(Conditions)]
     if unknown := next((name for name in values if name not in known), None):
-        raise UsageError(f"command: got {unknown}; {choices(str(unknown), known)}")
+        raise UsageError(f"command: got {unknown}; {allowed_words(str(unknown), known)}")
     for name, value in values.items():
         if name != "configuration" and _shape(value) is None:
             raise UsageError(f"command, {name}: got {_named(value)}; expected a number")
@@ -145,7 +145,7 @@ def _commanded(robot: Robot, command: Command, conditions: Conditions | None) ->
         raise UsageError("conditions: the sides are driven apart; a step is of straight travel, use mmrjax.simulate")
     if conditions.shape:
         raise UsageError(f"conditions: got runs of shape {conditions.shape}; expected one, and jax.vmap over several")
-    conditions = checked(robot, dataclasses.replace(conditions, **values))
+    conditions = check_conditions(robot, dataclasses.replace(conditions, **values))
     if conditions.motor_speed is not None:
         raise UsageError("conditions: the motors' speed is imposed; a step needs a voltage or a current")
     return conditions
@@ -176,7 +176,7 @@ def _seconds(dt: Scalar) -> Scalar:
 
 
 def _vector(robot: Robot, state: State) -> Float[Array, " unknowns"]:
-    """The unknowns of `drive` for a state, the inverse of `drive.state_of`."""
+    """The unknowns of `drive` for a state, the inverse of `drive.state_of_unknowns`."""
     if not isinstance(state, State):
         raise UsageError(f"state: got {type(state).__name__}; expected one from mmrjax.initial_state or a step")
     remembered = {effect.name for effect in robot.remembering}
@@ -187,4 +187,4 @@ def _vector(robot: Robot, state: State) -> Float[Array, " unknowns"]:
     memory = [state.memory[effect.name] for effect in robot.remembering]
     own = [state.current, state.speed_motor, state.speed, state.distance, state.discharge]
     gap = [] if state.gap is None else [state.gap]
-    return jnp.stack([jnp.asarray(x, float) for x in (*own, *memory, *gap)]) / jnp.asarray(drive.units(robot))
+    return jnp.stack([jnp.asarray(x, float) for x in (*own, *memory, *gap)]) / jnp.asarray(drive.drive_units(robot))

@@ -19,7 +19,7 @@ from mmrjax import fidelities
 from mmrjax.compile.compiling import compiled
 from mmrjax.compile.programs import has_tracer
 from mmrjax.fidelities.base import Fidelity, History, Progress, Run
-from mmrjax.fidelities.result import mask, withhold
+from mmrjax.fidelities.result import flag_mask, withhold_numbers
 from mmrjax.model import balances, contact, masses
 from mmrjax.model.balances import signals_of
 from mmrjax.model.conditions import Conditions
@@ -32,11 +32,11 @@ from mmrjax.model.signals import (
     Signals,
 )
 from mmrjax.undercarriage import both_sides, half_robot
-from mmrjax.undercarriage.half_robot import Changes, Motion, Steady, System, system
+from mmrjax.undercarriage.half_robot import Changes, Motion, Steady, System, half_robot_system
 from mmrjax.undercarriage.side_contacts import Reactions
-from mmrjax.undercarriage.stability import largest_step, refuse
+from mmrjax.undercarriage.stability import check_track_step, largest_step
 
-STEP = fidelities.facts("track").resolved()["step"]  # [s]
+STEP = fidelities.fidelity_facts("track").resolved()["step"]  # [s]
 SAMPLE = 1e-3  # [s]
 WINDOW = 0.4  # share of a run, at its end, that is averaged
 PARTS = 20  # of a run, with progress reported in between
@@ -94,8 +94,8 @@ def _average(
     periods = jnp.where(jnp.isfinite(periods) & (periods >= 2), periods, 0)
 
     def mean(begin: Array, until: Scalar, otherwise: Array) -> tuple[Any, Array]:
-        rise = contact.step(middle, end - begin * pitch, 0.0, end - (begin - 1) * pitch, 1.0)
-        fall = contact.step(middle, end - (until + 1) * pitch, 1.0, end - until * pitch, 0.0)
+        rise = contact.cubic_step(middle, end - begin * pitch, 0.0, end - (begin - 1) * pitch, 1.0)
+        fall = contact.cubic_step(middle, end - (until + 1) * pitch, 1.0, end - until * pitch, 0.0)
         weight = jnp.where(periods > 0, rise * fall, otherwise)
         return jax.tree.map(lambda x: jnp.sum(weight * x) / jnp.sum(weight), sums)
 
@@ -139,7 +139,7 @@ def track(
         numbers are no longer finite, or the robot has left the ground. `failed` and `tips` withhold the result's
         numbers. Flag `jumps`: the robot has no contact for more than a hundredth of the averaging window.
     """
-    run = system(robot, conditions, step)
+    run = half_robot_system(robot, conditions, step)
     start = _start(run, rolling)
     end, record = _record(run, start, round(sample / step), round(duration / sample))
     return _trajectory(run, start, end, record, sample)
@@ -184,12 +184,14 @@ def _trajectory(run: System, start: Motion, end: Motion, record: Record, sample:
     load = jnp.sum(jnp.reshape(signals.normal, (len(motions.q), -1)), axis=-1)
     aloft = window & (load < ALOFT * jnp.sum(averages.signals.normal))
     jumps = jnp.sum(aloft) > JUMPS * jnp.sum(window)
-    flags = answer.flags | mask({"jumps": jumps})
-    answer = withhold(dataclasses.replace(answer, flags=flags), valid, status != FAILED)
+    flags = answer.flags | flag_mask({"jumps": jumps})
+    answer = withhold_numbers(dataclasses.replace(answer, flags=flags), valid, status != FAILED)
     return Trajectory(time[1:], motions.q, motions.v, signals, record.reactions, averages, answer)
 
 
-def check(robot: Robot, conditions: Conditions, *, duration: float, step: float, sample: float = SAMPLE) -> None:
+def check_track_runs(
+    robot: Robot, conditions: Conditions, *, duration: float, step: float, sample: float = SAMPLE
+) -> None:
     """Raises if the track model cannot compute some run of a batch.
 
     Raises:
@@ -219,7 +221,7 @@ def check(robot: Robot, conditions: Conditions, *, duration: float, step: float,
                 "side [kg·m^2]"
             )
     masses.check_parts(robot)
-    refuse(robot, conditions, step, sample)
+    check_track_step(robot, conditions, step, sample)
 
 
 def track_batch(
@@ -239,9 +241,9 @@ def track_batch(
             interrupted. None: one call of XLA, which cannot be interrupted.
 
     Raises:
-        ValueError: a run that `check` refuses.
+        ValueError: a run that `check_track_runs` refuses.
     """
-    check(robot, conditions, duration=duration, step=step, sample=sample)
+    check_track_runs(robot, conditions, duration=duration, step=step, sample=sample)
     if progress is not None:
         return _in_parts(robot, conditions, duration, step, sample, rolling, progress)
     return _batch(robot, conditions, duration, step, sample, rolling)
@@ -285,7 +287,7 @@ def _in_parts(
 
 @compiled
 def _begin(robot: Robot, conditions: Conditions, step: float, rolling: bool) -> Motion:
-    return jax.vmap(lambda one: _start(system(robot, one, step), rolling))(conditions)
+    return jax.vmap(lambda one: _start(half_robot_system(robot, one, step), rolling))(conditions)
 
 
 @compiled
@@ -293,7 +295,7 @@ def _part(
     robot: Robot, conditions: Conditions, motions: Motion, step: float, sample: float, samples: int
 ) -> tuple[Motion, Record]:
     def one(conditions: Conditions, motion: Motion) -> tuple[Motion, Record]:
-        return _record(system(robot, conditions, step), motion, round(sample / step), samples)
+        return _record(half_robot_system(robot, conditions, step), motion, round(sample / step), samples)
 
     return jax.vmap(one)(conditions, motions)
 
@@ -311,7 +313,7 @@ def _end(
     def one(conditions: Conditions, start: Motion, parts: list[Record]) -> Trajectory:
         record = jax.tree.map(lambda *x: jnp.concatenate(x)[:samples], *parts)
         end = jax.tree.map(lambda x: x[-1], record.motions)
-        return _trajectory(system(robot, conditions, step), start, end, record, sample)
+        return _trajectory(half_robot_system(robot, conditions, step), start, end, record, sample)
 
     return jax.vmap(one)(conditions, starts, records)
 
@@ -337,7 +339,7 @@ def _histories(
 
 
 def _check(robot: Robot, conditions: Conditions, options: Mapping[str, float]) -> None:
-    check(robot, conditions, duration=options["duration"], step=options["step"])
+    check_track_runs(robot, conditions, duration=options["duration"], step=options["step"])
 
 
 def _too_stiff(robot: Robot, conditions: Conditions) -> list[str]:

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from mmrjax import fidelities
 from mmrjax.compile.compiling import compiled
-from mmrjax.errors import UsageError, choices
+from mmrjax.errors import UsageError, allowed_words
 from mmrjax.fidelities import outputs as table_of_outputs
 from mmrjax.fidelities.base import Run
 from mmrjax.missions.profile import Profile
@@ -58,7 +58,7 @@ class Variation(eqx.Module):
 
     Attributes:
         robot: common start of all points.
-        names: of what varies: dotted parameters as in `params.walk`, or conditions (`CONDITIONS`).
+        names: of what varies: dotted parameters as in `params.walk_parameters`, or conditions (`CONDITIONS`).
 
     Raises:
         UsageError: an unknown name, or a name stated twice; the message suggests similar ones.
@@ -72,16 +72,16 @@ class Variation(eqx.Module):
         for k, name in enumerate(names):
             if name not in known:
                 raise UsageError(
-                    f"{name}: neither a parameter of the robot nor a condition; {choices(name, known, 3)}"
+                    f"{name}: neither a parameter of the robot nor a condition; {allowed_words(name, known, 3)}"
                 )
             if name in names[:k]:
                 raise UsageError(f"{name}: stated twice; expected each name once")
-        self.robot, self.names = params.strong(robot), tuple(names)
+        self.robot, self.names = params.without_weak_types(robot), tuple(names)
 
     @property
     def axes(self) -> dict[str, Axis]:
         """Properties of each name that varies, in order."""
-        every = {p.name: p for p in params.walk(self.robot)}
+        every = {p.name: p for p in params.walk_parameters(self.robot)}
         return {name: self._axis(name, every.get(name)) for name in self.names}
 
     def _axis(self, name: str, parameter: params.Parameter | None) -> Axis:
@@ -116,10 +116,10 @@ class Variation(eqx.Module):
 
 def variable_names(robot: Robot) -> tuple[str, ...]:
     """Every name that may vary: conditions, then the robot's parameters."""
-    return (*CONDITIONS, *(p.name for p in params.walk(robot)))
+    return (*CONDITIONS, *(p.name for p in params.walk_parameters(robot)))
 
 
-def evaluate(
+def evaluate_points(
     variation: Variation,
     fidelity: str,
     values: Float[Array, "points names"],
@@ -136,7 +136,7 @@ def evaluate(
         fidelity: one of `fidelities.NAMES`; options: all of its options, from `Facts.resolved`.
         values: one row per point, in the order of `variation.names`.
         conditions: the other conditions, of shape () or (points,), names of configurations resolved.
-        outputs: names of `outputs.table`, or of columns that the fidelity adds; also `flags`. Over a profile
+        outputs: names of `outputs.output_table`, or of columns that the fidelity adds; also `flags`. Over a profile
             columns of `missions.OUTPUTS`.
         profile: a mission that every point follows, with the fidelity `missions.MODEL`; fields of shape (rows,).
 
@@ -166,7 +166,7 @@ def _evaluate(
     if profile is None and fidelity == "steady":
         from mmrjax.fidelities.steady import steady_outputs
 
-        _known(names, table_of_outputs.names(shown))
+        _known(names, table_of_outputs.output_names(shown))
         robot, each = variation.at(values, conditions)
         each = jax.tree.map(lambda x: jnp.broadcast_to(x, (points,)), each)
         return steady_outputs(robot, each, (*names, STATUS))
@@ -175,23 +175,23 @@ def _evaluate(
         if profile is not None:
             from mmrjax.missions import mission_batch
 
-            return mission_batch.run(robot, conditions, profile)
-        return fidelities.get(fidelity).run(robot, conditions, options)
+            return mission_batch.run_missions(robot, conditions, profile)
+        return fidelities.get_fidelity(fidelity).run(robot, conditions, options)
 
     if not variation.varies_robot:
-        return pick(simulate(*variation.at(values, conditions)), shown, names)
+        return pick_outputs(simulate(*variation.at(values, conditions)), shown, names)
 
     def one(values: Array, conditions: Conditions) -> Run:
         robot, point = variation.at(values, conditions)
         run = simulate(robot, jax.tree.map(lambda x: x[None], point))
         return jax.tree.map(lambda x: x[0], run)
 
-    return pick(jax.vmap(one)(values, conditions), shown, names)
+    return pick_outputs(jax.vmap(one)(values, conditions), shown, names)
 
 
-def pick(run: Run, shown: tuple[Channel, ...], names: tuple[str, ...]) -> dict[str, Array]:
-    """Outputs of a batch by name, as from `evaluate`, of a rig with these channels."""
-    rows = {row.name: row for row in table_of_outputs.table(shown)}
+def pick_outputs(run: Run, shown: tuple[Channel, ...], names: tuple[str, ...]) -> dict[str, Array]:
+    """Outputs of a batch by name, as from `evaluate_points`, of a rig with these channels."""
+    rows = {row.name: row for row in table_of_outputs.output_table(shown)}
     _known(names, (*rows, *run.columns))
     found = {n: rows[n].get(run.result) if n in rows else run.columns[n] for n in names if n != FLAGS}
     further = {FLAGS: run.result.flags} if FLAGS in names else {}
@@ -201,4 +201,4 @@ def pick(run: Run, shown: tuple[Channel, ...], names: tuple[str, ...]) -> dict[s
 def _known(names: tuple[str, ...], known: tuple[str, ...]) -> None:
     for name in names:
         if name not in known and name != FLAGS:
-            raise UsageError(f"outputs: got {name}; {choices(name, (*known, FLAGS), 3)}")
+            raise UsageError(f"outputs: got {name}; {allowed_words(name, (*known, FLAGS), 3)}")

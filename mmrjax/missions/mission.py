@@ -16,9 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from mmrjax.fidelities.result import mask, withhold
+from mmrjax.fidelities.result import flag_mask, withhold_numbers
 from mmrjax.missions import mission_straight, mission_turning
-from mmrjax.missions.mission_steps import EVENTS, FIRST, Asked, Carry, Law, follow
+from mmrjax.missions.mission_steps import EVENTS, FIRST, Carry, MotionLaw, SegmentInputs, integrate_segment
 from mmrjax.missions.profile import BRAKE, COAST, MOTOR_SPEED, SPEED, Profile
 from mmrjax.model import balances, energy
 from mmrjax.model.conditions import Conditions
@@ -144,12 +144,12 @@ class Mission(eqx.Module):
     course: Course | None
 
 
-def law_of(conditions: Conditions, profile: Profile) -> Law:
+def law_of(conditions: Conditions, profile: Profile) -> MotionLaw:
     """Law of motion: free to turn if profile or conditions drive the sides apart or state a heading."""
     return mission_turning if profile.turns or conditions.turns else mission_straight
 
 
-def initial_unknowns(law: Law, robot: Robot, conditions: Conditions, start: Start) -> Float[Array, " unknowns"]:
+def initial_unknowns(law: MotionLaw, robot: Robot, conditions: Conditions, start: Start) -> Float[Array, " unknowns"]:
     """The unknowns at the start in SI, with the heading of the conditions, else uphill."""
     ambient, heading = robot.motor.temperature_ambient, conditions.heading_deg
     winding, housing = (ambient if t is None else t for t in (start.temperature_winding, start.temperature_housing))
@@ -165,7 +165,13 @@ def initial_unknowns(law: Law, robot: Robot, conditions: Conditions, start: Star
 
 
 def _ends(
-    law: Law, robot: Robot, otherwise: Conditions, segment: Profile, found: Any, asked: Asked, stands: Array
+    law: MotionLaw,
+    robot: Robot,
+    otherwise: Conditions,
+    segment: Profile,
+    found: Any,
+    asked: SegmentInputs,
+    stands: Array,
 ) -> tuple[Array, Array]:
     """Status of a segment at its end, and whether the robot has missed the demanded speed."""
     mode, signals = segment.mode[0], balances.signals_of(found)
@@ -226,7 +232,7 @@ def mission(
         segment = profile.row(k)
         fresh = carry._replace(peaks=nothing, flags=jnp.asarray(0))
         beginning = law.instant(robot, conditions, segment, carry.y.at[law.CLOCK].set(0.0), carry.stands)[0]
-        c = follow(law, robot, conditions, segment, fresh, tolerance, most_steps)
+        c = integrate_segment(law, robot, conditions, segment, fresh, tolerance, most_steps)
         ended = _segment_end(law, robot, conditions, segment, carry, c, beginning)
         carry = c._replace(peaks=jnp.maximum(carry.peaks, c.peaks), flags=carry.flags | ended.flags)
         return carry, ended
@@ -250,12 +256,12 @@ class _Segment(NamedTuple):
     kept: Array
 
 
-def _charge(law: Law, y: Array) -> Array:
+def _charge(law: MotionLaw, y: Array) -> Array:
     """Charge taken [C]."""
     return y[law.DISCHARGE] * law.UNITS[law.DISCHARGE]
 
 
-def _at_start(law: Law, robot: Robot, conditions: Conditions, start: Start, peaks: Array, keep: int) -> Carry:
+def _at_start(law: MotionLaw, robot: Robot, conditions: Conditions, start: Start, peaks: Array, keep: int) -> Carry:
     """The state at the start of a mission, with room for `keep` steps of its course."""
     dtype, whole, false = peaks.dtype, jnp.asarray(0), jnp.asarray(False)
     y0 = initial_unknowns(law, robot, conditions, start).astype(dtype) / law.units(robot).astype(dtype)
@@ -273,14 +279,14 @@ def _at_start(law: Law, robot: Robot, conditions: Conditions, start: Start, peak
 
 
 def _segment_end(
-    law: Law, robot: Robot, conditions: Conditions, segment: Profile, before: Carry, c: Carry, beginning: Any
+    law: MotionLaw, robot: Robot, conditions: Conditions, segment: Profile, before: Carry, c: Carry, beginning: Any
 ) -> _Segment:
     """A segment at its end `c`, from the state `before` it and its first instant."""
     found, _, _, asked = law.instant(robot, conditions, segment, c.y, c.stands)
     status, missed = _ends(law, robot, conditions, segment, found, asked, c.stands)
     status = jnp.where(c.ended, _ending(c), status)
-    slips = law.over(robot, found)["slips"] & ~c.stands
-    flags = c.flags | mask({"demand_missed": missed & ~c.ended, "slips": slips})
+    slips = law.exceeded(robot, found)["slips"] & ~c.stands
+    flags = c.flags | flag_mask({"demand_missed": missed & ~c.ended, "slips": slips})
     rise = law.stored(robot, found) - law.stored(robot, beginning)
     drawn, returned = (c.q[list(law.TOTALS).index(name)] for name in ("drawn", "returned"))
     first, last = (robot.battery.energy(_charge(law, x.y)) for x in (before, c))
@@ -290,7 +296,9 @@ def _segment_end(
     return _Segment(time, jnp.where(ran, c.q, 0.0), rise, given, c.peaks, status, flags, found, c.kept)
 
 
-def _mission(law: Law, robot: Robot, conditions: Conditions, profile: Profile, c: Carry, ends: _Segment) -> Mission:
+def _mission(
+    law: MotionLaw, robot: Robot, conditions: Conditions, profile: Profile, c: Carry, ends: _Segment
+) -> Mission:
     """The mission from its last state `c` and the ends of its segments, (cycles · segments, ...)."""
     shape = (profile.cycles, profile.segments)
     totals = {n: ends.q[:, i].reshape(shape) for i, n in enumerate(law.TOTALS)}
@@ -301,7 +309,7 @@ def _mission(law: Law, robot: Robot, conditions: Conditions, profile: Profile, c
     outcome = jnp.where(jnp.any(bad), status[first], CONVERGED)
     outcome = jnp.where(c.ended, _ending(c), outcome)
     end = jax.tree.map(lambda x: x[-1], ends.found)
-    answer = withhold(law.RESULT(robot, end, outcome), outcome != FAILED, outcome != FAILED)
+    answer = withhold_numbers(law.RESULT(robot, end, outcome), outcome != FAILED, outcome != FAILED)
     answer = dataclasses.replace(answer, flags=c.flags)
 
     def named(x: Array) -> dict[str, Array]:
@@ -321,14 +329,14 @@ def _mission(law: Law, robot: Robot, conditions: Conditions, profile: Profile, c
     )  # fmt: skip
 
 
-def _temperatures(law: Law, y: Array) -> tuple[Array, Array]:
+def _temperatures(law: MotionLaw, y: Array) -> tuple[Array, Array]:
     """Temperatures of windings and housings [°C]."""
     winding, housing = (np.asarray(law.UNITS)[k] * y[..., k] for k in (law.WINDING, law.HOUSING))
     return winding, housing
 
 
 def _course(
-    law: Law, robot: Robot, conditions: Conditions, profile: Profile, c: Carry, each: Totals, kept: Array
+    law: MotionLaw, robot: Robot, conditions: Conditions, profile: Profile, c: Carry, each: Totals, kept: Array
 ) -> Course:
     assert c.buffer is not None
     ys, qs, stood, marks = c.buffer

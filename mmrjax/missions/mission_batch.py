@@ -33,7 +33,7 @@ ROOM, LEAST_KEPT, MOST_KEPT = 64, 4096, 2**20
 
 
 @dataclasses.dataclass(frozen=True)
-class Output:
+class MissionOutput:
     """One number of a mission.
 
     Attributes:
@@ -49,49 +49,57 @@ class Output:
     resolution: int
 
 
-def _wh(name: str, label: str) -> Output:
-    return Output(name, f"{name}_Wh", "Wh", JOULE_PER_WH, label, 3)
+def _wh(name: str, label: str) -> MissionOutput:
+    return MissionOutput(name, f"{name}_Wh", "Wh", JOULE_PER_WH, label, 3)
 
 
-#: Numbers of a mission in the order of columns, in SI from `numbers`.
-OUTPUTS: tuple[Output, ...] = (
-    Output("duration", "duration_s", "s", 1.0, "duration", 1),
-    Output("distance", "distance_m", "m", 1.0, "distance travelled, either way", 2),
-    Output("displacement", "displacement_m", "m", 1.0, "displacement, forward less backward", 2),
+#: Numbers of a mission in the order of columns, in SI from `mission_numbers`.
+OUTPUTS: tuple[MissionOutput, ...] = (
+    MissionOutput("duration", "duration_s", "s", 1.0, "duration", 1),
+    MissionOutput("distance", "distance_m", "m", 1.0, "distance travelled, either way", 2),
+    MissionOutput("displacement", "displacement_m", "m", 1.0, "displacement, forward less backward", 2),
     _wh("energy", "energy"),
-    Output("energy_per_metre", "energy_per_metre_Wh", "Wh/m", JOULE_PER_WH, "energy per metre", 5),
+    MissionOutput("energy_per_metre", "energy_per_metre_Wh", "Wh/m", JOULE_PER_WH, "energy per metre", 5),
     _wh("energy_drawn", "energy drawn"),
     _wh("energy_returned", "energy returned"),
-    Output("rms_current", "rms_current_A", "A", 1.0, "rms current, all motors", 3),
-    Output("peak_current", "peak_current_A", "A", 1.0, "peak current, all motors", 2),
-    Output("rms_torque", "rms_torque_Nm", "N·m", 1.0, "rms torque, one gearbox output", 3),
-    Output("peak_torque", "peak_torque_Nm", "N·m", 1.0, "peak torque, one gearbox output", 3),
-    Output("peak_speed", "peak_speed_mm_s", "mm/s", MM, "peak speed", 1),
-    Output("peak_motor_speed", "peak_motor_speed_rpm", "rpm", RPM, "peak motor speed", 1),
-    Output("winding_peak", "winding_peak_C", "°C", 1.0, "hottest winding", 1),
-    Output("cell_low", "cell_low_V", "V", 1.0, "lowest cell voltage", 3),
-    Output("state_of_charge", "state_of_charge", "-", 1.0, "state of charge at the end", 4),
-    Output("winding_end", "winding_end_C", "°C", 1.0, "winding at the end", 1),
-    Output("housing_end", "housing_end_C", "°C", 1.0, "housing at the end", 1),
-    Output("endurance", "endurance_s", "s", 1.0, "endurance at this duty", 0),
-    Output("range", "range_m", "m", 1.0, "range at this duty", 0),
+    MissionOutput("rms_current", "rms_current_A", "A", 1.0, "rms current, all motors", 3),
+    MissionOutput("peak_current", "peak_current_A", "A", 1.0, "peak current, all motors", 2),
+    MissionOutput("rms_torque", "rms_torque_Nm", "N·m", 1.0, "rms torque, one gearbox output", 3),
+    MissionOutput("peak_torque", "peak_torque_Nm", "N·m", 1.0, "peak torque, one gearbox output", 3),
+    MissionOutput("peak_speed", "peak_speed_mm_s", "mm/s", MM, "peak speed", 1),
+    MissionOutput("peak_motor_speed", "peak_motor_speed_rpm", "rpm", RPM, "peak motor speed", 1),
+    MissionOutput("winding_peak", "winding_peak_C", "°C", 1.0, "hottest winding", 1),
+    MissionOutput("cell_low", "cell_low_V", "V", 1.0, "lowest cell voltage", 3),
+    MissionOutput("state_of_charge", "state_of_charge", "-", 1.0, "state of charge at the end", 4),
+    MissionOutput("winding_end", "winding_end_C", "°C", 1.0, "winding at the end", 1),
+    MissionOutput("housing_end", "housing_end_C", "°C", 1.0, "housing at the end", 1),
+    MissionOutput("endurance", "endurance_s", "s", 1.0, "endurance at this duty", 0),
+    MissionOutput("range", "range_m", "m", 1.0, "range at this duty", 0),
     *(_wh(f"energy_to_{name}", f"energy to: {meaning}") for name, meaning in energy.SINKS.items()),
     _wh("energy_stored", "rise of the energy in motion"),
-    Output("unaccounted_share", "unaccounted_share", "-", 1.0, "energy unaccounted for, of that turned over", 9),
+    MissionOutput(
+        "unaccounted_share", "unaccounted_share", "-", 1.0, "energy unaccounted for, of that turned over", 9
+    ),
 )
 #: Further numbers of a mission with separate sides.
-OF_TURNS: tuple[Output, ...] = (
-    Output("turned", "turned_deg", "deg", math.pi / 180, "turned by, positive to the left", 1),
-    Output("place_x", "place_x_m", "m", 1.0, "moved uphill, or ahead of the start", 2),
-    Output("place_y", "place_y_m", "m", 1.0, "moved to the left of the start", 2),
-    Output("peak_yaw_rate", "peak_yaw_rate_rad_s", "rad/s", 1.0, "peak yaw rate", 3),
-    *(Output(f"rms_current_{s}", f"rms_current_{s}_A", "A", 1.0, f"rms current, {s} motor", 3) for s in SIDES),
-    *(Output(f"peak_current_{s}", f"peak_current_{s}_A", "A", 1.0, f"peak current, {s} motor", 2) for s in SIDES),
-    *(Output(f"winding_peak_{s}", f"winding_peak_{s}_C", "°C", 1.0, f"hottest winding, {s}", 1) for s in SIDES),
+OF_TURNS: tuple[MissionOutput, ...] = (
+    MissionOutput("turned", "turned_deg", "deg", math.pi / 180, "turned by, positive to the left", 1),
+    MissionOutput("place_x", "place_x_m", "m", 1.0, "moved uphill, or ahead of the start", 2),
+    MissionOutput("place_y", "place_y_m", "m", 1.0, "moved to the left of the start", 2),
+    MissionOutput("peak_yaw_rate", "peak_yaw_rate_rad_s", "rad/s", 1.0, "peak yaw rate", 3),
+    *(MissionOutput(f"rms_current_{s}", f"rms_current_{s}_A", "A", 1.0, f"rms current, {s} motor", 3) for s in SIDES),
+    *(
+        MissionOutput(f"peak_current_{s}", f"peak_current_{s}_A", "A", 1.0, f"peak current, {s} motor", 2)
+        for s in SIDES
+    ),
+    *(
+        MissionOutput(f"winding_peak_{s}", f"winding_peak_{s}_C", "°C", 1.0, f"hottest winding, {s}", 1)
+        for s in SIDES
+    ),
 )
 
 
-def names(turns: bool = False) -> tuple[str, ...]:
+def mission_columns(turns: bool = False) -> tuple[str, ...]:
     """Columns of a mission's numbers, in order; `turns`: of a mission with separate sides."""
     return tuple(output.column for output in (*OUTPUTS, *(OF_TURNS if turns else ())))
 
@@ -113,7 +121,7 @@ def _root(x: Scalar) -> Array:
     return jnp.where(x > 0, jnp.sqrt(jnp.where(x > 0, x, 1.0)), 0.0 * x)
 
 
-def totals(found: Totals, peaks: Mapping[str, Array]) -> dict[str, Array]:
+def mission_totals(found: Totals, peaks: Mapping[str, Array]) -> dict[str, Array]:
     """Numbers [SI] by name that follow from totals and peaks of missions or segments; any shape.
 
     A segment that was not reached has NaN.
@@ -156,7 +164,7 @@ def totals(found: Totals, peaks: Mapping[str, Array]) -> dict[str, Array]:
     return {name: jnp.where(ran, value, jnp.nan) for name, value in numbers.items()}
 
 
-def numbers(robot: Robot, conditions: Conditions, found: Mission) -> dict[str, Array]:
+def mission_numbers(robot: Robot, conditions: Conditions, found: Mission) -> dict[str, Array]:
     """Numbers of missions [SI], by the names of `OUTPUTS`; any shape, NaN if a number does not apply.
 
     State of charge, endurance and range refer to the on-board battery. Endurance is the time from the charge at the
@@ -169,7 +177,7 @@ def numbers(robot: Robot, conditions: Conditions, found: Mission) -> dict[str, A
     ended = (found.result.status == BATTERY_EMPTY) | (found.result.status == CUT_OFF)
     times = jnp.where(ended, 1.0, _quotient(capacity - conditions.discharge, used))  # number of missions per charge
     return {
-        **totals(found.total, found.peaks),
+        **mission_totals(found.total, found.peaks),
         "state_of_charge": jnp.where(on_battery, 1 - found.discharge / capacity, jnp.nan),
         "winding_end": jnp.asarray(found.temperature_winding),
         "housing_end": jnp.asarray(found.temperature_housing),
@@ -178,7 +186,9 @@ def numbers(robot: Robot, conditions: Conditions, found: Mission) -> dict[str, A
     }
 
 
-def begins_below(robot: Robot, conditions: Conditions, profile: Profile, start: Start | None = None) -> np.ndarray:
+def cell_below_cutoff(
+    robot: Robot, conditions: Conditions, profile: Profile, start: Start | None = None
+) -> np.ndarray:
     """Cell voltage at the start of missions on the battery [V] if it is below the cut-off, else NaN; shape (runs,).
 
     Not traceable. The motors draw the current of the start, which is 0 at rest.
@@ -192,14 +202,14 @@ def begins_below(robot: Robot, conditions: Conditions, profile: Profile, start: 
     return np.asarray(jnp.where(below, cell, jnp.nan))
 
 
-def columns(found: Mapping[str, Any]) -> dict[str, Any]:
+def numbers_by_column(found: Mapping[str, Any]) -> dict[str, Any]:
     """Numbers [SI] by column of tables, in the columns' units."""
     return {
         output.column: found[output.name] / output.factor for output in (*OUTPUTS, *OF_TURNS) if output.name in found
     }
 
 
-def batch(
+def missions_of_runs(
     robot: Robot, conditions: Conditions, profile: Profile, start: Start | None = None, *, history: bool = False
 ) -> Mission:
     """Missions of a batch of runs; traceable.
@@ -260,7 +270,7 @@ def simulate_batch(
     keep: int = 0,
     tolerance: Scalar = TOLERANCE,
 ) -> Mission:
-    """Missions of a batch in one call, compiled; see `batch`.
+    """Missions of a batch in one call, compiled; see `missions_of_runs`.
 
     Args:
         keep: largest number of steps in the recorded courses; 0 for no courses.
@@ -273,7 +283,7 @@ def simulate_batch(
     return jax.vmap(one, in_axes=(0, own))(conditions, profile)
 
 
-def run(robot: Robot, conditions: Conditions, profile: Profile) -> Run:
+def run_missions(robot: Robot, conditions: Conditions, profile: Profile) -> Run:
     """Missions of a batch as runs of a fidelity, with their numbers as columns."""
-    found = batch(robot, conditions, profile)
-    return Run(found.result, columns(numbers(robot, conditions, found)))
+    found = missions_of_runs(robot, conditions, profile)
+    return Run(found.result, numbers_by_column(mission_numbers(robot, conditions, found)))

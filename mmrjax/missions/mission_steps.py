@@ -15,15 +15,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mmrjax.fidelities.rest import least
-from mmrjax.fidelities.result import mask
+from mmrjax.fidelities.rest import smallest
+from mmrjax.fidelities.result import flag_mask
 from mmrjax.missions.profile import Profile
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Signals
-from mmrjax.numerics.rarely import rarely
-from mmrjax.numerics.rosenbrock import stages, step_longest
+from mmrjax.numerics.rarely import compute_rarely
+from mmrjax.numerics.rosenbrock import rosenbrock_stages, step_longest
 
 #: The first step of a segment [s], and the shortest.
 FIRST, SHORTEST = 1e-4, 1e-9
@@ -46,7 +46,7 @@ RECOVERED = 1e-6
 FIRMLY = 1e-3
 
 
-class Asked(NamedTuple):
+class SegmentInputs(NamedTuple):
     """Inputs of the robot at an instant.
 
     The robot with its other consumers; the conditions with the controller's duty; the rate of the controller's
@@ -59,7 +59,7 @@ class Asked(NamedTuple):
     error: Scalar
 
 
-class Law(Protocol):
+class MotionLaw(Protocol):
     """Law of motion of a robot in a mission: unknowns, equations of an instant, and the quantities read from it.
 
     `found` is the result of `instant`: signals, and for a robot that turns also its motion.
@@ -99,21 +99,23 @@ class Law(Protocol):
         """The state of the unknowns."""
         ...
 
-    def asked_at(self, robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array) -> Asked:
-        """Inputs of the robot, see `Asked`."""
+    def asked_at(
+        self, robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array
+    ) -> SegmentInputs:
+        """Inputs of the robot, see `SegmentInputs`."""
         ...
 
     def instant(
         self, robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array
-    ) -> tuple[Any, Array, Array, Asked]:
+    ) -> tuple[Any, Array, Array, SegmentInputs]:
         """Signals of an instant, rates of the unknowns in their units and of the totals [1/s], and the inputs."""
         ...
 
-    def slowness(self, asked: Asked, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
+    def slowness(self, asked: SegmentInputs, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
         """Relative distance of shafts and sliding contacts below the speed at which friction is resolved [-]."""
         ...
 
-    def drawn(self, asked: Asked, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
+    def drawn(self, asked: SegmentInputs, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
         """Current that the motors take from the source [A], and the charge taken [C]."""
         ...
 
@@ -129,7 +131,7 @@ class Law(Protocol):
         """Peaks of currents and temperatures from the largest unknowns within a step."""
         ...
 
-    def over(self, robot: Robot, found: Any) -> dict[str, Scalar]:
+    def exceeded(self, robot: Robot, found: Any) -> dict[str, Scalar]:
         """Limits exceeded at an instant."""
         ...
 
@@ -151,7 +153,7 @@ class Law(Protocol):
 
 
 def _firmly(
-    law: Law, robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array
+    law: MotionLaw, robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array
 ) -> tuple[Array, Array]:
     """Margins of the friction that would hold the robot, now and at the later current.
 
@@ -162,10 +164,10 @@ def _firmly(
     current = law.AT_REST.current_at_rest(at_rest.robot, at_rest.conditions, law.state_of(at_rest.robot, y, stands))
     settled = y.at[law.CURRENT].set(current / law.UNITS[0])
     firm = _firm(law, asked, y, stands)
-    return firm, least(firm, _firm(law, at_rest, settled, stands))
+    return firm, smallest(firm, _firm(law, at_rest, settled, stands))
 
 
-def _firm(law: Law, asked: Asked, y: Array, stands: Array) -> Array:
+def _firm(law: MotionLaw, asked: SegmentInputs, y: Array, stands: Array) -> Array:
     """Margin of the friction that would hold the robot [-], see `rest.firmness`."""
     return jnp.asarray(law.AT_REST.firmness(asked.robot, asked.conditions, law.state_of(asked.robot, y, stands)))
 
@@ -205,15 +207,15 @@ def _top(before: Array, after: Array, rise: Array, fall: Array) -> Array:
     return jnp.where(bends, jnp.maximum(top, jnp.maximum(x0, x1)), jnp.maximum(x0, x1))
 
 
-def _cell_above(law: Law, asked: Asked, y: Array, stands: Array) -> Scalar:
+def _cell_above(law: MotionLaw, asked: SegmentInputs, y: Array, stands: Array) -> Scalar:
     """Margin of a cell above its cut-off [V]; large on an external supply."""
     battery = asked.robot.battery
     cell = battery.voltage_cell(*law.drawn(asked, y, stands))
     return jnp.where(asked.conditions.battery > 0.5, cell - battery.voltage_cutoff, 10.0)
 
 
-def events_of(
-    law: Law, robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array, below: Array
+def event_functions(
+    law: MotionLaw, robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array, below: Array
 ) -> Float[Array, " events"]:
     """Functions that become positive when their event of `EVENTS` has happened [-]."""
     asked = law.asked_at(robot, otherwise, segment, y, stands)
@@ -222,8 +224,8 @@ def events_of(
 
     none = -jnp.ones_like(slow)
     here = (robot, otherwise, segment, y, stands)
-    firm, stays = rarely(near, functools.partial(_firmly, law), here, (none, none))
-    standing = least(slow, grips, stays - FIRMLY)
+    firm, stays = compute_rarely(near, functools.partial(_firmly, law), here, (none, none))
+    standing = smallest(slow, grips, stays - FIRMLY)
     battery, discharge = asked.robot.battery, law.drawn(asked, y, stands)[1]
     empty = jnp.where(asked.conditions.battery > 0.5, (discharge / battery.capacity - 1) / OF_CHARGE, -1.0)
     above = _cell_above(law, asked, y, stands)
@@ -232,7 +234,7 @@ def events_of(
 
 
 def _onto(
-    law: Law,
+    law: MotionLaw,
     robot: Robot,
     otherwise: Conditions,
     segment: Profile,
@@ -252,7 +254,7 @@ def _onto(
         step in time [s].
     """
     _, dy, dq, _ = law.instant(robot, otherwise, segment, y, stands)
-    steep = jax.jvp(lambda y: events_of(law, robot, otherwise, segment, y, stands, below), (y,), (dy,))[1]
+    steep = jax.jvp(lambda y: event_functions(law, robot, otherwise, segment, y, stands, below), (y,), (dy,))[1]
     back = jnp.where(steep > 1e-9, -after / jnp.where(steep > 1e-9, steep, 1.0), 0.0)
     back = jnp.where(jnp.abs(back) < h, back, 0.0)
     which = jnp.argmin(jnp.where(after > 0, back, jnp.inf))
@@ -271,8 +273,8 @@ def _onto(
     return jnp.where(halts, rest, y), q, stands, below, which, back
 
 
-def follow(
-    law: Law,
+def integrate_segment(
+    law: MotionLaw,
     robot: Robot,
     otherwise: Conditions,
     segment: Profile,
@@ -339,7 +341,7 @@ class _Landed(NamedTuple):
 class _Leg(NamedTuple):
     """One segment of a mission, with its length and the longest step [s]."""
 
-    law: Law
+    law: MotionLaw
     robot: Robot
     otherwise: Conditions
     segment: Profile
@@ -358,7 +360,7 @@ class _Leg(NamedTuple):
         below = jnp.asarray(_cell_above(law, asked, y, stands) < 0)
         low = jnp.where(below & carry.below, carry.low, 0.0)
         step = jnp.minimum(jnp.asarray(FIRST, y.dtype), self.longest)
-        events = events_of(law, robot, otherwise, segment, y, stands, below)
+        events = event_functions(law, robot, otherwise, segment, y, stands, below)
         cut_off = carry.cut_off | _stayed_below(robot, below, low)
         begin = carry._replace(
             y=y, q=jnp.zeros_like(carry.q), step=step, stands=stands, below=below, low=low, cut_off=cut_off,
@@ -379,7 +381,7 @@ class _Leg(NamedTuple):
         left, trips = jnp.minimum(to_end, to_trip), to_trip < to_end
         last = c.step >= left * (1 - 1e-9)
         h = jnp.where(last, left, jax.lax.stop_gradient(c.step))
-        y, q, u, _ = stages(rates, c.y, c.q, h, looped=law.LONG)
+        y, q, u, _ = rosenbrock_stages(rates, c.y, c.q, h, looped=law.LONG)
         y = y.at[law.CLOCK].set(jnp.where(last & ~trips, self.length, y[law.CLOCK]))
         scale = self.tolerance * (1 + jnp.maximum(jnp.abs(c.y), jnp.abs(y)))
         size = law.norm(u[-1] / scale)
@@ -391,7 +393,7 @@ class _Leg(NamedTuple):
         """The step, shortened to its first event if it contains one."""
         law, robot, otherwise, segment, *_ = self
         y, q, h, last, good, grown = tried
-        after = events_of(law, robot, otherwise, segment, y, c.stands, c.below)
+        after = event_functions(law, robot, otherwise, segment, y, c.stands, c.below)
         happened = after > 0
         between = happened & (c.events < 0)
         # The next step is to end slightly beyond it.
@@ -401,7 +403,7 @@ class _Leg(NamedTuple):
         event = taken & jnp.any(happened)
         here = (robot, otherwise, segment, y, q, c.stands, c.below, after, h)
         none = (y, q, c.stands, c.below, jnp.asarray(-1, jnp.argmin(after).dtype), jnp.zeros_like(h))
-        y, q, stands, below, which, back = rarely(event, functools.partial(_onto, law), here, none)
+        y, q, stands, below, which, back = compute_rarely(event, functools.partial(_onto, law), here, none)
         y, q = jnp.where(taken, y, c.y), jnp.where(taken, q, c.q)
         stands = jnp.where(taken, stands, c.stands)
         low = jnp.where(below & c.below, c.low + jnp.where(taken, h + back, 0.0), 0.0)
@@ -425,12 +427,12 @@ class _Leg(NamedTuple):
         highest = jnp.stack([jnp.where(taken, within.get(name, -jnp.inf), -jnp.inf) for name in law.PEAKS])
         peaks = jnp.maximum(jnp.maximum(c.peaks, _peaks_of(law, robot, found)), highest)
         hot = taken & (within["temperature"] > robot.motor.temperature_limit)
-        flags = _flags(law, robot, found, cut_off) | mask({"too_hot": hot})
+        flags = _flags(law, robot, found, cut_off) | flag_mask({"too_hot": hot})
         failed = c.failed | (~good & (h <= SHORTEST))
         ended = c.ended | cut_off | (landed.which == EMPTY) | failed
         now = (robot, otherwise, segment, y, stands, below)
         unchanged = jnp.where(taken, landed.after, c.events)
-        events_now = rarely(landed.event, functools.partial(events_of, law), now, unchanged)
+        events_now = compute_rarely(landed.event, functools.partial(event_functions, law), now, unchanged)
         kept, buffer = c.kept, c.buffer
         if buffer is not None:
             at = jnp.where(taken, kept, buffer[0].shape[0])  # beyond the end: dropped
@@ -450,16 +452,16 @@ def _stayed_below(robot: Robot, below: Array, low: Array) -> Array:
     return below & (low >= robot.battery.delay_cutoff * (1 - rounding))
 
 
-def _peaks_of(law: Law, robot: Robot, found: Any) -> Array:
+def _peaks_of(law: MotionLaw, robot: Robot, found: Any) -> Array:
     each = law.peaks(robot, found)
     return jnp.stack([jnp.asarray(each[name]) * jnp.ones(()) for name in law.PEAKS])
 
 
-def _flags(law: Law, robot: Robot, found: Any, cut_off: Array) -> Array:
+def _flags(law: MotionLaw, robot: Robot, found: Any, cut_off: Array) -> Array:
     """Limits exceeded at an instant.
 
     A start exceeds the limits of the cells for an instant; only longer loads count.
     """
-    over = law.over(robot, found)
+    over = law.exceeded(robot, found)
     over.pop("slips")  # every start slips for an instant; for a segment, slip counts at its end
-    return mask({**over, "cut_off": cut_off})
+    return flag_mask({**over, "cut_off": cut_off})

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from mmrjax.compile.compiling import compiled
 from mmrjax.fidelities import rest, result
-from mmrjax.missions.mission_steps import Asked
+from mmrjax.missions.mission_steps import SegmentInputs
 from mmrjax.missions.profile import MOTOR_SPEED, SPEED, Profile
 from mmrjax.model import balances, energy
 from mmrjax.model.conditions import Conditions
@@ -28,7 +28,7 @@ CURRENT, MOTOR, GROUND, DISCHARGE, WINDING, HOUSING, INTEGRAL, CLOCK = range(len
 
 #: Unknowns that are 0 at rest; position of the heading: none.
 STOPS, HEADING = (MOTOR, GROUND), slice(0)
-LONG, AT_REST, RESULT = False, rest, result.result
+LONG, AT_REST, RESULT = False, rest, result.result_of_signals
 
 #: Integrated quantities: name, and unit of a total.
 TOTALS: dict[str, str] = {
@@ -96,22 +96,22 @@ def driven(
     return duty, jnp.where(controlled, error - excess, 0.0), jnp.where(controlled, error, 0.0)
 
 
-def asked_at(robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array) -> Asked:
+def asked_at(robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array) -> SegmentInputs:
     asked = segment.at(y[CLOCK])
     robot, conditions = with_consumers(robot, asked), asked.conditions(otherwise)
     state, integral = state_of(robot, y, stands), y[INTEGRAL] * UNITS[INTEGRAL]
     duty, rate, error = driven(robot, asked.mode, asked.demand, conditions, state, integral)
-    return Asked(robot, dataclasses.replace(conditions, duty=duty), rate, error)
+    return SegmentInputs(robot, dataclasses.replace(conditions, duty=duty), rate, error)
 
 
 @compiled
 def instant(
     robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array
-) -> tuple[Signals, Array, Array, Asked]:
+) -> tuple[Signals, Array, Array, SegmentInputs]:
     """Signals of an instant, rates of the unknowns in their units, and of the totals [1/s]."""
     asked = asked_at(robot, otherwise, segment, y, stands)
     state = state_of(robot, y, stands)
-    signals = balances.moving(asked.robot, asked.conditions, state)
+    signals = balances.moving_signals(asked.robot, asked.conditions, state)
     winding, housing = (y[k] * UNITS[k] for k in (WINDING, HOUSING))
     copper = robot.motor.voltage_winding(signals.current, winding) * signals.current
     copper = copper * robot.driver.ripple(signals.duty)
@@ -127,9 +127,9 @@ def instant(
         1.0,
         *(effect.rate(robot, signals) for effect in robot.remembering),
     ]
-    power = energy.source(asked.robot, asked.conditions, signals)
+    power = energy.source_power(asked.robot, asked.conditions, signals)
     current, torque = robot.sides * signals.current, signals.torque_gear
-    goes = energy.sinks(asked.robot, asked.conditions, signals)
+    goes = energy.sink_powers(asked.robot, asked.conditions, signals)
     totals = [
         signals.speed, jnp.abs(signals.speed), jnp.maximum(power, 0.0), jnp.maximum(-power, 0.0), current**2,
         torque**2, *goes.values(),
@@ -143,13 +143,13 @@ def instant(
     )
 
 
-def slowness(asked: Asked, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
+def slowness(asked: SegmentInputs, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
     load, state = asked.robot.chassis(asked.conditions.configuration), state_of(asked.robot, y, stands)
     rolling = load.radius * state.speed_motor / asked.robot.gearbox.ratio
     return 1 - jnp.abs(rolling) / load.speed_still, 1 - jnp.abs(rolling - state.speed) / load.speed_grip
 
 
-def drawn(asked: Asked, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
+def drawn(asked: SegmentInputs, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
     robot, state = asked.robot, state_of(asked.robot, y, stands)
     duty = robot.driver.duty_limited(asked.conditions.duty, state.current)
     motors = robot.sides * state.current * robot.driver.share_drawn(duty)
@@ -157,7 +157,7 @@ def drawn(asked: Asked, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
 
 
 def stored(robot: Robot, found: Signals) -> Scalar:
-    return energy.stored(robot, found)
+    return energy.stored_energy(robot, found)
 
 
 def peaks(robot: Robot, found: Signals) -> dict[str, Scalar]:
@@ -180,12 +180,12 @@ def peaks_within(robot: Robot, y: Array, tops: Array) -> dict[str, Scalar]:
     }
 
 
-def over(robot: Robot, found: Signals) -> dict[str, Scalar]:
+def exceeded(robot: Robot, found: Signals) -> dict[str, Scalar]:
     hot = jnp.asarray(found.temperature) > robot.motor.temperature_limit
-    return {**result.exceeded(robot, found), "too_hot": hot}
+    return {**result.exceeded_limits(robot, found), "too_hot": hot}
 
 
-norm = functools.partial(rosenbrock.norm, own=len(UNITS))
+norm = functools.partial(rosenbrock.error_norm, own=len(UNITS))
 
 
 def demanded(robot: Robot, otherwise: Conditions, segment: Profile) -> Array:

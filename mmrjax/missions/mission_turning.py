@@ -15,9 +15,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from mmrjax.compile.compiling import compiled
-from mmrjax.fidelities.rest import least
+from mmrjax.fidelities.rest import smallest
 from mmrjax.missions import mission_straight
-from mmrjax.missions.mission_steps import Asked
+from mmrjax.missions.mission_steps import SegmentInputs
 from mmrjax.missions.profile import SPEED, VOLTAGE, Profile
 from mmrjax.model import balances, channels, energy
 from mmrjax.model.conditions import Conditions
@@ -26,7 +26,7 @@ from mmrjax.model.robot import Robot
 from mmrjax.model.signals import PlaneMotion, Signals
 from mmrjax.numerics import rosenbrock
 from mmrjax.turning import circling
-from mmrjax.turning.two_sides import SIDES, total
+from mmrjax.turning.two_sides import SIDES, sum_of_sides
 
 #: Units of the unknowns, of each side: current, motor speed, temperatures of winding and housing, integral of the
 #: controller; of the robot: speed, lateral speed, yaw rate, heading, discharge, and time in the segment. The memories
@@ -64,7 +64,7 @@ PEAKS: dict[str, str] = {
 }  # fmt: skip
 
 
-class Found(balances.Travel):
+class TurningInstant(balances.Travel):
     """One instant: signals of both sides, and the motion of the robot."""
 
     motion: PlaneMotion
@@ -93,7 +93,7 @@ def demanded(robot: Robot, otherwise: Conditions, segment: Profile) -> Array:
     return demand - jnp.asarray(apart)[..., None] * y
 
 
-def asked_at(robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array) -> Asked:
+def asked_at(robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array) -> SegmentInputs:
     asked = segment.at(y[CLOCK])
     robot, conditions = mission_straight.with_consumers(robot, asked), asked.conditions(otherwise)
     motion, own = state_of(robot, y, stands), conditions.of_sides()
@@ -105,17 +105,17 @@ def asked_at(robot: Robot, otherwise: Conditions, segment: Profile, y: Array, st
     demand = demanded(robot, conditions, asked)
     law = jax.vmap(functools.partial(mission_straight.driven, robot, asked.mode))
     duty, rate, error = law(demand, own, state, y[INTEGRAL] * _EACH[-1])
-    return Asked(robot, dataclasses.replace(conditions, duty_left=duty[0], duty_right=duty[1]), rate, error)
+    return SegmentInputs(robot, dataclasses.replace(conditions, duty_left=duty[0], duty_right=duty[1]), rate, error)
 
 
 @compiled
 def instant(
     robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array
-) -> tuple[Found, Array, Array, Asked]:
+) -> tuple[TurningInstant, Array, Array, SegmentInputs]:
     """Signals and motion, rates of the unknowns in their units and of the totals [1/s], and inputs of an instant."""
     asked = asked_at(robot, otherwise, segment, y, stands)
     motion = state_of(robot, y, stands)
-    travel = balances.turning(asked.robot, asked.conditions, motion)
+    travel = balances.turning_signals(asked.robot, asked.conditions, motion)
     signals = travel.signals
     winding, housing = (y[k] * _EACH[2] for k in (WINDING, HOUSING))
     copper = robot.motor.voltage_winding(signals.current, winding) * signals.current
@@ -134,19 +134,19 @@ def instant(
         1.0,
         *(jax.vmap(lambda s, effect=effect: effect.rate(robot, s))(signals) for effect in robot.remembering),
     ]
-    power = jnp.mean(jnp.asarray(energy.source(asked.robot, asked.conditions, signals)))
+    power = jnp.mean(jnp.asarray(energy.source_power(asked.robot, asked.conditions, signals)))
     current, torque = (jnp.asarray(x) ** 2 for x in (signals.current, signals.torque_gear))
-    goes = energy.sinks_turning(asked.robot, asked.conditions, travel)
+    goes = energy.sink_powers_turning(asked.robot, asked.conditions, travel)
     cos, sin = jnp.cos(motion.heading), jnp.sin(motion.heading)
     totals = [
         motion.speed, _size(motion), jnp.maximum(power, 0.0), jnp.maximum(-power, 0.0),
-        robot.sides**2 * total(current) / 2, total(torque) / 2,
+        robot.sides**2 * sum_of_sides(current) / 2, sum_of_sides(torque) / 2,
         *(goes[name] for name in energy.SINKS),
         motion.speed * cos - motion.speed_lateral * sin, motion.speed * sin + motion.speed_lateral * cos,
         motion.yaw_rate, *current,
     ]  # fmt: skip
     return (
-        Found(**vars(travel), motion=motion),
+        TurningInstant(**vars(travel), motion=motion),
         jnp.concatenate([jnp.atleast_1d(jnp.asarray(r, y.dtype)) for r in rates]) / units(robot).astype(y.dtype),
         jnp.stack([jnp.asarray(x, y.dtype) for x in totals]),
         asked,
@@ -159,30 +159,32 @@ def _size(motion: PlaneMotion) -> Scalar:
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
 
 
-def slowness(asked: Asked, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
+def slowness(asked: SegmentInputs, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
     robot, conditions = asked.robot, asked.conditions
     load, motion = robot.chassis(conditions.configuration), state_of(robot, y, stands)
     rolling = load.radius * jnp.asarray(motion.speed_motor) / robot.gearbox.ratio
     along = jnp.abs(rolling - balances.states_of_sides(robot, conditions, motion).speed)
     across = jnp.abs(motion.speed_lateral) + jnp.abs(motion.yaw_rate) * robot.running_gear.wheelbase / 2
     slow, grips = 1 - jnp.abs(rolling) / load.speed_still, 1 - along / load.speed_grip
-    return least(*slow), least(*grips, 1 - across / load.speed_grip)
+    return smallest(*slow), smallest(*grips, 1 - across / load.speed_grip)
 
 
-def drawn(asked: Asked, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
+def drawn(asked: SegmentInputs, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
     robot, motion = asked.robot, state_of(asked.robot, y, stands)
     duty = robot.driver.duty_limited(asked.conditions.of_sides().duty, motion.current)
-    return robot.sides * total(jnp.asarray(motion.current * robot.driver.share_drawn(duty))) / 2, motion.discharge
+    return robot.sides * sum_of_sides(
+        jnp.asarray(motion.current * robot.driver.share_drawn(duty))
+    ) / 2, motion.discharge
 
 
-def stored(robot: Robot, found: Found) -> Scalar:
-    return energy.stored_turning(robot, found, found.motion)
+def stored(robot: Robot, found: TurningInstant) -> Scalar:
+    return energy.stored_energy_turning(robot, found, found.motion)
 
 
-def peaks(robot: Robot, found: Found) -> dict[str, Scalar]:
+def peaks(robot: Robot, found: TurningInstant) -> dict[str, Scalar]:
     each = jax.vmap(lambda s: mission_straight.peaks(robot, s))(found.signals)
     most: dict[str, Scalar] = {name: jnp.max(jnp.asarray(x)) for name, x in each.items()}
-    most |= {"current": total(jnp.asarray(each["current"])) / 2, "speed": _size(found.motion)}
+    most |= {"current": sum_of_sides(jnp.asarray(each["current"])) / 2, "speed": _size(found.motion)}
     return {**most, "yaw_rate": jnp.abs(found.motion.yaw_rate), **_of_sides(robot, each)}
 
 
@@ -190,7 +192,7 @@ def peaks_within(robot: Robot, y: Array, tops: Array) -> dict[str, Scalar]:
     current = robot.sides * _EACH[0] * tops[CURRENT]
     temperature = jnp.where(y[WINDING] > 0, _EACH[2] * tops[WINDING], -jnp.inf)
     either = _of_sides(robot, {"current": current, "temperature": temperature})
-    return {"current": total(current) / 2, "temperature": jnp.max(temperature), **either}
+    return {"current": sum_of_sides(current) / 2, "temperature": jnp.max(temperature), **either}
 
 
 def _of_sides(robot: Robot, each: dict[str, Any]) -> dict[str, Scalar]:
@@ -200,15 +202,17 @@ def _of_sides(robot: Robot, each: dict[str, Any]) -> dict[str, Scalar]:
     return {f"{name}_{side}": x[k] for name, x in both for k, side in enumerate(channels.SIDES)}
 
 
-def over(robot: Robot, found: Found) -> dict[str, Scalar]:
-    each = jax.vmap(lambda s: mission_straight.over(robot, s))(found.signals)
+def exceeded(robot: Robot, found: TurningInstant) -> dict[str, Scalar]:
+    each = jax.vmap(lambda s: mission_straight.exceeded(robot, s))(found.signals)
     return {name: jnp.any(x) for name, x in each.items()}
 
 
-norm = functools.partial(rosenbrock.norm_of_sides, whole=slice(GROUND, CLOCK + 1), own=len(mission_straight.UNITS))
+norm = functools.partial(
+    rosenbrock.error_norm_of_sides, whole=slice(GROUND, CLOCK + 1), own=len(mission_straight.UNITS)
+)
 
 
-def status(robot: Robot, conditions: Conditions, found: Found) -> Array:
+def status(robot: Robot, conditions: Conditions, found: TurningInstant) -> Array:
     return circling.status_moving(robot, conditions, found, found.motion)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from mmrjax.compile.precision import as_array
-from mmrjax.errors import UsageError, counted
+from mmrjax.errors import UsageError, count_noun
 from mmrjax.model.conditions import Conditions, Number
 from mmrjax.model.params import Scalar
 
@@ -147,7 +147,7 @@ def profile(
     """
     rows = np.asarray(time, float)
     if rows.ndim != 1 or len(rows) < 2:
-        raise UsageError(f"profile, time: got {counted(rows.size, 'row')}; expected two or more")
+        raise UsageError(f"profile, time: got {count_noun(rows.size, 'row')}; expected two or more")
     if not np.isfinite(rows).all():
         raise UsageError(f"profile, time: row {int(np.argmax(~np.isfinite(rows))) + 1} is not a finite number")
     back = np.flatnonzero(np.diff(rows) <= 0)
@@ -167,14 +167,14 @@ def profile(
     if unknown:
         raise UsageError(f"profile: no field {unknown[0]}; expected one of {', '.join(known)}")
     given: dict[str, Any] = {"demand": demand, **{name: v for name, v in values.items() if v is not None}}
-    if why := sides_refused(list(given), MODES[SPEED] in modes):
+    if why := sides_error(list(given), MODES[SPEED] in modes):
         raise UsageError(f"profile: {why}")
     arrays = {}
     for name, value in given.items():
         x = np.asarray(value, float)
         if x.ndim > 1 or (x.ndim == 1 and len(x) != len(rows)):
             raise UsageError(
-                f"profile, {name}: got {counted(x.shape[0] if x.ndim else 1, 'value')}; expected {len(rows)}"
+                f"profile, {name}: got {count_noun(x.shape[0] if x.ndim else 1, 'value')}; expected {len(rows)}"
             )
         if not np.isfinite(x).all():
             raise UsageError(
@@ -186,12 +186,12 @@ def profile(
         if (np.abs(duty) > 1).any():
             raise UsageError(f"profile, {name}: got {duty[np.argmax(np.abs(duty))]:g}; expected -1 to 1")
     if len(modes) != len(rows):
-        raise UsageError(f"profile, mode: got {counted(len(modes), 'value')}; expected {len(rows)}")
+        raise UsageError(f"profile, mode: got {count_noun(len(modes), 'value')}; expected {len(rows)}")
     index = as_array([MODES.index(name) for name in modes], int)
     return Profile(time=as_array(rows), mode=index, linear=linear, cycles=int(cycles), **arrays)
 
 
-def sides_refused(stated: Sequence[str], speed: bool, named: Callable[[str], str] = str) -> str | None:
+def sides_error(stated: Sequence[str], speed: bool, named: Callable[[str], str] = str) -> str | None:
     """Error message if a profile's fields for the sides contradict each other, else None.
 
     They do for one side without the other, two kinds at once, or a yaw rate without a demanded speed.

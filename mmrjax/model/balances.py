@@ -27,7 +27,7 @@ from mmrjax.model.shaft import Shaft
 from mmrjax.model.signals import GRAVITY, PlaneMotion, Signals, State
 from mmrjax.numerics.one_sided import at_least
 from mmrjax.numerics.trigonometry import cosine, sine
-from mmrjax.turning.two_sides import SIDES, Grip, Stance, grip, total
+from mmrjax.turning.two_sides import SIDES, Grip, Stance, grip, sum_of_sides
 
 #: Each balance with its unit and its equation.
 BALANCES = {
@@ -50,7 +50,7 @@ BALANCES = {
 ROUND = ("lateral", "yaw")
 
 
-def absent(robot: Robot) -> frozenset[str]:
+def absent_balances(robot: Robot) -> frozenset[str]:
     """Balances that a robot lacks or that its instruments cannot show.
 
     A load on a shaft lacks those of the ground. `supply` needs an imposed voltage, `electrical` and `inductance` an
@@ -61,7 +61,7 @@ def absent(robot: Robot) -> frozenset[str]:
     return robot.lacks | supply | winding | (set() if robot.rig.turns else {*ROUND})
 
 
-def added(robot: Robot, signals: Signals, balance: str, channel: str = "") -> Scalar:
+def effects_sum(robot: Robot, signals: Signals, balance: str, channel: str = "") -> Scalar:
     """Sum of the robot's effects in one balance, and for `sensor` in one channel, in its unit.
 
     An effect adds 0 in configurations that it does not apply to. All effects add 0 if the load lacks the balance.
@@ -84,7 +84,7 @@ def _fill(signals: Signals, **values: Any) -> Signals:
 IN_PLANE = ("speed_lateral", "yaw_rate", "heading", "place_x", "place_y")
 
 
-def begin(robot: Robot, conditions: Conditions, state: State, direction: Scalar | None = None) -> Signals:
+def begin_signals(robot: Robot, conditions: Conditions, state: State, direction: Scalar | None = None) -> Signals:
     """Kinematics and mass of the instant; `direction` None takes it from the speeds, smooth through rest."""
     chassis = robot.chassis(conditions.configuration)
     speed_wheel = state.speed_motor * (1 / robot.gearbox.ratio)
@@ -107,8 +107,8 @@ def begin(robot: Robot, conditions: Conditions, state: State, direction: Scalar 
         current=state.current,
         speed_motor=state.speed_motor,
         speed=state.speed,
-        direction=contact.direction(speed_theoretical, rest) if direction is None else direction,
-        direction_travel=contact.direction(state.speed, rest) if direction is None else direction,
+        direction=contact.smooth_sign(speed_theoretical, rest) if direction is None else direction,
+        direction_travel=contact.smooth_sign(state.speed, rest) if direction is None else direction,
         speed_wheel=speed_wheel,
         speed_theoretical=speed_theoretical,
         speed_output=state.speed / chassis.radius if robot.loose else speed_wheel,
@@ -122,7 +122,7 @@ def begin(robot: Robot, conditions: Conditions, state: State, direction: Scalar 
     if isinstance(chassis, Shaft):  # no ground carries it
         return _fill(signals, mass=jnp.zeros_like(state.speed), normal=jnp.zeros_like(state.speed))
     stated = chassis.mass + conditions.payload if conditions.total_mass is None else conditions.total_mass
-    mass = stated + added(robot, _fill(signals, mass=stated), "mass")
+    mass = stated + effects_sum(robot, _fill(signals, mass=stated), "mass")
     normal = chassis_room.normal_load(mass, conditions.slope, GRAVITY, robot.sides)
     return _fill(signals, mass=mass, normal=normal)
 
@@ -135,7 +135,7 @@ def supply(robot: Robot, conditions: Conditions, signals: Signals) -> Signals:
         robot.battery, conditions.voltage, conditions.battery, signals.total_current, signals.discharge
     )
     back = robot.motor.voltage_back(signals.speed_motor)
-    voltage = robot.driver.voltage(source - added(robot, signals, "supply"), signals.duty, signals.pause, back)
+    voltage = robot.driver.voltage(source - effects_sum(robot, signals, "supply"), signals.duty, signals.pause, back)
     blocked = robot.driver.blocks(signals.duty * conditions.polarity, signals.current, conditions.open)
     return _fill(signals, voltage_source=source, voltage=jnp.where(blocked, back, voltage))
 
@@ -158,7 +158,9 @@ def electrical(robot: Robot, conditions: Conditions, signals: Signals) -> Signal
     brings the current to its set value within the winding's time constant.
     """
     back = robot.motor.voltage_back(signals.speed_motor)
-    drop = robot.motor.voltage_winding(signals.current, signals.temperature) + added(robot, signals, "electrical")
+    drop = robot.motor.voltage_winding(signals.current, signals.temperature) + effects_sum(
+        robot, signals, "electrical"
+    )
     if conditions.voltage_follows:
         asked = signals.current if conditions.motor_current is None else conditions.motor_current
         taken = back + drop + robot.motor.resistance * (asked - signals.current)
@@ -168,7 +170,7 @@ def electrical(robot: Robot, conditions: Conditions, signals: Signals) -> Signal
         voltage_back=back,
         voltage_drop=drop,
         voltage_left=signals.voltage - back - drop,
-        inductance=robot.motor.inductance + added(robot, signals, "inductance"),
+        inductance=robot.motor.inductance + effects_sum(robot, signals, "inductance"),
     )
 
 
@@ -176,7 +178,7 @@ def motor(robot: Robot, signals: Signals) -> Signals:
     """Torque at the motor shaft [N·m]."""
     electromagnetic = robot.motor.torque_electromagnetic(signals.current)
     loss = robot.motor.torque_loss(signals.speed_motor, signals.direction)
-    loss = loss + added(robot, signals, "motor")
+    loss = loss + effects_sum(robot, signals, "motor")
     return _fill(
         signals,
         torque_electromagnetic=electromagnetic,
@@ -185,7 +187,7 @@ def motor(robot: Robot, signals: Signals) -> Signals:
     )
 
 
-def torque_held(chassis: Shaft, signals: Signals) -> Scalar:
+def opposing_torque(chassis: Shaft, signals: Signals) -> Scalar:
     """Torque that opposes forward rotation of a shaft in both directions: its own load and a brake's [N·m]."""
     own = chassis.torque_load(signals.angle)
     return own if signals.load_torque is None else own + signals.load_torque
@@ -194,11 +196,11 @@ def torque_held(chassis: Shaft, signals: Signals) -> Scalar:
 def travel(robot: Robot, chassis: Load, signals: Signals) -> Signals:
     """Forces along the slope that traction has to overcome [N]; for a shaft, its load torque over the radius."""
     if isinstance(chassis, Shaft):
-        demand = torque_held(chassis, signals) / chassis.radius
+        demand = opposing_torque(chassis, signals) / chassis.radius
         none = jnp.zeros_like(demand)
         return _fill(signals, resistance=none, gravity=demand, demand=demand, adhesion_limit=none + jnp.inf)
     resistance = chassis.ground.force_resistance(signals.normal, signals.direction_travel)
-    resistance = resistance + added(robot, signals, "ground")
+    resistance = resistance + effects_sum(robot, signals, "ground")
     gravity = ground.force_gravity(signals.mass * (1 / robot.sides), signals.slope, GRAVITY)
     return _fill(
         signals,
@@ -211,7 +213,7 @@ def travel(robot: Robot, chassis: Load, signals: Signals) -> Signals:
 
 def slip(robot: Robot, signals: Signals) -> Signals:
     """Sliding speed of the contact patch over the ground [m/s]."""
-    terms = added(robot, signals, "slip")
+    terms = effects_sum(robot, signals, "slip")
     return _fill(signals, speed_slip_terms=terms, speed_sliding=signals.speed_theoretical - signals.speed - terms)
 
 
@@ -221,11 +223,11 @@ def track(robot: Robot, chassis: Load, signals: Signals, guide: Scalar | None = 
     `guide` is the friction on the lower guide [N]; None applies (26) to the guides' stated share of the weight.
     """
     if isinstance(chassis, Shaft):
-        loss = chassis.torque_loss(signals.speed_wheel, signals.direction) + added(robot, signals, "track")
+        loss = chassis.torque_loss(signals.speed_wheel, signals.direction) + effects_sum(robot, signals, "track")
         return _fill(signals, torque_track_loss=loss)
     loss = chassis.track.torque_loss(signals.speed_wheel, signals.direction)
     guide = chassis.track.force_guide(signals.normal, signals.direction) if guide is None else guide
-    loss = loss + guide * chassis.radius + added(robot, signals, "track")
+    loss = loss + guide * chassis.radius + effects_sum(robot, signals, "track")
     return _fill(signals, torque_track_loss=loss)
 
 
@@ -244,10 +246,10 @@ def gearbox(robot: Robot, chassis: Load, signals: Signals, mover: Scalar | None 
     gear, inertia_motor = robot.gearbox, robot.motor.inertia
     idle = gear.torque_idle(signals.speed_motor, signals.direction)
     mover = chassis.radius * signals.traction if mover is None else mover
-    own = added(robot, signals, "gearbox")
+    own = effects_sum(robot, signals, "gearbox")
     load = signals.torque_track_loss + mover + own
     drive = signals.torque_motor - idle
-    inertia_added = added(robot, signals, "inertia")
+    inertia_added = effects_sum(robot, signals, "inertia")
     # Shafts without inertia get a very small one, which decides the direction of power and the torque transmitted.
     inertia_wheel = chassis.inertia + inertia_added
     next_to_none = LEAST_INERTIA + at_least(inertia_wheel, 0.0)  # keeps the derivative by an added inertia
@@ -286,7 +288,7 @@ def _pulled(robot: Robot, signals: Signals, traction: Scalar) -> Signals:
     return _fill(signals, traction=traction, acceleration=acceleration)
 
 
-def moving(robot: Robot, conditions: Conditions, state: State, way: Scalar | None = None) -> Signals:
+def moving_signals(robot: Robot, conditions: Conditions, state: State, way: Scalar | None = None) -> Signals:
     """All signals of a robot in motion: traction follows from sliding by the friction law.
 
     With an imposed motor speed, the current follows from the torque.
@@ -299,17 +301,17 @@ def moving(robot: Robot, conditions: Conditions, state: State, way: Scalar | Non
     return _moving(robot, conditions, state, way)
 
 
-def rolling(robot: Robot, conditions: Conditions, state: State, way: Scalar | None = None) -> Signals:
+def rolling_signals(robot: Robot, conditions: Conditions, state: State, way: Scalar | None = None) -> Signals:
     """All signals of a robot in motion whose load turns rigidly with its wheels.
 
     The load's inertia acts at the driving shaft, and traction is what the inertia and the demand need. Args: as for
-    `moving`.
+    `moving_signals`.
     """
     robot = robot.within(conditions.configuration)
     chassis = robot.chassis(conditions.configuration)
     if isinstance(chassis, Shaft):
-        return moving(robot, conditions, state, way)
-    signals = _to_slip(robot, conditions, chassis, _one_way(begin(robot, conditions, state), way))
+        return moving_signals(robot, conditions, state, way)
+    signals = _to_slip(robot, conditions, chassis, _one_way(begin_signals(robot, conditions, state), way))
     signals = track(robot, chassis, _fill(signals, traction=signals.demand))
     carried = signals.mass * (1 / robot.sides)
     heavy = dataclasses.replace(chassis, inertia=chassis.inertia + carried * chassis.radius**2)
@@ -319,7 +321,7 @@ def rolling(robot: Robot, conditions: Conditions, state: State, way: Scalar | No
 
 
 def _one_way(signals: Signals, way: Scalar | None) -> Signals:
-    """Signals with the direction that dry friction opposes, as in `moving`."""
+    """Signals with the direction that dry friction opposes, as in `moving_signals`."""
     if way is None:
         return signals
     directions = "direction", "direction_travel"
@@ -378,7 +380,7 @@ def _current_of(signals: Callable[[Any, Scalar], Signals], given: tuple) -> Scal
 def _moving(robot: Robot, conditions: Conditions, state: State, way: Scalar | None) -> Signals:
     robot = robot.within(conditions.configuration)
     chassis = robot.chassis(conditions.configuration)
-    signals = _to_slip(robot, conditions, chassis, _one_way(begin(robot, conditions, state), way))
+    signals = _to_slip(robot, conditions, chassis, _one_way(begin_signals(robot, conditions, state), way))
     if isinstance(chassis, Shaft):
         signals = _fill(signals, traction=signals.demand)
         if state.gap is not None:
@@ -394,10 +396,10 @@ def _within_backlash(robot: Robot, chassis: Shaft, signals: Signals, gap: Scalar
     """Motor and load as two bodies, between which the gear flanks carry their contact torque [N·m]."""
     gear = robot.gearbox
     idle = gear.torque_idle(signals.speed_motor, signals.direction)
-    loss = chassis.torque_loss(signals.speed_output, signals.direction_travel) + added(robot, signals, "track")
+    loss = chassis.torque_loss(signals.speed_output, signals.direction_travel) + effects_sum(robot, signals, "track")
     signals = _fill(signals, torque_track_loss=loss)  # effects of the gearbox depend on it
-    own = added(robot, signals, "gearbox")
-    inertia_added = added(robot, signals, "inertia")
+    own = effects_sum(robot, signals, "gearbox")
+    inertia_added = effects_sum(robot, signals, "inertia")
     inertia_motor = robot.motor.inertia * gear.ratio**2
     mesh = chassis.torque_mesh(gap, signals.speed_wheel - signals.speed_output, inertia_motor)
     efficiency = gear.efficiency_flow(mesh, signals.direction)
@@ -416,7 +418,7 @@ def _within_backlash(robot: Robot, chassis: Shaft, signals: Signals, gap: Scalar
         torque_gear=mesh + own,
         torque_output=mesh,
         acceleration=chassis.radius
-        * (mesh - loss - torque_held(chassis, signals))
+        * (mesh - loss - opposing_torque(chassis, signals))
         / (chassis.inertia + inertia_added),
     )
 
@@ -434,7 +436,7 @@ class Mover(Protocol):
         ...
 
 
-def resolved(
+def resolved_signals(
     robot: Robot, conditions: Conditions, state: State, mover: Mover, inertia: Scalar
 ) -> tuple[Signals, Any]:
     """All signals of a robot in motion whose normal load, traction and guide load come from its contacts.
@@ -448,7 +450,7 @@ def resolved(
     """
     robot = robot.within(conditions.configuration)
     chassis = dataclasses.replace(robot.chassis(conditions.configuration), inertia=inertia)
-    signals = _fill(begin(robot, conditions, state), normal=mover.normal)
+    signals = _fill(begin_signals(robot, conditions, state), normal=mover.normal)
     signals = _to_slip(robot, conditions, chassis, signals)
     pull = mover.pull(chassis, signals)
     return _drawn(robot, chassis, signals, pull), pull
@@ -464,7 +466,7 @@ def _drawn(robot: Robot, chassis: Chassis, signals: Signals, pull: Any) -> Signa
 def resolved_sides(
     robot: Robot, conditions: Conditions, motion: PlaneMotion, mover: Mover, inertia: Scalar
 ) -> tuple[Signals, Any]:
-    """Same as `resolved` for a robot free to turn; left and right side are a leading axis of 2.
+    """Same as `resolved_signals` for a robot free to turn; left and right side are a leading axis of 2.
 
     Signals, the normal loads of `mover` and its result have that axis.
     """
@@ -477,21 +479,25 @@ def resolved_sides(
     return jax.vmap(lambda s, p: _drawn(robot, chassis, s, p))(signals, pull), pull
 
 
-def driven(robot: Robot, conditions: Conditions, state: State, direction: Scalar | None) -> Signals:
-    """Signals of an instant up to the voltage balance; direction: as in `begin`."""
+def driven_signals(robot: Robot, conditions: Conditions, state: State, direction: Scalar | None) -> Signals:
+    """Signals of an instant up to the voltage balance; direction: as in `begin_signals`."""
     robot = robot.within(conditions.configuration)
-    return electrical(robot, conditions, supply(robot, conditions, begin(robot, conditions, state, direction)))
-
-
-def demanded(robot: Robot, conditions: Conditions, state: State, direction: Scalar) -> Signals:
-    """Signals of an instant up to the demand on traction and the sliding of the contact."""
-    robot = robot.within(conditions.configuration)
-    return _to_slip(
-        robot, conditions, robot.chassis(conditions.configuration), begin(robot, conditions, state, direction)
+    return electrical(
+        robot, conditions, supply(robot, conditions, begin_signals(robot, conditions, state, direction))
     )
 
 
-def settled(robot: Robot, conditions: Conditions, state: State, direction: Scalar = 1.0) -> tuple[Signals, Scalar]:
+def demanded_signals(robot: Robot, conditions: Conditions, state: State, direction: Scalar) -> Signals:
+    """Signals of an instant up to the demand on traction and the sliding of the contact."""
+    robot = robot.within(conditions.configuration)
+    return _to_slip(
+        robot, conditions, robot.chassis(conditions.configuration), begin_signals(robot, conditions, state, direction)
+    )
+
+
+def settled_signals(
+    robot: Robot, conditions: Conditions, state: State, direction: Scalar = 1.0
+) -> tuple[Signals, Scalar]:
     """All signals of steady travel: traction is the demand.
 
     Args:
@@ -503,7 +509,7 @@ def settled(robot: Robot, conditions: Conditions, state: State, direction: Scala
     """
     robot = robot.within(conditions.configuration)
     chassis = robot.chassis(conditions.configuration)
-    signals = demanded(robot, conditions, state, direction * jnp.ones_like(state.speed_motor))
+    signals = demanded_signals(robot, conditions, state, direction * jnp.ones_like(state.speed_motor))
     # In steady travel nothing changes: the rates that other fidelities compute are zero.
     still = jnp.zeros_like(signals.demand)
     signals = _fill(signals, traction=signals.demand, acceleration=still)
@@ -538,11 +544,11 @@ def stance(robot: Robot, conditions: Conditions, chassis: Chassis, mass: Scalar)
     """
     length, on_tracks = robot.running_gear.wheelbase, chassis.on_tracks
     if conditions.states_levers:
-        rests = resting_posture.level(robot, conditions, mass)
+        rests = resting_posture.level_posture(robot, conditions, mass)
         length, on_tracks, height = rests.length, rests.line, rests.centre_height
         ahead = rests.centre_ahead - (rests.front + rests.rear) / 2
     else:
-        ahead, up = masses.masses(robot, conditions, mass).centre
+        ahead, up = masses.masses_of_parts(robot, conditions, mass).centre
         height = chassis.radius + chassis.on_tracks * robot.running_gear.grouser_height + up
     return Stance(
         length=length,
@@ -576,14 +582,14 @@ def _both(x: Scalar) -> Array:
 
 
 def _begin_sides(robot: Robot, conditions: Conditions, own: Conditions, motion: PlaneMotion) -> Signals:
-    """Same as `begin` for left and right side, with motion in the plane; `own` are the conditions of each side."""
+    """`begin_signals` of left and right side, with motion in the plane; `own` are the conditions of each side."""
     chassis = robot.chassis(conditions.configuration)
-    signals = jax.vmap(functools.partial(begin, robot))(own, states_of_sides(robot, conditions, motion))
+    signals = jax.vmap(functools.partial(begin_signals, robot))(own, states_of_sides(robot, conditions, motion))
     return _fill(
         signals,
-        total_current=_both(total(jnp.asarray(signals.total_current)) / 2),
+        total_current=_both(sum_of_sides(jnp.asarray(signals.total_current)) / 2),
         side=jnp.sign(SIDES),
-        direction_turn=_both(contact.direction(motion.yaw_rate * chassis.turning.width / 2, chassis.speed_still)),
+        direction_turn=_both(contact.smooth_sign(motion.yaw_rate * chassis.turning.width / 2, chassis.speed_still)),
         slope=_both(jnp.arcsin(sine(conditions.slope) * cosine(motion.heading))),
         **{name: _both(getattr(motion, name)) for name in IN_PLANE},
     )
@@ -593,13 +599,13 @@ def added_in_plane(robot: Robot, signals: Signals) -> tuple[Scalar, Scalar]:
     """Sums of the robot's effects in the balances `lateral` [N] and `yaw` [N·m], over both sides."""
 
     def of(balance: str) -> Scalar:
-        each = _both(jax.vmap(lambda s: added(robot, s, balance))(signals))
-        return robot.sides / 2 * total(each)
+        each = _both(jax.vmap(lambda s: effects_sum(robot, s, balance))(signals))
+        return robot.sides / 2 * sum_of_sides(each)
 
     return of("lateral"), of("yaw")
 
 
-def turning(
+def turning_signals(
     robot: Robot, conditions: Conditions, motion: PlaneMotion, loads: Float[Array, " 2"] | None = None
 ) -> Travel:
     """All signals of a robot free to turn: the balances of both sides, coupled by supply and ground.
@@ -619,7 +625,7 @@ def turning(
     rolling = chassis.ground.force_resistance(1.0, even.direction_travel)
     units = robot.sides / 2
     stands = stance(robot, conditions, chassis, mass)
-    load, sliding = total(units * jnp.asarray(even.normal)), jnp.asarray(even.speed_sliding)
+    load, sliding = sum_of_sides(units * jnp.asarray(even.normal)), jnp.asarray(even.speed_sliding)
     held = grip(
         stands, chassis.ground.friction, conditions.adhesion, load, sliding, motion.speed_lateral, motion.yaw_rate,
         jnp.asarray(rolling), loads,
@@ -629,9 +635,9 @@ def turning(
     )
     lateral, yaw = added_in_plane(robot, own_load)
     pull = held.ahead - units * own_load.resistance
-    along = total(pull) - mass * GRAVITY * sine_slope * cosine(motion.heading)
-    across = total(held.aside) + mass * GRAVITY * sine_slope * sine(motion.heading) - lateral
-    turn = (total(held.moment - y * pull) - yaw) / chassis.turning.inertia
+    along = sum_of_sides(pull) - mass * GRAVITY * sine_slope * cosine(motion.heading)
+    across = sum_of_sides(held.aside) + mass * GRAVITY * sine_slope * sine(motion.heading) - lateral
+    turn = (sum_of_sides(held.moment - y * pull) - yaw) / chassis.turning.inertia
     acceleration = along / mass + motion.yaw_rate * motion.speed_lateral
     pulled = _fill(own_load, traction=held.ahead / units, acceleration=acceleration - turn * y)
     pulled = jax.vmap(lambda s: track(robot, chassis, s))(pulled)
@@ -639,7 +645,7 @@ def turning(
         pulled = jax.vmap(lambda s: gearbox(robot, chassis, s))(pulled)
     else:
         pulled = jax.vmap(lambda c, s: _speed_imposed(robot, c, chassis, s))(own, pulled)
-        pulled = _fill(pulled, total_current=_both(total(jnp.asarray(pulled.total_current)) / 2))
+        pulled = _fill(pulled, total_current=_both(sum_of_sides(jnp.asarray(pulled.total_current)) / 2))
     return Travel(
         pulled,
         held,
@@ -652,14 +658,15 @@ def turning(
 def sensor(robot: Robot, signals: Signals) -> dict[str, Scalar]:
     """Ideal readings of every channel [SI], by channel name; NaN if a reading depends on an unknown parameter."""
     return {
-        c.name: robot.rig.instrument(c.name).shows(c.read(robot, signals)) + added(robot, signals, "sensor", c.name)
+        c.name: robot.rig.instrument(c.name).shows(c.read(robot, signals))
+        + effects_sum(robot, signals, "sensor", c.name)
         if robot.knows(c.rests_on)
         else jnp.full_like(signals.speed, jnp.nan)
         for c in channels.EVERY
     }
 
 
-def shown(robot: Robot, signals: Signals) -> dict[str, Scalar]:
+def readings_of_sides(robot: Robot, signals: Signals) -> dict[str, Scalar]:
     """Same as `sensor` for signals with a last axis of left and right side.
 
     A channel of one side shows that side; the others show the mean.
@@ -671,7 +678,7 @@ def shown(robot: Robot, signals: Signals) -> dict[str, Scalar]:
     }
 
 
-def together(signals: Signals) -> Signals:
+def mean_of_sides(signals: Signals) -> Signals:
     """Mean signals of both sides, as one motor's; totals follow as for equal sides."""
     return jax.tree.map(lambda x: jnp.mean(x, axis=-1) if jnp.ndim(x) else x, signals)
 

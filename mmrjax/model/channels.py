@@ -83,7 +83,7 @@ class Channel(Quantity):
 
     def __reduce__(self) -> tuple[Callable[[str], Channel], tuple[str]]:
         """Pickles the channel by its name, so that tables and results can go to other processes."""
-        return find, (self.name,)
+        return find_channel, (self.name,)
 
 
 def _winding_temperature(robot: Robot, signals: Signals) -> Any:
@@ -352,7 +352,7 @@ EVERY: tuple[Channel, ...] = _EITHER + OF_TURNS
 USUAL = ("total_current", "motor_speed", "speed")
 
 
-def rows(names: Iterable[str]) -> tuple[Channel, ...]:
+def channels_named(names: Iterable[str]) -> tuple[Channel, ...]:
     """The channels of these names, in the order of `EVERY`, which columns, arrays and reports follow.
 
     Raises:
@@ -364,37 +364,37 @@ def rows(names: Iterable[str]) -> tuple[Channel, ...]:
     return tuple(c for c in EVERY if c.name in wanted)
 
 
-def usual() -> tuple[Channel, ...]:
+def usual_channels() -> tuple[Channel, ...]:
     """The channels of a robot without a rig."""
-    return rows(USUAL)
+    return channels_named(USUAL)
 
 
-def find(name: str) -> Channel:
+def find_channel(name: str) -> Channel:
     """The channel with this name.
 
     Raises:
         KeyError: no such channel.
     """
-    return rows((name,))[0]
+    return channels_named((name,))[0]
 
 
-def names(shown: Iterable[Channel]) -> tuple[str, ...]:
+def channel_names(shown: Iterable[Channel]) -> tuple[str, ...]:
     """Names of the channels, in order."""
     return tuple(c.name for c in shown)
 
 
-def index(name: str, shown: Iterable[Channel]) -> int:
+def channel_index(name: str, shown: Iterable[Channel]) -> int:
     """Position of a channel in arrays over the channels `shown`.
 
     Raises:
         KeyError: `shown` does not contain the channel.
     """
-    known = names(shown)
+    known = channel_names(shown)
     if name not in known:
         raise KeyError(f"no channel {name}; there are {', '.join(known)}")
     return known.index(name)
 
 
-def factors(shown: Iterable[Channel]) -> tuple[float, ...]:
+def channel_factors(shown: Iterable[Channel]) -> tuple[float, ...]:
     """SI value of one unit of each channel's column."""
     return tuple(c.factor for c in shown)

@@ -156,7 +156,7 @@ class Conditions(eqx.Module):
     ) -> None:
         # arrays come from other conditions or a table; users write a number or a few
         if not isinstance(duty, np.ndarray | jax.Array | None) and None not in (duty_left, duty_right):
-            raise UsageError(sides_contradict(("duty", *OF_SIDES[:2])))
+            raise UsageError(sides_contradiction(("duty", *OF_SIDES[:2])))
         duty = 1.0 if duty is None else duty
         which: Any = configuration
         if not isinstance(configuration, jax.Array | Named):
@@ -258,7 +258,7 @@ class Conditions(eqx.Module):
         return dataclasses.replace(self, configuration=which)
 
 
-def sides_contradict(stated: Collection[str]) -> str:
+def sides_contradiction(stated: Collection[str]) -> str:
     """Error message if conditions of these names contradict each other, else an empty string.
 
     They do if only one side's motor speed is imposed, or if a side's duty is stated together with that of both.

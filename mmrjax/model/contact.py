@@ -12,7 +12,7 @@ _SLIPS = "Tables A1, A2 simulated: slip at 5 and 10 deg implies 9-39 mm/s with t
 _PACKAGE = "10 V_s, the ratio of the defaults of the multibody package of ref. [48]; the paper prints none"
 
 
-def step(x: Scalar, x0: Scalar, y0: Scalar, x1: Scalar, y1: Scalar) -> Scalar:
+def cubic_step(x: Scalar, x0: Scalar, y0: Scalar, x1: Scalar, y1: Scalar) -> Scalar:
     """Cubic step from y0 at x0 to y1 at x1, flat outside, Fig. 9a (ref. [48]).
 
     y0 + (y1 - y0) u² (3 - 2u) with u = (x - x0) / (x1 - x0) held within 0..1.
@@ -21,7 +21,7 @@ def step(x: Scalar, x0: Scalar, y0: Scalar, x1: Scalar, y1: Scalar) -> Scalar:
     return y0 + (y1 - y0) * u**2 * (3 - 2 * u)
 
 
-def direction(speed: Scalar, speed_rest: Scalar) -> Scalar:
+def smooth_sign(speed: Scalar, speed_rest: Scalar) -> Scalar:
     """Smooth sign of `speed`: the odd cubic x(3 - x²)/2 within ±speed_rest, exactly ±1 beyond [-]."""
     x = jnp.clip(speed / speed_rest, -1.0, 1.0)
     return x * (3 - x**2) / 2
@@ -76,8 +76,8 @@ class Friction(eqx.Module):
     def coefficient(self, speed: Scalar) -> Scalar:
         """Friction coefficient [-] at sliding `speed` [m/s], with the sign of the speed."""
         size = jnp.abs(speed)
-        falling = step(size, self.speed_static, self.static, self.speed_dynamic, self.dynamic)
-        rising = self.static * direction(speed, self.speed_static)
+        falling = cubic_step(size, self.speed_static, self.static, self.speed_dynamic, self.dynamic)
+        rising = self.static * smooth_sign(speed, self.speed_static)
         return jnp.where(size < self.speed_static, rising, jnp.sign(speed) * falling)
 
     def per_speed(self, square: Scalar) -> Scalar:
@@ -88,7 +88,7 @@ class Friction(eqx.Module):
         slow = square < self.speed_static**2
         creeping = self.static * (3 - square / self.speed_static**2) / (2 * self.speed_static)
         size = jnp.sqrt(jnp.where(slow, self.speed_static**2, square))
-        falling = step(size, self.speed_static, self.static, self.speed_dynamic, self.dynamic)
+        falling = cubic_step(size, self.speed_static, self.static, self.speed_dynamic, self.dynamic)
         return jnp.where(slow, creeping, falling / size)
 
     def per_speed_rise(self, square: Scalar) -> Scalar:
@@ -137,10 +137,10 @@ def force_contact(
     h = gap_free - gap
     touching = h > 0
     deep = jnp.where(touching, h, depth)  # a value with a finite derivative when there is no contact
-    force = stiffness * deep**exponent - damping * gap_rate * step(deep, 0.0, 0.0, depth, 1.0)
+    force = stiffness * deep**exponent - damping * gap_rate * cubic_step(deep, 0.0, 0.0, depth, 1.0)
     return jnp.where(touching, jnp.maximum(force, 0.0), 0.0)
 
 
 def damping_contact(force: Scalar, gap: Scalar, gap_free: Scalar, damping: Scalar, depth: Scalar) -> Scalar:
     """Damping of a `force` from `force_contact`: its decrease with the gap's rate [N·s/m]; same arguments."""
-    return jnp.where(force > 0, damping * step(gap_free - gap, 0.0, 0.0, depth, 1.0), 0.0)
+    return jnp.where(force > 0, damping * cubic_step(gap_free - gap, 0.0, 0.0, depth, 1.0), 0.0)

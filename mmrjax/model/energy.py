@@ -7,7 +7,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from mmrjax.model.balances import Travel, added, power_drawn
+from mmrjax.model.balances import Travel, effects_sum, power_drawn
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
@@ -29,7 +29,7 @@ SINKS: dict[str, str] = {
 }
 
 
-def source(robot: Robot, conditions: Conditions, signals: Signals) -> Scalar:
+def source_power(robot: Robot, conditions: Conditions, signals: Signals) -> Scalar:
     """Power of the source [W], negative if it takes power back.
 
     For the battery, its current times the no-load voltage; for the external supply, its output.
@@ -39,10 +39,10 @@ def source(robot: Robot, conditions: Conditions, signals: Signals) -> Scalar:
     return jnp.where(conditions.battery > 0.5, chemical, signals.voltage_source * signals.total_current)
 
 
-def sinks(robot: Robot, conditions: Conditions, signals: Signals) -> dict[str, Scalar]:
+def sink_powers(robot: Robot, conditions: Conditions, signals: Signals) -> dict[str, Scalar]:
     """Power into each of `SINKS` [W], over all motors and sides.
 
-    Together with the change of the energy `stored` they add up to `source` at each instant.
+    Together with the change of the energy `stored_energy` they add up to `source_power` at each instant.
     """
     sides, battery, on_battery = robot.sides, robot.battery, conditions.battery > 0.5
     load = battery.current(signals.total_current)
@@ -63,7 +63,7 @@ def sinks(robot: Robot, conditions: Conditions, signals: Signals) -> dict[str, S
     }
 
 
-def stored(robot: Robot, signals: Signals) -> Scalar:
+def stored_energy(robot: Robot, signals: Signals) -> Scalar:
     """Energy in the motion of robot, wheels and rotors, and in the motors' inductance [J]."""
     inertia = robot.chassis(signals.configuration).inertia + signals.inertia_added
     rotating = robot.motor.inertia * signals.speed_motor**2 + inertia * signals.speed_wheel**2
@@ -71,25 +71,25 @@ def stored(robot: Robot, signals: Signals) -> Scalar:
     return 0.5 * (signals.mass * signals.speed**2 + robot.sides * (rotating + magnetic))
 
 
-def sinks_turning(robot: Robot, conditions: Conditions, travel: Travel) -> dict[str, Scalar]:
-    """Same as `sinks` for a robot that turns: sliding is Σ F·u over all contacts, lift follows its heading."""
+def sink_powers_turning(robot: Robot, conditions: Conditions, travel: Travel) -> dict[str, Scalar]:
+    """Same as `sink_powers` for a robot that turns: sliding is Σ F·u over all contacts, lift follows its heading."""
     signals = travel.signals
-    each = jax.vmap(lambda c, s: sinks(robot, c, s))(conditions.of_sides(), signals)
+    each = jax.vmap(lambda c, s: sink_powers(robot, c, s))(conditions.of_sides(), signals)
     found: dict[str, Scalar] = {name: jnp.mean(jnp.asarray(power)) for name, power in each.items()}
     weight = jnp.mean(jnp.asarray(signals.mass)) * GRAVITY * sine(conditions.slope)
     across = jnp.mean(jnp.asarray(signals.speed_lateral)) * sine(jnp.mean(jnp.asarray(signals.heading)))
     found["sliding"] = found["sliding"] + jnp.sum(travel.grip.across)
     for balance, rate in (("lateral", signals.speed_lateral), ("yaw", signals.yaw_rate)):
-        taken = jax.vmap(lambda s, balance=balance: added(robot, s, balance) * jnp.ones(()))(signals)
+        taken = jax.vmap(lambda s, balance=balance: effects_sum(robot, s, balance) * jnp.ones(()))(signals)
         found["sliding"] = found["sliding"] + robot.sides / 2 * jnp.sum(taken * jnp.asarray(rate))
     found["lift"] = found["lift"] - weight * across
     return found
 
 
-def stored_turning(robot: Robot, travel: Travel, motion: PlaneMotion) -> Scalar:
-    """Same as `stored` for a robot that turns, with lateral and yaw motion [J]."""
+def stored_energy_turning(robot: Robot, travel: Travel, motion: PlaneMotion) -> Scalar:
+    """Same as `stored_energy` for a robot that turns, with lateral and yaw motion [J]."""
     signals = dataclasses.replace(travel.signals, speed=jnp.broadcast_to(motion.speed, (2,)))
     turning = robot.chassis(jnp.max(jnp.asarray(signals.configuration))).turning
-    own = jnp.mean(jax.vmap(lambda s: stored(robot, s))(signals))
+    own = jnp.mean(jax.vmap(lambda s: stored_energy(robot, s))(signals))
     across = jnp.mean(jnp.asarray(signals.mass)) * motion.speed_lateral**2
     return own + 0.5 * (across + turning.inertia * motion.yaw_rate**2)

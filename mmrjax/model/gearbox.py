@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from mmrjax.model.params import Scalar, parameter
-from mmrjax.model.signals import quotient
+from mmrjax.model.signals import safe_quotient
 
 #: Torque below which the gearbox counts as unloaded, so that rounding does not decide the direction of power [N·m].
 NO_TORQUE = 1e-12
@@ -93,7 +93,7 @@ class Gearbox(eqx.Module):
 
     def efficiency(self, torque_input: Scalar, speed: Scalar) -> Scalar:
         """Efficiency η_r [-], eq. (19), driving forward at input torque [N·m] and `speed` [rad/s]."""
-        return (1 - quotient(self.torque_idle(speed, 1.0), torque_input)) * self.efficiency_load
+        return (1 - safe_quotient(self.torque_idle(speed, 1.0), torque_input)) * self.efficiency_load
 
     def torque_loss(self, torque_input: Scalar, speed: Scalar) -> Scalar:
         """Total loss at the output M_rf [N·m], eq. (22), driving forward."""

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from mmrjax.model.contact import Friction
 from mmrjax.model.params import Scalar, parameter
-from mmrjax.model.signals import quotient
+from mmrjax.model.signals import safe_quotient
 from mmrjax.numerics.trigonometry import sine
 
 #: Least normal load that divides a demand, beyond the traction it can hold [N].
@@ -53,6 +53,6 @@ def force_gravity(mass: Scalar, slope: Scalar, gravity: float) -> Scalar:
     return mass * gravity * sine(slope)
 
 
-def slip(speed: Scalar, speed_theoretical: Scalar) -> Scalar:
+def slip_ratio(speed: Scalar, speed_theoretical: Scalar) -> Scalar:
     """s = 1 - V / V_theoretical [-], eq. (33); 0 at rest."""
-    return quotient(speed_theoretical - speed, speed_theoretical)
+    return safe_quotient(speed_theoretical - speed, speed_theoretical)

@@ -108,8 +108,8 @@ def _levers(gear: RunningGear, tracked: Scalar, front: Scalar, rear: Scalar) -> 
     ]
 
 
-def masses(robot: Robot, conditions: Conditions, mass: Scalar) -> Masses:
-    """Masses of half a robot whose total with payload is `mass` [kg], as `balances.begin` gives it.
+def masses_of_parts(robot: Robot, conditions: Conditions, mass: Scalar) -> Masses:
+    """Masses of half a robot whose total with payload is `mass` [kg], as `balances.begin_signals` gives it.
 
     The body's mass is the rest after pulleys, wheels, tracks, levers and payload; it has its own radius of gyration.
     The moment of inertia is summed over the parts at the lever angles. A robot may state the inertia of the whole
@@ -120,7 +120,7 @@ def masses(robot: Robot, conditions: Conditions, mass: Scalar) -> Masses:
 
 
 def without_levers(robot: Robot, conditions: Conditions, mass: Scalar) -> Masses:
-    """Same as `masses` without the levers, which rest on their axles."""
+    """Same as `masses_of_parts` without the levers, which rest on their axles."""
     fixed, _, body, pulley, inertia_pulley = _of_robot(robot, conditions, mass)
     return Masses(*_together(fixed), body, pulley, inertia_pulley)
 
@@ -166,7 +166,7 @@ def check_parts(robot: Robot) -> None:
     gear = params.replace(robot.running_gear, {name: jnp.asarray(x) for name, x in (without | folded).items()})
     bodiless = dataclasses.replace(robot, running_gear=gear)
     for k, (name, chassis) in enumerate(robot.configurations.items()):
-        half = masses(bodiless, Conditions(k).resolved(robot), chassis.mass)
+        half = masses_of_parts(bodiless, Conditions(k).resolved(robot), chassis.mass)
         if np.any(np.asarray(half.body) <= 0):
             parts = np.max(np.asarray(chassis.mass - robot.sides * half.body))
             raise ValueError(

@@ -36,7 +36,7 @@ __all__ = [
     "SURFACES",
     "VOLTAGES_V",
     "adhesion_ratio",
-    "blank",
+    "blank_robot",
     "nominal",
     "sm1",
     "sm2",
@@ -94,7 +94,7 @@ _NOTHING = {
 _OF_A_SHEET, _ASSUMED = ("battery.", "motor.", "running_gear."), ("motor.temperature_ambient",)
 
 
-def blank(configurations: Configurations, sides: float = 1.0, rig: Rig | None = None) -> Robot:
+def blank_robot(configurations: Configurations, sides: float = 1.0, rig: Rig | None = None) -> Robot:
     """A robot with known loads only: no losses in its drive and no limits; a rig's file adds what it states.
 
     Args:
@@ -103,7 +103,9 @@ def blank(configurations: Configurations, sides: float = 1.0, rig: Rig | None = 
     motor = dataclasses.replace(Motor(), speed_limit=UNLIMITED, temperature_limit=UNLIMITED)
     gearbox = dataclasses.replace(Gearbox(), speed_limit=UNLIMITED, torque_limit=None)
     robot = Robot(Battery(), motor, gearbox, configurations, sides=sides)
-    unknown = tuple(p.name for p in params.walk(robot) if p.name.startswith(_OF_A_SHEET) and p.name not in _ASSUMED)
+    unknown = tuple(
+        p.name for p in params.walk_parameters(robot) if p.name.startswith(_OF_A_SHEET) and p.name not in _ASSUMED
+    )
     rig = dataclasses.replace(rig or Rig(), inherits=False, unknown=unknown)
     return params.replace(dataclasses.replace(robot, rig=rig), _NOTHING)
 

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from mmrjax.compile.precision import as_array
-from mmrjax.errors import near
+from mmrjax.errors import similar_words
 
 #: A number, or an array of numbers (a batch or a tracer).
 Scalar = Float[Array, "..."] | float
@@ -97,7 +97,7 @@ STATED, DEFAULT = "stated in the robot's file", "default"
 
 
 @functools.cache
-def own_spec(spec: Spec, stated: bool) -> Spec:
+def rig_spec(spec: Spec, stated: bool) -> Spec:
     """Specification of a rig's parameter: the meaning without the paper's numbers, and its own source.
 
     Args:
@@ -107,10 +107,10 @@ def own_spec(spec: Spec, stated: bool) -> Spec:
     return dataclasses.replace(spec, meaning=_OF_PAPER.sub("", spec.meaning), source=source)
 
 
-def walk(component: eqx.Module, prefix: str = "") -> Iterator[Parameter]:
+def walk_parameters(component: eqx.Module, prefix: str = "") -> Iterator[Parameter]:
     """Yields every parameter below `component`, depth first, by dotted name.
 
-    Parameters of a rig without a base robot do not mention the paper (`own_spec`). A tuple of modules (the effects)
+    Parameters of a rig without a base robot do not mention the paper (`rig_spec`). A tuple of modules (the effects)
     is walked by each member's `name`; a mapping of modules (the configurations) by its keys only: `6T2A.mass`.
     """
     rig = getattr(component, "rig", None)
@@ -119,7 +119,7 @@ def walk(component: eqx.Module, prefix: str = "") -> Iterator[Parameter]:
         return
     stated = {name for name, _, _ in rig.priors}
     for parameter in _walk(component, prefix):
-        spec = own_spec(parameter.spec, parameter.name in stated)
+        spec = rig_spec(parameter.spec, parameter.name in stated)
         yield dataclasses.replace(parameter, spec=spec)
 
 
@@ -140,17 +140,17 @@ def _walk(component: eqx.Module, prefix: str) -> Iterator[Parameter]:
                 yield from _walk(member, f"{name}.{member.name}.")
 
 
-def table(component: eqx.Module) -> str:
+def parameter_table(component: eqx.Module) -> str:
     """Every parameter with value and unit, one line for each part; for a batch or a tracer, its shape."""
     parts: dict[str, list[str]] = {}
-    for p in walk(component):
+    for p in walk_parameters(component):
         part, _, key = p.name.rpartition(".")
         unit = "" if p.spec.unit == "-" else f" {p.spec.unit}"
-        parts.setdefault(part, []).append(f"{key} {shown(p.value)}{unit}")
+        parts.setdefault(part, []).append(f"{key} {number_text(p.value)}{unit}")
     return "\n".join(f"  {part}: {', '.join(lines)}" for part, lines in parts.items())
 
 
-def shown(value: Any) -> str:
+def number_text(value: Any) -> str:
     """A number to six digits; for an array its shape."""
     if isinstance(value, jax.core.Tracer) or not isinstance(value, jax.Array | np.ndarray | np.number | float | int):
         return str(value)
@@ -175,10 +175,10 @@ def replace(component: M, values: dict[str, Any]) -> M:
     Raises:
         KeyError: a name is no parameter of `component`; the message suggests similar names.
     """
-    known = [p.name for p in walk(component)]
+    known = [p.name for p in walk_parameters(component)]
     unknown = sorted(set(values) - set(known))
     if unknown:
-        meant = [near(name, known, 3) for name in unknown]
+        meant = [similar_words(name, known, 3) for name in unknown]
         hints = [f"{n} (did you mean {', '.join(m)}?)" if m else n for n, m in zip(unknown, meant, strict=True)]
         raise KeyError(f"no such parameter: {', '.join(hints)}")
     replaced = _replace(component, values, "")
@@ -209,11 +209,11 @@ def _replace(component: Any, values: dict[str, Any], prefix: str) -> Any:
     return dataclasses.replace(component, **changes) if changes else component
 
 
-def one_by_one(numbers: Float[Array, " n"]) -> tuple[Array, ...]:
+def split_numbers(numbers: Float[Array, " n"]) -> tuple[Array, ...]:
     """Splits an array into its numbers."""
     return tuple(x.reshape(()) for x in jax.lax.split(numbers, [1] * len(numbers))) if len(numbers) else ()
 
 
-def strong(robot: M) -> M:
+def without_weak_types(robot: M) -> M:
     """Returns `robot` without weakly typed numbers, which would make a function compile another program."""
     return jax.tree.map(lambda x: jnp.asarray(x, x.dtype) if isinstance(x, jax.Array) else x, robot)

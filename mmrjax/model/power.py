@@ -123,7 +123,7 @@ class Battery(eqx.Module):
         return jnp.asarray(discharge >= self.capacity)
 
 
-def cutoff_refused(battery: Battery) -> str | None:
+def cutoff_error(battery: Battery) -> str | None:
     """Reason why no mission can start on a battery, without naming its place; None: one can. Not traceable."""
     full = float(battery.voltage_full)
     if battery.voltage_cutoff < full:

@@ -29,17 +29,17 @@ WRITTEN = {
 }  # fmt: skip
 
 
-def spelled(unit: str) -> str:
+def unit_in_column(unit: str) -> str:
     """Returns a unit as a column's name ends with it: `km_h` for `km/h`."""
     unit = WRITTEN.get(unit.lower(), unit)
     return unit.replace("/", "_").replace("%", PERCENT).replace("·", "")
 
 
-def at_the_end(text: str, known: Iterable[str]) -> str | None:
+def unit_at_end(text: str, known: Iterable[str]) -> str | None:
     """Returns the unit among `known` that a column's name ends with, such as kNm of `torque_kNm` and `Torque [kN·m]`;
     None if there is none."""
     end = re.split(r"[\[(\s]", text.rstrip("])"))[-1]
-    found = [unit for unit in known if unit and re.search(rf"(?:^|[^A-Za-z]){unit}$", spelled(end))]
+    found = [unit for unit in known if unit and re.search(rf"(?:^|[^A-Za-z]){unit}$", unit_in_column(end))]
     return max(found, key=len, default=None)
 
 
@@ -80,7 +80,7 @@ class Quantity:
     @property
     def column(self) -> str:
         """Name of its column in tables, with the unit."""
-        return self._column(spelled(self.unit))
+        return self._column(unit_in_column(self.unit))
 
     @property
     def unit_shown(self) -> str:
@@ -91,7 +91,7 @@ class Quantity:
     def units(self) -> Mapping[str, float]:
         """Value of one unit in the unit of its column, by its spelling, that of the column first."""
         written = ((self.unit, self.factor), *self.other_units)
-        return {spelled(unit): size / self.factor for unit, size in written}
+        return {unit_in_column(unit): size / self.factor for unit, size in written}
 
     def columns(self) -> dict[str, str]:
         """Names of the columns that may hold it, each with the unit at its end."""
@@ -165,7 +165,7 @@ LABELS: tuple[Label, ...] = (
 GROUND, SHAFT, VEHICLE = "ground", "shaft", "vehicle"
 _MILLIVOLT, _MILLIAMPERE = (("mV", 1e-3),), (("mA", 1e-3),)
 _GRAM, _RADIAN = (("g", 1e-3),), (("rad", 1.0),)
-_TIMES = (("ms", 1e-3), ("min", 60.0), ("h", 3600.0))
+_TIMES = (("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9), ("min", 60.0), ("h", 3600.0))
 _TORQUES = (("mNm", 1e-3), ("kNm", 1e3))
 _SHARES = ((PERCENT, 1e-2),)
 _VOLTS, _SHARE, _SWITCH = (-100.0, 100.0), (-1.0, 1.0), (-1.0, 1.0)
@@ -271,7 +271,7 @@ CONDITIONS: dict[str, Condition] = {c.field: c for c in SET if c.field}
 BY_COLUMN: dict[str, Condition] = {c.column: c for c in SET}
 
 
-def named(name: str) -> Condition:
+def condition_named(name: str) -> Condition:
     """Returns the condition of a name without its unit: `slope`, `supply_voltage`.
 
     Raises:

@@ -23,7 +23,7 @@ IMPOSED = ("voltage", "motor_speed", "motor_current")
 BETWEEN = ("held", "linear")
 
 
-def on_line(first: Array, second: Array, share: Array) -> Array:
+def interpolate(first: Array, second: Array, share: Array) -> Array:
     """Values at a share of the way from `first` to `second`, shape (*share.shape, ...).
 
     At a share of 0 the second value is ignored, because it may be NaN.
@@ -175,7 +175,7 @@ class Rig(eqx.Module):
         """
         if not jnp.issubdtype(values.dtype, jnp.inexact):
             return values[k]
-        return on_line(values[k], values[k + 1], share)
+        return interpolate(values[k], values[k + 1], share)
 
     def clock(self, times: Float[Array, " times"]) -> Array:
         """Instants of the tables' clock [s] for a run known at `times` since the imposed quantity acts.

@@ -101,8 +101,10 @@ class Robot(eqx.Module):
 
     def __repr__(self) -> str:
         effects = "".join(f", {e.name}" for e in self.effects)
-        head = f"Robot: {', '.join(self.configurations)}; {params.shown(self.sides)} motors driven alike{effects}"
-        return f"{head}\n{params.table(self)}"
+        head = (
+            f"Robot: {', '.join(self.configurations)}; {params.number_text(self.sides)} motors driven alike{effects}"
+        )
+        return f"{head}\n{params.parameter_table(self)}"
 
     def for_equations(self) -> Robot:
         """Same robot without the fields that only files, priors and reports read."""
@@ -114,7 +116,7 @@ class Robot(eqx.Module):
     @property
     def channels(self) -> tuple[Channel, ...]:
         """Channels that its rig's instruments show, in order."""
-        return channels.rows(self.rig.channels)
+        return channels.channels_named(self.rig.channels)
 
     def showing_turns(self, columns: Collection[str] | None = None) -> Robot:
         """Same robot with instruments for both sides and yaw; with `columns`, only for columns of the table."""
@@ -211,7 +213,7 @@ class Robot(eqx.Module):
 NO_BRAKE = "the robot is a vehicle; the torque of a brake acts only on a shaft"
 
 
-def cannot_turn(robot: Robot, names: Iterable[str]) -> str | None:
+def turn_error(robot: Robot, names: Iterable[str]) -> str | None:
     """Reason why a robot with independently driven sides cannot be computed in these configurations, else None."""
     if not robot.has_ground:
         return "the robot's load is a shaft, which does not turn over the ground"

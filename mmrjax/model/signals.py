@@ -221,12 +221,12 @@ class Result(eqx.Module):
         raise AttributeError(f"{type(self).__name__} has no {name}")
 
 
-def done(status: Any) -> Any:
+def is_done(status: Any) -> Any:
     """True for status codes of runs that ended as requested, with an operating point."""
     return (status == CONVERGED) | (status == REVERSES)
 
 
-def quotient(part: Scalar, whole: Scalar) -> Float[Array, "..."]:
+def safe_quotient(part: Scalar, whole: Scalar) -> Float[Array, "..."]:
     """part / whole, and 0 with a finite derivative where `whole` is 0 (at rest)."""
     moving = jnp.abs(whole) > 1e-9
     return jnp.where(moving, part / jnp.where(moving, whole, 1.0), 0.0)

@@ -19,7 +19,7 @@ LANES = 256
 
 
 class _Loop(NamedTuple):
-    """A loop of one member, see `until`: functions of its numbers.
+    """A loop of one member, see `loop_until`: functions of its numbers.
 
     Attributes:
         lanes: members that are at work at once.
@@ -85,7 +85,7 @@ class _Loop(NamedTuple):
         return jax.lax.while_loop(busy, step, carry)[0]
 
 
-def until(
+def loop_until(
     begun: Callable[[Any], T],
     turn: Callable[[Any, T], T],
     ended: Callable[[T], Bool[Array, ""]],

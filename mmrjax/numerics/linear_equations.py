@@ -8,13 +8,13 @@ They are here instead of lineax for two reasons, measured in one run (two cores,
   parallel threads can each hold a thread and wait for ever. Four threads that solved batches of 512 to 2048 systems
   by lineax's `LU`, `QR` or `Cholesky` came to a standstill within seconds, in four runs of four. Fits run in parallel
   threads. So the loops for many unknowns stay too, although lineax is faster there: `LU` takes 0.6, 0.8 and 0.5 times
-  the time of `solved` at n = 9, 12 and 20, and `Cholesky` 0.4, 0.4 and 0.2 times.
+  the time of `solve` at n = 9, 12 and 20, and `Cholesky` 0.4, 0.4 and 0.2 times.
 
-* `factorise`, `substitute`, `solution`, `regular`: each number is an array of the batch, without pivoting. For
-  equations in the order of the unknowns that they determine: balances, masses with damping.
+* `factorise`, `substitute`, `solve_factorised`, `regularise`: each number is an array of the batch, without pivoting.
+  For equations in the order of the unknowns that they determine: balances, masses with damping.
 * `inverse`: the same for a matrix as one array, for several right-hand sides in sequence.
-* `solved`, `inverted`: loops with row exchanges, for any matrix and many unknowns.
-* `half_solved`: the forward half of a solution by a Cholesky factor, for least squares by normal equations. With
+* `solve`, `invert`: loops with row exchanges, for any matrix and many unknowns.
+* `solve_lower`: the forward half of a solution by a Cholesky factor, for least squares by normal equations. With
   priors every direction is known to at least one prior sd and at best to about 1e-4 of it. The condition number is
   therefore about 1e8 at most, and float64 leaves half its digits.
 """
@@ -82,12 +82,12 @@ def substitute(factors: Factors, vector: Sequence[Entry] | Float[Array, " n"]) -
     return x
 
 
-def solution(factors: Factors, vector: Float[Array, " n"]) -> Float[Array, " n"]:
+def solve_factorised(factors: Factors, vector: Float[Array, " n"]) -> Float[Array, " n"]:
     """Solution for one right-hand side as one array, see `substitute`."""
     return jnp.stack([jnp.asarray(x) for x in substitute(factors, vector)])
 
 
-def regular(factors: Factors) -> tuple[Factors, Bool[Array, ""]]:
+def regularise(factors: Factors) -> tuple[Factors, Bool[Array, ""]]:
     """Replaces factors that are singular or not finite by those of the unit matrix.
 
     Also returns whether the factors are the matrix's own. One member of a batch then does not affect the others, in
@@ -117,7 +117,7 @@ def inverse(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Float[Arr
     return matrix, determinant
 
 
-def solved(matrix: Float[Array, "n n"], b: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
+def solve(matrix: Float[Array, "n n"], b: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
     """A⁻¹ b by Gauss-Jordan elimination, with row exchanges for the largest pivot; b may have columns.
 
     Not finite if A is singular.
@@ -137,12 +137,12 @@ def solved(matrix: Float[Array, "n n"], b: Float[Array, "n ..."]) -> Float[Array
     return done[:, n:].reshape(b.shape)
 
 
-def inverted(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """A⁻¹, computed as in `solved`."""
-    return solved(matrix, jnp.eye(len(matrix), dtype=matrix.dtype))
+def invert(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """A⁻¹, computed as in `solve`."""
+    return solve(matrix, jnp.eye(len(matrix), dtype=matrix.dtype))
 
 
-def half_solved(matrix: Float[Array, "n n"], b: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
+def solve_lower(matrix: Float[Array, "n n"], b: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
     """L⁻¹ b with the lower Cholesky factor, L Lᵀ = matrix; NaN if it is not positive definite; b may have columns."""
     n = matrix.shape[0]
     index = jnp.arange(n)

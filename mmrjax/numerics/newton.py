@@ -21,7 +21,7 @@ import optimistix as optx
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float
 
-from mmrjax.numerics.linear_equations import Entry, Matrix, Vector, factorise, regular, substitute
+from mmrjax.numerics.linear_equations import Entry, Matrix, Vector, factorise, regularise, substitute
 
 #: f(y, shared, own): as many scalars as unknowns, so that in a batch each is an array.
 Residual = Callable[[Vector, Any, Any], Vector]
@@ -209,7 +209,7 @@ def _implicit(primals: tuple, tangents: tuple) -> tuple[tuple[Vector, Array], tu
     moved = eqx.filter_jvp(lambda *given: residual(y, *given), (shared, own), tangents[2:4])[1]
     if moved is None or all(m is None for m in moved):
         return (y, solved), (tuple(jnp.zeros_like(x) for x in y), None)
-    factors, own_factors = regular(factorise(_linearised(_function(residual), y, (shared, own), apart)[0]))
+    factors, own_factors = regularise(factorise(_linearised(_function(residual), y, (shared, own), apart)[0]))
     step = substitute(factors, moved)
     change = tuple(
         jnp.zeros_like(a) if b is None else jnp.where(own_factors, -b, 0.0) for a, b in zip(y, step, strict=True)
@@ -229,7 +229,7 @@ def implicit_slopes(slope: Float[Array, "rows outputs x_and_y"], left: Float[Arr
     """
     n = left.shape[1]
     size = left.shape[2] - n
-    factors, own = regular(factorise([[left[:, i, size + j, None] for j in range(n)] for i in range(n)]))
+    factors, own = regularise(factorise([[left[:, i, size + j, None] for j in range(n)] for i in range(n)]))
     by_x = slope[:, :, :size]
     for k, moved in enumerate(substitute(factors, [left[:, i, :size] for i in range(n)])):
         assert moved is not None

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool
 T = TypeVar("T")
 
 
-def rarely(needed: Bool[Array, ""], function: Callable[..., T], arguments: tuple, otherwise: T) -> T:
+def compute_rarely(needed: Bool[Array, ""], function: Callable[..., T], arguments: tuple, otherwise: T) -> T:
     """`function(*arguments)` if `needed`, else `otherwise`.
 
     Similar to `jax.lax.cond`, but `jax.vmap` turns that into computing both branches for every member of a batch.

@@ -9,7 +9,7 @@ import diffrax
 import jax.numpy as jnp
 from diffrax import RESULTS
 
-from mmrjax.numerics.rosenbrock import stages
+from mmrjax.numerics.rosenbrock import rosenbrock_stages
 
 # Weights of the stages in the two coefficients of the dense output.
 _D = (
@@ -61,7 +61,7 @@ class Rodas4(diffrax.AbstractAdaptiveSolver):
         def rate(y: Any) -> tuple[Any, Any]:
             return terms.vf(t0, y, args), y[:0]
 
-        y1, _, u, _ = stages(rate, y0, y0[:0], t1 - t0)
+        y1, _, u, _ = rosenbrock_stages(rate, y0, y0[:0], t1 - t0)
         c2, c3 = (sum(d * v for d, v in zip(row, u[:5], strict=True)) for row in _D)
         dense = {"y0": y0, "y1": y1, "c2": c2, "c3": c3}
         return y1, u[-1], dense, None, RESULTS.successful

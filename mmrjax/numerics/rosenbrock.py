@@ -33,20 +33,20 @@ _C = (
 )
 
 
-def norm(error: Float[Array, " unknowns"], own: int, weight: float | np.ndarray = 1.0) -> Scalar:
+def error_norm(error: Float[Array, " unknowns"], own: int, weight: float | np.ndarray = 1.0) -> Scalar:
     """Root mean square of an error of the robot's `own` unknowns; memories add to it and never dilute it."""
     return jnp.sqrt(jnp.sum(weight * error**2) / own)
 
 
-def norm_of_sides(error: Float[Array, " unknowns"], whole: slice, own: int) -> Scalar:
-    """Same as `norm` for unknowns of both sides and those of the `whole` robot.
+def error_norm_of_sides(error: Float[Array, " unknowns"], whole: slice, own: int) -> Scalar:
+    """Same as `error_norm` for unknowns of both sides and those of the `whole` robot.
 
     A pair counts as one unknown, so that with equal sides the steps are those of the `own` unknowns of straight
     travel.
     """
     weight = np.full(error.shape[0], 0.5)
     weight[whole] = 1.0
-    return norm(error, own, weight)
+    return error_norm(error, own, weight)
 
 
 def step_longest(robot: Robot, conditions: Conditions) -> Array | None:
@@ -55,7 +55,7 @@ def step_longest(robot: Robot, conditions: Conditions) -> Array | None:
     return jax.lax.stop_gradient(jnp.min(jnp.stack(limits))) if limits else None
 
 
-def stages(
+def rosenbrock_stages(
     rates: Callable[[Array], tuple[Array, Array]],
     y0: Float[Array, " n"],
     q0: Float[Array, " m"],
@@ -106,7 +106,7 @@ def _looped(
     first: Array,
     first_q: Array,
 ) -> tuple[Array, Array, Array, Array]:
-    """The stages after the first, see `stages`, in one loop."""
+    """The stages after the first, see `rosenbrock_stages`, in one loop."""
     reach = np.zeros((5, 6))  # of the second to the sixth stage; the sixth begins at the end of the fifth
     for row, weights in enumerate((*_A, (*_A[-1], 1.0))):
         reach[row, : len(weights)] = weights

@@ -19,7 +19,7 @@ from mmrjax.compile.compiling import compiled
 from mmrjax.effects.base import Effect
 from mmrjax.fidelities import rest
 from mmrjax.fidelities.rest import SHARE, TIME, voltage_at_rest
-from mmrjax.fidelities.result import efficiency, known, result, withhold
+from mmrjax.fidelities.result import mask_unknown, power_ratio, result_of_signals, withhold_numbers
 from mmrjax.model import balances, ground
 from mmrjax.model.chassis import Chassis
 from mmrjax.model.conditions import Conditions
@@ -40,7 +40,7 @@ from mmrjax.model.signals import (
 )
 from mmrjax.numerics import lanes
 from mmrjax.numerics.linear_equations import inverse
-from mmrjax.numerics.rosenbrock import norm_of_sides
+from mmrjax.numerics.rosenbrock import error_norm_of_sides
 from mmrjax.turning.two_sides import SIDES
 
 # Units of the unknowns: currents, motor speeds, speed, lateral speed, yaw rate; heading, place; discharge.
@@ -83,11 +83,11 @@ def motion_of(robot: Robot, y: Float[Array, " unknowns"]) -> PlaneMotion:
     return PlaneMotion(y[:2], y[2:4], y[4], y[5], y[6], y[7], y[8], y[9], y[10], memory)
 
 
-_turning = compiled(balances.turning)
+_turning = compiled(balances.turning_signals)
 
 
 @compiled
-def rates(robot: Robot, conditions: Conditions, y: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:
+def turning_rates(robot: Robot, conditions: Conditions, y: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:
     """Rates of the unknowns, in their units [1/s]; 0 for a motor whose speed is imposed."""
     return _rates(robot, conditions, y, _turning(robot, conditions, motion_of(robot, y)))
 
@@ -113,7 +113,7 @@ def _rates(robot: Robot, conditions: Conditions, y: Array, travel: balances.Trav
     return jnp.stack([jnp.asarray(x, y.dtype) for x in found]) / _units(kept).astype(y.dtype)
 
 
-def start(robot: Robot, conditions: Conditions, rolling: bool = False) -> Float[Array, " unknowns"]:
+def turning_start(robot: Robot, conditions: Conditions, rolling: bool = False) -> Float[Array, " unknowns"]:
     """Unknowns at rest with the heading of the conditions, or for `rolling` in the settled turn if it exists.
 
     Motors with an imposed speed turn.
@@ -127,7 +127,7 @@ def start(robot: Robot, conditions: Conditions, rolling: bool = False) -> Float[
         return y / size
     unknowns, solved = _unknowns(robot, conditions)
     settled, loads = _motion(robot, conditions, unknowns)
-    signals = balances.turning(robot, conditions, settled, loads).signals
+    signals = balances.turning_signals(robot, conditions, settled, loads).signals
     memory = [jax.vmap(lambda s, e=e: e.settled(robot, s))(signals) for e in robot.remembering]
     flat = [settled.current, settled.speed_motor, *(jnp.reshape(getattr(settled, name), 1) for name in _OF_ROBOT)]
     rolls = jnp.concatenate([*flat, *memory]).at[7].set(y[7])
@@ -329,9 +329,11 @@ def _unknowns(robot: Robot, conditions: Conditions) -> tuple[Float[Array, " 9"],
     each member ends on its own (`lanes`), while a search by `optimistix.root_find` lasts as long as its slowest.
     """
     held = robot, conditions
-    first = lanes.until(_secant, _look, lambda s: (s.looks >= SOON) | s.solved, held, lambda s: (s.y, s.solved))
-    known = lanes.until(_unknown, _linear, lambda s: s.known, (*held, *first))
-    end = lanes.until(_follow, _turn, lambda s: (s.turns >= TURNS) | s.solved, (*held, first[0], known), most=FEW)
+    first = lanes.loop_until(_secant, _look, lambda s: (s.looks >= SOON) | s.solved, held, lambda s: (s.y, s.solved))
+    known = lanes.loop_until(_unknown, _linear, lambda s: s.known, (*held, *first))
+    end = lanes.loop_until(
+        _follow, _turn, lambda s: (s.turns >= TURNS) | s.solved, (*held, first[0], known), most=FEW
+    )
     sound = end.solved & jnp.all(jnp.isfinite(end.jacobian))
     slope = jnp.where(sound, end.jacobian, jnp.asarray(_still(conditions)))
     return end.y + inverse(-slope)[0] @ jnp.where(sound, _balance(robot, conditions, end.y), 0.0), sound
@@ -342,24 +344,24 @@ def _motion(robot: Robot, conditions: Conditions, y: Float[Array, " 9"]) -> tupl
     return motion_of(robot, _whole(conditions, y)), _loads(robot, conditions, y)
 
 
-def solve(robot: Robot, conditions: Conditions) -> tuple[Float[Array, " 9"], Bool[Array, ""]]:
+def solve_turn(robot: Robot, conditions: Conditions) -> tuple[Float[Array, " 9"], Bool[Array, ""]]:
     """The unknowns of a settled turn, and whether they were found, see `Implicit.solve`."""
     return jax.lax.stop_gradient(_unknowns(*jax.lax.stop_gradient((robot, conditions))))
 
 
-def shown(
+def turn_results(
     robot: Robot, conditions: Conditions, unknowns: Float[Array, " 9"], found: Bool[Array, ""]
 ) -> tuple[Result, Signals, Float[Array, " 9"]]:
     """Result, signals of both sides and residuals of the balances at given unknowns, see `Implicit.shown`."""
     motion, loads = _motion(robot, conditions, unknowns)
-    travel = balances.turning(robot, conditions, motion, loads)
+    travel = balances.turning_signals(robot, conditions, motion, loads)
     stays = unknowns - jax.lax.stop_gradient(_begins(robot, conditions))
     left = jnp.where(_moves(conditions), _left(robot, conditions, unknowns, travel), stays)
     status = _status(robot, conditions, travel, motion, found)
     return result_of(robot, travel, status), travel.signals, left
 
 
-def circling(robot: Robot, conditions: Conditions) -> tuple[balances.Travel, PlaneMotion, Array]:
+def circling_signals(robot: Robot, conditions: Conditions) -> tuple[balances.Travel, PlaneMotion, Array]:
     """Signals of a settled turn on level ground, and its status; with numbers at any status.
 
     Args:
@@ -373,7 +375,7 @@ def circling(robot: Robot, conditions: Conditions) -> tuple[balances.Travel, Pla
     """
     unknowns, solved = _unknowns(robot, conditions)
     motion, loads = _motion(robot, conditions, unknowns)
-    travel = balances.turning(robot, conditions, motion, loads)
+    travel = balances.turning_signals(robot, conditions, motion, loads)
     return travel, motion, _status(robot, conditions, travel, motion, solved)
 
 
@@ -396,7 +398,7 @@ def status_keeping(robot: Robot, conditions: Conditions, travel: balances.Travel
     shafts = jnp.max(jnp.abs(travel.signals.speed_theoretical))
     along = _size(chassis, motion.speed, motion.speed_lateral, motion.yaw_rate)
     status = jnp.where(jnp.minimum(shafts, along) < chassis.speed_still, STALLED, CONVERGED)
-    status = jnp.where(tips(robot, travel), TIPS, status)
+    status = jnp.where(has_tipped(robot, travel), TIPS, status)
     empty = (conditions.battery > 0.5) & robot.battery.empty(motion.discharge)
     return jnp.where(empty, BATTERY_EMPTY, status)
 
@@ -413,12 +415,12 @@ def status_moving(robot: Robot, conditions: Conditions, travel: balances.Travel,
     return jnp.where((change * TIME > SHARE * size) & (status == CONVERGED), NOT_SETTLED, status)
 
 
-def at_rest(y: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:
+def changing_at_rest(y: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:
     """1 for the unknowns that change while friction holds a robot (currents and charge), else 0."""
     return jnp.zeros_like(y).at[jnp.asarray([0, 1, 10])].set(1.0)
 
 
-norm = functools.partial(norm_of_sides, whole=slice(4, len(_UNITS)), own=OF_STRAIGHT)
+norm = functools.partial(error_norm_of_sides, whole=slice(4, len(_UNITS)), own=OF_STRAIGHT)
 
 
 def _of_sides(robot: Robot, conditions: Conditions, motion: PlaneMotion) -> tuple[Conditions, State]:
@@ -447,17 +449,17 @@ def firmness(robot: Robot, conditions: Conditions, motion: PlaneMotion) -> Scala
     chassis = robot.chassis(conditions.configuration)
     level = chassis.ground.friction.static * conditions.adhesion * balances.lateral_friction(conditions, chassis)
     aside = jnp.abs(jnp.tan(conditions.slope) * jnp.sin(motion.heading))
-    return rest.least(sides[0], sides[1], jnp.where(aside > 0, level - aside, jnp.inf))
+    return rest.smallest(sides[0], sides[1], jnp.where(aside > 0, level - aside, jnp.inf))
 
 
 def holds(robot: Robot, conditions: Conditions) -> Array:
     """True if friction at rest holds a standing robot, at the currents a millisecond after the start."""
-    motion = motion_of(robot, start(robot, conditions))
+    motion = motion_of(robot, turning_start(robot, conditions))
     settled = dataclasses.replace(motion, current=current_at_rest(robot, conditions, motion))
     return jnp.asarray(jax.lax.stop_gradient(firmness(robot, conditions, settled)) >= 0)
 
 
-def tips(robot: Robot, travel: balances.Travel) -> Array:
+def has_tipped(robot: Robot, travel: balances.Travel) -> Array:
     """True if no load is left on a side, or all of it is at an end of the contact."""
     load = jnp.sum(travel.grip.normal)
     return (jnp.abs(travel.grip.moved) >= load / 2) | (
@@ -468,38 +470,38 @@ def tips(robot: Robot, travel: balances.Travel) -> Array:
 def result_of(robot: Robot, travel: balances.Travel, status: Array) -> Result:
     """Readings, powers and warnings of an instant: means over both sides, and the worse of them."""
     signals = travel.signals
-    each = jax.vmap(lambda s: result(robot, s, status))(signals)
+    each = jax.vmap(lambda s: result_of_signals(robot, s, status))(signals)
     mean = jax.tree.map(lambda x: jnp.mean(x, axis=0), each)
     flags = each.flags[0] | each.flags[1]
     limit = robot.sides / 2 * signals.adhesion_limit
     found = dataclasses.replace(
         mean,
-        reading=balances.shown(robot, signals),
-        slip=ground.slip(mean.speed, mean.theoretical_speed),
+        reading=balances.readings_of_sides(robot, signals),
+        slip=ground.slip_ratio(mean.speed, mean.theoretical_speed),
         adhesion_used=jnp.max(jnp.hypot(travel.grip.ahead, travel.grip.aside) / limit),
-        efficiency_motor=efficiency(mean.power_motor, mean.power_supply),
-        efficiency_gear=efficiency(mean.power_gear, mean.power_motor),
-        efficiency_chassis=efficiency(mean.power_ground, mean.power_gear),
+        efficiency_motor=power_ratio(mean.power_motor, mean.power_supply),
+        efficiency_gear=power_ratio(mean.power_gear, mean.power_motor),
+        efficiency_chassis=power_ratio(mean.power_ground, mean.power_gear),
         winding_settled=jnp.max(each.winding_settled),
         status=status,
         flags=flags,
     )
-    return known(robot, found)
+    return mask_unknown(robot, found)
 
 
 def operating_point(robot: Robot, conditions: Conditions) -> tuple[Result, Array]:
-    """A settled turn, see `circling`, and whether its conditions are sound; with numbers at any status."""
+    """A settled turn, see `circling_signals`, and whether its conditions are sound; with numbers at any status."""
     sound = jnp.asarray(True)
     for number in jax.tree.leaves(conditions):
         sound &= jnp.isfinite(number)
     conditions = jax.tree.map(lambda x: jnp.where(sound, x, jnp.ones_like(x)), conditions)
-    travel, _, status = circling(robot, conditions)
+    travel, _, status = circling_signals(robot, conditions)
     # On a slope the heading changes continuously.
     status = jnp.where(conditions.slope_deg == 0, status, NOT_SETTLED)
     return result_of(robot, travel, jnp.where(sound, status, FAILED)), sound
 
 
 def steady(robot: Robot, conditions: Conditions) -> Result:
-    """`steady` for a robot that turns: see `circling`; NaN if it has no settled turn."""
+    """`steady` for a robot that turns: see `circling_signals`; NaN if it has no settled turn."""
     point, sound = operating_point(robot, conditions)
-    return withhold(point, (point.status == CONVERGED) | (point.status == STALLED), sound)
+    return withhold_numbers(point, (point.status == CONVERGED) | (point.status == STALLED), sound)

@@ -23,7 +23,7 @@ from jaxtyping import Array, Float
 
 from mmrjax.model.contact import Friction
 from mmrjax.model.params import Scalar, parameter
-from mmrjax.numerics.rarely import rarely
+from mmrjax.numerics.rarely import compute_rarely
 
 #: Position of a side's contact line from the middle of the robot, in shares of B [-]: left, right.
 SIDES = np.array([0.5, -0.5])
@@ -48,7 +48,7 @@ def _nodes(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return place, weight / 2, ends
 
 
-def total(sides: Float[Array, "2 ..."]) -> Array:
+def sum_of_sides(sides: Float[Array, "2 ..."]) -> Array:
     """Sum over both sides, as two numbers: XLA makes a call of every reduction, even a short one."""
     return sides[0] + sides[1]
 
@@ -139,7 +139,7 @@ class Grip(eqx.Module):
     lacking: Float[Array, " 2"]
 
 
-def footprint(stance: Stance, centre: Scalar) -> tuple[Scalar, Scalar, Scalar]:
+def loaded_part(stance: Stance, centre: Scalar) -> tuple[Scalar, Scalar, Scalar]:
     """Centre and half length of the loaded part of a contact, from its own middle [m], and its relative excess load.
 
     The excess is that of the pressure at its front end over the mean [-]. Tracks: p = (N/L)(1 + 12 x_p x / L²). From
@@ -209,7 +209,7 @@ class Law(eqx.Module):
 
 
 @eqx.filter_custom_jvp
-def moments(law: Law, sliding: Float[Array, " 2"], middle: Scalar, end: Scalar) -> Float[Array, "2 4"]:
+def law_moments(law: Law, sliding: Float[Array, " 2"], middle: Scalar, end: Scalar) -> Float[Array, "2 4"]:
     """Moments of order 0 to 3 of `Law.per_speed` over a uniformly loaded contact, of each side [s/m].
 
     They are taken about its middle and in units of half its length.
@@ -222,7 +222,7 @@ def moments(law: Law, sliding: Float[Array, " 2"], middle: Scalar, end: Scalar) 
     return law.over(law.per_speed(sliding[:, None] ** 2, across**2), 3)
 
 
-@moments.def_jvp
+@law_moments.def_jvp
 def _moments_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     """Tangents in closed form for the speeds, once for all directions; as computed for the law's own numbers."""
     law, sliding, middle, end = primals
@@ -316,16 +316,16 @@ def _loads(given: _Given) -> tuple[Float[Array, " 2"], Grip]:
 
     nothing = load * given.sliding[0]
     begun = jnp.stack([jnp.zeros_like(nothing), stance.ahead * jnp.ones_like(nothing)])
-    even = moments(*_along(begun[1], given))
+    even = law_moments(*_along(begun[1], given))
     found = steps(begun, given, even)
     lifts = (stance.on_tracks > 0.5) & (jnp.maximum(jnp.abs(begun[1]), jnp.abs(found[0][1])) > stance.length / 6)
-    return rarely(lifts, lambda at, given: steps(at, given, None), (begun, given), found)
+    return compute_rarely(lifts, lambda at, given: steps(at, given, None), (begun, given), found)
 
 
 def _along(centre: Scalar, given: _Given) -> tuple[Law, Array, Scalar, Scalar]:
-    """Arguments of `moments` for this centre of pressure."""
+    """Arguments of `law_moments` for this centre of pressure."""
     stance, yaw = given.stance, given.yaw_rate
-    place, half, _ = footprint(stance, centre)
+    place, half, _ = loaded_part(stance, centre)
     law = Law(given.friction, stance.lateral ** (2 * stance.rule - 2), stance.on_tracks, stance.nodes)
     return law, given.sliding, -given.lateral_speed - yaw * (place - stance.ahead), -yaw * half
 
@@ -338,18 +338,18 @@ def _at_loads(loads: Array, even: Array | None, given: _Given) -> Grip:
     """
     (moved, centre), stance, adhesion, load = loads, given.stance, given.adhesion, given.load
     normal = jnp.maximum(load / 2 - 2 * SIDES * moved, 0.0)
-    place, half, tilt = footprint(stance, centre)
+    place, half, tilt = loaded_part(stance, centre)
     arm = place - stance.ahead
     law, sliding, middle, end = _along(centre, given)
-    even = moments(law, sliding, middle, end) if even is None else even
+    even = law_moments(law, sliding, middle, end) if even is None else even
     zeroth, first, second = (even[:, k] + tilt * even[:, k + 1] for k in range(3))
     held, across = adhesion * normal, adhesion * normal * stance.lateral**stance.rule
     aside = across * (middle * zeroth + end * first)
     turned = across * (middle * first + end * second)
     ahead = held * zeroth * sliding
-    outward = stance.height * total(aside) / stance.width
+    outward = stance.height * sum_of_sides(aside) / stance.width
     # A vertical ground carries no normal load.
-    behind = stance.height * total(ahead - given.resistance * normal) / jnp.maximum(load, 1e-9)
+    behind = stance.height * sum_of_sides(ahead - given.resistance * normal) / jnp.maximum(load, 1e-9)
     return Grip(
         normal=normal,
         ahead=ahead,

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mmrjax.model.contact import step
+from mmrjax.model.contact import cubic_step
 from mmrjax.model.params import Scalar
 from mmrjax.numerics.trigonometry import cosine, sine
 from mmrjax.undercarriage.running_gear import GROUSERS, TEETH_PULLEY, RunningGear
@@ -68,7 +68,7 @@ class Tips(eqx.Module):
         forward, up: position [m].
         rate_forward, rate_up: displacement per displacement of the belt [-].
         guided: share of a load on the grouser that passes to the lower guide, the rest to a pulley [-].
-        compliance: of the free belt between pulley and guide at unit tension [m], see `tips`.
+        compliance: of the free belt between pulley and guide at unit tension [m], see `tips_on_path`.
     """
 
     forward: Float[Array, " n"]
@@ -79,7 +79,7 @@ class Tips(eqx.Module):
     compliance: Float[Array, " n"]
 
 
-def tips(path: Path, place: Float[Array, " n"]) -> Tips:
+def tips_on_path(path: Path, place: Float[Array, " n"]) -> Tips:
     """Tips of the grousers at `place` [m along the path].
 
     A grouser sits on a rigid base and turns with the mean direction of the path under that base. Its
@@ -97,7 +97,7 @@ def tips(path: Path, place: Float[Array, " n"]) -> Tips:
     share = jnp.clip((base / 2 - x) / base, 0.0, 1.0)  # of the base on the arc
     tilt = jnp.minimum(jnp.where(x < -base / 2, -x / radius, share**2 * base / (2 * radius)), jnp.pi)
     tilt_rate = -jnp.where(tilt < jnp.pi, share, 0.0) / radius
-    rise = gear.guide_recess * step(x, 0.0, 0.0, gear.guide_gap, 1.0)
+    rise = gear.guide_recess * cubic_step(x, 0.0, 0.0, gear.guide_gap, 1.0)
     u = jnp.clip(x / gear.guide_gap, 0.0, 1.0)
     rise_rate = gear.guide_recess * 6 * u * (1 - u) / gear.guide_gap
     straight = jnp.where(x > 0, -x, jnp.where(turned < jnp.pi, 0.0, x + arc))
@@ -107,7 +107,7 @@ def tips(path: Path, place: Float[Array, " n"]) -> Tips:
         up=-radius * cosine(turned) - height * cosine(tilt) + rise,
         rate_forward=-cosine(turned) + height * cosine(tilt) * tilt_rate,
         rate_up=side * (-sine(turned) + height * sine(tilt) * tilt_rate + rise_rate),
-        guided=jnp.where(x > 0, step(x, 0.0, 0.0, gear.guide_gap, 1.0), 0.0),
+        guided=jnp.where(x > 0, cubic_step(x, 0.0, 0.0, gear.guide_gap, 1.0), 0.0),
         compliance=u * (1 - u) * gear.guide_gap,
     )
 
@@ -128,7 +128,7 @@ class Runs(eqx.Module):
     torque_rear: Scalar
 
 
-def travel(radius: Scalar, angle: Scalar) -> tuple[Scalar, Scalar]:
+def belt_travel(radius: Scalar, angle: Scalar) -> tuple[Scalar, Scalar]:
     """Belt drawn by a pulley turned by `angle` [m], and per radian [m]: s = r (φ + ε sin(nφ) / n).
 
     The links form a polygon of n = 48 sides, so the lever arm varies by ±ε with each tooth (chordal action;
@@ -138,15 +138,15 @@ def travel(radius: Scalar, angle: Scalar) -> tuple[Scalar, Scalar]:
     return radius * (angle + POLYGON * sine(phase) / TEETH_PULLEY), radius * (1 + POLYGON * cosine(phase))
 
 
-def runs(path: Path, angles: Sequence[Scalar], rates: Sequence[Scalar]) -> Runs:
+def belt_runs(path: Path, angles: Sequence[Scalar], rates: Sequence[Scalar]) -> Runs:
     """Tensions from the angles [rad] and rates [rad/s] of front and rear pulley, relative to the chassis.
 
     P = max(0, P_0 ± k Δs ± b Δṡ), with Δs the belt drawn by the front pulley less that of the rear one: the
     upper run pulls, the lower one slackens. The teeth transmit, so P_0 only keeps the runs from going slack.
     """
     gear = path.gear
-    drawn_front, lever_front = travel(path.radius, angles[0])
-    drawn_rear, lever_rear = travel(path.radius, angles[1])
+    drawn_front, lever_front = belt_travel(path.radius, angles[0])
+    drawn_rear, lever_rear = belt_travel(path.radius, angles[1])
     stretch = drawn_front - drawn_rear
     rate = lever_front * rates[0] - lever_rear * rates[1]
     pull = gear.span_stiffness * stretch + gear.span_damping * rate

@@ -26,7 +26,7 @@ from mmrjax.model.chassis import Chassis
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar
 from mmrjax.model.signals import CONVERGED, NOT_SETTLED, PlaneMotion, Result, Signals
-from mmrjax.numerics.linear_equations import factorise, solution
+from mmrjax.numerics.linear_equations import factorise, solve_factorised
 from mmrjax.numerics.trigonometry import cosine, sine
 from mmrjax.turning import circling
 from mmrjax.turning.two_sides import SIDES, Grip, Law
@@ -61,9 +61,9 @@ class _Sides(eqx.Module):
 
     def pull(self, chassis: Chassis, signals: Signals) -> Pull:
         def side(signals: Signals, at: Touch, aside: Array, height: Scalar) -> Pull:
-            along = side_contacts.sliding(signals, at)
+            along = side_contacts.sliding_speeds(signals, at)
             held = signals.adhesion * at.force * self.law.per_speed(along**2, aside**2)
-            pulled = side_contacts.pull(self.path, chassis, signals, at, height, held * along)
+            pulled = side_contacts.contact_forces(self.path, chassis, signals, at, height, held * along)
             return dataclasses.replace(pulled, aside=-self.lateral * held * aside)
 
         return jax.vmap(side)(signals, self.at, self.aside, self.height)
@@ -106,7 +106,7 @@ def _contacts(run: System, motion: Motion) -> _Sides:
     nothing = jnp.zeros_like(y)
     of_q = jnp.stack([nothing, heights, q[PITCH] + nothing, *q[PULLEYS].T], axis=1)
     of_v = jnp.stack([speed - v[YAW] * y, rises, v[PITCH] + nothing, *v[PULLEYS].T], axis=1)
-    at = jax.vmap(lambda q, v: side_contacts.touch(run.path, run.chassis, q, v))(of_q, of_v)
+    at = jax.vmap(lambda q, v: side_contacts.contact_state(run.path, run.chassis, q, v))(of_q, of_v)
     own, ratio = run.chassis.turning, balances.lateral_friction(run.conditions, run.chassis)
     law = Law(run.chassis.ground.friction, ratio ** (2 * own.rule - 2), run.chassis.on_tracks, own.nodes)
     aside = lateral + v[YAW] * at.lever_x - v[ROLL] * at.lever_z
@@ -192,7 +192,7 @@ def resistance(
     """
     levers, at = _levers(run, motion, sides.at), sides.at
     assert pulled.aside is not None
-    sliding = jax.vmap(side_contacts.sliding)(signals, at)
+    sliding = jax.vmap(side_contacts.sliding_speeds)(signals, at)
     weight = jnp.asarray(signals.adhesion)[:, None] * at.force
     rises = jnp.stack([jnp.stack(row) for row in sides.law.rises(sliding, -sides.aside)])
     rises = rises * jnp.stack([weight, sides.lateral * weight])[:, None]
@@ -251,14 +251,14 @@ def _forces(run: System, motion: Motion, stored: bool = False) -> _Forces:
     sides = found(_contacts(run, motion))
     signals, pulled = found(_resolved(run, plane_motion(run, motion), sides))
     damping, levers, rises = resistance(run, motion, signals, sides, pulled)
-    mass, bias = dynamics(run, motion, jnp.asarray(run.robot.sides / 2 * half_robot.rotating(run, signals)))
+    mass, bias = dynamics(run, motion, jnp.asarray(run.robot.sides / 2 * half_robot.armature_inertia(run, signals)))
     push = run.step * (generalized(run, motion, signals, sides.at, pulled) - bias)
     return _Forces(sides, signals, pulled, levers, rises, mass, damping, push)
 
 
 def _solver(run: System, found: _Forces) -> Callable[[Float[Array, " 10"]], Float[Array, " 10"]]:
     factors = factorise(found.mass + run.step * found.damping)
-    return functools.partial(solution, factors)
+    return functools.partial(solve_factorised, factors)
 
 
 @eqx.filter_custom_jvp
@@ -315,7 +315,7 @@ def _moved(
 
     def later(own: Conditions, signals: Signals, memory: Mapping[str, Scalar]) -> Any:
         of_side = dataclasses.replace(run, conditions=own), dataclasses.replace(motion, memory=memory)
-        return half_robot.later(*of_side, signals)
+        return half_robot.state_after(*of_side, signals)
 
     each = jax.vmap(later)(run.conditions.of_sides(), found.signals, motion.memory)
     after = Motion(motion.q + run.step * v, v, each.current, each.discharge[0], each.memory)
@@ -393,7 +393,7 @@ def _heading(run: System) -> Scalar:
 def roll(run: System) -> Motion:
     """In the settled turn of the steady fidelity, at rest if it has none."""
     begins = stand(run)
-    rolls = circling.motion_of(run.robot, circling.start(run.robot, run.conditions, rolling=True))
+    rolls = circling.motion_of(run.robot, circling.turning_start(run.robot, run.conditions, rolling=True))
     cos, sin = cosine(rolls.heading), sine(rolls.heading)
     lateral = rolls.speed_lateral - run.half.centre[0] * rolls.yaw_rate
     shafts = rolls.speed_motor / run.robot.gearbox.ratio
@@ -420,7 +420,7 @@ def averaged(average: Average, travelled: Array, passed: balances.Travel, guided
     share = jnp.sum(load) / jnp.maximum(jnp.sum(travel.signals.normal), 1e-9)
     # A side that hardly moves counts as settled if its changes are small compared with the other side's.
     larger = [(change, jnp.max(size)) for change, size in changes]
-    return Steady(travel.signals, share, periods, jnp.max(half_robot.relative(larger)), travel)
+    return Steady(travel.signals, share, periods, jnp.max(half_robot.relative_changes(larger)), travel)
 
 
 def status(run: System, averages: Steady, end: Motion) -> Array:
@@ -432,7 +432,7 @@ def status(run: System, averages: Steady, end: Motion) -> Array:
     status = circling.status_keeping(run.robot, run.conditions, travel, keeps)
     status = jnp.where((averages.change > half_robot.SETTLED) & (status == CONVERGED), NOT_SETTLED, status)
     tilt = jnp.maximum(jnp.abs(end.q[PITCH]), jnp.abs(end.q[ROLL]))
-    return half_robot.unless_lost(run, status, end, end.q[HEIGHT], tilt, signals.total_current)
+    return half_robot.status_unless_lost(run, status, end, end.q[HEIGHT], tilt, signals.total_current)
 
 
 def result_of(run: System, averages: Steady, status: Array) -> Result:

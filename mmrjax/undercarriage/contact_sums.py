@@ -20,8 +20,15 @@ from mmrjax.model.chassis import Chassis
 from mmrjax.model.params import Scalar
 from mmrjax.model.signals import Signals
 from mmrjax.numerics.trigonometry import cosine, sine
-from mmrjax.undercarriage.belt import Path, runs, tips
-from mmrjax.undercarriage.side_contacts import WHEEL, Touch, bearing, of_contacts, tension_free, touch
+from mmrjax.undercarriage.belt import Path, belt_runs, tips_on_path
+from mmrjax.undercarriage.side_contacts import (
+    WHEEL,
+    Touch,
+    bearing_contacts,
+    contact_state,
+    join_contacts,
+    tension_free,
+)
 
 #: Parameters of the running gear, of the friction of the ground and of a chassis that contacts depend on.
 GEAR = (
@@ -79,7 +86,7 @@ class Sums(eqx.Module):
 ROWS = tuple(f.name for f in dataclasses.fields(Sums))
 
 
-def inputs(path: Path, chassis: Chassis, adhesion: Any) -> dict[str, Any]:
+def contact_inputs(path: Path, chassis: Chassis, adhesion: Any) -> dict[str, Any]:
     """Inputs of the contacts other than the motion, by name; tangents have the same form (None: constant)."""
     gear, friction = path.gear, chassis.ground.friction
     return {
@@ -100,7 +107,7 @@ def _with(path: Path, chassis: Chassis, values: Mapping[str, Any]) -> tuple[Path
     return Path(values["pulley"], gear), dataclasses.replace(chassis, ground=ground, **changed)
 
 
-def shares(
+def contact_shares(
     path: Path, chassis: Chassis, at: Touch, slip: Scalar, adhesion: Scalar, gained: Float[Array, " 5"]
 ) -> Float[Array, "sums contacts"]:
     """Contribution of each contact to the `Sums`; `slip` shifts all sliding speeds [m/s], `gained` is Δv."""
@@ -171,20 +178,20 @@ def linearize(
     """Sums and their derivatives.
 
     Derivatives with respect to motion and slip are written out. The others are by forward differentiation of
-    `shares`, one input at a time.
+    `contact_shares`, one input at a time.
 
     Args:
         path, chassis: of the run.
-        given: values of `MOTION`, of `inputs` and of `slip`.
+        given: values of `MOTION`, of `contact_inputs` and of `slip`.
         gained: Δv of the step, constant.
-        constants: `inputs` to differentiate with respect to.
+        constants: `contact_inputs` to differentiate with respect to.
     """
 
     def each(values: Mapping[str, Any]) -> Float[Array, "sums contacts"]:
         path_now, chassis_now = _with(path, chassis, values)
         z, pitch, front, rear, *v = (values[name] for name in MOTION)
-        at = touch(path_now, chassis_now, (0.0, z, pitch, front, rear), v)
-        return shares(path_now, chassis_now, at, values["slip"], values["adhesion"], gained)
+        at = contact_state(path_now, chassis_now, (0.0, z, pitch, front, rear), v)
+        return contact_shares(path_now, chassis_now, at, values["slip"], values["adhesion"], gained)
 
     def along(name: str) -> Float[Array, "sums contacts"]:
         value = jnp.asarray(given[name])
@@ -262,7 +269,7 @@ def _law(path: Path, chassis: Chassis, at: Touch, given: Mapping[str, Any], gain
     yields = 1 / (1 + at.compliance * stiff)
     u = jnp.clip(depth / gear.contact_depth, 0.0, 1.0)
     deepens = gear.contact_damping * 6 * u * (1 - u) / gear.contact_depth
-    bears = jnp.where(at.force > 0, bearing(chassis), 0.0) * yields
+    bears = jnp.where(at.force > 0, bearing_contacts(chassis), 0.0) * yields
     softens = at.compliance * stiff * yields * (gear.contact_exponent - 1) / depth
     sliding = -at.speed_x - given["slip"]
     rise, bend = jax.jvp(friction.rise, (sliding,), (jnp.ones_like(sliding),))
@@ -329,7 +336,7 @@ def _by_motion(
     and changes of the levers with its forces.
     """
     height, pitch, front, rear, *v = (given[name] for name in MOTION)
-    at = touch(path, chassis, (0.0, height, pitch, front, rear), v)
+    at = contact_state(path, chassis, (0.0, height, pitch, front, rear), v)
     law = _law(path, chassis, at, given, gained)
     x, z, rate_x, rate_z, guided, one = at.lever_x, at.lever_z, at.rate_x, at.rate_z, at.guided, jnp.ones_like(at.gap)
     on_front, on_rear = path.radius * (1 - at.weight), path.radius * at.weight
@@ -356,8 +363,8 @@ def _by_motion(
     # Along the belt the tips move in the frame of the pitched chassis, and their shares of the pulleys change.
     unit = jnp.ones_like(front)
     (place, _), (by_front, shared) = jax.jvp(lambda a: path.place(a, rear), (front,), (unit,))
-    by_front, shared, by_rear = of_contacts(by_front), of_contacts(shared), at.weight * path.radius
-    tip = jax.tree.map(of_contacts, jax.jvp(lambda p: tips(path, p), (place,), (jnp.ones_like(place),))[1])
+    by_front, shared, by_rear = join_contacts(by_front), join_contacts(shared), at.weight * path.radius
+    tip = jax.tree.map(join_contacts, jax.jvp(lambda p: tips_on_path(path, p), (place,), (jnp.ones_like(place),))[1])
     cos, sin = cosine(pitch), sine(pitch)
     belt = (
         tip.forward * cos + tip.up * sin,
@@ -369,7 +376,7 @@ def _by_motion(
     pitched = (z + below, -x, rate_z, -rate_x - below / path.radius)
 
     def free(motion: Sequence[Scalar]) -> Scalar:
-        return tension_free(path, runs(path, motion[:2], motion[2:]))
+        return tension_free(path, belt_runs(path, motion[:2], motion[2:]))
 
     pulleys = (front, rear, v[3], v[4])
     taut = free(pulleys)
@@ -406,7 +413,7 @@ def _by_motion(
     return rows[-1], slopes
 
 
-class Drawn(eqx.Module):
+class ContactForces(eqx.Module):
     """Forces of the contacts at an instant, from their sums; see `undercarriage.Pull`."""
 
     traction: Scalar
@@ -418,7 +425,7 @@ class Drawn(eqx.Module):
 
 
 class Mover(eqx.Module):
-    """The contacts in the form that `balances.resolved` expects, from their sums near an instant.
+    """The contacts in the form that `balances.resolved_signals` expects, from their sums near an instant.
 
     The forces also depend on `speed_slip_terms`: traction and load to second order, so that the first derivatives
     of their change with it are exact as well.
@@ -446,12 +453,12 @@ class Mover(eqx.Module):
             front=sums.front - (rise_front + by.rise_front * moved / 2) * moved,
         )
 
-    def pull(self, chassis: Chassis, signals: Signals) -> Drawn:
+    def pull(self, chassis: Chassis, signals: Signals) -> ContactForces:
         """Forces of the contacts for these signals."""
         sums = self.shifted(signals.speed_slip_terms)
         friction = chassis.track.guide_friction * signals.direction
         guided = (sums.guide_front + sums.guide_rear) / self.radius
         load = -(sums.front - friction * sums.guide_front + self.torque_front)
-        return Drawn(
+        return ContactForces(
             sums.traction, sums.moment, sums.rear - friction * sums.guide_rear, friction * guided, guided, load
         )

@@ -15,13 +15,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from mmrjax.fidelities.rest import STARTS, creeps, direction, unless_slipping, voltage_at_rest
-from mmrjax.fidelities.result import result, travels
+from mmrjax.fidelities.rest import STARTS, is_at_rest, status_with_slip, travel_direction, voltage_at_rest
+from mmrjax.fidelities.result import result_of_signals, travel_status
 from mmrjax.fidelities.steady import steady
 from mmrjax.model import balances
 from mmrjax.model.chassis import Chassis, inertia_reduced
 from mmrjax.model.conditions import Conditions
-from mmrjax.model.masses import Masses, masses
+from mmrjax.model.masses import Masses, masses_of_parts
 from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import (
@@ -35,12 +35,12 @@ from mmrjax.model.signals import (
     Result,
     Signals,
     State,
-    done,
+    is_done,
 )
-from mmrjax.numerics.linear_equations import Factors, Vector, factorise, solution
+from mmrjax.numerics.linear_equations import Factors, Vector, factorise, solve_factorised
 from mmrjax.numerics.newton import root
 from mmrjax.undercarriage import contact_sums, mjcf, side_contacts
-from mmrjax.undercarriage.belt import Path, runs
+from mmrjax.undercarriage.belt import Path, belt_runs
 from mmrjax.undercarriage.contact_sums import Linearized
 from mmrjax.undercarriage.mjcf import mjx
 from mmrjax.undercarriage.side_contacts import Pull, Reactions, Touch
@@ -116,13 +116,13 @@ class System(eqx.Module):
     step: Scalar
 
 
-def system(robot: Robot, conditions: Conditions, step: Scalar) -> System:
+def half_robot_system(robot: Robot, conditions: Conditions, step: Scalar) -> System:
     """Constants of one run (scalar fields), of half a robot or of a whole one; the robot may hold tracers."""
     zero = jnp.zeros_like(conditions.voltage)
-    mass = balances.begin(robot, conditions, State(zero, zero, zero, zero)).mass
-    half = masses(robot, conditions, mass)
-    model, data = mjcf.template(conditions.turns)
-    model = mjcf.member(model, mjcf.bodies(robot, half, conditions), conditions.slope, step)
+    mass = balances.begin_signals(robot, conditions, State(zero, zero, zero, zero)).mass
+    half = masses_of_parts(robot, conditions, mass)
+    model, data = mjcf.model_template(conditions.turns)
+    model = mjcf.member_model(model, mjcf.robot_bodies(robot, half, conditions), conditions.slope, step)
     path, chassis = Path(robot.radius_pulley, robot.running_gear), robot.chassis(conditions.configuration)
     return System(robot, conditions, path, half, chassis, model, data, jnp.asarray(step, float))
 
@@ -137,12 +137,12 @@ class _Mover(eqx.Module):
         return self.at.normal
 
     def pull(self, chassis: Chassis, signals: Signals) -> Pull:
-        return side_contacts.pull(self.path, chassis, signals, self.at, self.height)
+        return side_contacts.contact_forces(self.path, chassis, signals, self.at, self.height)
 
 
 def instant(run: System, motion: Motion) -> tuple[Signals, Touch, Pull]:
     """All signals, contacts and forces of an instant."""
-    at = side_contacts.touch(run.path, run.chassis, motion.q, motion.v)
+    at = side_contacts.contact_state(run.path, run.chassis, motion.q, motion.v)
     signals, pulled = _resolved(run, motion, _Mover(run.path, at, motion.q[1]), motion.v[0], motion.v[3])
     return signals, at, pulled
 
@@ -153,7 +153,7 @@ def _resolved(
     """Signals and forces of the given contacts, for a speed of the robot [m/s] and of the driving shaft [rad/s]."""
     ratio = run.robot.gearbox.ratio
     state = State(motion.current, ratio * speed_shaft, speed, motion.discharge, motion.memory)
-    return balances.resolved(run.robot, run.conditions, state, mover, run.half.inertia_pulley)
+    return balances.resolved_signals(run.robot, run.conditions, state, mover, run.half.inertia_pulley)
 
 
 def _losses(run: System, motion: Motion, mover: balances.Mover) -> tuple[Scalar, Scalar]:
@@ -177,10 +177,10 @@ def _losses(run: System, motion: Motion, mover: balances.Mover) -> tuple[Scalar,
 def generalized(run: System, signals: Signals, pulled: Pull) -> tuple[Float[Array, " 5"], Float[Array, " 5"]]:
     """Generalized forces on q [N, N·m], and the armature's inertia seen at each joint [kg·m²], eq. (31)."""
     force = jnp.insert(pulled.generalized, 3, signals.torque_net)
-    return force, jnp.zeros_like(force).at[3].set(rotating(run, signals))
+    return force, jnp.zeros_like(force).at[3].set(armature_inertia(run, signals))
 
 
-def rotating(run: System, signals: Signals) -> Scalar:
+def armature_inertia(run: System, signals: Signals) -> Scalar:
     """The armature's inertia seen at the driving shaft [kg·m²], eq. (31)."""
     motor, ratio = run.robot.motor.inertia, run.robot.gearbox.ratio
     return inertia_reduced(motor, ratio, signals.efficiency_load, signals.inertia_added)
@@ -269,8 +269,8 @@ def _step(run: System, motion: Motion) -> _Step:
     pushed, mass = _pushed(run, motion, signals, pulled)
     damping = resistance(run, motion, signals, at, pulled)
     factors = factorise(mass + run.step * damping)
-    gained = solution(factors, mass @ (pushed - motion.v))
-    after, over = _moved(motion, run.step, later(run, motion, signals), damping @ gained, gained, signals)
+    gained = solve_factorised(factors, mass @ (pushed - motion.v))
+    after, over = _moved(motion, run.step, state_after(run, motion, signals), damping @ gained, gained, signals)
     return _Step(after, over, pulled.guided, damping, factors, gained, jnp.asarray(signals.speed_slip_terms))
 
 
@@ -282,7 +282,7 @@ class _Later(eqx.Module):
     memory: Mapping[str, Scalar]
 
 
-def later(run: System, motion: Motion, signals: Signals) -> _Later:
+def state_after(run: System, motion: Motion, signals: Signals) -> _Later:
     """Currents, charge and memories after one step."""
     charge = balances.charge_drawn(run.robot, run.conditions, signals.total_current)
     memory = {
@@ -340,7 +340,7 @@ def _differentiated(
     (left, fallen, later, signals, _), d_held = eqx.filter_jvp(held, (run, motion), (d_run, d_motion))
     d_left, d_fallen, d_later, d_signals, d_guided = d_held
     # None: the differentiated quantity does not enter.
-    d_gained = jnp.zeros_like(left) if d_left is None else solution(step.factors, d_left)
+    d_gained = jnp.zeros_like(left) if d_left is None else solve_factorised(step.factors, d_left)
     through = step.damping[:2] @ d_gained
     d_fallen = through if d_fallen is None else d_fallen + through
     _, (d_after, d_over) = eqx.filter_jvp(
@@ -354,12 +354,12 @@ def _differentiated(
 def _inputs(run: System, motion: Motion) -> dict[str, Scalar]:
     """Inputs of the contacts, by name."""
     moving = dict(zip(contact_sums.MOTION, (*motion.q[1:], *motion.v), strict=True))
-    return moving | contact_sums.inputs(run.path, run.chassis, run.conditions.adhesion)
+    return moving | contact_sums.contact_inputs(run.path, run.chassis, run.conditions.adhesion)
 
 
 def _linearized(run: System, motion: Motion, step: _Step, changed: System) -> Linearized:
     """The contacts' sums with derivatives with respect to the motion and to the `changed` inputs."""
-    constants = contact_sums.inputs(changed.path, changed.chassis, changed.conditions.adhesion)
+    constants = contact_sums.contact_inputs(changed.path, changed.chassis, changed.conditions.adhesion)
     differentiated = tuple(name for name, change in constants.items() if change is not None)
     given = _inputs(run, motion) | {"slip": step.slip}
     return contact_sums.linearize(run.path, run.chassis, given, step.gained, differentiated)
@@ -373,7 +373,7 @@ def _held(
     The residual is Δt τ - Δt c - (M + Δt K) Δv, see `advance`.
     """
     q, v = motion.q, motion.v
-    belt = runs(run.path, (q[3], q[4]), (v[3], v[4]))
+    belt = belt_runs(run.path, (q[3], q[4]), (v[3], v[4]))
     sums = linearized.near(_inputs(run, motion))
     mover = contact_sums.Mover(linearized, sums, run.path.radius, belt.torque_front)
     signals, drawn = _resolved(run, motion, mover, v[0], v[3])
@@ -388,20 +388,20 @@ def _held(
             drawn.rear + belt.torque_rear,
         ]
     )
-    gear, spins = run.path.gear, rotating(run, signals)
-    spent = mjcf.impulse(run.half, gear.wheelbase, run.conditions, q[2], v[2], spins, gained, run.step)
+    gear, spins = run.path.gear, armature_inertia(run, signals)
+    spent = mjcf.step_impulse(run.half, gear.wheelbase, run.conditions, q[2], v[2], spins, gained, run.step)
     fallen = jnp.stack([sums.fallen_x + losses[0], sums.fallen_z])
-    return run.step * force - spent, fallen, later(run, motion, signals), signals, drawn.guided
+    return run.step * force - spent, fallen, state_after(run, motion, signals), signals, drawn.guided
 
 
-def margin(run: System) -> Scalar:
+def tipping_margin(run: System) -> Scalar:
     """Distance of the line of gravity inside the outermost contacts on the ground [m]; negative: the robot tips."""
-    forward, up, _ = centre(run)
+    forward, up, _ = centre_of_mass(run)
     meets = forward - jnp.tan(run.conditions.slope) * (up + axle_height(run))
     return run.path.gear.wheelbase / 2 - jnp.abs(meets)
 
 
-def centre(run: System) -> tuple[Scalar, Scalar, Scalar]:
+def centre_of_mass(run: System) -> tuple[Scalar, Scalar, Scalar]:
     """Centre of mass ahead of and above the middle of the wheelbase [m], and the mass of half a robot [kg]."""
     return *run.half.centre, run.half.chassis + 2 * run.half.pulley
 
@@ -423,7 +423,7 @@ def stand(run: System, turned: Scalar = 0.0) -> Motion:
     Args:
         turned: angle of both pulleys [rad], which gives the position of the belt.
     """
-    forward, up, total = centre(run)
+    forward, up, total = centre_of_mass(run)
     weight = total * GRAVITY
     cos, sin = jnp.cos(run.conditions.slope), jnp.sin(run.conditions.slope)
     axle = axle_height(run)
@@ -434,14 +434,14 @@ def stand(run: System, turned: Scalar = 0.0) -> Motion:
 
     def unbalanced(y: Vector, _: None, given: tuple[Any, ...]) -> Vector:
         path, chassis, turned, weight, forward, up, axle, cos, sin = given
-        at = side_contacts.touch(path, chassis, placed(turned, axle - y[0], y[1]), jnp.zeros_like(rest))
+        at = side_contacts.contact_state(path, chassis, placed(turned, axle - y[0], y[1]), jnp.zeros_like(rest))
         moment = weight * (cos * (forward + y[1] * up) - sin * (up + axle)) - jnp.sum(at.force * at.lever_x)
         return (at.normal - weight * cos) / weight, moment / weight
 
     recess = jnp.maximum(run.path.gear.guide_recess, 0.0) * run.chassis.on_tracks
     given = run.path, run.chassis, turned, weight, forward, up, axle, cos, sin
     (sunk, pitch), _ = root(unbalanced, (2e-4 + recess, jnp.zeros_like(recess)), None, given, SUNK, False, False)
-    stands = margin(run) > 0
+    stands = tipping_margin(run) > 0
     q = placed(turned, axle - jnp.where(stands, sunk, 0.0), jnp.where(stands, pitch, 0.0))
     memory = {effect.name: jnp.zeros_like(axle) for effect in run.robot.remembering}
     return Motion(q, rest, jnp.zeros_like(axle), run.conditions.discharge * jnp.ones_like(axle), memory)
@@ -454,7 +454,7 @@ def roll(run: System) -> Motion:
     """
     start = stand(run)
     guess = steady(run.robot, run.conditions)
-    solved = done(guess.status) | (guess.status == ROLLS_BACK)
+    solved = is_done(guess.status) | (guess.status == ROLLS_BACK)
     ratio, radius = run.robot.gearbox.ratio, run.chassis.radius
     no_load = voltage_at_rest(run.robot, run.conditions) / run.robot.motor.torque_constant
     speed_wheel = guess.theoretical_speed / radius  # the reading may include a sensor's error
@@ -470,7 +470,7 @@ def roll(run: System) -> Motion:
 
 def loads(run: System, at: Touch, pulled: Pull) -> Reactions:
     """Loads inside the running gear at an instant."""
-    return side_contacts.reactions(run.path, at, pulled)
+    return side_contacts.inner_loads(run.path, at, pulled)
 
 
 def away(q: Array, reactions: Reactions) -> tuple[Array, Reactions | None]:
@@ -481,10 +481,10 @@ def away(q: Array, reactions: Reactions) -> tuple[Array, Reactions | None]:
 def averaged(average: Average, travelled: Array, passed: Any, guided: Array) -> Steady:
     """Averages at the end of a run, from its record."""
     signals, load, periods, changes = average(travelled, (passed, guided))
-    return Steady(signals, load / jnp.maximum(signals.normal, 1e-9), periods, jnp.max(relative(changes)))
+    return Steady(signals, load / jnp.maximum(signals.normal, 1e-9), periods, jnp.max(relative_changes(changes)))
 
 
-def relative(changes: Changes) -> Array:
+def relative_changes(changes: Changes) -> Array:
     """Changes over their sizes [-]."""
     return jnp.stack([change / jnp.maximum(size, 1e-3) for change, size in changes])
 
@@ -492,20 +492,22 @@ def relative(changes: Changes) -> Array:
 def status(run: System, averages: Steady, end: Motion) -> Array:
     """Status of a run from its averages and its last motion."""
     robot, conditions, signals = run.robot, run.conditions, averages.signals
-    status = jnp.where(averages.change > SETTLED, NOT_SETTLED, travels(signals.speed, signals.voltage))
-    sense, rest = direction(robot, conditions), robot.chassis(conditions.configuration).speed_still
-    stands = creeps(sense, voltage_at_rest(robot, conditions), signals.speed_theoretical, signals.speed, rest)
+    status = jnp.where(averages.change > SETTLED, NOT_SETTLED, travel_status(signals.speed, signals.voltage))
+    sense, rest = travel_direction(robot, conditions), robot.chassis(conditions.configuration).speed_still
+    stands = is_at_rest(sense, voltage_at_rest(robot, conditions), signals.speed_theoretical, signals.speed, rest)
     parked = (jnp.abs(signals.direction) < 0.999) | (stands & (sense * signals.acceleration < STARTS))
     status = jnp.where(parked, STALLED, status)
     # On average over the window.
-    status = unless_slipping(status, robot, signals, signals.acceleration * jnp.sign(signals.direction), 1e-2, stands)
+    status = status_with_slip(
+        status, robot, signals, signals.acceleration * jnp.sign(signals.direction), 1e-2, stands
+    )
     empty = (conditions.battery > 0.5) & robot.battery.empty(end.discharge)
     status = jnp.where(empty, BATTERY_EMPTY, status)
-    status = jnp.where(margin(run) < 0, TIPS, status)
-    return unless_lost(run, status, end, end.q[1], jnp.abs(end.q[2]), signals.total_current)
+    status = jnp.where(tipping_margin(run) < 0, TIPS, status)
+    return status_unless_lost(run, status, end, end.q[1], jnp.abs(end.q[2]), signals.total_current)
 
 
-def unless_lost(run: System, status: Array, end: Motion, height: Array, tilt: Array, current: Scalar) -> Array:
+def status_unless_lost(run: System, status: Array, end: Motion, height: Array, tilt: Array, current: Scalar) -> Array:
     """The status of a run, or `tips` or `failed` if it has left the ground, sunk through it or turned over.
 
     The numbers of such a run are not valid.
@@ -523,4 +525,4 @@ def unless_lost(run: System, status: Array, end: Motion, height: Array, tilt: Ar
 
 def result_of(run: System, averages: Steady, status: Array) -> Result:
     """Result of a run with this status."""
-    return result(run.robot, averages.signals, status)
+    return result_of_signals(run.robot, averages.signals, status)

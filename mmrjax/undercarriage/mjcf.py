@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 
 from mmrjax.model import channels
 from mmrjax.model.conditions import Conditions
-from mmrjax.model.masses import Masses, masses
+from mmrjax.model.masses import Masses, masses_of_parts
 from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import GRAVITY
@@ -56,7 +56,7 @@ class Bodies(NamedTuple):
     place: Float[Array, "bodies 3"]
 
 
-def bodies(robot: Robot, half: Masses, conditions: Conditions) -> Bodies:
+def robot_bodies(robot: Robot, half: Masses, conditions: Conditions) -> Bodies:
     """The bodies of half a robot, or of a whole robot free to turn (`Conditions.turns`).
 
     In the plane of travel only the moments about y count, and the others are set equal. The moment of yaw is
@@ -96,7 +96,7 @@ def bodies(robot: Robot, half: Masses, conditions: Conditions) -> Bodies:
     )
 
 
-def text(robot: Robot, conditions: Conditions, mass: float, step: float = 1e-4) -> str:
+def mjcf_text(robot: Robot, conditions: Conditions, mass: float, step: float = 1e-4) -> str:
     """MJCF of half a robot under some conditions (scalar fields), or of a whole one if they free it to turn.
 
     The shapes are for display and show both sides; masses and inertias are stated, for half a robot those of one
@@ -106,7 +106,7 @@ def text(robot: Robot, conditions: Conditions, mass: float, step: float = 1e-4) 
         mass: total [kg]; step: [s].
     """
     gear = robot.running_gear
-    parts = bodies(robot, masses(robot, conditions, jnp.asarray(mass)), conditions)
+    parts = robot_bodies(robot, masses_of_parts(robot, conditions, jnp.asarray(mass)), conditions)
     chassis = robot.chassis(conditions.configuration)
     wheeled = bool(chassis.on_tracks < 0.5)
     stand = " 0 0 0 0" if conditions.turns else ""
@@ -166,7 +166,7 @@ def _row(numbers: Array) -> str:
     return " ".join(f"{float(x):.17g}" for x in numbers)
 
 
-def impulse(
+def step_impulse(
     half: Masses,
     wheelbase: Scalar,
     conditions: Conditions,
@@ -178,8 +178,8 @@ def impulse(
 ) -> Float[Array, " 5"]:
     """Generalized impulse that changes velocities by `gained` in a `step`, M Δv + Δt c, in closed form.
 
-    M is the mass matrix and c the bias (gravity and centrifugal forces) of the model from `text`. MJX computes them
-    too, but the derivatives of its general tree cost many times as much. No other force depends on v here.
+    M is the mass matrix and c the bias (gravity and centrifugal forces) of the model from `mjcf_text`. MJX computes
+    them too, but the derivatives of its general tree cost many times as much. No other force depends on v here.
 
     Args:
         half, wheelbase: masses and distance of the pulleys.
@@ -212,16 +212,16 @@ def _template(double: bool, turns: bool) -> tuple[Any, Any]:
 
     with jax.ensure_compile_time_eval():
         run = Conditions(heading_deg=0.0 if turns else None)
-        model = mujoco.MjModel.from_xml_string(text(nominal(), run, 13.1))
+        model = mujoco.MjModel.from_xml_string(mjcf_text(nominal(), run, 13.1))
         return mjx.put_model(model), mjx.make_data(model)
 
 
-def template(turns: bool = False) -> tuple[Any, Any]:
+def model_template(turns: bool = False) -> tuple[Any, Any]:
     """The MJX model and data whose structure all members share, of half a robot or one free to turn."""
     return _template(jnp.result_type(float) == jnp.float64, turns)
 
 
-def member(model: Any, parts: Bodies, slope: Scalar, step: Scalar) -> Any:
+def member_model(model: Any, parts: Bodies, slope: Scalar, step: Scalar) -> Any:
     """The MJX `model` with this member's bodies, gravity and time step.
 
     Every constant that the smooth dynamics read and that depends on mass is set here (mujoco issue 1607).

@@ -15,7 +15,7 @@ from mmrjax.compile.compiling import compiled
 from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.robot import Robot
-from mmrjax.undercarriage.half_robot import mass_matrix, roll, stand, system
+from mmrjax.undercarriage.half_robot import half_robot_system, mass_matrix, roll, stand
 from mmrjax.undercarriage.stability import PROBE, step_derivative
 
 POSITIONS = 12  # of the belt within a pitch of the grousers
@@ -79,7 +79,7 @@ def modes(robot: Robot, conditions: Conditions, positions: int = POSITIONS) -> l
         robot, conditions: a batch of runs.
         positions: of the belt, evenly over a pitch of the grousers.
     """
-    rates, masses = jax.device_get(_linearised(params.strong(robot), conditions, positions))
+    rates, masses = jax.device_get(_linearised(params.without_weak_types(robot), conditions, positions))
     return [_named(rate, mass) for rate, mass in zip(rates, masses, strict=True)]
 
 
@@ -88,7 +88,7 @@ def _linearised(
     robot: Robot, conditions: Conditions, positions: int
 ) -> tuple[Float[Array, "runs positions 11 11"], Float[Array, "runs positions 5 5"]]:
     def one(conditions: Conditions) -> tuple[Array, Array]:
-        run = system(robot, conditions, PROBE)
+        run = half_robot_system(robot, conditions, PROBE)
         rolling = roll(run)
 
         def at(turned: Array) -> tuple[Array, Array]:

@@ -17,7 +17,7 @@ from mmrjax.model.conditions import Conditions
 from mmrjax.model.paper_tables import BODY_HEIGHT
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import GRAVITY
-from mmrjax.undercarriage.belt import Path, tips
+from mmrjax.undercarriage.belt import Path, tips_on_path
 from mmrjax.undercarriage.running_gear import GROUSERS, TEETH_BELT
 from mmrjax.undercarriage.side_contacts import lever_tips
 
@@ -130,10 +130,10 @@ def _turn(points: Any, angle: float, about: tuple[float, float] = (0.0, 0.0)) ->
     return np.asarray(points) @ np.array([[cos, sin], [-sin, cos]]) + np.asarray(about)
 
 
-def outline(path: Path, height: float, places: np.ndarray) -> np.ndarray:
+def belt_outline(path: Path, height: float, places: np.ndarray) -> np.ndarray:
     """Points of the belt (height 0) or of grouser tips in the chassis frame [m], at positions on its path."""
     gear = params.replace(path.gear, {"grouser_height": jnp.asarray(height)})
-    at = tips(Path(path.radius, gear), jnp.asarray(places))
+    at = tips_on_path(Path(path.radius, gear), jnp.asarray(places))
     return np.stack([np.asarray(at.forward), np.asarray(at.up)], axis=1)
 
 
@@ -166,17 +166,17 @@ def draw(axes: Any, view: Scene, k: int) -> None:
     axes.add_patch(Polygon(world(body), facecolor=_BODY, edgecolor=_INK, lw=1, alpha=0.85))
     for (x, z), start in zip(view.levers, (view.axle, -view.axle), strict=False):
         axes.plot(*world([(start, 0), (x, z)]).T, color="#8fa3b0", lw=7, solid_capstyle="round", alpha=0.7, zorder=2)
-    belt = world(outline(view.path, 0.0, np.linspace(0.0, float(view.path.length), 400)))
+    belt = world(belt_outline(view.path, 0.0, np.linspace(0.0, float(view.path.length), 400)))
     axes.plot(*belt.T, color=_BELT, lw=2.2, zorder=3)
     if view.wheeled:
         for x, phi in ((view.axle, q[3]), (-view.axle, q[4])):
             _disc(axes, Circle, world, x, view.wheel, phi, "#9aa5ad")
     else:
-        base = world(outline(view.path, 0.0, view.place[k]))
-        tip = world(outline(view.path, float(view.path.gear.grouser_height), view.place[k]))
+        base = world(belt_outline(view.path, 0.0, view.place[k]))
+        tip = world(belt_outline(view.path, float(view.path.gear.grouser_height), view.place[k]))
         axes.add_collection(LineCollection(list(np.stack([base, tip], axis=1)), colors=_BELT, lw=4, zorder=3))
     teeth = (view.place[k][:, None] + np.arange(7) * float(view.path.pitch) / 7).ravel() % float(view.path.length)
-    root, inner = (world(outline(view.path, h, teeth[:TEETH_BELT])) for h in (0.0, -0.0022))
+    root, inner = (world(belt_outline(view.path, h, teeth[:TEETH_BELT])) for h in (0.0, -0.0022))
     axes.add_collection(LineCollection(list(np.stack([root, inner], axis=1)), colors=_BELT, lw=0.9, zorder=3))
     for x, phi in ((view.axle, q[3]), (-view.axle, q[4])):
         _disc(axes, Circle, world, x, radius - 0.003, phi, "#d9dee2")
@@ -203,7 +203,7 @@ def _forces(axes: Any, view: Scene, k: int, world: Any, ground: Any) -> None:
         for x, force in zip((view.axle, -view.axle), view.support[k], strict=True):
             arrow((x, -force * FORCE), (0.0, force), _NORMAL)
     else:
-        tip = outline(view.path, float(view.path.gear.grouser_height), view.place[k])
+        tip = belt_outline(view.path, float(view.path.gear.grouser_height), view.place[k])
         for j in range(GROUSERS):
             force = view.normal[k, j]
             x = _turn([tip[j]], -q[2])[0, 0]
@@ -268,7 +268,7 @@ def _pixels(sheet: Any) -> np.ndarray:
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
-def instants(
+def frame_times(
     file: File, begin: float, end: float | None, slow: float, length: float, rate: int = RATE
 ) -> Float[np.ndarray, " frames"]:
     """Times [s] that `render` draws for a run of `length` [s]; called before a run, it finds errors early.
@@ -307,10 +307,10 @@ def render(
         rate: frames per second.
 
     Raises:
-        ValueError: as for `instants`.
+        ValueError: as for `frame_times`.
     """
     file = File(file)
-    times = instants(file, begin, end, slow, float(view.time[-1]), rate)
+    times = frame_times(file, begin, end, slow, float(view.time[-1]), rate)
     frames = [int(np.argmin(np.abs(view.time - t))) for t in times]
     if file.suffix == ".png":
         view.sheet(frames[0]).savefig(file)

@@ -14,7 +14,7 @@ from mmrjax.model.robot import Robot
 from mmrjax.turning.two_sides import SIDES
 from mmrjax.undercarriage import both_sides
 from mmrjax.undercarriage.belt import Path
-from mmrjax.undercarriage.rendering import check_finite, outline
+from mmrjax.undercarriage.rendering import belt_outline, check_finite
 
 #: Length of an arrow per sliding speed [s], and number of arrows per track.
 SPEED, ARROWS = 0.15, 5
@@ -66,7 +66,7 @@ def scene(robot: Robot, conditions: Conditions, run: Trajectory) -> Above:
     place = np.asarray(run.reactions.place)
     if chassis.on_tracks > 0.5:
         load = np.asarray(run.reactions.grouser)
-        along = outline(path, float(gear.grouser_height), place.ravel())[:, 0].reshape(place.shape)
+        along = belt_outline(path, float(gear.grouser_height), place.ravel())[:, 0].reshape(place.shape)
     else:
         load = np.asarray(run.reactions.support)
         along = np.broadcast_to(np.array([0.5, -0.5]) * length, load.shape)

@@ -122,7 +122,7 @@ class Stages(NamedTuple):
     slip: float
 
 
-def stages(time: Series, speed: Series, theoretical: Series, speed_static: float) -> Stages:
+def slipping_stages(time: Series, speed: Series, theoretical: Series, speed_static: float) -> Stages:
     """Stages of a run from standstill, from its speed V, r_k ω_k and V_s [m/s]."""
     time, speed, theoretical = (np.asarray(x, float) for x in (time, speed, theoretical))
     slides = theoretical - speed > speed_static

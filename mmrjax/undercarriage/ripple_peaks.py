@@ -56,7 +56,7 @@ class Passing(NamedTuple):
     travel: float
 
 
-def passing(robot: Robot, configuration: int) -> Passing:
+def passing_parts(robot: Robot, configuration: int) -> Passing:
     """Excitation of a configuration: the grousers S_g on tracks; on wheels the tooth mesh S_t."""
     chassis, radius = robot.configurations.members[configuration], float(robot.radius_pulley)
     if float(chassis.on_tracks) > 0.5:
@@ -91,7 +91,7 @@ class Vibrations:
         return self.read & (self.status == CONVERGED)
 
 
-def vibrations(robot: Robot, runs: Trajectory, pitch: float) -> Vibrations:
+def vibrations_of_runs(robot: Robot, runs: Trajectory, pitch: float) -> Vibrations:
     """Ripple at the end of each run of a batch.
 
     Args:
@@ -138,7 +138,7 @@ class Peak(NamedTuple):
     mode: str
 
 
-def peaks(
+def peaks_over_speed(
     signal: str,
     payload: float,
     speed: Float[np.ndarray, " runs"],
@@ -177,7 +177,7 @@ def peaks(
     return answer
 
 
-def confirmed(found: Sequence[Peak], modes: Mapping[float, Sequence[Mode]]) -> list[Peak]:
+def confirm_peaks(found: Sequence[Peak], modes: Mapping[float, Sequence[Mode]]) -> list[Peak]:
     """The peaks, without their mode if they do not follow it over the payloads.
 
     If a mode's frequency changes with payload by more than `MOVES`, the lines of the peaks of one order have to
@@ -213,7 +213,7 @@ class Crossing(NamedTuple):
     signals: tuple[str, ...]
 
 
-def crossings(
+def find_crossings(
     modes: Sequence[Mode], payload: float, travel: float, slowest: float, fastest: float, found: Sequence[Peak]
 ) -> list[Crossing]:
     """Crossings at one payload between two speeds [m/s], and the ripple peaks that confirm them.
@@ -253,7 +253,7 @@ class Resonance(NamedTuple):
     rise: float
 
 
-def resonances(found: Sequence[Peak]) -> list[Resonance]:
+def group_resonances(found: Sequence[Peak]) -> list[Resonance]:
     """Peaks by mode, order and signal: signals in the order of `SIGNALS`, their largest ripple first."""
     keys = dict.fromkeys((p.mode, p.order, p.signal) for p in found)
     answer = []
@@ -270,7 +270,7 @@ def resonances(found: Sequence[Peak]) -> list[Resonance]:
     return sorted(answer, key=lambda r: (list(SIGNALS).index(r.signal), -r.ripple))
 
 
-def strongest(found: Sequence[Resonance]) -> list[Resonance]:
+def strongest_resonances(found: Sequence[Resonance]) -> list[Resonance]:
     """Resonances to avoid: for each signal, all with at least half of its largest rise, to 1 %."""
     largest = {s: max((r.rise for r in found if r.signal == s), default=0.0) for s in SIGNALS}
     return [r for r in found if r.rise >= largest[r.signal] / 2 and r.ripple >= MATTERS]

@@ -24,7 +24,7 @@ from mmrjax.model.masses import lever_angles
 from mmrjax.model.params import Scalar
 from mmrjax.model.signals import GRAVITY, Signals
 from mmrjax.numerics.trigonometry import cosine, sine
-from mmrjax.undercarriage.belt import Path, Runs, Tips, runs, tension_along, tips
+from mmrjax.undercarriage.belt import Path, Runs, Tips, belt_runs, tension_along, tips_on_path
 from mmrjax.undercarriage.running_gear import GROUSERS, TEETH_BELT, WHEELS, RunningGear
 
 CONTACTS = GROUSERS + WHEELS  # with the ground, of one side; those of the other configuration carry no load
@@ -69,7 +69,9 @@ class Touch(eqx.Module):
         return jnp.sum(self.force)
 
 
-def of_contacts(grousers: Float[Array, " 24"], wheels: Array | np.ndarray | float = 0.0) -> Float[Array, " contacts"]:
+def join_contacts(
+    grousers: Float[Array, " 24"], wheels: Array | np.ndarray | float = 0.0
+) -> Float[Array, " contacts"]:
     """One array of grousers and wheels, padded and masked: XLA vectorises this but not a concatenation."""
     return jnp.where(WHEEL, wheels, jnp.pad(grousers, (0, WHEELS)))
 
@@ -78,8 +80,8 @@ def _geometry(
     path: Path, where: Tips, weight: Array, pitch: Scalar, radius_wheel: Scalar
 ) -> tuple[Array, Array, Array, Array, Array]:
     cos, sin = cosine(pitch), sine(pitch)
-    forward, up = of_contacts(where.forward, path.gear.wheelbase / 2 * _END), of_contacts(where.up)
-    ahead, rise = of_contacts(where.rate_forward), of_contacts(where.rate_up)
+    forward, up = join_contacts(where.forward, path.gear.wheelbase / 2 * _END), join_contacts(where.up)
+    ahead, rise = join_contacts(where.rate_forward), join_contacts(where.rate_up)
     # The lowest point of a wheel is below its axle at any pitch of the robot.
     below = jnp.where(WHEEL, radius_wheel, 0.0)
     return (
@@ -87,11 +89,11 @@ def _geometry(
         up * cos - forward * sin - below,
         ahead * cos + rise * sin - below / path.radius,
         rise * cos - ahead * sin,
-        of_contacts(weight, jnp.where(_END < 0, 1.0, 0.0)),
+        join_contacts(weight, jnp.where(_END < 0, 1.0, 0.0)),
     )
 
 
-def bearing(chassis: Chassis) -> Float[Array, " contacts"]:
+def bearing_contacts(chassis: Chassis) -> Float[Array, " contacts"]:
     """1 for contacts that carry load in this configuration, else 0 [-]."""
     return jnp.where(WHEEL, 1 - chassis.on_tracks, chassis.on_tracks)
 
@@ -101,7 +103,7 @@ def tension_free(path: Path, belt: Runs) -> Scalar:
     return jnp.maximum(belt.lower - belt.centrifugal, 0.01 * path.gear.pretension)
 
 
-def touch(path: Path, chassis: Chassis, q: Sequence[Scalar] | Array, v: Sequence[Scalar] | Array) -> Touch:
+def contact_state(path: Path, chassis: Chassis, q: Sequence[Scalar] | Array, v: Sequence[Scalar] | Array) -> Touch:
     """Contact points and normal forces (27)-(29) at coordinates `q`, velocities `v`.
 
     The free belt between pulley and guide deflects under the grouser as a string of tension P - P_ct. The force falls
@@ -113,17 +115,17 @@ def touch(path: Path, chassis: Chassis, q: Sequence[Scalar] | Array, v: Sequence
         q, v: coordinates and velocities, see the module.
     """
     gear = path.gear
-    belt = runs(path, (q[3], q[4]), (v[3], v[4]))
+    belt = belt_runs(path, (q[3], q[4]), (v[3], v[4]))
     place, weight = path.place(q[3], q[4])
-    where = tips(path, place)
+    where = tips_on_path(path, place)
     x, z, rate_x, rate_z, weight = _geometry(path, where, weight, q[2], chassis.radius)
     speed = path.radius * ((1 - weight) * v[3] + weight * v[4])
     gap = q[1] + z
     gap_rate = v[1] - v[2] * x + rate_z * speed
-    compliance = of_contacts(where.compliance / tension_free(path, belt))
+    compliance = join_contacts(where.compliance / tension_free(path, belt))
     depth = jnp.maximum(-gap, 1e-9)
     yields = 1 / (1 + compliance * gear.contact_stiffness * depth ** (gear.contact_exponent - 1))
-    bears = bearing(chassis)
+    bears = bearing_contacts(chassis)
     stiffness, damping = gear.contact_stiffness * yields, gear.contact_damping * yields
     force = force_contact(gap, gap_rate, 0.0, stiffness, gear.contact_exponent, damping, gear.contact_depth)
     return Touch(
@@ -138,7 +140,7 @@ def touch(path: Path, chassis: Chassis, q: Sequence[Scalar] | Array, v: Sequence
         compliance=compliance,
         force=jnp.asarray(force * bears),
         damped=damping_contact(force, gap, 0.0, damping, gear.contact_depth) * bears,
-        guided=of_contacts(where.guided),
+        guided=join_contacts(where.guided),
         place=place,
         belt=belt,
     )
@@ -169,17 +171,17 @@ class Pull(eqx.Module):
         return jnp.sum(self.force)
 
 
-def sliding(signals: Signals, at: Touch) -> Float[Array, " contacts"]:
+def sliding_speeds(signals: Signals, at: Touch) -> Float[Array, " contacts"]:
     """Backward sliding speed of each contact over the ground [m/s]; `speed_slip_terms` shifts it."""
     return -at.speed_x - signals.speed_slip_terms
 
 
 def friction_rise(chassis: Chassis, signals: Signals, at: Touch) -> Float[Array, " contacts"]:
     """Derivative of the traction of each contact with respect to its sliding speed [N·s/m]."""
-    return jnp.asarray(chassis.ground.traction_rise(sliding(signals, at), at.force, signals.adhesion))
+    return jnp.asarray(chassis.ground.traction_rise(sliding_speeds(signals, at), at.force, signals.adhesion))
 
 
-def pull(
+def contact_forces(
     path: Path, chassis: Chassis, signals: Signals, at: Touch, height: Scalar, force: Array | None = None
 ) -> Pull:
     """Friction of the contacts (25) by Fig. 7, of the guide (26), and all generalized forces.
@@ -196,7 +198,7 @@ def pull(
         force: traction of each contact if contacts slide laterally too [N]; None: by Fig. 7.
     """
     if force is None:
-        force = jnp.asarray(chassis.ground.traction(sliding(signals, at), at.force, signals.adhesion))
+        force = jnp.asarray(chassis.ground.traction(sliding_speeds(signals, at), at.force, signals.adhesion))
     guide = chassis.track.guide_friction * at.guided * at.force * signals.direction
     # Power of the contact forces per belt speed, then on the pulleys in their shares of that speed.
     along = force * at.rate_x + at.force * at.rate_z - guide
@@ -245,7 +247,7 @@ class Reactions(eqx.Module):
         return lower, jnp.where(over, path.gear.belt_mass * GRAVITY / TEETH_BELT, 0.0)
 
 
-def reactions(path: Path, at: Touch, pulled: Pull) -> Reactions:
+def inner_loads(path: Path, at: Touch, pulled: Pull) -> Reactions:
     """Loads on guides, pulleys and belt at an instant."""
     guided = at.guided * at.force
     to_support = at.force - guided

@@ -16,7 +16,7 @@ from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import State
 from mmrjax.undercarriage import mjcf
-from mmrjax.undercarriage.half_robot import Motion, System, advance, roll, stand, system
+from mmrjax.undercarriage.half_robot import Motion, System, advance, half_robot_system, roll, stand
 from mmrjax.undercarriage.side_contacts import lever_tips
 
 SAFETY = 0.75  # of the linear limit: ripple loads the contacts more than standing does
@@ -41,24 +41,26 @@ def _maps(
     """Derivatives of (q, v, current) after one step with respect to (q, v, current), standing and rolling."""
 
     def one(conditions: Conditions, steps: Float[Array, " starts"]) -> Float[Array, "starts 11 11"]:
-        run = system(robot, conditions, PROBE)
+        run = half_robot_system(robot, conditions, PROBE)
         starts = jax.tree.map(lambda *at: jnp.stack(at), stand(run), roll(run))
-        return jax.vmap(lambda at, step: step_derivative(system(robot, conditions, step), at))(starts, steps)
+        return jax.vmap(lambda at, step: step_derivative(half_robot_system(robot, conditions, step), at))(
+            starts, steps
+        )
 
     return jax.vmap(one)(conditions, steps)
 
 
 def _unhurried(robot: Robot) -> Robot:
     """The robot with every V_s at least `LEAST`."""
-    laws = [p for p in params.walk(robot) if p.name.endswith("ground.friction.speed_static")]
+    laws = [p for p in params.walk_parameters(robot) if p.name.endswith("ground.friction.speed_static")]
     return params.replace(robot, {p.name: jnp.maximum(p.value, LEAST) for p in laws})
 
 
 def _roll_period(robot: Robot, conditions: Conditions) -> Scalar:
     """Period of rolling over that of bouncing, for a robot on contacts at ±B/2 [-]."""
     zero = jnp.zeros_like(conditions.voltage)
-    mass = balances.begin(robot, conditions, State(zero, zero, zero, zero)).mass
-    parts = mjcf.bodies(robot, masses.masses(robot, conditions, mass), conditions)
+    mass = balances.begin_signals(robot, conditions, State(zero, zero, zero, zero)).mass
+    parts = mjcf.robot_bodies(robot, masses.masses_of_parts(robot, conditions, mass), conditions)
     aside = robot.chassis(conditions.configuration).turning.width / 2
     inertia = jnp.sum(parts.inertia[:, 0] + parts.mass * parts.place[:, 1] ** 2)
     return jnp.sqrt(inertia / jnp.sum(parts.mass)) / aside
@@ -75,7 +77,7 @@ def largest_step(robot: Robot, conditions: Conditions) -> Float[np.ndarray, " ru
     if conditions.turns:
         slower = np.asarray(jax.vmap(lambda c: _roll_period(robot, c))(conditions))
         return np.minimum(slower, 1.0) * largest_step(robot, conditions.straight())
-    robot = params.strong(_unhurried(robot))
+    robot = params.without_weak_types(_unhurried(robot))
 
     def maps(steps: Float[np.ndarray, "runs starts"]) -> Float[np.ndarray, "runs starts 11 11"]:
         found = np.asarray(_maps(robot, conditions, jnp.asarray(steps)))
@@ -95,7 +97,7 @@ def largest_step(robot: Robot, conditions: Conditions) -> Float[np.ndarray, " ru
     return np.asarray(SAFETY * (10**low).min(axis=1))
 
 
-def refuse(robot: Robot, conditions: Conditions, step: float, sample: float) -> None:
+def check_track_step(robot: Robot, conditions: Conditions, step: float, sample: float) -> None:
     """Raises for conditions and steps that the track model cannot compute.
 
     Args:

@@ -11,7 +11,7 @@ from calibration.inference import blocks, priors
 from calibration.inference.calibration import calibrate as run
 from calibration.inference.result import CalibrationResult
 from calibration.inference.simulation_errors import OF_SIZE
-from mmrjax.errors import counted
+from mmrjax.errors import count_noun
 from sweeps import config as configuration
 from sweeps.console import pulse, say, tell
 from sweeps.inputs import load_robot, read_runs
@@ -29,7 +29,7 @@ def calibrate(
     0 done; 3 done, but the search or a fit without a block did not converge, or the solver failed at a row.
     """
     robot = load_robot(config).robot
-    runs = read_runs(source, robot, measured=True, series=True)
+    runs = read_runs(source, robot, columns=config.columns, measured=True, series=True)
     stated = priors.parse_priors(config.prior)
     with open_folder("calibrate", config, robot, out, force, runs) as folder, pulse(tell, "fitting") as heard:
         found = run(
@@ -38,7 +38,7 @@ def calibrate(
             generations=config.generations, members=members, seed=config.seed,
             profiles=config.profiles, blocks=config.hold_out, solver=config.solver, tell=heard,
         )  # fmt: skip
-        found.save(folder.partial, config.robot)
+        found.save(folder.partial, config.robot, folder.tables)
         print_calibration(found)
         settled = found.converged and all(b.converged for h in found.held_out.values() for b in h.blocks.values())
         manifest = {"seed": found.seed, "statuses": found.counts}
@@ -51,7 +51,7 @@ def print_calibration(found: CalibrationResult) -> None:
     say(fit_words.calibration(found))
     say(f"{found.adequacy.statement}.")
     shown = Table(
-        title=f"{counted(len(found), 'row')}, {found.model}", title_justify="left", box=None, pad_edge=False
+        title=f"{count_noun(len(found), 'row')}, {found.model}", title_justify="left", box=None, pad_edge=False
     )
     for heading in ("parameter", "value", "95 % interval", "shift [σ]", "determined"):
         left = heading in ("parameter", "determined")
@@ -65,7 +65,7 @@ def print_calibration(found: CalibrationResult) -> None:
     for heading in ("", "rows", *(c.label for c in found.channels)):
         errors.add_column(heading, justify="right" if heading else "left")
     lines = {"before": found.errors_before, "after": found.errors_after}
-    lines |= {f"after, held out by {blocks.in_words(k)}": found.held_out[k].errors for k in found.held_out_alike}
+    lines |= {f"after, held out by {blocks.kind_in_words(k)}": found.held_out[k].errors for k in found.held_out_alike}
     for which, by in lines.items():
         cells = ("-" if e.rows == 0 else f"{e.rms_percent:.1f}" for e in by.values())
         errors.add_row(which, f"{max(e.rows for e in by.values())}/{len(found)}", *cells)

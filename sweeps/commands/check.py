@@ -36,16 +36,16 @@ def check(config: configuration.Check, out: Path | None, force: bool) -> int:
     file = load_robot(config)
     robot = file.robot
     imposed.check_on_ground(robot, "check")
-    sheet.refuse(robot, asked)
+    sheet.refuse_impossible(robot, asked)
     _check_charge(robot, asked)
     _check_heat(robot, asked)
     with open_folder("check", config, robot, out, force) as folder:
         with pulse(tell, "reading the requirements") as heard:
-            outcomes = sheet.check(robot, asked, changes=config.changes, tell=in_words(heard))
+            outcomes = sheet.check_requirements(robot, asked, changes=config.changes, tell=in_words(heard))
             found = CheckResult(asked, robot, outcomes, posture_results.of_requirements(robot, outcomes))
         _write(folder, config, found)
         shown = report(check_report.document(found, capabilities.shown_name(file), config.changes), file)
-        manifest = {"seed": None, **sheet.counts(found.outcomes)}
+        manifest = {"seed": None, **sheet.count_outcomes(found.outcomes)}
         solved = words.solved(Counter(o.status for o in found.outcomes))
         return leave(folder, config, manifest, solved=solved, page=shown)
 

@@ -16,10 +16,10 @@ from calibration.data import robot_file, terrains
 from calibration.data.contradictions import without_levers
 from calibration.data.input_errors import BadConfiguration
 from mmrjax.climbing import climb_simulation, terrain
-from mmrjax.climbing.climb_derivatives import Derivatives, Given, climb_derivatives
+from mmrjax.climbing.climb_derivatives import ClimbInputs, Derivatives, climb_derivatives
 from mmrjax.climbing.climb_simulation import Climb, Sequence, climb_batch
 from mmrjax.climbing.terrain import Terrain
-from mmrjax.errors import near
+from mmrjax.errors import similar_words
 from mmrjax.fidelities.variation import Variation
 from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
@@ -150,8 +150,8 @@ def _along(config: configuration.Climb, robot: Robot, conditions: Conditions, se
     for k, name in enumerate(names):
         if name in names[:k]:
             raise BadConfiguration(f"--derivatives: got {name} twice; expected each once")
-        if name not in known and name not in (every := [p.name for p in params.walk(robot)]):
-            meant = " or ".join(near(name, (*known, *every), 2))
+        if name not in known and name not in (every := [p.name for p in params.walk_parameters(robot)]):
+            meant = " or ".join(similar_words(name, (*known, *every), 2))
             raise BadConfiguration(
                 f"--derivatives: got {name}; expected {', '.join(known)} or a parameter of the robot"
                 + (f"; did you mean {meant}?" if meant else "")
@@ -166,7 +166,7 @@ def _along(config: configuration.Climb, robot: Robot, conditions: Conditions, se
     units = {name: a.unit for name, a in axes.items()} | dict.fromkeys(levers, "deg") | {SIZE: "mm"}
     searched = config.model_copy(update={"step_mm": None, "gap_mm": None, "find": kind})
 
-    def given(values: Array) -> Given:
+    def given(values: Array) -> ClimbInputs:
         at = dict(zip(names, values, strict=True))
         own, run = variation.at(jnp.stack([at[name] for name in of_run] or [jnp.zeros(())]), conditions)
         moved = {
@@ -175,7 +175,7 @@ def _along(config: configuration.Climb, robot: Robot, conditions: Conditions, se
             if name in at
         }
         ground = _terrain(searched, at[SIZE] / 1000) if SIZE in at else _terrain(config, 0.1)
-        return Given(own, run, ground[0], dataclasses.replace(sequence, **moved))
+        return ClimbInputs(own, run, ground[0], dataclasses.replace(sequence, **moved))
 
     values = [usual[name] for name in names]
     widths = [WIDTHS.get(name, WIDTH * abs(value) or 1.0) for name, value in zip(names, values, strict=True)]
@@ -225,7 +225,9 @@ def _terrain(config: configuration.Climb, size: Scalar) -> tuple[Terrain, str]:
         width = size if config.gap_mm is None else config.gap_mm / 1000
         return terrain.gap(width), "a gap" if config.gap_mm is None else f"a gap of {config.gap_mm:g} mm"
     height = size if config.step_mm is None else config.step_mm / 1000
-    return terrain.step(height, nose), "a step" if config.step_mm is None else f"a step of {config.step_mm:g} mm"
+    return terrain.single_step(
+        height, nose
+    ), "a step" if config.step_mm is None else f"a step of {config.step_mm:g} mm"
 
 
 def _sequence(config: configuration.Climb, robot: Robot, name: str) -> Sequence:
@@ -248,7 +250,7 @@ def _sequence(config: configuration.Climb, robot: Robot, name: str) -> Sequence:
             raise BadConfiguration(f"{option}: {why}")
         angles.append(float(np.radians(angle)))
     if config.sequence is None:
-        found = climb_simulation.still(*angles)
+        found = climb_simulation.constant_angles(*angles)
     else:
         found = terrains.read_sequence(config.sequence, robot, (angles[0], angles[1]))
         if found.begins is None and stated[1:] != (None, None):

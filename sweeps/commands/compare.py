@@ -33,7 +33,7 @@ HISTORIES, OVER = "drive", {"time_s": "time [s]"}
 def compare(config: configuration.Compare, source: str, own_mass: bool, out: Path | None, force: bool) -> int:
     """Simulate the runs of a table, compare them with its readings, write a run folder; returns the exit code."""
     file = load_robot(config)
-    stated = runs = read_runs(source, file.robot, measured=True, series=True, of_turns=True)
+    stated = runs = read_runs(source, file.robot, columns=config.columns, measured=True, series=True, of_turns=True)
     if runs.turns:
         file = dataclasses.replace(file, robot=file.robot.showing_turns(runs.layout.measured_columns), remarks=())
     if runs.sampled:

@@ -68,7 +68,7 @@ def _run() -> str:
 
     robot = paper_robots.nominal()
     words = ("friction_", "loss_", "rolling", "guide_share")
-    losses = [p.name for p in params.walk(robot) if any(word in p.name for word in words)]
+    losses = [p.name for p in params.walk_parameters(robot) if any(word in p.name for word in words)]
     ideal = params.replace(robot, dict.fromkeys(losses, jnp.asarray(0.0)))
     start = time.perf_counter()
     answer = steady_batch(ideal, Conditions(voltage=jnp.array([24.0])))

@@ -14,7 +14,7 @@ from calibration.data import effect_file
 from calibration.data.input_errors import BadConfiguration, number
 from mmrjax import derived, effects
 from mmrjax.effects import Effect
-from mmrjax.errors import near
+from mmrjax.errors import similar_words
 from mmrjax.fidelities import outputs
 from mmrjax.missions import mission_batch
 from mmrjax.model import channels, paper_robots, params, quantities
@@ -56,7 +56,7 @@ def explain(name: str | None, files: tuple[str, ...] = ()) -> int:
         below = [p for p in known["parameters"] if p.endswith(f".{name}")]
         if below:
             raise BadConfiguration(f"explain: got {name}; is one of these meant? {', '.join(below)}")
-        close = near(name, [n for those in known.values() for n in those], 3)
+        close = similar_words(name, [n for those in known.values() for n in those], 3)
         hint = f"did you mean {', '.join(close)}? " if close else ""
         raise BadConfiguration(f"explain: got {name}; {hint}mmrjax explain lists the names that there are")
     return 0
@@ -81,7 +81,7 @@ def names(library: dict[str, type[Effect]]) -> dict[str, list[str]]:
         "channels": [c.name for c in channels.EVERY],
         "conditions": [*(c.name for c in quantities.LABELS), *(c.field for c in quantities.SET if c.field)],
         "outputs": list(dict.fromkeys(o.name for o in EVERY_OUTPUT)),
-        "parameters": [p.name for p in params.walk(paper_robots.nominal())],
+        "parameters": [p.name for p in params.walk_parameters(paper_robots.nominal())],
     }
 
 
@@ -94,7 +94,7 @@ def _effect(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
     yield "stands for", meaning
     yield "enters", f"the {effect.balance} balance{f', channel {effect.channel}' if effect.channel else ''}"
     made = effect()
-    for p in params.walk(made):
+    for p in params.walk_parameters(made):
         if p.spec.amplitude:
             yield "typical size", f"{p.spec.prior_sd(0.0):g} {p.spec.unit} ({p.spec.meaning}; {p.spec.source})"
             yield "bounds", _bounds(p.spec)
@@ -130,7 +130,7 @@ def _changes(effect: Effect) -> Iterator[str]:
     import mmrjax as mm
 
     robot = paper_robots.nominal()
-    spec = next(p.spec for p in params.walk(effect) if p.spec.amplitude)
+    spec = next(p.spec for p in params.walk_parameters(effect) if p.spec.amplitude)
     within = dataclasses.replace(robot, effects=(effect,))
     run = mm.Conditions(
         list(robot.configurations), voltage=24.0, slope_deg=5.0, payload=3.0, battery=float(effect.needs_battery)
@@ -228,7 +228,7 @@ def _attribute(kind: type, name: str) -> str:
 
 def _parameter(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
     robot = paper_robots.nominal()
-    found = next((p for p in params.walk(robot) if p.name == name), None)
+    found = next((p for p in params.walk_parameters(robot) if p.name == name), None)
     if found is None:
         return
     spec = found.spec

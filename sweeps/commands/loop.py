@@ -65,11 +65,11 @@ def _loop(
 ) -> int:
     began = time.monotonic()
     robot = load_robot(config).robot
-    runs = read_runs(source, robot, measured=True, series=True)
+    runs = read_runs(source, robot, columns=config.columns, measured=True, series=True)
     stated = priors.parse_priors(config.prior)
     if config.resolve:
         check_resolvable(runs, members)
-    replicates = max(config.replicates, fewest_replicates(observers.kind(runs)))
+    replicates = max(config.replicates, fewest_replicates(observers.observer_kind(runs)))
 
     stages: dict[str, Any] = {}
 
@@ -113,7 +113,7 @@ def _loop(
         print_discovery(found)
         if config.resolve and found.resolved is None:
             say("The track model was not asked: nothing remains in slip, track or ground that it has a say in.")
-        found.save(folder.partial, config.robot)
+        found.save(folder.partial, config.robot, folder.tables)
         if config.report:
             progress("writing the report")
         manifest = {"seed": config.seed, "verdict": found.verdict}
@@ -228,7 +228,7 @@ def _errors(found: DiscoveryResult) -> Table:
     lines = {"as stated, nothing fitted": found.errors_as_stated}
     lines |= {f"{when[k]}, fitted": found.errors[k] for k in whens}
     for kind, both in found.errors_held_out.items():
-        lines |= {f"{when[k]}, held out by {blocks.in_words(kind)}": both[k] for k in whens}
+        lines |= {f"{when[k]}, held out by {blocks.kind_in_words(kind)}": both[k] for k in whens}
     for text, by in lines.items():
         cells = ("-" if e["rows"] == 0 else f"{e['rms_percent']:.1f}" for e in by.values())
         errors.add_row(text, f"{max(e['rows'] for e in by.values())}/{len(found.runs)}", *cells)

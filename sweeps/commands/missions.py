@@ -16,7 +16,7 @@ from calibration.data import runs as records
 from calibration.data.columns import LOAD, ON_SHAFT, SUPPLY
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.profiles import ProfileTable
-from mmrjax.errors import counted
+from mmrjax.errors import count_noun
 from mmrjax.fidelities import outputs
 from mmrjax.missions import mission_batch
 from mmrjax.missions.mission import Mission
@@ -84,7 +84,7 @@ def simulate(
             )
     _check_charge(robot, config)
     if isinstance(given, str):
-        runs = read_runs(given, robot, measured=False, battery=config.battery)
+        runs = read_runs(given, robot, columns=config.columns, measured=False, battery=config.battery)
     else:
         runs = one_run(robot, given, config.battery, source.stated)
     for column in source.stated:
@@ -176,7 +176,7 @@ def _check_cutoff(robot: Robot, runs: records.Runs, source: ProfileTable, config
     if not config.battery:
         return
     conditions = run.commanded(robot, runs, config)
-    cell = mission_batch.begins_below(robot, conditions, source.profile(robot, conditions), source.start)
+    cell = mission_batch.cell_below_cutoff(robot, conditions, source.profile(robot, conditions), source.start)
     below = np.flatnonzero(np.isfinite(cell))
     if len(below):
         raise BadConfiguration(
@@ -200,9 +200,12 @@ def simulated(robot: Robot, runs: records.Runs, source: ProfileTable, config: co
             count = len(found.steps)
             own = slice(done, done + count)
             at = jax.tree.map(lambda x, own=own: x[own], conditions)
-            numbers = jax.device_get(mission_batch.numbers(robot, at, found))
+            numbers = jax.device_get(mission_batch.mission_numbers(robot, at, found))
             tables.append(
-                {**mission_batch.columns(numbers), **outputs.codes(found.result.status, found.result.flags)}
+                {
+                    **mission_batch.numbers_by_column(numbers),
+                    **outputs.status_words(found.result.status, found.result.flags),
+                }
             )
             segments.append(_segments(robot, at, source, found, names[own]))
             courses += [_course(robot, at, source, found, k, str(names[done + k]), rows) for k in range(count)]
@@ -236,7 +239,9 @@ def _segments(
     robot: Robot, conditions: Conditions, source: ProfileTable, found: Mission, names: np.ndarray
 ) -> dict[str, np.ndarray]:
     """A row for each segment of each cycle of each run, up to where the run has ended."""
-    numbers = mission_batch.columns(jax.device_get(mission_batch.totals(found.segments, found.segment_peaks)))
+    numbers = mission_batch.numbers_by_column(
+        jax.device_get(mission_batch.mission_totals(found.segments, found.segment_peaks))
+    )
     (runs, cycles, segments) = found.status.shape
     time = np.asarray(found.segments.time).reshape(runs, -1)
     begun = np.cumsum(time, 1) - time
@@ -257,7 +262,7 @@ def _segments(
         "mode": np.tile(np.array(source.modes)[segment], runs),
         **{column: np.asarray(numbers[column]).ravel() for column in numbers},
         "state_of_charge": charge.ravel(),
-        **outputs.codes(found.status.ravel(), found.flags.ravel()),
+        **outputs.status_words(found.status.ravel(), found.flags.ravel()),
     }
     order = [
         "run_id",
@@ -265,7 +270,7 @@ def _segments(
         "segment",
         "time_s",
         "mode",
-        *(c for c in mission_batch.names(source.turns) if c in rows),
+        *(c for c in mission_batch.mission_columns(source.turns) if c in rows),
     ]
     reached = time.ravel() > 0
     return {column: rows[column][reached] for column in (*order, "status", "flags")}
@@ -312,7 +317,7 @@ def _course(
     signals, of_sides = course.signals, {}
     winding, housing = course.temperature_winding, course.temperature_housing
     if source.turns:
-        reading, signals = balances.shown(robot, signals), balances.together(signals)
+        reading, signals = balances.readings_of_sides(robot, signals), balances.mean_of_sides(signals)
         of_sides = {c.column: np.asarray(reading[c.name]) / c.factor for c in channels.OF_TURNS}
         for side, duty, hot in zip(channels.SIDES, course.signals.duty.T, winding.T, strict=True):
             of_sides |= {f"duty_{side}": duty, f"winding_temperature_{side}_C": hot}
@@ -340,7 +345,7 @@ def _course(
         "time_s": course.time + late,
         **{c.column: np.asarray(reading[c.name]) / c.factor for c in robot.channels},
         "theoretical_speed_mm_s": signals.speed_theoretical / channels.MM,
-        "slip": np.asarray(ground.slip(signals.speed, signals.speed_theoretical)),
+        "slip": np.asarray(ground.slip_ratio(signals.speed, signals.speed_theoretical)),
         "distance_m": course.path,
         "displacement_m": course.distance,
         "voltage_V": signals.voltage,
@@ -378,7 +383,7 @@ def print_missions(found: Missions, idle: Collection[str] = ()) -> None:
     table, source = found.table, found.source
     count = len(table["status"])
     cycles, each = (f", {source.cycles} cycles", " each") if source.cycles > 1 else ("", "")
-    segments = counted(source.segments, "segment")
+    segments = count_noun(source.segments, "segment")
     say(f"profile {source.source}: {source.duration:g} s{cycles}, {segments}{each}")
     shown = Table(show_header=False)
     shown.add_row("configuration", *table["configuration"][:_SHOWN])

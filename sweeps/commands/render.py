@@ -32,7 +32,7 @@ def render(
     """
     options = config.options
     try:
-        rendering.instants(file, begin, end, slow, options["duration"])
+        rendering.frame_times(file, begin, end, slow, options["duration"])
     except ValueError as error:
         raise BadConfiguration(f"render: {error}") from error
     _check_free(file, force)

@@ -23,7 +23,7 @@ def reproduce(config: configuration.Reproduce, out: Path | None, force: bool) ->
     robot = file.robot
     imposed.check_on_ground(robot, "reproduce")
     runs = records.read("measured")
-    gear = "track.guide_share" in fidelities.facts(config.model).computes
+    gear = "track.guide_share" in fidelities.fidelity_facts(config.model).computes
     with open_folder("reproduce", config, robot, out, force) as folder:
         _, rows = report.write(folder.partial, file, model=config.model, gear=gear)
         result = {"schema": "mmrjax.reproduce/1", "model": config.model, "rows": 0}

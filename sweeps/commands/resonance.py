@@ -25,11 +25,11 @@ from mmrjax.undercarriage.ripple_peaks import (
     SIGNALS,
     Passing,
     Peak,
-    confirmed,
-    crossings,
-    passing,
-    peaks,
-    vibrations,
+    confirm_peaks,
+    find_crossings,
+    passing_parts,
+    peaks_over_speed,
+    vibrations_of_runs,
 )
 from sweeps import config as configuration
 from sweeps.config import GridPart
@@ -79,7 +79,7 @@ def resonance(config: configuration.Resonance, out: Path | None, force: bool) ->
     conditions = run.commanded(robot, runs, config)
     run.refuse(robot, conditions, config)
     with open_folder("resonance", config, robot, out, force, runs) as folder:
-        what = passing(robot, robot.configurations.names.index(name))
+        what = passing_parts(robot, robot.configurations.names.index(name))
         columns = _rippled(folder, robot, conditions, config, what)
         table = {**run.conditions(robot, runs), "table8": of_table8, **columns}
         found = _found(config, robot, what, table)
@@ -142,7 +142,7 @@ def _rippled(
 
 def _columns(robot: Robot, ended: Any, what: Passing) -> dict[str, np.ndarray]:
     """Ripple of a batch of runs, in the units of the table."""
-    found = vibrations(robot, ended, what.pitch)
+    found = vibrations_of_runs(robot, ended, what.pitch)
     status = np.array(STATUSES)[found.status]
     slow = ~found.read & np.isin(status, ("converged", "not_settled"))
     columns = {
@@ -179,15 +179,15 @@ def _found(
         here = [
             peak
             for name in SIGNALS
-            for peak in peaks(
+            for peak in peaks_over_speed(
                 name, payload, speed, table["passing_Hz"][rows], table[f"{name}_ripple_percent"][rows] / 100,
                 table[f"{name}_frequency_Hz"][rows], own,
             )
         ]  # fmt: skip
         tops += here
         ends[payload] = float(speed[0]), float(speed[-1])
-    tops = confirmed(tops, by_payload)
-    meets = [c for p, own in ends.items() for c in crossings(by_payload[p], p, what.travel, *own, tops)]
+    tops = confirm_peaks(tops, by_payload)
+    meets = [c for p, own in ends.items() for c in find_crossings(by_payload[p], p, what.travel, *own, tops)]
     return ResonanceResult(
         config.configuration, config.slope_deg, config.surface, what, robot, table, by_payload, tops, meets
     )

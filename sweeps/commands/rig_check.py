@@ -20,9 +20,9 @@ from calibration.data.writing import finite
 from calibration.described import described, sentences
 from calibration.inference import foresight, identifiability, priors
 from calibration.inference.fit_notes import Determination
-from calibration.inference.fit_posterior import undetermined
+from calibration.inference.fit_posterior import undetermined_names
 from calibration.inference.foresight import Determined, Foresight
-from mmrjax.errors import counted
+from mmrjax.errors import count_noun
 from mmrjax.model import channels
 from mmrjax.model.channels import HEAT, Channel
 from mmrjax.model.driver import FAST
@@ -93,7 +93,7 @@ class RigCheck:
             )
         if self.examples:
             lines = ", ".join(map(str, self.examples))
-            hold = f"{counted(len(self.examples), 'line')} still hold{'s' * (len(self.examples) == 1)}"
+            hold = f"{count_noun(len(self.examples), 'line')} still hold{'s' * (len(self.examples) == 1)}"
             said.append(f"{hold} the number of an example ({EXAMPLE}): {lines}")
         said += self.doubts
         if self.runs is not None and self.runs.has("duty") and self.runs.has("total_current_A"):
@@ -187,7 +187,7 @@ class RigCheck:
         if self.foresight is None:
             return "Without data: give a table to see what it can determine."
         pairs = self.foresight.together
-        held = undetermined([p.name for p in self.foresight.parameters if p.held], pairs)
+        held = undetermined_names([p.name for p in self.foresight.parameters if p.held], pairs)
         traded = {name for pair in pairs for name in (pair.one, pair.other)}
         told = [p.name for p in self.foresight.parameters if not p.held and p.name not in traded]
         told += [fit_words.combination(p) for p in pairs]
@@ -245,7 +245,7 @@ def _source(word: str, channel: Channel) -> str:
 
 def _program(robot: Robot, origin: Origin) -> str:
     """A number stated without ±, with the width that the program gives it where a fit frees it."""
-    sd = float(priors.coordinates(robot, (origin.name,)).prior_sd[0])
+    sd = float(priors.parameter_coordinates(robot, (origin.name,)).prior_sd[0])
     return f"{origin.name} (±{100 * sd / abs(origin.value):.2g} %)"
 
 
@@ -274,7 +274,7 @@ def _use(column: str, robot: Robot) -> str:
     return "condition"
 
 
-def check(file: Path, data: str | None, effects: tuple[str, ...], as_json: bool) -> int:
+def check(file: Path, data: str | None, effects: tuple[str, ...], as_json: bool, columns: str | None = None) -> int:
     """Say what was understood of a rig's file, and what a table can tell of it; returns 0.
 
     Raises:
@@ -285,7 +285,7 @@ def check(file: Path, data: str | None, effects: tuple[str, ...], as_json: bool)
         raise BadConfiguration(f"{file}: is a folder; expected a rig's TOML file")
     if not file.is_file():
         raise BadConfiguration(f"{file}: no such file; mmrjax rig new {file} writes one to fill in")
-    found = examined(file, data, effects)
+    found = examined(file, data, effects, columns)
     if as_json:
         print(json.dumps(finite(found.to_json()), indent=2, ensure_ascii=False))
     else:
@@ -293,16 +293,16 @@ def check(file: Path, data: str | None, effects: tuple[str, ...], as_json: bool)
     return 0
 
 
-def examined(file: Path, data: str | None, effects: tuple[str, ...] = ()) -> RigCheck:
-    """Returns the check of a rig's file and, if given, of a table."""
+def examined(file: Path, data: str | None, effects: tuple[str, ...] = (), columns: str | None = None) -> RigCheck:
+    """Remarks on a rig's file, and on a table whose columns a preset may name."""
     rig = load_robot(RobotPart(robot=str(file), effects=effects))
     lines, robot = rig.text.splitlines(), rig.robot
     examples = tuple(k for k, line in enumerate(lines, 1) if EXAMPLE in line and not line.startswith("#"))
     found = RigCheck(rig.name, robot, examples, tuple(rig_facts.origins(rig)), tuple(rig_facts.facts(robot)))
     if data is None:
         return found
-    runs = read_runs(data, robot, measured=True, series=True)
-    seen = foresight.foresee(runs, robot)
+    runs = read_runs(data, robot, columns=columns, measured=True, series=True)
+    seen = foresight.predict_identifiability(runs, robot)
     doubts = (*filter(None, (settling.doubtful_sign(runs),)), *rig_facts.doubts(runs, robot), *sentences(seen.doubts))
     return dataclasses.replace(found, runs=runs, foresight=seen, doubts=doubts)
 
@@ -343,7 +343,9 @@ def print_check(found: RigCheck) -> None:
 
 
 def _print_data(found: RigCheck, runs: Runs, seen: Foresight) -> None:
-    shown = _table(f"\n{runs.source}: {counted(len(runs), 'row')}", "column", "used as", "values>r", "from>r", "to>r")
+    shown = _table(
+        f"\n{runs.source}: {count_noun(len(runs), 'row')}", "column", "used as", "values>r", "from>r", "to>r"
+    )
     for c in found.columns():
         ends = [_words(c["words"]), ""] if c["words"] else [_end(c["least"]), _end(c["greatest"])]
         name = c["column"] if c["theirs"] in ("", c["column"]) else f"{c['column']}, yours {c['theirs']}"
@@ -355,7 +357,7 @@ def _print_data(found: RigCheck, runs: Runs, seen: Foresight) -> None:
         say(f"- {sentence}")
     names, counts = np.unique(np.array(seen.status), return_counts=True)
     others = [
-        f"{counted(count, 'row')}: {name}"
+        f"{count_noun(count, 'row')}: {name}"
         for name, count in zip(names, counts, strict=True)
         if name not in words.SETTLED
     ]

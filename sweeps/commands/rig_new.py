@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib import resources
 from pathlib import Path
 
-from calibration.data.input_errors import BadConfiguration, choices
+from calibration.data.input_errors import BadConfiguration, allowed_words
 from sweeps.console import say
 
 #: Kinds of rig, in words.
@@ -26,23 +26,34 @@ def template(kind: str) -> str:
     return resources.files("sweeps").joinpath("rigs", f"{kind}.toml").read_text(encoding="utf-8")
 
 
-def new(file: Path, kind: str, force: bool) -> int:
-    """Write a rig's file to fill in; returns 0.
+def new(file: Path, kind: str, force: bool, source: Path | None = None, joint: str | None = None) -> int:
+    """Write a rig's file to fill in, or the file of a joint of a model; returns 0.
+
+    Args:
+        source: the model; None: a file of a kind; joint: its name in the model.
 
     Raises:
-        BadConfiguration: no such kind, no such folder, or the file exists and `force` is false.
+        BadConfiguration: no such kind, model, joint or folder, or a file that exists without `force`.
     """
+    if joint is not None and source is None:
+        raise BadConfiguration(f"--joint: got {joint} without --from; expected a model that has this joint")
     if kind not in KINDS:
         each = "; ".join(f"{name}: {what}" for name, what in KINDS.items())
-        raise BadConfiguration(f"--kind: got {kind}; {choices(kind, KINDS)} ({each})")
+        raise BadConfiguration(f"--kind: got {kind}; {allowed_words(kind, KINDS)} ({each})")
     if file.exists() and (file.is_dir() or not force):
         what = "a folder; state a file, as my-rig.toml" if file.is_dir() else "there already; --force replaces it"
         raise BadConfiguration(f"{file}: {what}")
     if not file.parent.is_dir():
         raise BadConfiguration(f"{file}: no such folder as {file.parent}; make it first")
+    if source is None:
+        written, what = template(kind), f"{KINDS[kind]}. Fill in what is marked example: yours, then"
+    else:
+        from sweeps.commands import rig_from_model
+
+        written, what = rig_from_model.text(source, joint), f"the joint of {source}. Next"
     try:
-        file.write_text(template(kind), encoding="utf-8")
+        file.write_text(written, encoding="utf-8")
     except OSError as error:
         raise BadConfiguration(f"{file}: cannot be written ({error.strerror}); state a file elsewhere") from error
-    say(f"{file}: {KINDS[kind]}. Fill in what is marked example: yours, then: mmrjax rig check {file} [DATA.csv]")
+    say(f"{file}: {what}: mmrjax rig check {file} [DATA.csv]")
     return 0

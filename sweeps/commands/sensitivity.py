@@ -17,7 +17,7 @@ from calibration.data.runs import Runs
 from calibration.described import in_words
 from calibration.inference import noise
 from calibration.sensitivity import uncertain_inputs
-from calibration.sensitivity.analyse import analyse
+from calibration.sensitivity.analyse import analyse_sensitivity
 from calibration.sensitivity.model import chosen_outputs
 from calibration.sensitivity.next_runs import Candidates
 from calibration.sensitivity.result import METHODS, NEGLIGIBLE, Points, SensitivityResult
@@ -80,7 +80,7 @@ def sensitivity(config: configuration.Sensitivity, out: Path | None, force: bool
     supply = Supply(float(config.battery), config.discharge_mAh * COULOMB_PER_MAH, np.asarray(conditions.adhesion))
     study = Study(robot, inputs, Points.of(runs), outputs, config.model, config.options, supply, in_words(tell))
     with open_folder("sensitivity", config, robot, out, force, runs) as folder:
-        found = analyse(study, config.method, config.evaluations, config.seed, candidates)
+        found = analyse_sensitivity(study, config.method, config.evaluations, config.seed, candidates)
         folder.write_json("result.json", found.to_json())
         for name, table in found.tables().items():
             folder.write_table(name, table)
@@ -165,27 +165,27 @@ def _inputs(
     if config.posterior:
         if config.parameters:
             raise BadConfiguration("--posterior: says what is uncertain, and so does --parameters; give one of them")
-        return uncertain_inputs.of_posterior(robot, beside_robot(file), ranges)
-    names = config.parameters or uncertain_inputs.default_names(
+        return uncertain_inputs.inputs_from_posterior(robot, beside_robot(file), ranges)
+    names = config.parameters or uncertain_inputs.default_input_names(
         robot, present, config.battery, config.model, not {*OF_TURNS}.isdisjoint(ranges)
     )
-    return uncertain_inputs.of_priors(robot, names, ranges)
+    return uncertain_inputs.inputs_from_priors(robot, names, ranges)
 
 
 def _candidates(config: configuration.Sensitivity, robot: Robot, points: Runs, turns: bool) -> Candidates:
     """Runs of a table, or of Table 8 in every configuration; of a rig, and of turns, its operating points."""
     if config.candidates:
-        runs = read_runs(config.candidates, robot, measured=False)
+        runs = read_runs(config.candidates, robot, columns=config.columns, measured=False)
         source = runs.source
     elif turns or not Layout.of(robot).table8:
         runs, source = points, "the operating points"
     else:
         runs = grid(GridPart(surface=config.surface), robot)
         source = "Table 8"
-    usual = noise.default(robot.channels)
-    stated = noise.parse(usual, robot.channels)
+    usual = noise.default_noise(robot.channels)
+    stated = noise.parse_noise(usual, robot.channels)
     if config.noise:
-        stated |= noise.parse(config.noise, robot.channels)
+        stated |= noise.parse_noise(config.noise, robot.channels)
     return Candidates(
         Points.of(runs), runs.conditions(robot), source, stated, config.noise or usual, runs.deviations(), config.runs
     )

@@ -30,8 +30,9 @@ from sweeps.store import open_folder
 def settle(config: configuration.Settle, source: str, out: Path | None, force: bool) -> int:
     """Find the settled runs of a log and write a run folder with their table; returns the exit code, 0."""
     robot = load_robot(config).robot
-    runs = read_runs(source, robot, measured=True, series=True)
-    loop = shlex.join(["mmrjax", "loop", source, "--robot", config.robot])
+    runs = read_runs(source, robot, columns=config.columns, measured=True, series=True)
+    named = [] if config.columns is None else ["--columns", config.columns]
+    loop = shlex.join(["mmrjax", "loop", source, "--robot", config.robot, *named])
     found = settling.settle(
         runs,
         shortest=config.shortest_s,
@@ -88,7 +89,7 @@ def inertia(robot: Robot) -> dict[str, Inertia]:
 
 def _shown(robot: Robot, configuration: int, channel: Channel, state: State) -> float:
     """Reading of a channel that follows from a state alone [unit of its column]; 0 for others."""
-    signals = balances.begin(robot, Conditions(configuration), state)
+    signals = balances.begin_signals(robot, Conditions(configuration), state)
     try:
         return float(channel.read(robot, signals)) / channel.factor
     except (AttributeError, TypeError):  # a signal that the balances fill in

@@ -18,10 +18,10 @@ from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration
 from mmrjax import fidelities
 from mmrjax.compile.compiling import SELDOM, compiled
-from mmrjax.derived.start_figures import peak
+from mmrjax.derived.start_figures import curve_peak
 from mmrjax.fidelities import outputs, start_stages
 from mmrjax.fidelities.base import History, Run
-from mmrjax.fidelities.result import result
+from mmrjax.fidelities.result import result_of_signals
 from mmrjax.model import channels, ground
 from mmrjax.model.channels import Channel
 from mmrjax.model.motor import Motor
@@ -49,7 +49,7 @@ OF_VEHICLE = ("speed",)
 #: share of it).
 PEAK = "peak_current_A"
 #: Columns of the currents of the motors of either side, where sides are driven apart.
-_OF_SIDES = tuple(channels.find(f"motor_current_{side}").column for side in channels.SIDES)
+_OF_SIDES = tuple(channels.find_channel(f"motor_current_{side}").column for side in channels.SIDES)
 #: Runs are filled up to a multiple of this, so that tables of about one size share what is compiled.
 PAD = 16
 #: Column of the time that a run's current may flow before its windings are at their limit.
@@ -65,10 +65,10 @@ def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: P
     file = load_robot(config)
     robot = file.robot
     if isinstance(given, str):
-        runs = read_runs(given, robot, measured=False, battery=config.battery)
+        runs = read_runs(given, robot, columns=config.columns, measured=False, battery=config.battery)
     else:
         runs = one_run(robot, given, config.battery)
-    if fidelities.facts(config.model).histories and len(runs) > _HISTORIES:
+    if fidelities.fidelity_facts(config.model).histories and len(runs) > _HISTORIES:
         raise BadConfiguration(
             f"--runs: got {len(runs)} runs; --model {config.model} keeps at most {_HISTORIES} histories"
         )
@@ -112,7 +112,7 @@ def _simulated(
     folder: RunFolder, robot: Robot, runs: records.Runs, config: configuration.Simulate
 ) -> tuple[dict[str, np.ndarray], Run | None]:
     """The table of the runs; where the fidelity keeps them over time these are written, and returned too."""
-    fidelity = fidelities.get(config.model)
+    fidelity = fidelities.get_fidelity(config.model)
     if fidelity.histories is None:
         return run.evaluate(robot, runs, config, folder), None
     conditions = run.commanded(robot, runs, config)
@@ -147,7 +147,9 @@ def over_time(robot: Robot, batch: Run) -> dict[str, np.ndarray]:
     empty = (status == BATTERY_EMPTY) & ~finite[rows, -1]
     if empty.any():
         signals = jax.tree.map(lambda x: np.asarray(x)[rows, last], history.signals)
-        at_last = outputs.columns(jax.device_get(result(robot, signals, jnp.asarray(status))), robot.channels)
+        at_last = outputs.output_columns(
+            jax.device_get(result_of_signals(robot, signals, jnp.asarray(status))), robot.channels
+        )
         for name, values in at_last.items():
             columns[name] = np.where(empty & finite.any(-1), values, columns[name])
         after = time[rows, np.minimum(last + 1, finite.shape[-1] - 1)] - time[rows, last]
@@ -171,7 +173,7 @@ def permissible(robot: Robot, table: dict[str, np.ndarray]) -> np.ndarray:
 
 @functools.partial(compiled, options=SELDOM)
 def _peaks(time: Float[Array, "runs samples"], values: Float[Array, "runs samples"]) -> Float[Array, " runs"]:
-    return jax.vmap(peak)(time, values)
+    return jax.vmap(curve_peak)(time, values)
 
 
 @functools.partial(compiled, options=SELDOM)
@@ -245,7 +247,7 @@ def history_table(robot: Robot, history: History, runs: records.Runs) -> dict[st
         "time_s": np.ravel(history.time),
         **{c.column: np.ravel(history.reading[c.name]) / c.factor for c in shown},
         "theoretical_speed_mm_s": np.ravel(signals.speed_theoretical) / channels.MM,
-        "slip": np.ravel(ground.slip(signals.speed, signals.speed_theoretical)),
+        "slip": np.ravel(ground.slip_ratio(signals.speed, signals.speed_theoretical)),
         "displacement_m": np.ravel(history.distance),
         "voltage_V": np.ravel(signals.voltage),
         "traction_N": float(robot.sides) * np.ravel(signals.traction),
@@ -256,7 +258,7 @@ def starts(robot: Robot, batch: Run, runs: records.Runs) -> list[dict[str, Any]]
     """Of each run from standstill its stages, their slip (33) and the acceleration time; no stages where it does not
     get under way."""
     assert batch.history is not None  # the fidelity was asked for it
-    found = start_stages.of_histories(robot, batch.history, runs.configurations(robot))
+    found = start_stages.stages_of_histories(robot, batch.history, runs.configurations(robot))
     nothing: dict[str, Any] = {"stages": [], "acceleration_time_s": None, "slip_over_acceleration": None}
     under_way = [STATUSES[int(s)] in words.UNDER_WAY for s in np.asarray(batch.result.status)]
     return [

@@ -7,13 +7,13 @@ from collections import Counter
 from pathlib import Path
 
 from calibration.data import requirements_file, robot_file
-from calibration.data.input_errors import BadConfiguration, choices
+from calibration.data.input_errors import BadConfiguration, allowed_words
 from calibration.data.parts import motors
 from calibration.described import in_words
 from calibration.sizing import sheet
-from calibration.sizing.chart import Chart, chart, extent
+from calibration.sizing.chart import Chart, chart_extent, margin_chart
 from calibration.sizing.design import OBJECTIVES
-from calibration.sizing.design_search import size as search
+from calibration.sizing.design_search import size_robot as search
 from sweeps import capabilities
 from sweeps import config as configuration
 from sweeps.console import pulse, tell
@@ -39,14 +39,14 @@ def size(config: configuration.Size, out: Path | None, force: bool) -> int:
     for name in objectives:
         if name not in OBJECTIVES:
             where = "--pareto" if config.pareto else "--objective"
-            raise BadConfiguration(f"{where}: got {name}; {choices(name, OBJECTIVES)}")
+            raise BadConfiguration(f"{where}: got {name}; {allowed_words(name, OBJECTIVES)}")
     if config.pareto and len(set(config.pareto)) != 2:
         raise BadConfiguration(f"--pareto: got {', '.join(config.pareto)}; expected two different objectives")
     known = [m.name for m in motors()]
     for name in config.motors:
         if name not in known:
-            raise BadConfiguration(f"--motors: got {name}; {choices(name, known)}")
-    sheet.refuse(robot, asked)
+            raise BadConfiguration(f"--motors: got {name}; {allowed_words(name, known)}")
+    sheet.refuse_impossible(robot, asked)
     with open_folder("size", config, robot, out, force) as folder:
         with pulse(tell, "drawing designs") as heard:
             sizing = search(
@@ -54,12 +54,16 @@ def size(config: configuration.Size, out: Path | None, force: bool) -> int:
                 tell=in_words(heard),
             )  # fmt: skip
             best = robot if sizing.best is None else sizing.best.robot
-            outcomes = () if sizing.best is None else sheet.check(best, asked, changes=False, tell=in_words(heard))
+            outcomes = (
+                ()
+                if sizing.best is None
+                else sheet.check_requirements(best, asked, changes=False, tell=in_words(heard))
+            )
             charts: tuple[Chart, ...] = ()
             if config.report:
                 heard("charts of the limits")
                 drawn = (robot,) if sizing.best is None else (best, robot)
-                charts = tuple(chart(r, asked, extent(asked)) for r in drawn)
+                charts = tuple(margin_chart(r, asked, chart_extent(asked)) for r in drawn)
         found = SizeResult(asked, robot, sizing, objectives, outcomes, charts)
         _write(folder, config, found)
         shown = report(

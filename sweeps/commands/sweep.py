@@ -17,7 +17,7 @@ from rich.table import Table
 from calibration.data import profiles, robot_file
 from calibration.data.input_errors import BadConfiguration, InputError
 from calibration.data.robot_file import RobotFile
-from mmrjax.errors import counted
+from mmrjax.errors import count_noun
 from mmrjax.model.signals import STATUSES
 from sweeps import config_campaign, skeleton
 from sweeps.config import Sweep
@@ -319,7 +319,7 @@ def statuses(done: Iterable[Done]) -> dict[str, int]:
 
 def print_counts(counts: Mapping[str, int], things: str, model: str = "") -> None:
     """Print the number of runs or points by status, in words."""
-    total = counted(sum(counts.values()), things.removesuffix("s"))
+    total = count_noun(sum(counts.values()), things.removesuffix("s"))
     shown = Table(title=total, title_justify="left")
     for heading in ("status", things, "meaning"):
         shown.add_column(heading, justify="right" if heading == things else "left")

@@ -69,7 +69,7 @@ def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: P
             folder.write_table("turns.csv", capabilities.without_idle(robot, turns))
             first, history = jax.tree.map(lambda x: x[:1], batch), None
         else:
-            fidelity = fidelities.get(config.model)
+            fidelity = fidelities.get_fidelity(config.model)
             assert fidelity.histories is not None  # of `drive` and `track`
             slow = fidelity.facts.slow
             with stage(stages - 1, stages, "the turn over time", slow), progress(1, quiet=not slow) as advance:
@@ -203,7 +203,7 @@ def cells(config: configuration.TurnPart, given: dict[str, Any]) -> dict[str, An
 
 def _channels(robot: Robot, settled: bool) -> tuple[Channel, ...]:
     """Channels shown for a turn."""
-    every = channels.rows((*robot.rig.channels, *SHOWN))
+    every = channels.channels_named((*robot.rig.channels, *SHOWN))
     return tuple(c for c in every if c.settled or not settled)
 
 
@@ -218,7 +218,7 @@ def _with_others(robot: Robot, asked: Conditions) -> tuple[Run, Conditions]:
     rows = jax.tree.map(lambda x: np.repeat(np.asarray(x), shares + 1), asked)
     rows = dataclasses.replace(rows, duty_left=jax.numpy.asarray(duty_left), duty_right=jax.numpy.asarray(duty_right))
     rows = jax.tree.map(jax.numpy.asarray, rows)
-    return jax.device_get(fidelities.get(fidelities.NAMES[0]).run(robot, rows, {})), rows
+    return jax.device_get(fidelities.get_fidelity(fidelities.NAMES[0]).run(robot, rows, {})), rows
 
 
 def _duties(conditions: Conditions) -> dict[str, np.ndarray]:
@@ -229,8 +229,8 @@ def _columns(robot: Robot, shown: tuple[Channel, ...], conditions: Conditions, b
     radii = np.array([float(c.radius) for c in robot.configurations.members])
     reading = batch.result.reading
     return {
-        **outputs.columns(batch.result, shown),
-        **turning_figures.columns(robot, reading, radii[np.asarray(conditions.configuration)]),
+        **outputs.output_columns(batch.result, shown),
+        **turning_figures.turning_columns(robot, reading, radii[np.asarray(conditions.configuration)]),
     }
 
 

@@ -117,7 +117,7 @@ def pairs(found: CalibrationResult) -> Figure:
 def before_after(found: CalibrationResult) -> Figure:
     """rms errors by channel: before, fitted, and with each kind of block held out."""
     lines = {"before": found.errors_before, "fitted": found.errors_after}
-    lines |= {f"held out: {blocks.in_words(k, ' + ')}": found.held_out[k].errors for k in found.held_out_alike}
+    lines |= {f"held out: {blocks.kind_in_words(k, ' + ')}": found.held_out[k].errors for k in found.held_out_alike}
     fig, grid = figure(1, len(found.channels), 1.1 + 0.36 * len(lines), sharey=True)
     for axes, channel in zip(grid[0], found.channels, strict=True):
         most = int(np.isfinite(found.readings[channel.name].measured).sum())

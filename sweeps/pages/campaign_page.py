@@ -10,7 +10,7 @@ import numpy as np
 
 from calibration.data.robot_file import RobotFile
 from mmrjax.climbing.climb_simulation import OVER
-from mmrjax.errors import counted
+from mmrjax.errors import count_noun
 from mmrjax.fidelities.variation import STATUS
 from mmrjax.model import signals
 from sweeps.pages import campaign_figures, words
@@ -48,7 +48,7 @@ def write(folder: Path, file: RobotFile, layout: Layout, result: dict[str, Any])
         folder,
         "campaign.html.j2",
         album,
-        title=f"Sweep of {counted(total, 'point')}",
+        title=f"Sweep of {count_noun(total, 'point')}",
         model=result["model"],
         total=total,
         status=statuses,

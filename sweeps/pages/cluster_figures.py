@@ -35,7 +35,7 @@ def clusters(found: Sequence[ResidualCluster]) -> Figure:
             axes.set_xticks(range(len(one.levels)), [m.name for m in one.levels], rotation=turned, fontsize=8)
         else:
             axes.plot(one.at, one.residual, "o", ms=3, color=BLUE, alpha=0.7)
-        axes.set(xlabel=one.column, ylabel=f"{channels.find(one.channel).label} [{one.unit}]")
+        axes.set(xlabel=one.column, ylabel=f"{channels.find_channel(one.channel).label} [{one.unit}]")
         words = f"within {one.within}" if one.within else "all rows"
         axes.set_title(f"{words}, p = {one.p:.1g}", fontsize=9)
     return fig

@@ -177,7 +177,7 @@ def _wrap(fig: Figure) -> bool:
         beyond = max(box.x1 - width, -box.x0, 0.0)
         if beyond > 0 and " " in text and written.get_rotation() == 0:
             longest = max(map(len, text.split("\n")))
-            room = 1 - (2 if written.get_ha() == "center" else 1) * beyond / box.width
+            room = 1 - (2 if written.get_horizontalalignment() == "center" else 1) * beyond / box.width
             written.set_text("\n".join(textwrap.wrap(text, max(12, int(longest * room) - 2))))
             wrapped = True
     return wrapped

@@ -11,8 +11,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from mmrjax.derived.start_figures import peak
-from mmrjax.fidelities.start_stages import Stages, ending, numbers, of_histories
+from mmrjax.derived.start_figures import curve_peak
+from mmrjax.fidelities.start_stages import StartStages, count_finite_samples, last_samples, stages_of_histories
 from mmrjax.model import channels
 from mmrjax.model.channels import Channel
 from mmrjax.model.quantities import MM
@@ -28,7 +28,9 @@ def _largest(time: np.ndarray, values: np.ndarray) -> float:
     """Value of the largest size of a sampled curve, between its samples too; NaN of none."""
     if len(values) < 3:
         return float(values[np.argmax(np.abs(values))]) if values.size else np.nan
-    return float(np.sign(values[np.argmax(np.abs(values))]) * peak(jnp.asarray(time), jnp.asarray(np.abs(values))))
+    return float(
+        np.sign(values[np.argmax(np.abs(values))]) * curve_peak(jnp.asarray(time), jnp.asarray(np.abs(values)))
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,7 +50,7 @@ class Start:
     current: np.ndarray
     speed: np.ndarray
     theoretical: np.ndarray
-    stages: Stages | None
+    stages: StartStages | None
 
     @property
     def sense(self) -> float:
@@ -83,7 +85,7 @@ class Start:
     @property
     def ended(self) -> tuple[float, float]:
         """Current [A] and speed [mm/s] at the end: the running gear may ripple, so the means over the last 0.15 s."""
-        last = ending(self.time)
+        last = last_samples(self.time)
         return float(self.current[last].mean()), float(self.speed[last].mean())
 
 
@@ -97,9 +99,11 @@ def starts(robot: Robot, history: Any, status: np.ndarray, which: Sequence[int],
     from mmrjax.model.signals import STATUSES
 
     answer = []
-    for k, (name, found) in enumerate(zip(names, of_histories(robot, history, which[: len(names)]), strict=True)):
+    for k, (name, found) in enumerate(
+        zip(names, stages_of_histories(robot, history, which[: len(names)]), strict=True)
+    ):
         current = np.asarray(history.signals.total_current[k])
-        upto = slice(0, numbers(current))
+        upto = slice(0, count_finite_samples(current))
         speed, theoretical = (
             np.asarray(x[k])[upto] for x in (history.signals.speed, history.signals.speed_theoretical)
         )
@@ -168,7 +172,7 @@ def _current(axes: Axes, start: Start, colour: str) -> None:
     if start.slipping - start.starting > 1.5 * _share(axes, f"{middle:.2f} A") * last and start.gets_under_way:
         at = (start.starting + start.slipping) / 2
         axes.annotate(f"{middle:.2f} A", (at, middle), xytext=(0, 5), textcoords="offset points", ha="center")
-    crest = start.current[ending(start.time)].max()
+    crest = start.current[last_samples(start.time)].max()
     axes.annotate(
         f"{start.ended[0]:.2f} A", (0.98 * last, crest), xytext=(0, 5), ha="right", textcoords="offset points"
     )
@@ -331,7 +335,7 @@ def courses(read: Iterable[Channel], history: Any, status: np.ndarray, names: Se
 
 def over_time(shown: list[Course]) -> Figure:
     """A row for each run, a panel for each channel."""
-    read = channels.rows(shown[0].readings)
+    read = channels.channels_named(shown[0].readings)
     fig, grid = figure(len(shown), len(read), 2.6 * len(shown))
     for row, course in zip(grid, shown, strict=True):
         row[0].set_title(course.name)

@@ -12,7 +12,7 @@ from calibration.data.table import Runs
 from calibration.discovery.result import DiscoveryResult, Evidence, UnnamedDiscrepancy
 from calibration.discovery.settings import WITHOUT_NAME
 from calibration.inference import blocks
-from calibration.inference.bases import in_words
+from calibration.inference.bases import place_in_words
 from calibration.inference.details import TimeStatistics
 from mmrjax.effects.curve import EVERY_VARIABLE, Variable
 from mmrjax.model.channels import EVERY, SIDES, Channel
@@ -207,7 +207,7 @@ def null(before: Evidence) -> Figure:
 def errors(found: DiscoveryResult) -> Figure:
     """rms error before and after, fitted and held out by every kind of block."""
     lines = {"fitted": found.errors}
-    lines |= {f"held out by\n{blocks.in_words(k, ', ')}": v for k, v in found.errors_held_out.items()}
+    lines |= {f"held out by\n{blocks.kind_in_words(k, ', ')}": v for k, v in found.errors_held_out.items()}
     fig, grid = figure(1, len(found.channels), 2.9, sharey=False)
     for place, channel in enumerate(found.channels):
         axes = grid[0, place]
@@ -429,6 +429,6 @@ def curve(found: UnnamedDiscrepancy) -> Figure:
     low, high = found.value - 1.96 * found.sd, found.value + 1.96 * found.sd
     axes.fill_between(found.at * scale, low, high, color="#cfe3f2", lw=0, label="95 %")
     axes.plot(found.at * scale, found.value, color=GREEN, label="smooth curve")
-    axes.set(xlabel=words, ylabel=f"missing in the {in_words(found.place)} [{found.unit}]")
+    axes.set(xlabel=words, ylabel=f"missing in the {place_in_words(found.place)} [{found.unit}]")
     axes.legend(loc="best")
     return fig

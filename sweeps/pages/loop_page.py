@@ -118,7 +118,7 @@ def would_be_seen(found: DiscoveryResult) -> list[dict[str, Any]]:
     level, listed = found.before.kinds["single"].threshold, []
     for s in found.scores:
         if s.name in BY_NAME and s.sigmas_per_prior_sd > 0:
-            spec = next(p.spec for p in params.walk(BY_NAME[s.name]()) if p.spec.amplitude)
+            spec = next(p.spec for p in params.walk_parameters(BY_NAME[s.name]()) if p.spec.amplitude)
             times = level / s.sigmas_per_prior_sd
             size = f"{times * spec.prior_sd(0.0):.2g} {spec.unit}"
             listed.append({"name": s.name, "what": BY_NAME[s.name].family(), "size": size, "times": times})
@@ -141,12 +141,12 @@ def unseen(found: DiscoveryResult) -> list[dict[str, Any]]:
             arrow = {"bad": " ↑", "good": " ↓", "": ""}[mark]
             cells.append({"text": " → ".join(texts) + arrow, "mark": mark})
         rows = max(int(e["rows"]) for e in both[0].values())
-        what = f"unseen: another {blocks.in_words(kind)}" if kind else "seen by the fit"
+        what = f"unseen: another {blocks.kind_in_words(kind)}" if kind else "seen by the fit"
         lines.append({"what": what, "cells": cells, "reached": f"{rows} of {total}"})
     blank = [{"text": "-", "mark": ""} for _ in found.channels]
     for kind in found.held_out_unpredictable:
         if kind not in found.errors_held_out:
-            what, why = f"unseen: another {blocks.in_words(kind)}", "not predictable from the others"
+            what, why = f"unseen: another {blocks.kind_in_words(kind)}", "not predictable from the others"
             lines.append({"what": what, "cells": blank, "reached": why})
     return lines
 
@@ -228,7 +228,7 @@ def write(folder: Path, found: DiscoveryResult, *, robot_name: str) -> Path:
             "robot.toml": f"the robot {'with what was found' if found.written and found.effects else 'refitted'}",
             "fitted.toml": "the robot refitted, with nothing added",
         },
-        seen_by=next((blocks.in_words(kind) for kind in found.errors_held_out), "nothing"),
+        seen_by=next((blocks.kind_in_words(kind) for kind in found.errors_held_out), "nothing"),
         use_it=loop_words.use_it(found),
         check_first=check_first(found),
         document=found.to_json(),

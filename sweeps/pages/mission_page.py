@@ -218,10 +218,10 @@ def _demand(found: Missions, k: int) -> str:
     mode = source.modes[k]
     said = []
     if mode in CONTROLLED:
-        channel = channels.find(mode)
+        channel = channels.find_channel(mode)
         said.append(span(source.demand, channel.factor, channel.unit))
         if mode == "speed" and YAW_RATE in source.values:
-            said.append(span(source.values[YAW_RATE], 1.0, channels.find(YAW_RATE).unit))
+            said.append(span(source.values[YAW_RATE], 1.0, channels.find_channel(YAW_RATE).unit))
     elif mode == "voltage":
         shares = [(name, 0.01, "% duty") for name in ("duty", *PAIRS[0])] + [(name, 1.0, "V") for name in PAIRS[1]]
         spans = [span(source.values[name], one, unit) for name, one, unit in shares if name in source.values]

@@ -173,13 +173,13 @@ def supply(value: Any) -> str:
 
 def reading(value: Any, channel: str) -> str:
     """A reading with one digit less than its channel's resolution."""
-    digits = max(channels.find(channel).resolution - 1, 0)
+    digits = max(channels.find_channel(channel).resolution - 1, 0)
     return number(value, f"{{:.{digits}f}}")
 
 
 def error(value: Any, channel: str) -> str:
     """A difference of readings, with its sign, with a digit more than they."""
-    return number(value, f"{{:+.{channels.find(channel).resolution}f}}")
+    return number(value, f"{{:+.{channels.find_channel(channel).resolution}f}}")
 
 
 def _grade(value: Any) -> str:

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from mmrjax.model.quantities import MM
-from mmrjax.undercarriage.ripple_peaks import MATTERS, SIGNALS, strongest
+from mmrjax.undercarriage.ripple_peaks import MATTERS, SIGNALS, strongest_resonances
 from sweeps.pages import words
 from sweeps.pages.figure_style import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, SKY, VERMILION, figure
 from sweeps.results.resonance_results import ResonanceResult, percent
@@ -37,7 +37,7 @@ def resonance_map(found: ResonanceResult) -> Figure:
 
 
 def _strong(found: ResonanceResult) -> set[tuple[str, int, str]]:
-    return {(r.mode, r.order, r.signal) for r in strongest(found.resonances)}
+    return {(r.mode, r.order, r.signal) for r in strongest_resonances(found.resonances)}
 
 
 def _top(found: ResonanceResult) -> float:

@@ -10,7 +10,7 @@ import numpy as np
 
 from calibration.data.robot_file import RobotFile
 from mmrjax.model.quantities import MM
-from mmrjax.undercarriage.ripple_peaks import MATTERS, PERIODS, SIGNALS, TAIL, strongest
+from mmrjax.undercarriage.ripple_peaks import MATTERS, PERIODS, SIGNALS, TAIL, strongest_resonances
 from sweeps.pages import resonance_figures, words
 from sweeps.pages.page import Album, named, render
 from sweeps.results.resonance_results import ResonanceResult
@@ -57,7 +57,7 @@ def _modes(found: ResonanceResult) -> list[dict[str, Any]]:
 
 
 def _peaks(found: ResonanceResult) -> list[dict[str, Any]]:
-    strong = {(r.mode, r.order, r.signal) for r in strongest(found.resonances)}
+    strong = {(r.mode, r.order, r.signal) for r in strongest_resonances(found.resonances)}
     return [
         {
             "signal": SIGNALS[p.signal].label,

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from calibration.sensitivity.replicates import Estimate
 from calibration.sensitivity.result import NEGLIGIBLE, NextRuns, OutputStudy, SensitivityResult
-from mmrjax.errors import counted
+from mmrjax.errors import count_noun
 from sweeps.pages.figure_style import BLUE, GREEN, INK, ORANGE, PURPLE, VERMILION, figure, note
 from sweeps.pages.words import short_name
 
@@ -220,7 +220,9 @@ def next_runs(runs: NextRuns, found: SensitivityResult) -> Figure:
         ax.text(left[k] + 0.01, -place, f"{100 * left[k]:.0f} %", va="center", fontsize=8.5)
     ax.set_yticks([-p for p in range(len(moving))], [short_name(found.names[k]) for k in moving])
     ax.set_xlim(0, 1.02)
-    ax.set_xlabel(f"standard deviation after {counted(len(runs.points), 'such run')}, as a share of that before [-]")
+    ax.set_xlabel(
+        f"standard deviation after {count_noun(len(runs.points), 'such run')}, as a share of that before [-]"
+    )
     ax.grid(axis="y", visible=False)
     if not moving:
         note(ax, "these runs give no information on these inputs")

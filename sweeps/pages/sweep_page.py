@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from calibration.data.robot_file import RobotFile
-from mmrjax.errors import counted
+from mmrjax.errors import count_noun
 from mmrjax.model.channels import Channel
 from sweeps import capabilities
 from sweeps.pages import sweep_figures, words
@@ -48,7 +48,7 @@ def write(folder: Path, file: RobotFile, *, model: str, runs: Table) -> Path:
         "sweep.html.j2",
         album,
         of_channels=robot.channels,
-        title=f"Sweep of {counted(len(runs['status']), 'run')}",
+        title=f"Sweep of {count_noun(len(runs['status']), 'run')}",
         model=model,
         answer=answer(runs),
         counts=counts(capabilities.without_idle(robot, runs), robot.channels),
@@ -63,14 +63,14 @@ def answer(runs: Table) -> str:
     settled = np.isin(runs["status"], words.SETTLED)
     over = settled & (runs["flags"] != "")
     verb = "has" if 1 in (total, settled.sum()) else "have"
-    first = f"{settled.sum()} of {counted(total, 'run')} {verb} an operating point"
+    first = f"{settled.sum()} of {count_noun(total, 'run')} {verb} an operating point"
     if not over.any():
         return f"{first}; all within every limit." if settled.any() else f"{first}."
     raised = Counter(flag for flags in runs["flags"][over] for flag in str(flags).split(";"))
     most, times = raised.most_common(1)[0]
     return (
         f"{first}; {over.sum()} of them {'exceeds' if over.sum() == 1 else 'exceed'} a limit, most often: "
-        f"{words.FLAGS.get(most, most)} ({counted(times, 'run')})."
+        f"{words.FLAGS.get(most, most)} ({count_noun(times, 'run')})."
     )
 
 

@@ -61,6 +61,17 @@ STATUSES: dict[str, Status] = {
 
 #: What lies in a run folder beside its page.
 FILES = {
+    "drive.xml": "the drive for MuJoCo, for <include>",
+    "scene.xml": "a model that runs with it",
+    "actuator.py": "the law in JAX, which needs nothing else",
+    "actuator.jaxexport": "the same as a program, for jax.export.deserialize",
+    "actuator.onnx": "the law as an ONNX model",
+    "mjlab_actuator.py": "the law in PyTorch, with a configuration for mjlab",
+    "feed_forward.csv": "voltage, current and losses over speed and torque",
+    "feed_forward.h": "the same tables for C",
+    "draws.npz": "draws of the posterior, for NumPy",
+    "draws.json": "the same draws as JSON",
+    "LAW.md": "the law for people who have never seen this program",
     "robot.toml": "the robot; every command takes it with --robot",
     "runs.csv": "every run, one row each",
     "rows.csv": "every row: measured, simulated, residuals",

@@ -63,7 +63,7 @@ def operating_points(robot: Robot, asked: Conditions) -> Columns:
         part = steady_batch(robot, jax.tree.map(lambda x, i=index: x[i], asked))
         parts.append(jax.tree.map(np.asarray, part))
     answer = jax.tree.map(lambda *x: np.concatenate(x)[:rows], *parts)
-    return {**outputs.columns(answer, robot.channels), "total_mass_kg": np.asarray(answer.mass)}
+    return {**outputs.output_columns(answer, robot.channels), "total_mass_kg": np.asarray(answer.mass)}
 
 
 def channels_of_paper() -> tuple[Channel, ...]:
@@ -202,7 +202,7 @@ def idle_current(robot: Robot, configuration: str, speed_wheel: np.ndarray) -> n
 
     def torque_net(current: float) -> np.ndarray:
         state = State(zero + current, wheel * robot.gearbox.ratio, chassis.radius * wheel, zero)
-        signals = balances.begin(robot, asked, state, direction=zero + 1.0)
+        signals = balances.begin_signals(robot, asked, state, direction=zero + 1.0)
         signals = dataclasses.replace(signals, normal=zero, traction=zero)
         signals = balances.motor(robot, balances.electrical(robot, asked, balances.supply(robot, asked, signals)))
         return np.asarray(balances.gearbox(robot, chassis, balances.track(robot, chassis, signals)).torque_net)
@@ -215,7 +215,7 @@ def idle_current(robot: Robot, configuration: str, speed_wheel: np.ndarray) -> n
 def fit_line(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, float]:
     """Least-squares line through the points, evaluated at them, and its R² (A1)."""
     line = np.polyval(np.polyfit(x, y, 1), x)
-    return line, simulation_errors.certainty(y, line)
+    return line, simulation_errors.r_squared(y, line)
 
 
 # --- runs ---------------------------------------------------------------------------------------------
@@ -308,7 +308,7 @@ def energy_split(robot: Robot, asked: Conditions) -> tuple[Columns, Columns]:
         points["theoretical_speed_mm_s"] * MM * (1 - points["slip"]),
         asked.discharge,
     )
-    at, _ = eqx.filter_jit(balances.settled)(robot, asked, state)
+    at, _ = eqx.filter_jit(balances.settled_signals)(robot, asked, state)
     sides = robot.sides
     parts = {
         "winding": sides * at.voltage_drop * at.current,
@@ -341,6 +341,6 @@ def summary(rows: Rows) -> dict[str, dict[str, Any]]:
     ways = {name: errors(getattr(rows, name), rows.measured) for name in ("plain", "raised", "weighed")}
     ways["paper"] = simulation_errors.relative_error(rows.paper, rows.measured)
     return {
-        way: {c.name: simulation_errors.summary(values[:, k]) for k, c in enumerate(channels_of_paper())}
+        way: {c.name: simulation_errors.error_summary(values[:, k]) for k, c in enumerate(channels_of_paper())}
         for way, values in ways.items()
     }

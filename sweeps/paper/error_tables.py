@@ -23,7 +23,7 @@ def errors(variants: dict[str, np.ndarray], rows: data.Rows) -> list[dict[str, A
     for name, values in variants.items():
         for group in ("all", *rows.ratio):
             pick = np.ones(len(kind), bool) if group == "all" else kind == group
-            cells = [simulation_errors.summary(values[pick, k]) for k in range(values.shape[1])]
+            cells = [simulation_errors.error_summary(values[pick, k]) for k in range(values.shape[1])]
             answer.append(
                 {"variant": name, "group": group, "rows": cells[0]["rows"], "of": int(pick.sum()), "cells": cells}
             )

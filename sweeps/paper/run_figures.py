@@ -63,10 +63,10 @@ def current_over_slope(robot: Robot, rows: data.Rows) -> tuple[Figure, list[dict
                         "configuration": kind,
                         "mode": mode,
                         "straight": straight,
-                        "own": simulation_errors.certainty(measured, rows.plain["total_current_A"][pick]),
+                        "own": simulation_errors.r_squared(measured, rows.plain["total_current_A"][pick]),
                         "own_rows": int(np.isfinite(rows.plain["total_current_A"][pick]).sum()),
-                        "raised": simulation_errors.certainty(measured, rows.raised["total_current_A"][pick]),
-                        "weighed": simulation_errors.certainty(measured, rows.weighed["total_current_A"][pick]),
+                        "raised": simulation_errors.r_squared(measured, rows.raised["total_current_A"][pick]),
+                        "weighed": simulation_errors.r_squared(measured, rows.weighed["total_current_A"][pick]),
                     }
                 )
         axes.set(xlabel="slope [°]", xticks=[0, 5, 10, 15, 20], xlim=(-0.5, 20.9))

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from calibration.data.columns import IMPOSED as OF_IMPOSED
 from calibration.data.columns import LEVERS
 from calibration.data.contradictions import without_levers
-from calibration.data.input_errors import BadConfiguration, choices, stated_number
+from calibration.data.input_errors import BadConfiguration, allowed_words, stated_number
 from mmrjax.fidelities import variation
 from mmrjax.fidelities.variation import Axis
 from mmrjax.model.conditions import Conditions
@@ -155,7 +155,7 @@ def _known(name: str, robot: Robot, where: str) -> Axis:
     names = variation.variable_names(robot)
     if name not in names:
         raise BadConfiguration(
-            f"{where}: neither a parameter of the robot nor a condition; {choices(name, names, 3)}"
+            f"{where}: neither a parameter of the robot nor a condition; {allowed_words(name, names, 3)}"
         )
     return variation.Variation(robot, (name,)).axes[name]
 
@@ -176,7 +176,8 @@ def _within(values: Float[np.ndarray, " n"], axis: Axis, where: str) -> None:
 def _configuration(name: Any, robot: Robot, where: str) -> float:
     if name not in robot.configurations.names:
         raise BadConfiguration(
-            f"{where}: got {name!r}; the robot has no such configuration; {choices(str(name), robot.configurations)}"
+            f"{where}: got {name!r}; the robot has no such configuration; "
+            f"{allowed_words(str(name), robot.configurations)}"
         )
     return float(robot.configurations.index(name))
 
@@ -230,7 +231,7 @@ def _range(stated: Mapping[str, Any], where: str) -> np.ndarray:
 def _keys(stated: Mapping[str, Any], allowed: tuple[str, ...], needed: tuple[str, ...], where: str) -> None:
     for key in stated:
         if key not in allowed:
-            raise BadConfiguration(f"{where}.{key}: no such key; {choices(key, allowed)}")
+            raise BadConfiguration(f"{where}.{key}: no such key; {allowed_words(key, allowed)}")
     for key in needed:
         if key not in stated:
             raise BadConfiguration(f"{where}: {key} is missing; expected {', '.join(needed)}")
@@ -252,10 +253,10 @@ def _fixed(stated: Mapping[str, Any], robot: Robot, where: str) -> tuple[dict[st
     for name, value in stated.items():
         place = f"{where}.{name}"
         if name not in allowed:
-            raise BadConfiguration(f"{place}: no such condition; {choices(name, allowed)}")
+            raise BadConfiguration(f"{place}: no such condition; {allowed_words(name, allowed)}")
         if name == SURFACE:
             if not isinstance(value, str) or (value not in SURFACES and robot.rig.scales_adhesion):
-                raise BadConfiguration(f"{place}: got {value!r}; {choices(str(value), SURFACES)}")
+                raise BadConfiguration(f"{place}: got {value!r}; {allowed_words(str(value), SURFACES)}")
             surface = str(value)
         elif name == CONFIGURATION:
             fixed[name] = _configuration(value, robot, place)
@@ -276,7 +277,7 @@ def _samples(stated: Mapping[str, Any], robot: Robot, where: str, data: list[str
     _keys(stated, _SAMPLES, ("design", "number"), where)
     design = stated["design"]
     if not isinstance(design, str) or design not in DESIGNS:
-        raise BadConfiguration(f"{where}.design: got {design!r}; {choices(str(design), DESIGNS)}")
+        raise BadConfiguration(f"{where}.design: got {design!r}; {allowed_words(str(design), DESIGNS)}")
     number = _count(stated["number"], f"{where}.number", 2**52)
     seed = stated.get("seed", 0)
     if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**32:
@@ -325,7 +326,7 @@ def _quantile(name: str, stated: Any, robot: Robot, where: str) -> Quantile:
     table = {"distribution": stated} if isinstance(stated, str) else stated
     kind = table.get("distribution") if isinstance(table, Mapping) else None
     if not isinstance(kind, str) or kind not in DISTRIBUTIONS:
-        raise BadConfiguration(f"{where}.distribution: got {kind!r}; {choices(str(kind), DISTRIBUTIONS)}")
+        raise BadConfiguration(f"{where}.distribution: got {kind!r}; {allowed_words(str(kind), DISTRIBUTIONS)}")
     needed = DISTRIBUTIONS[kind]
     _keys(table, ("distribution", *needed), needed, where)
     numbers = {key: stated_number(table[key], f"{where}.{key}") for key in needed}
@@ -351,7 +352,7 @@ def _prior(name: str, robot: Robot) -> Quantile:
 
     from calibration.inference import priors
 
-    coordinates = priors.coordinates(robot, [name])
+    coordinates = priors.parameter_coordinates(robot, [name])
 
     def quantile(u: np.ndarray) -> np.ndarray:
         return in_blocks(coordinates.value, ndtri(u)[:, None])[:, 0]

@@ -14,7 +14,16 @@ import numpy as np
 from calibration.data import terrains
 from calibration.data.input_errors import BadConfiguration
 from mmrjax.climbing import terrain
-from mmrjax.climbing.climb_simulation import FAILED, NAMES, OVER, UNFINISHED, Climb, Sequence, climb_batch, still
+from mmrjax.climbing.climb_simulation import (
+    FAILED,
+    NAMES,
+    OVER,
+    UNFINISHED,
+    Climb,
+    Sequence,
+    climb_batch,
+    constant_angles,
+)
 from mmrjax.climbing.footing import PITCH
 from mmrjax.climbing.terrain import Terrain
 from mmrjax.fidelities.variation import STATUS, Axis, Variation
@@ -69,7 +78,7 @@ def terrains_of(obstacle: Obstacle, sizes: np.ndarray) -> Terrain:
     """Terrains of sizes [mm]."""
     nose, tread = obstacle.nose_mm / 1000, obstacle.tread_mm / 1000
     make = {
-        "step": lambda s: terrain.step(s, nose),
+        "step": lambda s: terrain.single_step(s, nose),
         "stairs": lambda s: terrain.stairs(s, tread, obstacle.count, nose),
         "gap": terrain.gap,
     }
@@ -166,7 +175,7 @@ def _sequences(obstacle: Obstacle, robot: Robot, conditions: Conditions, points:
     each = 0 if jnp.ndim(robot.sides) else None
     angles = jax.vmap(lambda r, c: masses.lever_angles(r.running_gear, c), in_axes=(each, 0))(robot, conditions)
     front, rear = (jnp.broadcast_to(x, (points,)) for x in angles)
-    found = jax.vmap(still)(front, rear)
+    found = jax.vmap(constant_angles)(front, rear)
     if obstacle.sequence is not None:
         one = terrains.read_sequence(obstacle.sequence, robot, (0.0, 0.0))
         found = jax.tree.map(lambda x: jnp.broadcast_to(x, (points, *jnp.shape(x))), one)

@@ -52,7 +52,7 @@ def tables(store: Path, layout: Layout) -> Iterator[Any]:
 
     group = zarr.open_group(store, mode="r")
     design, blocks = layout.design, layout.blocks
-    columns = {row.name: row.column for row in outputs.table(channels.EVERY)}
+    columns = {row.name: row.column for row in outputs.output_table(channels.EVERY)}
     for chunk in range(len(blocks)):
         box = blocks.box(chunk)
         shape = tuple(b.stop - b.start for b in box)

@@ -9,7 +9,7 @@ from typing import TypeVar
 import numpy as np
 
 from calibration.data.columns import LOAD, Layout
-from calibration.data.input_errors import BadConfiguration, choices
+from calibration.data.input_errors import BadConfiguration, allowed_words
 from calibration.data.runs import Runs
 from mmrjax.model.paper_tables import BENCH, PAYLOADS_KG, SLOPES_DEG, SURFACES
 from mmrjax.model.robot import Robot
@@ -79,7 +79,7 @@ def check(config: GridPart, robot: Robot) -> None:
     imposed.check_acting(robot, ground, shaft)
     surface = config.surface
     if surface is not None and robot.rig.scales_adhesion and surface not in SURFACES:
-        raise BadConfiguration(f"{OPTIONS['surface']}: got {surface!r}; {choices(surface, SURFACES)}")
+        raise BadConfiguration(f"{OPTIONS['surface']}: got {surface!r}; {allowed_words(surface, SURFACES)}")
 
 
 def axes(config: GridPart, robot: Robot, battery: bool = False) -> dict[str, tuple[object, ...]]:

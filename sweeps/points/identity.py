@@ -30,8 +30,8 @@ def identity(config: Part, robot: Robot, files: Iterable[str], device: str) -> I
     Raises:
         BadConfiguration: a file that cannot be read.
     """
-    configuration = _flat(config.model_dump(mode="json", exclude={"report"}), "")
-    configuration |= {f"robot {p.name}": repr(float(p.value)) for p in params.walk(robot)}
+    configuration = _flat(config.model_dump(mode="json", exclude={"report", "table"}), "")
+    configuration |= {f"robot {p.name}": repr(float(p.value)) for p in params.walk_parameters(robot)}
     return {
         "configuration": configuration,
         "data": {file: _hash(file) for file in files},

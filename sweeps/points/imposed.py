@@ -10,10 +10,10 @@ import numpy as np
 
 from calibration.data.columns import Layout
 from calibration.data.input_errors import BadConfiguration
-from mmrjax.model.conditions import OF_TURNS, sides_contradict
+from mmrjax.model.conditions import OF_TURNS, sides_contradiction
 from mmrjax.model.paper_tables import VOLTAGES_V
 from mmrjax.model.quantities import RPM
-from mmrjax.model.robot import NO_BRAKE, Robot, cannot_turn
+from mmrjax.model.robot import NO_BRAKE, Robot, turn_error
 from sweeps import capabilities
 
 #: A limit from which on there is none (`robots.blank`).
@@ -170,7 +170,7 @@ def check_can_turn(robot: Robot, names: Iterable[str], where: str) -> None:
     Raises:
         BadConfiguration: opens with `where`, and says why.
     """
-    if why := cannot_turn(robot, names):
+    if why := turn_error(robot, names):
         raise BadConfiguration(f"{where}: {why}")
 
 
@@ -183,5 +183,5 @@ def check_turning(robot: Robot, stated: Collection[str], names: Iterable[str], w
     if not (freed := [name for name in OF_TURNS if name in stated]):
         return
     check_can_turn(robot, names, f"{where}, {freed[0]}")
-    if why := sides_contradict(stated):
+    if why := sides_contradiction(stated):
         raise BadConfiguration(f"{where}, {why}")

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibration.data import profiles
-from calibration.data.input_errors import BadConfiguration, choices
+from calibration.data.input_errors import BadConfiguration, allowed_words
 from mmrjax import __version__, fidelities
 from mmrjax.fidelities import outputs
 from mmrjax.fidelities.variation import STATUS, Variation
@@ -51,8 +51,8 @@ def prepare(config: Campaign, robot: Robot, plan: axes.Plan, where: str) -> scal
         raise BadConfiguration(f"{where}, outputs: got {taken[0]}, which varies; expected what comes out of a run")
     task = task_of(config, robot, profile is not None and profile.turns)
     if unknown := [name for name in config.outputs if name not in task.attributes]:
-        raise BadConfiguration(f"{where}, outputs: got {unknown[0]}; {choices(unknown[0], task.attributes, 3)}")
-    rests = {**{o.name: o.rests_on for o in outputs.table(robot.channels)}, **capabilities.RESTS_ON}
+        raise BadConfiguration(f"{where}, outputs: got {unknown[0]}; {allowed_words(unknown[0], task.attributes, 3)}")
+    rests = {**{o.name: o.rests_on for o in outputs.output_table(robot.channels)}, **capabilities.RESTS_ON}
     for name in config.outputs:
         if lacking := [n for n in robot.unknown(rests.get(name, ())) if n not in plan.design.names]:
             raise BadConfiguration(
@@ -98,7 +98,7 @@ def _bearable(variation: Variation, task: Task, plan: axes.Plan) -> None:
     Raises:
         BadConfiguration: a point that the fidelity refuses.
     """
-    fidelity = fidelities.get(task.model)
+    fidelity = fidelities.get_fidelity(task.model)
     shape = plan.design.shape
     ends = itertools.product(*({0, n - 1} for n in shape[:4]))
     corners = [(*end, *(0 for _ in shape[4:])) for end in ends]

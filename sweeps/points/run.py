@@ -83,7 +83,7 @@ class SimulationResult:
 def ended(robot: Robot, batch: Run) -> dict[str, np.ndarray]:
     """The columns of how a batch of runs ended, with those of its fidelity alone."""
     result, further = jax.device_get((batch.result, batch.columns))
-    return outputs.columns(result, robot.channels, further)
+    return outputs.output_columns(result, robot.channels, further)
 
 
 def refuse(robot: Robot, conditions: Conditions, config: FidelityPart) -> None:
@@ -93,7 +93,7 @@ def refuse(robot: Robot, conditions: Conditions, config: FidelityPart) -> None:
         BadConfiguration: no whole number of steps, a step too large for the stiffness, and the like.
     """
     try:
-        fidelities.get(config.model).check(robot, conditions, config.options)
+        fidelities.get_fidelity(config.model).check(robot, conditions, config.options)
     except ValueError as error:
         raise BadConfiguration(f"--model {config.model}: {error}") from error
 
@@ -144,7 +144,7 @@ def job_of(robot: Robot, runs: Runs, config: FidelityPart, samples: Drawn | None
     rows = commanded(robot, runs, config)
     refuse(robot, rows, config)
     plan = Plan.of_rows(jax.tree.map(np.asarray, rows), samples)
-    wanted = (*outputs.names(robot.channels), FLAGS_CODE, *fidelities.get(config.model).columns)
+    wanted = (*outputs.output_names(robot.channels), FLAGS_CODE, *fidelities.get_fidelity(config.model).columns)
     task = of_fidelity(config.model, config.options, robot)
     chunk = getattr(config, "chunk", None) or scale.default_chunk(task)
     blocks = Blocks.of(plan.design.shape, chunk)
@@ -167,12 +167,12 @@ def evaluate(
             a bar on stderr where it takes long.
     """
     job = job_of(robot, runs, config)
-    slow = fidelities.facts(config.model).slow or len(job.blocks) > 1
+    slow = fidelities.fidelity_facts(config.model).slow or len(job.blocks) > 1
     with bar(len(runs), quiet=not slow or advance is not None) as own:
         found = computed(job, folder, "chunk", advance or own)
-    columns = {row.column: found[row.name] for row in outputs.table(robot.channels)}
-    further = {name: found[name] for name in fidelities.get(config.model).columns}
-    return {**conditions(robot, runs), **columns, **outputs.codes(found[STATUS], found[FLAGS_CODE]), **further}
+    columns = {row.column: found[row.name] for row in outputs.output_table(robot.channels)}
+    further = {name: found[name] for name in fidelities.get_fidelity(config.model).columns}
+    return {**conditions(robot, runs), **columns, **outputs.status_words(found[STATUS], found[FLAGS_CODE]), **further}
 
 
 def followed(robot: Robot, runs: Runs, model: str | None) -> Table:
@@ -184,9 +184,11 @@ def followed(robot: Robot, runs: Runs, model: str | None) -> Table:
     Raises:
         BadConfiguration: a fidelity that cannot follow them.
     """
-    seen = jax.device_get(_observed(observers.kind(runs).of(runs, robot, model), params.strong(robot)))
+    seen = jax.device_get(
+        _observed(observers.observer_kind(runs).of(runs, robot, model), params.without_weak_types(robot))
+    )
     columns = {c.column: seen.reading[:, k] / c.factor for k, c in enumerate(robot.channels)}
-    return {**conditions(robot, runs), **columns, **outputs.codes(seen.status, seen.flags)}
+    return {**conditions(robot, runs), **columns, **outputs.status_words(seen.status, seen.flags)}
 
 
 @compiled

@@ -27,7 +27,7 @@ from mmrjax import fidelities
 from mmrjax.compile.compiling import compiled
 from mmrjax.compile.precision import Threads
 from mmrjax.fidelities import outputs
-from mmrjax.fidelities.variation import FLAGS, STATUS, Variation, evaluate, pick
+from mmrjax.fidelities.variation import FLAGS, STATUS, Variation, evaluate_points, pick_outputs
 from mmrjax.missions.profile import Profile
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.robot import Robot
@@ -98,13 +98,13 @@ class Compiled:
         self.mesh = Mesh(np.array(devices), (POINTS,))
         # Every device has the same number of points; the last ones stand for the chunk's last point again.
         each = -(-job.blocks.points // len(devices))
-        each = each if job.task.run is not None else fidelities.facts(job.task.model).filled(each)
+        each = each if job.task.run is not None else fidelities.fidelity_facts(job.task.model).filled(each)
         each = each if each < SHARED else -(-each // SHARED) * SHARED
         self.size = each * len(devices)
         everywhere = NamedSharding(self.mesh, PartitionSpec())
         self._variation, self._fixed = _placed((job.plan.varied(job.robot), job.plan.fixed()), everywhere)
         self._split = NamedSharding(self.mesh, PartitionSpec(POINTS))
-        factors = {row.name: row.factor for row in outputs.table(job.robot.channels)}
+        factors = {row.name: row.factor for row in outputs.output_table(job.robot.channels)}
         surface = None if job.plan.surface is None else adhesions(job.robot, job.plan.surface)
         self._asked = _Asked(
             job.task.model, tuple(job.task.options.items()), tuple((n, factors.get(n, 1.0)) for n in job.outputs),
@@ -148,8 +148,8 @@ class Compiled:
     def _run(self, variation: Variation, conditions: Conditions, values: Array, _: Any, told: Advance) -> Any:
         """A run of the fidelity."""
         robot, conditions = variation.at(values, conditions)
-        run = fidelities.get(self.job.task.model).run(robot, conditions, self.job.task.options, told)
-        return pick(run, robot.channels, self.job.outputs)
+        run = fidelities.get_fidelity(self.job.task.model).run(robot, conditions, self.job.task.options, told)
+        return pick_outputs(run, robot.channels, self.job.outputs)
 
 
 class _Asked(NamedTuple):
@@ -197,7 +197,7 @@ def _one_device(
     """Outputs of points as they are stored."""
     conditions = _on_surface(variation, conditions, values, asked.surface)
     names = tuple(name for name, _ in asked.factors)
-    found = evaluate(variation, asked.model, values, conditions, dict(asked.options), names, profile)
+    found = evaluate_points(variation, asked.model, values, conditions, dict(asked.options), names, profile)
     return _stored(found, asked)
 
 

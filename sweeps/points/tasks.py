@@ -67,8 +67,12 @@ def of_fidelity(
     model: str, options: Mapping[str, float], robot: Robot, profiled: bool = False, turns: bool = False
 ) -> Task:
     """Task of a run; `profiled`: over a profile, with its totals as outputs; `turns`: with both sides."""
-    facts, own, usual = fidelities.facts(model), fidelities.get(model).columns, channels.names(robot.channels)
-    rows: dict[str, tuple[str, str]] = {r.name: (r.unit, r.label) for r in outputs.table(robot.channels)}
+    facts, own, usual = (
+        fidelities.fidelity_facts(model),
+        fidelities.get_fidelity(model).columns,
+        channels.channel_names(robot.channels),
+    )
+    rows: dict[str, tuple[str, str]] = {r.name: (r.unit, r.label) for r in outputs.output_table(robot.channels)}
     rows |= {name: ("", name.replace("_", " ")) for name in own}
     if profiled:
         from mmrjax.missions import mission_batch  # which imports an integrator

@@ -60,12 +60,12 @@ def intervals(
     """
     samples = Drawn(tuple(posterior.names), posterior.draw(draws, SEED).T)
     job = run.job_of(robot, runs, config, samples)
-    slow = fidelities.facts(config.model).slow or draws * len(runs) > 100_000
+    slow = fidelities.fidelity_facts(config.model).slow or draws * len(runs) > 100_000
 
     def summary(found: run.Table) -> run.Table:
         seen = {name: values.reshape(-1, draws) for name, values in found.items()}
         counts = np.isin(seen[STATUS], DONE) & np.isfinite(seen[robot.channels[0].name])
-        return _summary({o.column: seen[o.name] for o in outputs.table(robot.channels)}, counts)
+        return _summary({o.column: seen[o.name] for o in outputs.output_table(robot.channels)}, counts)
 
     whole = job.blocks.size[-1] == draws  # of a run all draws are in one chunk, which is kept in short
     with progress(draws, quiet=not slow, doing="draws") as advance:

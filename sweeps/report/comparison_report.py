@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mmrjax.errors import counted
+from mmrjax.errors import count_noun
 from sweeps.pages import words
 from sweeps.report.condition_columns import conditions
 from sweeps.report.document import Cell, Column, Document, Figure, Note, Section, Table, drawing, missing
@@ -33,7 +33,7 @@ def document(found: Comparison) -> Document:
     known = found.table, found.channels
     lead = (
         f"Robot: **{found.robot_name}**. Fidelity: **{found.model}**. Measured: **{found.source}**, "
-        f"{counted(len(found.table['status']), 'row')}."
+        f"{count_noun(len(found.table['status']), 'row')}."
     )
     draw = drawing("comparison_figures.errors_over", *known, in_units=True, beside=found.over)
     parity = Figure("parity", _bias(found), _PARITY, drawing("comparison_figures.parity", *known, band=False))
@@ -83,7 +83,7 @@ def answer(found: Comparison) -> str:
         return "No row has both a simulated and a measured number."
     errors = ", ".join(f"{e['rms_percent']:.1f} % {c.label}" for c, e in each)
     rows, worst = max(e["rows"] for _, e in each), max(e["max_percent"] for _, e in each)
-    what = f"{rows} of {total} rows" if rows < total else counted(total, "row")
+    what = f"{rows} of {total} rows" if rows < total else count_noun(total, "row")
     if found.over is not None:
         what = f"{_seconds(found):.3g} s of log"
     return f"{what}: rms error {errors} (worst reading {worst:.1f} %). {_FITS[found.fit]}".rstrip()

@@ -9,8 +9,8 @@ import numpy as np
 
 from calibration.sizing.chart import LIMITS, Chart
 from calibration.sizing.design import OBJECTIVES
-from calibration.sizing.design_search import Found
-from mmrjax.errors import counted
+from calibration.sizing.design_search import SizedDesign
+from mmrjax.errors import count_noun
 from sweeps.report.check_report import sheet
 from sweeps.report.document import Cell, Column, Document, Figure, Note, Section, Table, drawing
 from sweeps.results.size_results import SizeResult, missed, objective, verdict
@@ -60,12 +60,14 @@ def document(found: SizeResult, robot_name: str) -> Document:
     )
 
 
-def _table(name: str, found: SizeResult, designs: Iterable[Found], title: str = "", terminal: bool = False) -> Table:
+def _table(
+    name: str, found: SizeResult, designs: Iterable[SizedDesign], title: str = "", terminal: bool = False
+) -> Table:
     left_out = found.sizing.unmeetable
     rows = [
         (
             Cell(verdict(f, left_out), "good" if f.feasible and not left_out else "bad"), f.drive.motor.name,
-            f"{f.drive.family}, {counted(f.drive.stages, 'stage')}", f.ratio, 1000 * f.radius,
+            f"{f.drive.family}, {count_noun(f.drive.stages, 'stage')}", f.ratio, 1000 * f.radius,
             f"{f.in_series} × {f.parallel:.3g} {f.cell.name}", *(f.objectives.get(k) for k in OBJECTIVES),
             ", ".join(f.binds if f.feasible else missed(f)) or "none",
         )
@@ -97,7 +99,7 @@ def _front(found: SizeResult) -> tuple[Figure | Note, ...]:
         return ()
     first, second = found.objectives
     text = (
-        f"{counted(len(front), 'design')} on the Pareto front of {first} and {second}, from "
+        f"{count_noun(len(front), 'design')} on the Pareto front of {first} and {second}, from "
         f"{objective(front[0], first)} to {objective(front[-1], second)}"
     )
     return (Note(f"{text}."), Figure("front", text, _FRONT, drawing("size_figures.front", found)))

@@ -58,7 +58,7 @@ class CheckResult:
             "schema": "mmrjax.check/1",
             "statement": self.statement(),
             "source": self.asked.source,
-            **sheet.counts(self.outcomes),
+            **sheet.count_outcomes(self.outcomes),
             "requirements": [o.to_json() for o in self.outcomes],
         }
 

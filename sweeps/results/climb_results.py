@@ -16,7 +16,7 @@ from jaxtyping import Array
 
 from calibration.data import robot_file
 from calibration.data.input_errors import BadConfiguration
-from mmrjax.climbing.climb_derivatives import OUTPUTS, Derivatives, Given, outputs_of_run
+from mmrjax.climbing.climb_derivatives import OUTPUTS, ClimbInputs, Derivatives, outputs_of_run
 from mmrjax.climbing.climb_simulation import LOSSES, NAMES, OVER, SOURCES, Climb
 from mmrjax.climbing.footing import FRONT, PITCH, REAR, SHAFT
 from mmrjax.climbing.terrain import Terrain
@@ -58,7 +58,7 @@ class Along:
     units: tuple[str, ...]
     values: Array
     widths: Array
-    given: Callable[[Array], Given]
+    given: Callable[[Array], ClimbInputs]
 
     @property
     def rows(self) -> list[tuple[str, str, float, float]]:

@@ -75,9 +75,9 @@ def compared(
 def _summary(channel: Channel, table: dict[str, np.ndarray]) -> dict[str, Any]:
     measured, simulated = table[channel.column], table[f"simulated_{channel.column}"]
     return {
-        **residual.summary(table[f"error_{channel.name}_percent"]),
+        **residual.error_summary(table[f"error_{channel.name}_percent"]),
         "rms": residual.root_mean_square(simulated - measured),
         "unit": channel.unit,
-        "r2": residual.certainty(measured, simulated),
+        "r2": residual.r_squared(measured, simulated),
         "missing": int(np.isnan(measured).sum()),
     }

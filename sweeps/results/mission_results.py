@@ -43,7 +43,9 @@ class Missions:
     def _one(self, row: int) -> dict[str, Any]:
         to = {name: f"energy_to_{name}_Wh" for name in SINKS}
         numbers = {
-            c: float(self.table[c][row]) for c in mission_batch.names(self.source.turns) if c not in to.values()
+            c: float(self.table[c][row])
+            for c in mission_batch.mission_columns(self.source.turns)
+            if c not in to.values()
         }
         flags = str(self.table["flags"][row])
         return {

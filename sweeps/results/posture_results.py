@@ -73,7 +73,7 @@ def postures(robot: Robot, runs: Runs, conditions: Conditions) -> Postures | Non
     """Postures of the runs of a table; None if it states no levers."""
     if not conditions.states_levers:
         return None
-    rests, limits, lies, steps = jax.device_get(static_limits.standing(robot, conditions))
+    rests, limits, lies, steps = jax.device_get(static_limits.postures_of_runs(robot, conditions))
     shown = ("configuration", *(c for c in ("payload_kg", "slope_deg", *LEVERS) if runs.has(c)))
     degrees, millimetres = 180 / np.pi, 1 / MM
     table = {name: runs[name] for name in shown} | {
@@ -101,7 +101,7 @@ def postures(robot: Robot, runs: Runs, conditions: Conditions) -> Postures | Non
 
 def step_map(robot: Robot, conditions: Conditions) -> StepMap:
     """Highest steps and margins of tipping of one run over the angles of its levers."""
-    found, margin = jax.device_get(static_limits.over_levers(robot, conditions, ANGLES, ANGLES))
+    found, margin = jax.device_get(static_limits.steps_over_lever_angles(robot, conditions, ANGLES, ANGLES))
     front, rear = np.unravel_index(np.argmax(found.height), found.height.shape)
     best = _on_step(jax.tree.map(lambda x: x[front, rear], found))
     own = tuple(float(np.degrees(x)) for x in lever_angles(robot.running_gear, conditions))
@@ -127,13 +127,13 @@ def of_requirements(robot: Robot, outcomes: Sequence[Outcome]) -> dict[str, tupl
             step, front, rear = jax.device_get(static_limits.best_step(robot, conditions))
             drawn = _on_step(step)
         else:
-            front = rear = float(static_limits.flush(robot)) if name == "gap_mm" else np.pi
+            front = rear = float(static_limits.flush_lever_angle(robot)) if name == "gap_mm" else np.pi
             stands = static_limits.with_levers(conditions, front, rear)
-            rests, side = resting_posture.level(robot, stands), resting_posture.outline(robot, stands)
+            rests, side = resting_posture.level_posture(robot, stands), resting_posture.side_outline(robot, stands)
             drawn = Drawn(jax.device_get(side.pitched(rests.pitch)), float(rests.height), 0.0)
         found[name] = drawn, float(np.degrees(front)), float(np.degrees(rear))
     return found
 
 
-def _on_step(found: static_limits.Step) -> Drawn:
+def _on_step(found: static_limits.StepLimit) -> Drawn:
     return Drawn(found.side, float(found.base), float(found.height))

@@ -12,7 +12,15 @@ from mmrjax.model.quantities import MM
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import STATUSES
 from mmrjax.undercarriage.modes import Mode
-from mmrjax.undercarriage.ripple_peaks import SIGNALS, Crossing, Passing, Peak, Resonance, resonances, strongest
+from mmrjax.undercarriage.ripple_peaks import (
+    SIGNALS,
+    Crossing,
+    Passing,
+    Peak,
+    Resonance,
+    group_resonances,
+    strongest_resonances,
+)
 
 SAID = 3  # ranges to avoid in a sentence
 
@@ -45,7 +53,7 @@ class ResonanceResult:
     @property
     def resonances(self) -> list[Resonance]:
         """Peaks over the payloads; those without a mode are confirmed by none."""
-        return resonances(self.peaks)
+        return group_resonances(self.peaks)
 
     @property
     def read(self) -> np.ndarray:
@@ -67,7 +75,7 @@ class ResonanceResult:
     def avoid(self) -> list[tuple[float, float, list[Resonance]]]:
         """Ranges of speed to avoid [m/s], lowest first, each of one mode and order, with what shows it."""
         found: dict[tuple[str, int], list[Resonance]] = {}
-        for r in strongest(self.resonances):
+        for r in strongest_resonances(self.resonances):
             found.setdefault((r.mode, r.order), []).append(r)
         ranges = [
             (min(r.avoid[0] for r in members), max(r.avoid[1] for r in members), members)
@@ -182,7 +190,7 @@ class ResonanceResult:
     def shaken(self, row: int | np.integer[Any]) -> bool:
         """True if a run is within one of the strongest peaks of its own payload."""
         speed, payload = self.table["speed_mean_mm_s"][row] * MM, self.table["payload_kg"][row]
-        strong = {(r.mode, r.order, r.signal) for r in strongest(self.resonances)}
+        strong = {(r.mode, r.order, r.signal) for r in strongest_resonances(self.resonances)}
         return any(
             p.low <= speed <= p.high
             for p in self.peaks

@@ -8,9 +8,9 @@ from typing import Any
 from calibration.data.requirements_file import Requirements
 from calibration.sizing.chart import Chart
 from calibration.sizing.design import OBJECTIVES
-from calibration.sizing.design_search import Found, Sizing
+from calibration.sizing.design_search import SizedDesign, Sizing
 from calibration.sizing.sheet import Outcome
-from mmrjax.errors import counted
+from mmrjax.errors import count_noun
 from mmrjax.model.robot import Robot
 from sweeps.results.check_results import label
 
@@ -65,31 +65,31 @@ class SizeResult:
         }
 
 
-def verdict(found: Found, unmeetable: tuple[str, ...]) -> str:
+def verdict(found: SizedDesign, unmeetable: tuple[str, ...]) -> str:
     """Verdict on a design; `unmeetable`: requirements that no choice of parts meets, which were dropped."""
     return "misses" if not found.feasible else "meets the others" if unmeetable else "meets"
 
 
-def short(found: Found) -> float:
+def short(found: SizedDesign) -> float:
     """Sum of the margins that a design misses [-]."""
     return sum(max(-m, 0.0) for m in found.margins.values())
 
 
-def missed(found: Found) -> list[str]:
+def missed(found: SizedDesign) -> list[str]:
     """Limits that a design misses, with their margins."""
     return [f"{label} ({100 * m:+.1f} %)" for label, m in sorted(found.margins.items(), key=lambda x: x[1]) if m < 0]
 
 
-def described(found: Found) -> str:
+def described(found: SizedDesign) -> str:
     """Motor, gearbox, ratio, radius and cells of a design."""
-    stages = counted(found.drive.stages, "stage")
+    stages = count_noun(found.drive.stages, "stage")
     return (
         f"{found.drive.motor.name}, {found.drive.family} with {stages}, ratio {found.ratio:.4g}, radius "
         f"{1000 * found.radius:.1f} mm, {found.in_series} × {found.parallel:.3g} {found.cell.name}"
     )
 
 
-def objective(found: Found, name: str) -> str:
+def objective(found: SizedDesign, name: str) -> str:
     """An objective with its unit, or `not stated` if no sheet states it."""
     unit, words = OBJECTIVES[name]
     return f"{words} {found.objectives[name]:.4g} {unit}" if name in found.objectives else f"{words} not stated"

@@ -20,7 +20,7 @@ from mmrjax.model import channels
 SHOWN = ("motor_current_left", "motor_current_right", "motor_speed_left", "motor_speed_right", "yaw_rate")
 #: Sds of the instruments, in the units of the columns.
 SDS = dict(zip(SHOWN, (0.02, 0.02, 8.0, 8.0, 0.01), strict=True))
-NOISE = ",".join(f"{name}={sd}{channels.find(name).unit}" for name, sd in SDS.items())
+NOISE = ",".join(f"{name}={sd}{channels.find_channel(name).unit}" for name, sd in SDS.items())
 #: Of the truth: distance of the sides [m], φ_y/φ_x [-], height of the centre of mass, as the packaged robot's [m].
 WIDTH, LATERAL, HEIGHT = 0.236, 1.45, 0.0476
 VOLTAGES = (15.0, 24.0, 33.0)
@@ -100,7 +100,7 @@ def rows(case: str, count: int = 40, seed: int = 0) -> dict[str, np.ndarray]:
     columns = {"configuration": np.full(count, "6T2A"), "supply_voltage_V": told[:, 0], "total_mass_kg": mass}
     columns |= {"payload_kg": 0.0, "slope_deg": 0.0, "duty_left": told[:, 1], "duty_right": told[:, 2]}
     for k, name in enumerate(SHOWN):
-        channel = channels.find(name)
+        channel = channels.find_channel(name)
         columns[channel.column] = np.round(read[:, k] / channel.factor + SDS[name] * random.normal(size=count), 4)
     return {name: np.broadcast_to(x, count) for name, x in columns.items()}
 

@@ -1,49 +1,51 @@
-"""Observers: what runs show, settled or over time, and how inference treats each kind. One file a kind.
+"""Observers: readings of runs, settled or over time, and the treatment of each kind in inference. One file a kind.
 
-No other room asks which kind a table holds (tests/test_structure.py reads the code for it).
+No other room tests which kind a table has (tests/test_structure.py checks the code for it).
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from calibration.data.input_errors import BadConfiguration, choices
+from calibration.data.input_errors import BadConfiguration, allowed_words
 from calibration.data.runs import Runs
 from calibration.inference.observers.base import Observer
 from calibration.inference.observers.settled import SettledRuns
 from calibration.inference.observers.time_histories import Histories
 from calibration.inference.observers.turns import SettledTurns
 from calibration.inference.priors import Coordinates
-from calibration.inference.problem import Problem, data_of
+from calibration.inference.problem import Problem, data_from_readings
 from mmrjax import fidelities
 from mmrjax.fidelities import Facts
 from mmrjax.model import params
 from mmrjax.model.robot import Robot
 
-__all__ = ["Histories", "Observer", "SettledRuns", "SettledTurns", "facts", "kind", "pose"]
+__all__ = ["Histories", "Observer", "SettledRuns", "SettledTurns", "fidelity_facts", "observer_kind", "pose_problem"]
 
-#: In the order in which they are asked whether a table is theirs.
+#: In the order in which a table is tested for them.
 KINDS: tuple[type[Observer], ...] = (Histories, SettledTurns, SettledRuns)
 
 
-def kind(runs: Runs) -> type[Observer]:
+def observer_kind(runs: Runs) -> type[Observer]:
     """The observer of a table: time histories where it has `time_s`, else settled turns or straight runs."""
     return next(k for k in KINDS if k.observes(runs))
 
 
-def facts(model: str) -> Facts:
-    """What is known of a fidelity, by its name.
+def fidelity_facts(model: str) -> Facts:
+    """Facts about a fidelity, by its name.
 
     Raises:
         BadConfiguration: no such fidelity.
     """
     if model not in fidelities.TABLE:
-        raise BadConfiguration(f"--model {model}: no such fidelity; {choices(model, fidelities.TABLE)}")
-    return fidelities.facts(model)
+        raise BadConfiguration(f"--model {model}: no such fidelity; {allowed_words(model, fidelities.TABLE)}")
+    return fidelities.fidelity_facts(model)
 
 
-def pose(runs: Runs, base: Robot, coordinates: Coordinates, sd: np.ndarray, model: str | None = None) -> Problem:
-    """The problem of these runs.
+def pose_problem(
+    runs: Runs, base: Robot, coordinates: Coordinates, sd: np.ndarray, model: str | None = None
+) -> Problem:
+    """Inverse problem of these runs.
 
     Args:
         sd: of the readings [SI], shape (rows, channels).
@@ -54,6 +56,11 @@ def pose(runs: Runs, base: Robot, coordinates: Coordinates, sd: np.ndarray, mode
         BadData: a configuration that `base` does not have.
     """
     if model is not None:
-        facts(model)
-    observe = kind(runs).of(runs, base, model)
-    return Problem(params.strong(base), coordinates, observe, data_of(runs.measured(), sd, len(coordinates)))
+        fidelity_facts(model)
+    observe = observer_kind(runs).of(runs, base, model)
+    return Problem(
+        params.without_weak_types(base),
+        coordinates,
+        observe,
+        data_from_readings(runs.measured(), sd, len(coordinates)),
+    )

@@ -1,4 +1,4 @@
-"""The protocol of observers."""
+"""Protocol of observers."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from calibration.inference.details import Detail
 from calibration.inference.fit_notes import Note
 from calibration.inference.linearization import Linearization, ScoredEffect
 from calibration.inference.noise import Noise
-from calibration.inference.optimizers import Numbers, Optimum, linearised, read
+from calibration.inference.optimizers import Numbers, Optimum, linearise, observe_robot
 from calibration.inference.problem import Data, Observation, Problem
 from mmrjax.effects import Effect
 from mmrjax.model.conditions import Conditions
@@ -28,13 +28,13 @@ from mmrjax.model.signals import Signals
 
 @dataclasses.dataclass(frozen=True)
 class SearchPolicy:
-    """How fits of one kind of data are searched for in batches.
+    """Options of batched fits for one kind of data.
 
     Attributes:
         batch: fits in one batch.
-        steps: most steps of one.
-        searches: of the base.
-        one_by_one: whether outliers are set aside one at a time, with a fit after each.
+        steps: largest number of steps of one.
+        searches: number of searches of the base.
+        one_by_one: True if outliers are removed one at a time, with a fit after each.
     """
 
     batch: int = 16
@@ -44,7 +44,7 @@ class SearchPolicy:
 
 
 class CurveScores(Protocol):
-    """Scores of the curves that a fit leaves: as normal deviates, and what each explains [σ²]; shape (families,)."""
+    """Scores of curves in the residuals: normal deviates, and decrease of χ² by each [σ²]; shape (families,)."""
 
     @property
     def curve(self) -> Array: ...
@@ -61,7 +61,7 @@ class Statistics(Protocol):
 
 
 class AdequacyTest(Protocol):
-    """Test of whether a fit leaves something, by kind of statistic."""
+    """Test of a fit's residuals, by kind of statistic."""
 
     @property
     def found(self) -> Statistics: ...
@@ -72,7 +72,7 @@ class AdequacyTest(Protocol):
 
 
 class Diagnosis(Protocol):
-    """What an observer reads of a fit and of what it leaves, see `discovery.adequacy.Diagnosis`."""
+    """Parts of a fit and its residuals that an observer reads, see `discovery.adequacy.Diagnosis`."""
 
     @property
     def linear(self) -> Linearization: ...
@@ -85,22 +85,22 @@ class Diagnosis(Protocol):
 
 
 class Observer(eqx.Module):
-    """What runs show, and what inference has to know of their kind.
+    """Readings of runs of one kind, and the facts about that kind that inference needs.
 
     Attributes:
-        conditions: of each run, shape (runs,); of a history what changes within one at each of its instants.
-        word: what a row is; fewest: rows in which a missing effect can be told from noise.
-        axis: column of a table along which the rows of a run follow one another; empty where a run is one row.
-        sizes_padded: numbers of rows to which tables are padded, so that those of about one size share what is
-            compiled; beyond the last to a multiple of that, and with none not at all.
-        blocks: kinds of blocks to hold out, the most telling first.
-        policy: how fits are searched for.
-        rows_tell: whether a single row shows a defect by itself.
-        evidence: kinds of evidence that something is missing.
-        library: effects that such data show beside the library's.
-        menu: whether the menu of experiments is of runs of this kind.
-        searches: of a calibration; None takes the fidelity's; profiled: whether its parameters are profiled too,
-            where the fidelity's are.
+        conditions: of each run, shape (runs,); conditions that change within a history, at each of its instants.
+        word: name of a row; fewest: rows needed to separate a missing effect from noise.
+        axis: column of a table that orders the rows of a run; empty if a run is one row.
+        sizes_padded: numbers of rows to which tables are padded, so that those of similar size share compiled
+            programs; beyond the last one, to a multiple of it; empty for no padding.
+        blocks: kinds of blocks to hold out, the most informative first.
+        policy: options of batched fits.
+        rows_tell: True if a single row shows a defect.
+        evidence: kinds of evidence for a missing effect.
+        library: effects that such data show in addition to the library's.
+        menu: True if the menu of experiments has runs of this kind.
+        searches: of a calibration; None takes the fidelity's; profiled: True if its parameters are profiled
+            when the fidelity's are.
     """
 
     conditions: eqx.AbstractVar[Conditions]
@@ -122,28 +122,28 @@ class Observer(eqx.Module):
 
     @classmethod
     def axes_of(cls, runs: Runs) -> tuple[str, ...]:
-        """Columns of a table over which its readings vary."""
+        """Columns of a table that its readings vary with."""
         return (*runs.axes, *([cls.axis] if cls.axis else []))
 
     @classmethod
     @abc.abstractmethod
     def observes(cls, runs: Runs) -> bool:
-        """Whether a table is of this kind."""
+        """True if a table is of this kind."""
 
     @classmethod
     @abc.abstractmethod
     def of(cls, runs: Runs, robot: Robot, fidelity: str | None = None) -> Observer:
-        """The observer of a table; see `observers.pose`."""
+        """Observer of a table; see `observers.pose_problem`."""
 
     @classmethod
     @abc.abstractmethod
     def sizes(cls, runs: Runs) -> np.ndarray:
-        """What a share of noise is of [SI], shape (rows, channels)."""
+        """Reference sizes of noise stated as a share [SI], shape (rows, channels)."""
 
     @classmethod
     @abc.abstractmethod
     def check(cls, runs: Runs, noise: Noise) -> list[Note | str]:
-        """Refuse runs that contradict themselves; return what should be said of them.
+        """Refuse runs that contradict each other; return notes on the others.
 
         Raises:
             BadData: readings that cannot all be true.
@@ -152,7 +152,7 @@ class Observer(eqx.Module):
     @classmethod
     @abc.abstractmethod
     def check_start(cls, runs: Runs, noise: Noise, robot: Robot) -> list[Note | str]:
-        """Refuse runs whose beginning the model cannot follow; return what should be said of their length.
+        """Refuse runs with a start that the model cannot follow; return notes on their length.
 
         Raises:
             BadData: a run that does not begin as the model does.
@@ -160,13 +160,13 @@ class Observer(eqx.Module):
 
     @classmethod
     def with_initial_states(cls, robot: Robot, runs: Runs, noise: Noise) -> Robot:
-        """`robot` with the beginnings of runs that do not begin at rest; as it is where runs are settled."""
+        """`robot` with the initial states of runs that do not begin at rest; unchanged for settled runs."""
         return robot
 
     @classmethod
     @abc.abstractmethod
     def check_settled(cls, runs: Runs) -> None:
-        """Refuse runs that are not one settled row each.
+        """Refuse runs other than settled ones of one row each.
 
         Raises:
             BadData: time histories.
@@ -175,35 +175,35 @@ class Observer(eqx.Module):
     @classmethod
     @abc.abstractmethod
     def settled(cls, runs: Runs, steady: bool = False) -> tuple[Runs, np.ndarray, np.ndarray]:
-        """One row a run, what it shows in the end [SI], shape (runs, channels), and how long it lasts [s].
+        """One row a run, its final readings [SI], shape (runs, channels), and its duration [s].
 
         Args:
-            steady: whether runs are left out whose speed still changes as it does below half of steady travel.
+            steady: True to omit runs with a speed that still changes as it does below half of steady travel.
         """
 
     @classmethod
     @abc.abstractmethod
     def identity(cls, runs: Runs) -> tuple[str, ...]:
-        """Columns in which exact copies of a row agree."""
+        """Columns in which duplicates of a row agree."""
 
     @classmethod
     @abc.abstractmethod
     def shows(cls, effect: type[Effect]) -> bool:
-        """Whether data of this kind on an external supply can show an effect."""
+        """True if data of this kind with an external supply can show an effect."""
 
     @classmethod
     @abc.abstractmethod
     def free(cls) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Parameters that such data determine beside those that all do: of the drive, and of each chassis."""
+        """Further parameters that such data determine: of the drive, and of each chassis."""
 
     # --- of robots
 
     @abc.abstractmethod
     def __call__(self, robot: Robot) -> Observation:
-        """What a robot shows in every row."""
+        """Observation of a robot in each row."""
 
     def solve(self, robot: Robot) -> tuple[Array, Array] | None:
-        """Where what rows show is a root: the unknowns of each, shape (rows, unknowns), and which were found."""
+        """Unknowns of each row, shape (rows, unknowns), and True if found; None if rows are no roots of equations."""
         return None
 
     @property
@@ -212,50 +212,50 @@ class Observer(eqx.Module):
         return False
 
     def read(self, robot: Robot) -> Observation:
-        """Returns what a robot shows in every row, of an observer whose `apart` is true."""
+        """Observation of a robot in each row; only for observers with `apart`."""
         raise NotImplementedError
 
     def shown(self, robot: Robot, unknowns: Array, found: Array) -> tuple[Observation, Signals, Array]:
-        """What a robot shows in every row at such unknowns, its signals, and what its equations leave there, shape
-        (rows, unknowns)."""
+        """Observation of a robot in each row at given unknowns, its signals, and the residuals of its equations,
+        shape (rows, unknowns)."""
         raise NotImplementedError
 
     def operating(self, robot: Robot) -> Signals | None:
-        """Signals of a robot at every row's operating point; None where rows have none."""
+        """Signals of a robot at each row's operating point; None for rows without one."""
         return None
 
     @property
     @abc.abstractmethod
     def long(self) -> bool:
-        """Whether the model is a rollout: searches then run one by one, and end sooner."""
+        """True if the model is a rollout: searches then run one at a time, and end sooner."""
 
     @property
     @abc.abstractmethod
     def eased(self) -> bool:
-        """Whether a search may begin at the optimum of the same problem with `steady`."""
+        """True if a search may begin at the optimum of the same problem with `steady`."""
 
     @abc.abstractmethod
     def unreachable(self, status: np.ndarray) -> np.ndarray:
-        """Whether the model has no such operating point, by row."""
+        """True for rows without an operating point of the required kind."""
 
     @property
     def driven(self) -> Conditions:
-        """Under what conditions the robot was driven, as if forwards; shape (cases,)."""
+        """Conditions under which the robot was driven, as if forwards; shape (cases,)."""
         return self.conditions
 
     def cautions(self, robot: Robot) -> list[str]:
-        """What to know before the readings of a calibrated robot are trusted, as sentences."""
+        """Cautions about the readings of a calibrated robot, as sentences."""
         return []
 
     @abc.abstractmethod
     def runs_counting(self, included: np.ndarray) -> int:
-        """How many runs count, of rows that do."""
+        """Number of runs with at least one included row."""
 
     def noise_misfit(self, off: Callable[[], np.ndarray], counts: Bool[np.ndarray, "rows channels"]) -> float:
-        """χ² that noise alone leaves: of settled runs, whose rows tell nothing of one another, one for each reading.
+        """Expected χ² of noise alone: one for each reading of settled runs, because their rows are independent.
 
         Args:
-            off: returns the whitened residuals of a fit, shape (rows, channels); counts: True for readings that do.
+            off: returns the whitened residuals of a fit, shape (rows, channels); counts: True for included readings.
         """
         return float(counts.sum())
 
@@ -266,15 +266,15 @@ class Observer(eqx.Module):
         """Residuals, Jacobian and signatures at z."""
 
     def at_fit(self, problem: Problem, z: Numbers) -> Observer:
-        """The same with what a fit of a problem has found out about its runs."""
+        """Observer updated by the facts about its runs that a fit has determined."""
         return self
 
     def draws(self, problem: Problem, z: Array, linear: Linearization, keys: Array, factors: np.ndarray) -> Any:
-        """What replicates of the bootstrap begin with, leading axis the keys: the keys, or fits of tables drawn.
+        """Initial values of the bootstrap's replicates, leading axis the keys: the keys, or fits of tables drawn.
 
         Args:
-            problem: of the base alone, at its fit z; linear: the same fit, linearised.
-            keys: random, as numbers, shape (replicates, words).
+            problem: of the base only, at its fit z; linear: the same fit, linearised.
+            keys: random keys, as numbers, shape (replicates, words).
             factors: on the sds of each replicate, shape (replicates, channels).
         """
         return keys
@@ -283,15 +283,15 @@ class Observer(eqx.Module):
     def replicate(
         self, problem: Problem, data: Data, effects: tuple[ScoredEffect, ...], linear: Linearization, drawn: Any
     ) -> Linearization:
-        """A table drawn from the fit of the base, fitted again and linearised: one replicate of the bootstrap.
+        """One replicate of the bootstrap: a table drawn from the fit of the base, fitted again and linearised.
 
         Args:
-            problem: of the base alone; data: of the table; linear: the fit, linearised.
+            problem: of the base only; data: of the table; linear: the fit, linearised.
             drawn: one of `draws`.
         """
 
     def starts(self, problem: Problem, random: np.random.Generator, count: int) -> Float[np.ndarray, "starts z"]:
-        """Coordinates at which at most `count` searches of a base begin: the prior mean, and draws of the prior.
+        """Initial coordinates of at most `count` searches of a base: the prior mean, and draws of the prior.
 
         Args:
             problem: without effects in its coordinates.
@@ -300,21 +300,23 @@ class Observer(eqx.Module):
         return np.concatenate([np.zeros((1, size)), random.standard_normal((max(count, 1) - 1, size))])
 
     def scanned(self, problem: Problem) -> tuple[int, ...]:
-        """Coordinates whose misfit is looked at over their prior's range, see `scans`: none where the searches of a
-        kind of data begin at so many draws of the prior that they see every basin."""
+        """Coordinates with an objective that is scanned over the prior's range, see `scans`.
+
+        Empty for a kind of data with enough starts drawn from the prior to reach every basin.
+        """
         return ()
 
     def scan_points(self, problem: Problem, k: int) -> int:
-        """At how many values a coordinate is looked at, a multiple of `scans.CLOSER`."""
+        """Number of values of a coordinate that are scanned, a multiple of `scans.CLOSER`."""
         raise NotImplementedError
 
     def scan(self, problem: Problem, z: Array, data: Data, k: int, values: Array) -> tuple[Array, Array]:
-        """Objective where coordinate k has each of `values` and the others have moved from z to where their
-        linearisation has its minimum, shape (values,), and all coordinates then, (values, coordinates)."""
+        """Objective, shape (values,), at each of `values` of coordinate k, and all coordinates there, (values,
+        coordinates); the others move from z to the minimum of their linearisation."""
         raise NotImplementedError
 
     def places(self, problem: Problem) -> int:
-        """Searches of a problem side by side on a core, by `searches_refilled`."""
+        """Number of searches of a problem that run together on a core, by `searches_refilled`."""
         raise NotImplementedError
 
     @abc.abstractmethod
@@ -328,33 +330,33 @@ class Observer(eqx.Module):
         rivals: bool = False,
         most: int | None = None,
     ) -> tuple[Optimum, Observation]:
-        """Any number of fits, each to its own weights, and what each says of every row.
+        """Optima of any number of fits, each with its own weights, and their observations.
 
         Args:
             starts: shape (members, coordinates); weights: of each member's readings, (members, rows, channels).
-            active: set of effects of each member, see `ActiveSet`; None leaves the problem's.
-            rivals: whether all search the same optimum, so that some may be given up.
-            most: steps of each; None: those of the policy.
+            active: set of effects of each member, see `ActiveSet`; None keeps the problem's.
+            rivals: True if all search the same optimum, so that some may be stopped early.
+            most: largest number of steps of each; None: the policy's.
         """
 
     def observed(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> Observation:
-        """What the model says of every row at z.
+        """Observation of the model in each row at z.
 
         Args:
-            active: its effects, of a problem with slots.
+            active: its effects, for a problem with slots.
         """
         if not self.long:
             return self.at(problem, z, active)[2]
         problem = _with_effects(problem, active)
-        return read(problem, problem.robot(jnp.asarray(z)))
+        return observe_robot(problem, problem.robot(jnp.asarray(z)))
 
     def at(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> tuple[Numbers, Numbers, Observation]:
-        """Residuals, their Jacobian and what the model says of every row at z; arguments as of `observed`."""
-        return linearised(_with_effects(problem, active), jnp.asarray(z), problem.data)
+        """Residuals, their Jacobian and the observation at z; arguments as in `observed`."""
+        return linearise(_with_effects(problem, active), jnp.asarray(z), problem.data)
 
     @abc.abstractmethod
     def bases(self, columns: Mapping[str, np.ndarray], included: Bool[np.ndarray, " rows"], robot: Robot) -> Bases:
-        """Bases of the curves that a discrepancy is looked for with.
+        """Bases of curves for the search for a discrepancy.
 
         Args:
             columns: of the padded table, with fitted readings; robot: fitted.
@@ -362,11 +364,11 @@ class Observer(eqx.Module):
 
     @abc.abstractmethod
     def detail(self, bases: Bases, included: np.ndarray, before: Diagnosis, after: Diagnosis) -> Detail:
-        """What data of this kind tell beside the fit.
+        """Further findings for data of this kind.
 
         Args:
-            bases: of curves; included: whether a row of the table counts.
-            before, after: what base and proposed robot leave.
+            bases: of curves; included: True for included rows of the table.
+            before, after: diagnoses of base and proposed robot.
         """
 
 

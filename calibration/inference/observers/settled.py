@@ -22,19 +22,26 @@ from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
 from calibration.inference.details import EquationDefects
 from calibration.inference.fit_notes import Note, Repeats
-from calibration.inference.linearization import Linearization, ScoredEffect, finite, probe
+from calibration.inference.linearization import Linearization, ScoredEffect, balance_probe, finite_or_zero
 from calibration.inference.noise import Noise
 from calibration.inference.observers.base import Diagnosis, Observer, SearchPolicy
-from calibration.inference.optimizers import Member, Numbers, Optimum, counted, penalties, searches_refilled
+from calibration.inference.optimizers import (
+    Member,
+    Numbers,
+    Optimum,
+    penalty_slice,
+    search_refilling,
+    zero_inactive_residuals,
+)
 from calibration.inference.problem import Data, Observation, Problem
-from calibration.inference.repeats import same_conditions
+from calibration.inference.repeats import rows_of_same_conditions
 from calibration.inference.simulation_errors import root_mean_square
 from mmrjax import fidelities
 from mmrjax.compile.compiling import SELDOM, compiled
 from mmrjax.effects import Effect
-from mmrjax.effects.curve import WAYS, acts_along
+from mmrjax.effects.curve import WAYS, direction_signal
 from mmrjax.fidelities.base import Implicit
-from mmrjax.fidelities.rest import direction
+from mmrjax.fidelities.rest import travel_direction
 from mmrjax.fidelities.steady import SIZES, operating_signals
 from mmrjax.model import balances, channels
 from mmrjax.model.conditions import Conditions
@@ -42,20 +49,20 @@ from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import FAILED, SLIDES, TIPS, Result, Signals
 
-#: Column that a brake or a weight may set, so that a reading is a condition.
+#: Column that a brake or a weight may impose, so that a reading is a condition.
 LOAD = "output_torque_Nm"
-#: Replicates further apart than this many sds of their difference contradict each other.
+#: Replicates that differ by more than this many sds of their difference contradict each other.
 CONTRADICTION = 6.0
-#: The same for replicates whose sd is not known, as a share of their mean.
+#: The same for replicates with unknown sd, as a share of their mean.
 CONTRADICTION_SHARE = 0.25
-#: Searches side by side on a core: of a robot without effects, and with.
+#: Searches that run together on a core: for a robot without effects, and with effects.
 MANY, FEW = 16, 4
-#: Least spread of a fitted speed or current, over its largest, for curves to be over it [-].
+#: Least spread of a fitted speed or current, over its largest value, for curves over it [-].
 VARIES = 0.05
-#: Share of the torque that motors make which the torque at the output is at least taken to be about [-].
+#: Least size of the torque at the output as a share of the motors' torque [-].
 LOST = 0.1
-#: Balances to which the defect of a row is attributed, one for each equation that the channels close: what each is a
-#: part of, by its name among the signals.
+#: Balances to which the defect of a row is attributed, one for each equation that the channels close, with the signal
+#: that is the size of each equation.
 EQUATIONS = {"electrical": "voltage", "track": "torque_output", "slip": "speed_theoretical"}
 
 
@@ -63,7 +70,7 @@ def _unused(runs: Runs, first: int, second: int, but: str) -> tuple[str, ...]:
     """Columns that differ between two rows and are no condition: those without a role, and a load's torque.
 
     Args:
-        but: a column that is left out.
+        but: an omitted column.
     """
     without = [c for c, cells in runs.extras.items() if cells.dtype.kind == "f"]
     torque = [c for c in (LOAD,) if c != but and runs.has(c)]
@@ -72,8 +79,11 @@ def _unused(runs: Runs, first: int, second: int, but: str) -> tuple[str, ...]:
 
 
 class SettledLinearization(Linearization):
-    """Of settled rows: `defects` has shape (balances, rows, channels), a defect of each row of its own, or (balances,
-    sides, rows, channels) where sides are driven apart."""
+    """Linearization of settled rows.
+
+    `defects` has shape (balances, rows, channels), with an independent defect in each row, or (balances, sides, rows,
+    channels) for independently driven sides.
+    """
 
     def columns(self, balance: Scalar | int, shapes: Array | np.ndarray) -> Float[Array, "readings terms"]:
         of_sides = shapes.reshape(-1, self.rows, shapes.shape[1])
@@ -81,21 +91,21 @@ class SettledLinearization(Linearization):
         return moved.sum(0).reshape(-1, shapes.shape[1])
 
     def of_sides(self, balance: Scalar | int) -> Float[Array, "sides rows channels"]:
-        """What a defect of a balance changes, of each side; sides that are alike are one."""
+        """Change of the readings by a defect of a balance on each side; identical sides are one."""
         return self.defects[balance].reshape(-1, *self.scale.shape)
 
     def along_of_sides(self, balance: str) -> np.ndarray:
-        """What a defect that counts along the travel changes, shape (sides, rows, channels)."""
-        way = self.variable(acts_along(balance)).reshape(-1, self.rows)
+        """Change of the readings by a defect along the travel, shape (sides, rows, channels)."""
+        way = self.variable(direction_signal(balance)).reshape(-1, self.rows)
         return np.asarray(self.of_sides(self.probed.index(balance))) * way[:, :, None]
 
     def places(self) -> np.ndarray:
         return np.arange(self.rows)
 
 
-def shares(channel: str, sides: int) -> np.ndarray:
-    """What a channel shows of each side [-]: of one of a side that alone, else their mean."""
-    side = channels.find(channel).side
+def side_shares(channel: str, sides: int) -> np.ndarray:
+    """Weights of the sides in a channel's reading [-]: one side, or the mean of all."""
+    side = channels.find_channel(channel).side
     return np.full(sides, 1 / sides) if side is None or sides == 1 else np.eye(sides)[side]
 
 
@@ -103,7 +113,7 @@ class SettledRuns(Observer):
     """Observer of settled rows: one run a row.
 
     Attributes:
-        fidelity: that simulates them.
+        fidelity: name of the fidelity that simulates them.
     """
 
     word: ClassVar[str] = "run"
@@ -117,7 +127,7 @@ class SettledRuns(Observer):
     rows_tell: ClassVar[bool] = True
     evidence: ClassVar[tuple[str, ...]] = ("single", "curve", "pair", "chi2")
     linearization: ClassVar[type[SettledLinearization]] = SettledLinearization
-    shape_sides: ClassVar[tuple[int, ...]] = ()  # of what each side has of its own
+    shape_sides: ClassVar[tuple[int, ...]] = ()  # of values that differ between sides
 
     conditions: Conditions
     fidelity: str = eqx.field(static=True)
@@ -128,7 +138,7 @@ class SettledRuns(Observer):
 
     @classmethod
     def of(cls, runs: Runs, robot: Robot, fidelity: str | None = None) -> SettledRuns:
-        chosen = fidelities.get(fidelity or "steady")
+        chosen = fidelities.get_fidelity(fidelity or "steady")
         conditions = runs.conditions(robot)
         if not chosen.facts.rollout:
             try:
@@ -139,19 +149,19 @@ class SettledRuns(Observer):
 
     @classmethod
     def sizes(cls, runs: Runs) -> np.ndarray:
-        """The readings, and a hundredth of the channel's largest where one is smaller."""
+        """The readings, or a hundredth of the channel's largest if that is larger."""
         measured = np.abs(runs.measured())
         return np.maximum(measured, 0.01 * np.max(np.nan_to_num(measured), 0))
 
     @classmethod
     def least(cls, runs: Runs) -> np.ndarray:
-        """Sizes below which no reading counts when repeated ones are compared [SI], shape (rows, channels)."""
+        """Least sizes for comparisons of repeated readings [SI], shape (rows, channels)."""
         return np.zeros(runs.measured().shape)
 
     @classmethod
     def check(cls, runs: Runs, noise: Noise) -> list[Note | str]:
-        """Refuses a table of one condition whose readings differ; notes the repeats that differ most."""
-        measured, alike = runs.measured(), same_conditions(runs)
+        """Refuses a table of one condition with readings that differ; notes the repeats that differ most."""
+        measured, alike = runs.measured(), rows_of_same_conditions(runs)
         least, found = cls.least(runs), list[Repeats]()
         shared = np.array([source == "series" for source in noise.source])
         usual = np.array([c.sd_share for c in runs.channels])
@@ -161,7 +171,7 @@ class SettledRuns(Observer):
             mean = np.maximum(np.abs(here[:, None] + here) / 2, least[rows])
             sd = np.hypot(sds[:, None], sds)
             allowed = np.where(noise.estimated, CONTRADICTION_SHARE * mean, CONTRADICTION * sd)
-            # Noise that is estimated by the scatter of these readings is no measure of it.
+            # An estimate of the noise from the scatter of these readings cannot test that scatter.
             allowed = np.where(shared, np.minimum(allowed, CONTRADICTION * np.sqrt(2) * usual * mean), allowed)
             for at in np.argwhere(apart > allowed)[:1]:
                 (one, other, k), at = at.tolist(), tuple(at)
@@ -190,7 +200,7 @@ class SettledRuns(Observer):
 
     @classmethod
     def identity(cls, runs: Runs) -> tuple[str, ...]:
-        own = () if "order" in runs.headings else ("order",)  # of the rows in the file
+        own = () if "order" in runs.headings else ("order",)  # the order of the rows in the file
         return tuple(c for c in runs.columns if c not in own)
 
     @classmethod
@@ -202,15 +212,15 @@ class SettledRuns(Observer):
         return (), ()
 
     def __call__(self, robot: Robot) -> Observation:
-        return self._observed(robot, fidelities.get(self.fidelity).settled(robot, self.conditions))
+        return self._observed(robot, fidelities.get_fidelity(self.fidelity).settled(robot, self.conditions))
 
     def _observed(self, robot: Robot, result: Result) -> Observation:
-        reading = jnp.stack([result.reading[name] for name in channels.names(robot.channels)], -1)
+        reading = jnp.stack([result.reading[name] for name in channels.channel_names(robot.channels)], -1)
         return Observation(reading, jnp.asarray(result.adhesion_used), result.status, jnp.asarray(result.flags))
 
     @property
     def _implicit(self) -> Implicit | None:
-        return fidelities.get(self.fidelity).implicit
+        return fidelities.get_fidelity(self.fidelity).implicit
 
     def solve(self, robot: Robot) -> tuple[Array, Array] | None:
         implicit = self._implicit
@@ -229,7 +239,7 @@ class SettledRuns(Observer):
 
     @property
     def long(self) -> bool:
-        return fidelities.facts(self.fidelity).rollout
+        return fidelities.fidelity_facts(self.fidelity).rollout
 
     @property
     def eased(self) -> bool:
@@ -242,16 +252,19 @@ class SettledRuns(Observer):
         return int(included.sum())
 
     def cautions(self, robot: Robot) -> list[str]:
-        return fidelities.get(self.fidelity).cautions(robot, self.conditions)
+        return fidelities.get_fidelity(self.fidelity).cautions(robot, self.conditions)
 
     def linearise(
         self, problem: Problem, z: Array, data: Data, effects: tuple[ScoredEffect, ...]
     ) -> SettledLinearization:
-        """As the protocol says. A signature is the sensitivity of the readings to a defect of the effect's balance,
-        times its term: exact, as an effect enters one balance and is linear in its amplitude."""
+        """Linearization as in the protocol.
+
+        A signature is the sensitivity of the readings to a defect of the effect's balance, times the effect's term.
+        This is exact, because an effect enters one balance and is linear in its amplitude.
+        """
         kind = self.linearization
-        probes = tuple(probe(b) for b in kind.probed)
-        robot, size, shown = problem.robot(z), z.size, channels.names(problem.channels)
+        probes = tuple(balance_probe(b) for b in kind.probed)
+        robot, size, shown = problem.robot(z), z.size, channels.channel_names(problem.channels)
 
         def probed(x: Array) -> Robot:
             delta = x[size:].reshape(len(probes), *self.shape_sides)
@@ -261,7 +274,7 @@ class SettledRuns(Observer):
 
         wide = jnp.concatenate([z, jnp.zeros(len(probes) * math.prod(self.shape_sides))])
         r, slopes, _, signals = problem.linearised(probed, wide, data)
-        r, slopes = counted(r, slopes, penalties(data))
+        r, slopes = zero_inactive_residuals(r, slopes, penalty_slice(data))
         jacobian = jnp.concatenate([slopes, jnp.eye(size, wide.size)])
         residual = jnp.concatenate([r, z - data.centre])
         rows, count = data.measured.shape
@@ -273,10 +286,10 @@ class SettledRuns(Observer):
 
         def signature(effect: Effect) -> Array:
             alone = dataclasses.replace(robot, effects=(effect,))
-            term = jax.vmap(lambda s: balances.added(alone, s, effect.balance, effect.channel))(each)
+            term = jax.vmap(lambda s: balances.effects_sum(alone, s, effect.balance, effect.channel))(each)
             term = jnp.broadcast_to(term, each.speed.shape).reshape(rows, -1)
             if effect.balance == "sensor":
-                term = term @ shares(effect.channel, term.shape[1])
+                term = term @ side_shares(effect.channel, term.shape[1])
                 moved = term[:, None] * (jnp.arange(count) == shown.index(effect.channel)) * scale
             elif effect.balance in kind.probed:
                 moved = (term.T[:, :, None] * defects[kind.probed.index(effect.balance)]).sum(0)
@@ -287,22 +300,24 @@ class SettledRuns(Observer):
         signatures = jnp.concatenate([e.each(signature) for e in effects]).T
         defects = defects.reshape(len(probes), *self.shape_sides, rows, count)
         return kind(
-            residual, jacobian[:, :size], finite(signatures), defects, scale, signals, channels=shown,
+            residual, jacobian[:, :size], finite_or_zero(signatures), defects, scale, signals, channels=shown,
             magnitudes=robot.rig.magnitudes,
         )  # fmt: skip
 
     def draws(
         self, problem: Problem, z: Array, linear: Linearization, keys: Array, factors: np.ndarray
     ) -> tuple[Array, Array, Array]:
-        """As the protocol says: readings and priors of each table, and its fit. Readings are drawn with their sds,
-        and the bench values too: a prior is a measurement made beforehand. The refit is the search that found
-        the fit, from the truth."""
+        """Draws as in the protocol: readings and priors of each table, and its fit.
+
+        Readings are drawn with their sds, and bench values too, because a prior is an earlier measurement. Each refit
+        is the search that found the fit, from the true coordinates.
+        """
         data, count = problem.data, len(keys)
-        clean = data.measured + data.sd * linear.by_row()  # where a reading counts
-        measured, centre = jax.device_get(_drawn(clean, data.sd, z, keys, jnp.asarray(factors)))
+        clean = data.measured + data.sd * linear.by_row()  # for included readings
+        measured, centre = jax.device_get(_draw_tables(clean, data.sd, z, keys, jnp.asarray(factors)))
         start, weight = (np.repeat(np.asarray(x)[None], count, 0) for x in (z, data.weight))
         members = Member(start, weight, measured, centre)
-        refits, _ = searches_refilled(problem, members, self.policy.steps, self.places(problem))
+        refits, _ = search_refilling(problem, members, self.policy.steps, self.places(problem))
         return measured, centre, refits.z
 
     def replicate(
@@ -332,34 +347,39 @@ class SettledRuns(Observer):
         own = np.asarray(starts), np.asarray(weights), measured, centre
         members = Member(*own, active=None if active is None else np.asarray(active))
         steps = self.policy.steps if most is None else most
-        return searches_refilled(problem, members, steps, self.places(problem))
+        return search_refilling(problem, members, steps, self.places(problem))
 
     def places(self, problem: Problem) -> int:
-        """Searches side by side on a core: fewer where effects make the model costly, so that few wait for one."""
+        """Number of searches that run together on a core.
+
+        Fewer if effects make the model costly, so that few searches wait for the slowest.
+        """
         return FEW if problem.base.effects else MANY
 
     def bases(self, columns: Mapping[str, np.ndarray], included: np.ndarray, robot: Robot) -> Bases:
         weight = included.astype(float)
-        if "duty" in columns:  # what the motors get
+        if "duty" in columns:  # the motors' mean voltage
             columns = {**columns, "supply_voltage_V": columns["supply_voltage_V"] * columns["duty"]}
         if CURRENT in columns and CURRENT in bases_room.axes_of(robot):  # imposed: no channel measures it
             columns = {**columns, bases_room.VARIABLES["current"]: columns[CURRENT]}
         columns = {**_unmeasured(self, robot, columns), **columns}
         ways = dict.fromkeys(WAYS, np.asarray(_directions(self, robot)))
         told = columns, weight, robot, None, ways
-        return (*bases_room.families(*told), *bases_room.windows(*told))
+        return (*bases_room.curve_families(*told), *bases_room.window_families(*told))
 
     def detail(self, bases: Bases, included: np.ndarray, before: Diagnosis, after: Diagnosis) -> EquationDefects:
-        """As the protocol says: a row's residual (simulated less measured) is split among the defects of the
-        balances `electrical`, `track` and `slip`, of each side where they are driven apart, that together make it."""
+        """Defects of `electrical`, `track` and `slip` that together make each row's residual.
+
+        Residuals are simulated less measured; sides have defects of their own if they are driven independently.
+        """
         return EquationDefects(_defects(before.linear, included), _defects(after.linear, included))
 
 
 def _unmeasured(
     observe: SettledRuns, robot: Robot, columns: Mapping[str, np.ndarray]
 ) -> dict[str, Float[np.ndarray, " rows"]]:
-    """Motor speed [rad/s] and motor current [A] of a fit by their columns, where no channel measures one; rigs may
-    show the output alone."""
+    """Fitted motor speed [rad/s] and motor current [A], by column, if no channel measures them (rigs may show only
+    the output)."""
     wanted = [v for v in ("speed_motor", "current") if bases_room.VARIABLES[v] not in columns]
     if bases_room.VARIABLES["speed"] in columns:
         wanted = [v for v in wanted if v != "speed_motor"]
@@ -370,7 +390,7 @@ def _unmeasured(
 
 
 def _varies(x: np.ndarray) -> bool:
-    """True if sizes differ by more than `VARIES` of the largest: a current that friction alone takes does not."""
+    """True if sizes differ by more than `VARIES` of the largest, unlike a current that only friction needs."""
     return bool(np.ptp(x) > VARIES * np.max(x))
 
 
@@ -383,12 +403,12 @@ def _signals(observe: SettledRuns, robot: Robot, names: tuple[str, ...]) -> tupl
 
 
 def _defects(linear: Linearization, included: np.ndarray) -> dict[str, np.ndarray]:
-    """The defects along the travel of each row that make its residual r, of each side where sides are driven apart.
+    """Defects along the travel that make the residual r of each row, of each side if sides are driven independently.
 
-    The likeliest of r = -S δ + noise of one sd, where δ has the prior sds D^½, the size of what each equation is
-    about (rms over the table): δ = -D Sᵀ (S D Sᵀ + 1)⁻¹ r. A defect that the readings of a row hardly show is so next
-    to nothing, and never a residual over a vanishing slope; what they show of several together is shared out. The
-    torque is at least a share of what the motors make: one that turns nothing but itself may lack some too.
+    They are the most probable δ of r = -S δ + noise of one sd: δ = -D Sᵀ (S D Sᵀ + 1)⁻¹ r. Their prior sds D^½ are
+    the size of each equation (rms over the table). A defect that barely changes the readings of a row is therefore
+    near zero, never a residual over a vanishing slope. Defects that act on the same readings share the residual. The
+    size of the torque is at least a share of the motors' torque, as a free shaft may have a defect too.
     """
     assert isinstance(linear, SettledLinearization)
     rows = np.flatnonzero(included)
@@ -412,13 +432,13 @@ def _defects(linear: Linearization, included: np.ndarray) -> dict[str, np.ndarra
 
 @functools.partial(compiled, options=SELDOM)
 def _directions(observe: SettledRuns, robot: Robot) -> Float[Array, " rows"]:
-    """Which way each run goes, 1 or -1."""
-    return jax.vmap(lambda c: direction(robot, c))(observe.conditions)
+    """Direction of each run, 1 or -1."""
+    return jax.vmap(lambda c: travel_direction(robot, c))(observe.conditions)
 
 
 @functools.partial(compiled, options=SELDOM)
-def _drawn(clean: Array, sd: Array, z: Array, keys: Array, factors: Array) -> tuple[Array, Array]:
-    """Readings and bench values of a table for each key, its sds times its factors."""
+def _draw_tables(clean: Array, sd: Array, z: Array, keys: Array, factors: Array) -> tuple[Array, Array]:
+    """Readings and bench values of a table for each key, with its sds times its factors."""
 
     def one(key: Array, factors: Array) -> tuple[Array, Array]:
         one, two = jax.random.split(jax.random.wrap_key_data(key))

@@ -1,7 +1,7 @@
 """Time histories: one run from standstill for each `run_id`, one row a sample.
 
-The conditions of a run may change from sample to sample; each value holds from its sample until the next, but what is
-imposed where the rig's file says that it goes on straight lines (`Rig.between_rows`).
+The conditions of a run may change from sample to sample; each value holds from its sample until the next. An imposed
+quantity is instead linear between samples if the rig's file says so (`Rig.between_rows`).
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ from calibration.inference.linearization import (
     PROBED,
     Linearization,
     ScoredEffect,
-    each_shape,
-    finite,
-    probe,
-    shaped_as_in,
-    terms_of,
+    balance_probe,
+    effect_terms,
+    finite_or_zero,
+    map_over_shapes,
+    with_shape_of_robot,
 )
 from calibration.inference.noise import Noise
 from calibration.inference.observers import settled_ends
@@ -48,11 +48,11 @@ from calibration.inference.optimizers import (
     Evaluate,
     Numbers,
     Optimum,
-    counted,
-    linearised,
-    linearised_signed,
-    penalties,
-    searches_long,
+    linearise,
+    linearise_rollout,
+    penalty_slice,
+    search_rollouts,
+    zero_inactive_residuals,
 )
 from calibration.inference.priors import DELAY
 from calibration.inference.problem import MISSING, Data, Observation, Problem
@@ -62,23 +62,23 @@ from mmrjax.compile.compiling import OVER_TIME, SELDOM, compiled
 from mmrjax.compile.precision import Threads
 from mmrjax.effects import Effect
 from mmrjax.effects.curve import WAYS
-from mmrjax.fidelities.drive import moving, rates, state_of
+from mmrjax.fidelities.drive import drive_rates, moving, state_of_unknowns
 from mmrjax.fidelities.histories import (
     CHANGE,
     LONGEST,
     LOOSE,
     START,
     STEPS,
-    Followed,
-    Step,
-    Within,
-    at_first,
-    followed,
-    grid,
-    histories,
-    respond,
-    steps_of,
-    within,
+    LinearisedRun,
+    RunStep,
+    StepCourse,
+    course_between_instants,
+    first_instant,
+    history_signals,
+    linearise_run,
+    run_response,
+    run_steps,
+    time_grid,
 )
 from mmrjax.model import balances, channels
 from mmrjax.model.channels import Channel
@@ -87,68 +87,71 @@ from mmrjax.model.params import Scalar
 from mmrjax.model.rig import Begin, Begins, Rig
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import CONVERGED, FAILED, Signals, State
-from mmrjax.numerics.linear_equations import solved
+from mmrjax.numerics.linear_equations import solve
 
-#: Most knots of a run's defect in time, and most of knots times steps of all runs: 2 GB while they are computed.
+#: Most knots of a run's defect in time, and largest product of knots and steps of all runs (2 GB of working memory).
 KNOTS, KNOT_STEPS = 256, 1e7
-#: Lags of a run's residual that are looked at, at most a quarter of its samples.
+#: Lags of a run's residual in tests of memory, at most a quarter of its samples.
 LAGS = 12
-#: Values of a delay at which the misfit is looked at, fewest and most; and of what else is scanned, a run each.
+#: Fewest and most values of a delay in a scan; number of values of other scanned coordinates, one run each.
 DELAYS, SCANNED = (256, 2048), 32
-#: A first sample so early shows a robot at rest [s]; how much of its largest speed, and how many sds, it may show.
+#: Time up to which a first sample has to show a robot at rest [s]; largest allowed reading there, as a share of the
+#: largest speed and in sds.
 EARLY, RESTING, RESTING_SD = 0.005, 0.2, 5.0
 #: Members of a search that one call of its program evaluates.
 TOGETHER = 2
-#: Differences between neighbouring residuals, over their median, beyond which they are jumps and no noise [-].
+#: Differences between neighbouring residuals, over their median, above which they are jumps rather than noise [-].
 JUMP = 7.0
 #: Fields of `Conditions` that may change within a run.
 CHANGING = (
     "voltage", "motor_current", "slope_deg", "payload", "adhesion", "total_mass", "duty", "open", "load_torque",
 )  # fmt: skip
-#: Of these what is imposed, and a brake's torque, which is measured as it is.
+#: Imposed quantities among these, and the torque of a brake, which is measured.
 ON_LINES = ("voltage", "motor_current", "duty", "load_torque")
-#: A stretch of unchanged conditions so long may show steady travel [s].
+#: Shortest interval of unchanged conditions that may show steady travel [s].
 LASTING = 0.25
-#: Fewest steps from sample to sample of a run that is driven both ways as it passes through rest, where shafts and
-#: load do not move as one: while a speed is below a share of its largest, and before that for so long [s], by what is
-#: imposed (when a current brings a shaft to rest depends more on what is calibrated), and for so many of the delay.
+#: Fewest steps between samples for a run that is driven both ways, near rest, if shafts and load do not move as one:
+#: while a speed is below a share of its largest, and for some time before [s], by imposed quantity (with an imposed
+#: current the instant of rest depends more on calibrated parameters), plus this many times the delay.
 FINE, DELAYED = 16, 2.0
 SLOW, EARLIER = {"voltage": 0.1, "motor_current": 0.3}, {"voltage": 0.03, "motor_current": 0.06}
-#: How many of the usual longest steps one may be elsewhere.
+#: Longest step elsewhere, in usual longest steps.
 FAST = 2
-#: Of a log that is thinned: how many steps there are at least between readings, and by how much they grow with the
-#: time since a condition changed, at most [1/s · s]; a supply by more than a share of its largest value.
+#: For a thinned log: least number of steps between readings; largest growth of steps with the time since a condition
+#: changed [1/s · s]; change of the supply that counts, as a share of its largest value.
 BETWEEN, LATER, SMALL = 4, 0.05, 0.05
-#: The same of one whose speed is imposed, and how many of the usual longest steps one of its steps may be.
+#: The same number for a log with imposed speed, and its longest step in usual longest steps.
 COARSELY, SLOWLY = 2, 4
-#: Change of a speed from the third to the last quarter of a stretch, as a share, from which on it has not settled.
+#: Change of a speed from the third to the last quarter of an interval, as a share, above which it has not settled.
 #: From rest a speed that nears steady travel exponentially and has reached half of it still changes by 0.23.
 STILL = 0.2
-#: Most levels of a condition that are told apart where it changes within runs.
+#: Largest number of levels of a condition that changes within runs.
 LEVELS = 6
-#: By how much a stated mass may change within a run beside the payload [kg].
+#: Largest change of a stated mass within a run, apart from the payload [kg].
 ROUNDING = 1e-3
 
 
 def _by_row(
     of_runs: Float[Array, "runs samples ..."], rows_of: Int[Array, "runs samples"], rows: int
 ) -> Float[Array, "rows ..."]:
-    """What is known of each sample of the runs, by the table's rows; beyond the last row of a run it is dropped."""
+    """Values of each sample of the runs, by the table's rows; values beyond a run's last row are dropped."""
     place = jnp.where(rows_of < 0, rows, rows_of)
     return jnp.zeros((rows, *of_runs.shape[2:]), of_runs.dtype).at[place].set(of_runs, mode="drop")
 
 
-#: How far above the lowest of several fits one that has not converged goes on [half σ²], the margin of a class.
+#: Distance from the lowest of several fits up to which an unconverged one continues [half σ²], the margin of a class.
 NEAR = 3.0
 
 
 class HistoriesLinearization(Linearization):
-    """Of histories: `defects` has shape (balances, runs, knots, samples, channels), a defect at each knot of a run.
+    """Linearization of histories.
+
+    `defects` has shape (balances, runs, knots, samples, channels), with a defect at each knot of a run.
 
     Attributes:
         rows_of: indices of each run's rows in the order of time, -1 beyond its last, shape (runs, samples).
         knots: rows between which a defect is linear, shape (runs, knots).
-        time: of every row since the start of its run [s]; angle: of the driving shaft since then [rad].
+        time: of each row since the start of its run [s]; angle: of the driving shaft since then [rad].
     """
 
     rows_of: Int[Array, "runs samples"]
@@ -179,7 +182,7 @@ class HistoriesLinearization(Linearization):
         return jnp.where(self.rows_of[:, :, None] < 0, 0.0, self.by_row()[self.rows_of])
 
     def memory(self) -> Array:
-        """Ljung and Box's (1978) statistic over all runs, as a normal deviate, the largest of the channels."""
+        """Ljung and Box's (1978) statistic over all runs, as a normal deviate; the largest of the channels."""
         x, rows = self.series(), self.rows_of
         count = jnp.sum(rows >= 0, 1)[:, None]
         power = jnp.sum(x**2, 1)
@@ -197,17 +200,17 @@ class Histories(Observer):
     """Observer of time histories: one run of `drive` from standstill for each `run_id`, one row a sample.
 
     Sliding during a start is part of the run, so adhesion is not penalised. Histories have hundreds of readings a
-    parameter, and refits of a bootstrap stay where the model is linear: there the refit is the linear one.
+    parameter, so refits of a bootstrap stay within the linear range and are linear fits.
 
     Attributes:
-        conditions: of each run; a field that changes within one has shape (runs, instants), else (runs,).
-        times: the grid of each run from 0 on, its last instant repeated to one length, shape (runs, instants) [s].
+        conditions: of each run; a field that changes within a run has shape (runs, instants), else (runs,).
+        times: the grid of each run from 0, its last instant repeated to a common length, shape (runs, instants) [s].
         run: index of each row's run; instant: of its sample in `times`; shape (rows,).
         rows_of: indices of each run's rows in the order of time, -1 beyond its last, shape (runs, samples).
-        knots: rows between which a defect is taken to be linear, a run's last repeated, shape (runs, knots).
-        delayed: whether what is imposed may act later than its column says (`Rig.delay`), so that readings are read
-            that much earlier between the instants.
-        known: the runs of the robot that is observed; None: not known.
+        knots: rows between which a defect is linear, a run's last repeated, shape (runs, knots).
+        delayed: True if imposed quantities may act later than their column says (`Rig.delay`), so that readings are
+            taken that much earlier, between the instants.
+        known: the simulated runs of the observed robot; None: not yet known.
     """
 
     word: ClassVar[str] = "sample"
@@ -226,7 +229,7 @@ class Histories(Observer):
     rows_of: Int[Array, "runs samples"]
     knots: Int[Array, "runs knots"]
     delayed: bool = eqx.field(default=False, static=True)
-    known: Followed | None = None
+    known: LinearisedRun | None = None
 
     @classmethod
     def observes(cls, runs: Runs) -> bool:
@@ -234,12 +237,12 @@ class Histories(Observer):
 
     @classmethod
     def of(cls, runs: Runs, robot: Robot, fidelity: str | None = None) -> Histories:
-        """Rows may come in any order; what does not change within a run is that of its first row."""
-        if fidelity is not None and fidelities.get(fidelity).name != "drive":
+        """Observer of a table; rows may be in any order, and constant conditions of a run are its first row's."""
+        if fidelity is not None and fidelities.get_fidelity(fidelity).name != "drive":
             raise BadConfiguration(f"--model {fidelity}: {runs.source} holds time histories; they need --model drive")
         if runs.turns:
             raise BadConfiguration(
-                f"{runs.source}: time histories of a robot that turns are simulated, and not fitted; make a "
+                f"{runs.source}: time histories of a robot that turns can be simulated but not fitted; make a "
                 f"table of its settled turns: mmrjax settle {runs.source} --robot FILE"
             )
         whole, exact = runs.whole, robot.rig.imposed == "motor_speed"
@@ -247,29 +250,32 @@ class Histories(Observer):
         names, run = np.unique(runs.run_names, return_inverse=True)
         mine, every = ([table.in_order(name) for name in names] for table in (runs, whole))
         given = [runs["time_s"][m] for m in mine]
-        # Of rows of the log without a reading here those count at which what drives a run changes.
+        # Rows of the log without a reading here are kept if the imposed quantity changes there.
         noted = [
-            np.isin(whole["time_s"][rows], t) | exact | linear | _changed(whole, rows)
+            np.isin(whole["time_s"][rows], t) | exact | linear | _drive_changes(whole, rows)
             for rows, t in zip(every, given, strict=True)
         ]
         steps = [
-            np.minimum.reduceat(h, np.flatnonzero(n)[:-1]) for h, n in zip(_longest(runs, robot), noted, strict=True)
+            np.minimum.reduceat(h, np.flatnonzero(n)[:-1])
+            for h, n in zip(_longest_steps(runs, robot), noted, strict=True)
         ]
         change = LOOSE if robot.loose else CHANGE
         grids = [
-            grid(whole["time_s"][rows[n]], *c, h, START if robot.has_ground else change, change)
-            for rows, n, c, h in zip(every, noted, _changes(whole, every, robot.rig), steps, strict=True)
+            time_grid(whole["time_s"][rows[n]], *c, h, START if robot.has_ground else change, change)
+            for rows, n, c, h in zip(every, noted, _drive_jumps(whole, every, robot.rig), steps, strict=True)
         ]
-        # The last instant begins a step, of no length, as every other does.
-        longest, samples = _common(max(map(len, grids)) + 1), max(map(len, mine))
+        # The last instant begins a step too, of length zero.
+        longest, samples = _common_length(max(map(len, grids)) + 1), max(map(len, mine))
         times = np.stack([np.concatenate([g, np.repeat(g[-1], longest - len(g))]) for g in grids])
         instant = np.array([np.searchsorted(grids[r], t) for r, t in zip(run, runs["time_s"], strict=True)])
         rows = np.stack([np.concatenate([m, np.full(samples - len(m), -1)]) for m in mine])
         most = min(samples, KNOTS, max(8, int(KNOT_STEPS / times.size)))
-        knots = np.stack([_knots(m, most) for m in mine])
-        conditions = _in_time(whole.conditions(robot), every, whole["time_s"], times, ON_LINES if linear else ())
+        knots = np.stack([_choose_knots(m, most) for m in mine])
+        conditions = _conditions_over_time(
+            whole.conditions(robot), every, whole["time_s"], times, ON_LINES if linear else ()
+        )
         if robot.rig.begins is not None:
-            order = [robot.rig.begins.names.index(begin_name(str(n))) for n in names]
+            order = [robot.rig.begins.names.index(initial_state_name(str(n))) for n in names]
             conditions = eqx.tree_at(lambda c: c.begin, conditions, jnp.asarray(order), is_leaf=lambda x: x is None)
         index = [jnp.asarray(x) for x in (run, instant, rows, knots)]
         rig = robot.rig
@@ -278,7 +284,7 @@ class Histories(Observer):
 
     @classmethod
     def sizes(cls, runs: Runs) -> np.ndarray:
-        """The channel's root mean square: histories pass through zero while their instruments stay as they are."""
+        """Root mean square of each channel: histories pass through zero, and the error of an instrument does not."""
         measured = runs.measured()
         finite = np.isfinite(measured)
         power = np.sum(np.where(finite, measured, 0.0) ** 2, 0) / np.maximum(finite.sum(0), 1)
@@ -295,33 +301,34 @@ class Histories(Observer):
                     "a run has one configuration, so give each its own run_id"
                 )
             if runs.has("total_mass_kg"):
-                own = runs["total_mass_kg"][mine] - runs["payload_kg"][mine]
-                if np.ptp(own) > ROUNDING:
+                empty = runs["total_mass_kg"][mine] - runs["payload_kg"][mine]
+                if np.ptp(empty) > ROUNDING:
                     raise BadData(
                         f"{runs.source}, total_mass_kg: run {name or '(no run_id)'} changes by "
-                        f"{number(np.ptp(own))} kg beside its payload; within a run it may change as payload_kg does"
+                        f"{number(np.ptp(empty))} kg apart from its payload; "
+                        "within a run only payload_kg may change it"
                     )
         _check_signs(runs)
         thinned: list[Note | str] = []
         if runs.log is not None:
             thinned.append(Thinned(runs.source, len(runs.log), len(runs)))
-        return [*thinned, *_stops(runs)]
+        return [*thinned, *_stop_notes(runs)]
 
     @classmethod
     def with_initial_states(cls, robot: Robot, runs: Runs, noise: Noise) -> Robot:
-        return with_begins(robot, runs, noise)
+        return measure_initial_states(robot, runs, noise)
 
     @classmethod
     def check_start(cls, runs: Runs, noise: Noise, robot: Robot) -> list[Note | str]:
-        """Histories begin at their first row, mostly at rest, and show one sample at a time."""
+        """Checks that histories begin at their first row, usually at rest, with one sample at a time."""
         names, measured = runs.run_names, runs.measured()
-        # Current rises within a millisecond; what moves does not.
+        # Current rises within a millisecond; speeds and angles do not.
         resting = robot.rig.start == "rest" and robot.rig.imposed != "motor_speed"
         moving = [k for k, c in enumerate(runs.channels) if c.zero_at_rest and resting]
         for channel in (c for c in runs.channels if not c.over_time and runs.has(c.column)):
             raise BadData(
-                f"{runs.source}, {channel.column}: histories do not follow it; remove the column, or give settled "
-                "runs without time_s"
+                f"{runs.source}, {channel.column}: time histories do not model it; remove the column, or give "
+                "settled runs without time_s"
             )
         for name in np.unique(names):
             mine = np.flatnonzero(names == name)
@@ -347,7 +354,7 @@ class Histories(Observer):
         said: list[Note | str] = []
         step = runs["time_s"].max() / STEPS
         if robot.rig.imposed != "motor_speed":
-            step = max(step, *(h.max(initial=0.0) for h in _longest(runs, robot)))
+            step = max(step, *(h.max(initial=0.0) for h in _longest_steps(runs, robot)))
         if step > FAST * LONGEST:
             said.append(CoarseSteps(float(runs["time_s"].max()), float(step)))
         return said
@@ -360,8 +367,10 @@ class Histories(Observer):
 
     @classmethod
     def settled(cls, runs: Runs, steady: bool = False) -> tuple[Runs, np.ndarray, np.ndarray]:
-        """The medians of the later half of each run, which have settled where the run is long enough; of one whose
-        conditions change, of the longest stretch in which it is driven forwards, where that lasts at all."""
+        """Medians of the later half of each run, which has settled if the run is long enough.
+
+        For a run with changing conditions, of the longest interval in which it is driven forwards, if long enough.
+        """
         time, measured = runs["time_s"], runs.measured()
         each = [
             max((s for s in run if s.driven or s.whole), key=lambda s: s.lasts, default=run[0])
@@ -379,7 +388,7 @@ class Histories(Observer):
 
     @classmethod
     def identity(cls, runs: Runs) -> tuple[str, ...]:
-        """Of histories the run too: repeats begin alike, at rest."""
+        """All columns, including the run: repeats have the same beginning, at rest."""
         return tuple(runs.columns)
 
     @classmethod
@@ -393,52 +402,56 @@ class Histories(Observer):
     def defective(
         self, robot: Robot, probes: tuple[Effect, ...]
     ) -> Float[Array, "probes runs knots samples channels"]:
-        """Change of the readings by a defect of each probe's balance [its unit] that is 1 at a knot of a run and
-        falls linearly to 0 at the next ones; an effect `probe` is its amplitude in its balance."""
+        """Change of the readings by a defect of each probe's balance [its unit]; a probe has amplitude 1.
+
+        The defect is 1 at a knot of a run and falls linearly to 0 at the neighbouring knots.
+        """
         return self.changes(robot, probes, ())[0]
 
     def changes(
         self, robot: Robot, probes: tuple[Effect, ...], effects: tuple[ScoredEffect, ...]
     ) -> tuple[Float[Array, "probes runs knots samples channels"], Float[Array, "runs samples channels instances"]]:
-        """The same, and the change of the readings by each effect at every point of its shape's grid.
+        """Changes of the readings as `defective`, and by each effect at each point of its shape's grid.
 
-        An effect enters one balance with one amplitude. So it changes a run as a defect of that balance does that has
-        the values of its term. What an effect remembers follows from the run too. Between two instants its change of
-        a reading is on a straight line.
+        An effect enters one balance with one amplitude. So it changes a run in the same way as a defect of that
+        balance with the values of its term. Its memory follows from the run too. Between two instants its change of
+        a reading is linear.
         """
         every = _Probed.of(robot, probes, effects)
         clock = self.times[jnp.arange(len(self.times))[:, None], self.instant[self.knots]]
         rows = jnp.where(self.rows_of < 0, 0, self.rows_of)
-        known = self.following(robot).known
-        assert known is not None
-        # One run after another: each is wide by its knots, and large.
-        given = self.conditions, clock, self.instant[rows], known, self.times, self.time[rows]
+        followed_signals = self.following(robot).known
+        assert followed_signals is not None
+        # One run at a time: each has a wide array, by its knots.
+        given = self.conditions, clock, self.instant[rows], followed_signals, self.times, self.time[rows]
         knots, by_effects = jax.lax.map(lambda of_run: every.changes(*of_run, delayed=self.delayed), given)
         return jnp.moveaxis(knots, 0, 1), by_effects
 
     def following(self, robot: Robot) -> Histories:
-        """The same for a robot whose runs are then known."""
+        """Observer with the simulated runs of a robot."""
         if self.known is not None:
             return self
-        known = jax.vmap(lambda c, t: followed(robot, c, t))(self.conditions, self.times)
+        known = jax.vmap(lambda c, t: linearise_run(robot, c, t))(self.conditions, self.times)
         return dataclasses.replace(self, known=known)
 
     def whole(self, robot: Robot) -> Signals:
-        """Every signal of every run at every instant, shape (runs, instants)."""
-        found = jax.vmap(lambda c, t, k: histories(robot, c, t, k))(self.conditions, self.times, self.known)
-        return jax.tree.map(lambda x: jnp.broadcast_to(x, self.times.shape), found)
+        """Signals of each run at each instant, shape (runs, instants)."""
+        whole_runs = jax.vmap(lambda c, t, k: history_signals(robot, c, t, k))(
+            self.conditions, self.times, self.known
+        )
+        return jax.tree.map(lambda x: jnp.broadcast_to(x, self.times.shape), whole_runs)
 
     def at_rows(self, whole: Signals) -> Signals:
-        """Every signal at every row."""
+        """Signals at each row."""
         return jax.tree.map(lambda x: x[self.run, self.instant], whole)
 
     @property
     def time(self) -> Float[Array, " rows"]:
-        """Time of every row since the start of its run [s]."""
+        """Time of each row since the start of its run [s]."""
         return self.times[self.run, self.instant]
 
     def angle(self, whole: Signals) -> Float[Array, " rows"]:
-        """Angle of the driving shaft at every row, since the start of its run [rad]."""
+        """Angle of the driving shaft at each row, since the start of its run [rad]."""
         speed = jnp.asarray(whole.speed_wheel)
         turned = 0.5 * (speed[:, 1:] + speed[:, :-1]) * jnp.diff(self.times)
         angle = jnp.concatenate([jnp.zeros((len(turned), 1)), jnp.cumsum(turned, 1)], 1)
@@ -446,18 +459,18 @@ class Histories(Observer):
 
     @property
     def of_rows(self) -> Any:
-        """The conditions of every row, with fields of NumPy, shape (rows,)."""
+        """Conditions of each row, with fields of NumPy, shape (rows,)."""
         run, instant = np.asarray(self.run), np.asarray(self.instant)
         held = jax.tree.map(np.asarray, self.conditions)
         return jax.tree.map(lambda x: x[run] if x.ndim == 1 else x[run, instant], held)
 
     @property
     def varying(self) -> bool:
-        """Whether some conditions change within a run."""
+        """True if some conditions change within a run."""
         return any(x.ndim > 1 for x in jax.tree.leaves(self.conditions))
 
     def stretches(self) -> list[list[Stretch]]:
-        """Of each run, the stretches of unchanged conditions."""
+        """Intervals of unchanged conditions, for each run."""
         rows_of, time, of_rows = np.asarray(self.rows_of), np.asarray(self.time), self.of_rows
         volts = np.where(of_rows.open > 0.5, 0.0, of_rows.voltage * of_rows.duty)
         volts = volts if of_rows.motor_current is None else of_rows.motor_current
@@ -466,63 +479,68 @@ class Histories(Observer):
 
     @property
     def driven(self) -> Conditions:
-        """As the protocol says. A robot that is driven backward up a slope is one that is driven forward up it; where
-        conditions change, levels that lie close together are one."""
+        """Conditions of driven travel as in the protocol.
+
+        Driving backward on a slope is the same as driving forward on it. Levels of changing conditions are merged
+        if they are close.
+        """
         if not self.varying:
             return self.conditions
         rows = self.of_rows
-        braked = np.zeros(len(rows.voltage)) if rows.load_torque is None else _few(rows.load_torque)
+        braked = np.zeros(len(rows.voltage)) if rows.load_torque is None else _merge_levels(rows.load_torque)
         if rows.voltage_follows:
-            own = "motor_current" if rows.motor_speed is None else "motor_speed"
-            levels = _few(getattr(rows, own))
+            driven_channel = "motor_current" if rows.motor_speed is None else "motor_speed"
+            levels = _merge_levels(getattr(rows, driven_channel))
             which = np.stack([rows.configuration, levels, rows.slope_deg, rows.payload, braked], 1)
             cases = np.unique(which[levels != 0], axis=0, return_index=True)[1]
             cases = np.flatnonzero(levels != 0)[cases] if len(cases) else np.arange(1)
             held = {} if rows.motor_speed is None else {"motor_acceleration": np.zeros_like(levels)}
             held |= {} if rows.load_torque is None else {"load_torque": braked}
-            steady = dataclasses.replace(rows, **{own: levels}, **held)
-            return _some(steady, cases)
+            steady = dataclasses.replace(rows, **{driven_channel: levels}, **held)
+            return _conditions_of_rows(steady, cases)
         applied = np.where(rows.open > 0.5, 0.0, rows.voltage * rows.duty)
         some = np.flatnonzero(applied != 0) if (applied != 0).any() else np.arange(1)
         way = np.where(applied < 0, -1.0, 1.0)
         braked = way * braked
         turned = dataclasses.replace(
             rows,
-            voltage=_few(np.abs(applied)),
-            slope_deg=_few(way * rows.slope_deg),
-            payload=_few(rows.payload),
+            voltage=_merge_levels(np.abs(applied)),
+            slope_deg=_merge_levels(way * rows.slope_deg),
+            payload=_merge_levels(rows.payload),
             load_torque=None if rows.load_torque is None else braked,
             duty=np.ones_like(rows.duty),
             open=np.zeros_like(rows.open),
         )
         which = np.stack([turned.configuration, turned.voltage, turned.slope_deg, turned.payload, braked], 1)[some]
         cases = some[np.unique(which, axis=0, return_index=True)[1]]
-        return _some(turned, cases)
+        return _conditions_of_rows(turned, cases)
 
     def late(self, every: tuple[Array, ...], rig: Rig) -> Float[Array, "rows ..."]:
-        """Of every row, what is there within a step, less the rig's delay.
+        """Values within a step at the time of each row less the rig's delay.
 
         Args:
-            every: what `Within.read` takes of every step, shape (runs, steps, ...) each.
+            every: arguments of `Within.read` for every step, shape (runs, steps, ...) each.
         """
 
         def of_run(times: Array, every: tuple[Array, ...], time: Array) -> Array:
             step, share = rig.before(times, time)
-            return Within.read(tuple(x[step] for x in every), share)
+            return StepCourse.read(tuple(x[step] for x in every), share)
 
         of_runs = jax.vmap(of_run)(self.times, every, self.time[self.rows_of])
         return _by_row(of_runs, self.rows_of, len(self.run))
 
     def __call__(self, robot: Robot) -> Observation:
         def of_run(
-            conditions: Conditions, times: Array, known: Followed | None, instants: Array, time: Array
+            conditions: Conditions, times: Array, known: LinearisedRun | None, instants: Array, time: Array
         ) -> Array:
             """Readings of a run's rows."""
 
             if not self.delayed:
-                return _readings(robot, histories(robot, conditions, times, known, instants))
+                return _readings(robot, history_signals(robot, conditions, times, known, instants))
             step, share = robot.rig.before(times, time)
-            return Within.read(_of_steps(robot, within(robot, conditions, times, known, step)), share)
+            return StepCourse.read(
+                _readings_within_steps(robot, course_between_instants(robot, conditions, times, known, step)), share
+            )
 
         places = self.instant[self.rows_of], self.time[self.rows_of]
         of_runs = jax.vmap(of_run)(self.conditions, self.times, self.known, *places)
@@ -546,8 +564,10 @@ class Histories(Observer):
         return self.rows_of.shape[0]
 
     def noise_misfit(self, off: Callable[[], np.ndarray], counts: np.ndarray) -> float:
-        """As the protocol says, and more where the differences between neighbouring samples, in which what a model
-        lacks nearly cancels, show that the noise is larger than its sds (von Neumann, Ann. Math. Stat. 12 (1941))."""
+        """Expected χ² of noise, larger than in the protocol if neighbouring samples show that the sds are too small.
+
+        A model error nearly cancels in the differences of neighbours (von Neumann, Ann. Math. Stat. 12 (1941)).
+        """
         residual, rows, total = off(), np.asarray(self.rows_of), 0.0
         first, second = rows[:, :-1].ravel(), rows[:, 1:].ravel()
         within = (first >= 0) & (second >= 0)
@@ -561,14 +581,17 @@ class Histories(Observer):
     def linearise(
         self, problem: Problem, z: Array, data: Data, effects: tuple[ScoredEffect, ...]
     ) -> HistoriesLinearization:
-        """As the protocol says; residuals and Jacobian by the program of the searches, and what defects and effects
-        change (`changes`) along the run that it has followed."""
+        """Linearization as in the protocol.
+
+        Residuals and Jacobian are from the program of the searches. The changes by defects and effects (`changes`)
+        are computed along its run.
+        """
         problem = dataclasses.replace(problem, data=data)
         which = getattr(problem.coordinates, "active", None)
         twice = lambda x: jnp.stack([jnp.asarray(x)] * TOGETHER)  # noqa: E731
         members = twice(z), twice(data.weight), None if which is None else twice(which)
         r, jacobian, _, known = jax.tree.map(lambda x: x[0], _evaluate(problem, *members))
-        residual, jacobian = counted(r, jacobian, penalties(data))
+        residual, jacobian = zero_inactive_residuals(r, jacobian, penalty_slice(data))
         robot, observe = problem.robot(jnp.asarray(z)), dataclasses.replace(self, known=known)
         signatures, defects, signals, angle = _responses(observe, robot, effects, data.weight / data.sd)
         return HistoriesLinearization(
@@ -582,12 +605,12 @@ class Histories(Observer):
             self.knots,
             self.time,
             angle,
-            channels=channels.names(problem.channels),
+            channels=channels.channel_names(problem.channels),
             magnitudes=robot.rig.magnitudes,
         )
 
     def at_fit(self, problem: Problem, z: Numbers) -> Histories:
-        """The same with its runs known as they are at coordinates z, by the program of the searches."""
+        """Observer with its runs as simulated at coordinates z, by the program of the searches."""
         which = getattr(problem.coordinates, "active", None)
         twice = lambda x: np.stack([np.asarray(x)] * TOGETHER)  # noqa: E731
         members = twice(z), twice(problem.data.weight), None if which is None else twice(which)
@@ -600,31 +623,37 @@ class Histories(Observer):
         jacobian = linear.jacobian
         counts = jnp.concatenate([data.weight.ravel(), jnp.zeros(linear.rows), jnp.ones(jacobian.shape[1])])
         noise = counts * jax.random.normal(jax.random.wrap_key_data(drawn), counts.shape)
-        return linear.with_residual(noise - jacobian @ solved(jacobian.T @ jacobian, jacobian.T @ noise))
+        return linear.with_residual(noise - jacobian @ solve(jacobian.T @ jacobian, jacobian.T @ noise))
 
     def starts(self, problem: Problem, random: np.random.Generator, count: int) -> Float[np.ndarray, "starts z"]:
-        """As the protocol says: where the log's equations in weak form lead (`weak_form`) and the prior mean; where a
-        ground may be slid on, as of `settled_ends`."""
+        """Starts as in the protocol: the fit of the log's equations in weak form (`weak_form`) and the prior mean.
+
+        On ground where the robot may slide, the starts of `settled_ends`.
+        """
 
         def search(blunt: Problem, starts: np.ndarray, steps: int) -> Optimum:
             weights = np.repeat(np.asarray(blunt.data.weight)[None], len(starts), 0)
             evaluate = _evaluator(blunt, weights, None)
-            return searches_long(evaluate, starts, blunt.data, weights, steps, self.policy.batch)[0]
+            return search_rollouts(evaluate, starts, blunt.data, weights, steps, self.policy.batch)[0]
 
-        if not problem.base.has_ground or problem.base.rig.imposed != "voltage":  # no grip that makes for valleys
+        if not problem.base.has_ground or problem.base.rig.imposed != "voltage":  # no grip, so no local minima by it
             shown = weak_form(problem)
             if shown is not None:
-                return scans.placed(problem, np.stack([shown.z, np.zeros(len(problem.coordinates))])[:count])
-            return scans.placed(problem, super().starts(problem, random, count))
+                return scans.place_at_minimum(
+                    problem, np.stack([shown.z, np.zeros(len(problem.coordinates))])[:count]
+                )
+            return scans.place_at_minimum(problem, super().starts(problem, random, count))
         draws = random.standard_normal((settled_ends.DRAWS, len(problem.coordinates)))
-        return scans.placed(problem, settled_ends.starts(problem, draws, search)[:count])
+        return scans.place_at_minimum(problem, settled_ends.starts_from_settled_ends(problem, draws, search)[:count])
 
     def scanned(self, problem: Problem) -> tuple[int, ...]:
-        return scans.beyond_a_basin(problem)
+        return scans.coordinates_beyond_a_basin(problem)
 
     def scan_points(self, problem: Problem, k: int) -> int:
-        """Of a delay so many that none is further from the next than half of the rise of a current L/R or an eighth
-        of a sample, as far as `DELAYS` go."""
+        """Number of values of a scan.
+
+        A delay has a spacing of at most half a current's rise time L/R or an eighth of a sample, within `DELAYS`.
+        """
         if problem.coordinates.names[k] != DELAY:
             return SCANNED
         motor, time = problem.base.motor, np.unique(np.round(np.asarray(self.time), 9))
@@ -634,12 +663,13 @@ class Histories(Observer):
         return int(2 ** np.clip(np.ceil(np.log2(wanted)), *np.log2(DELAYS)))
 
     def scan(self, problem: Problem, z: Array, data: Data, k: int, values: Array) -> tuple[Array, Array]:
-        """As the protocol says. A delay shifts what a run shows and does not change it: one run and its derivatives
-        serve for all."""
+        """Scan as in the protocol. A delay only shifts the readings of a run, so one run serves all its values."""
         if problem.coordinates.names[k] == DELAY:
             return _over_delays(problem, z, data, jnp.arange(len(z)) == k, values)
         found = [
-            _moved(*linearised(problem, z.at[k].set(v), data)[:2], z.at[k].set(v), jnp.arange(len(z)) == k)
+            _minimum_with_one_held(
+                *linearise(problem, z.at[k].set(v), data)[:2], z.at[k].set(v), jnp.arange(len(z)) == k
+            )
             for v in values
         ]
         return jnp.stack([cost for cost, _ in found]), jnp.stack([at for _, at in found])
@@ -654,46 +684,46 @@ class Histories(Observer):
         rivals: bool = False,
         most: int | None = None,
     ) -> tuple[Optimum, Observation]:
-        """As the protocol says; the runs are compiled once for all steps."""
+        """Searches as in the protocol; the runs are compiled once for all steps."""
         data, steps = problem.data, self.policy.steps if most is None else most
 
         def searched(starts: Numbers) -> tuple[Optimum, Observation]:
             evaluate = _evaluator(problem, weights, active)
-            return searches_long(evaluate, starts, data, weights, steps, self.policy.batch, rivals=rivals)
+            return search_rollouts(evaluate, starts, data, weights, steps, self.policy.batch, rivals=rivals)
 
-        found = searched(starts)
-        near = np.asarray(found[0].cost) < np.nanmin(found[0].cost) + NEAR
-        if most is None and np.any(
-            near & ~np.asarray(found[0].converged)
-        ):  # what may be proposed has to be an optimum
-            found = searched(np.asarray(found[0].z))
-        if not rivals or not scans.scanned(problem):
-            return found
-        k = int(np.nanargmin(found[0].cost))
+        optima = searched(starts)
+        near = np.asarray(optima[0].cost) < np.nanmin(optima[0].cost) + NEAR
+        if most is None and np.any(near & ~np.asarray(optima[0].converged)):  # a proposal has to be an optimum
+            optima = searched(np.asarray(optima[0].z))
+        if not rivals or not scans.scanned_coordinates(problem):
+            return optima
+        k = int(np.nanargmin(optima[0].cost))
         one = lambda x: jax.tree.map(lambda leaf: leaf[k], x)  # noqa: E731
         data = dataclasses.replace(problem.data, weight=weights[k])
-        best = scans.searched_on(
+        best = scans.search_lower_basins(
             problem,
-            one(found),
+            one(optima),
             data,
             lambda z: one(searched(np.tile(z, (len(starts), 1)))),
             lambda _: None,
         )
-        return jax.tree.map(lambda every, mine: jnp.asarray(every).at[k].set(mine), found, best)
+        return jax.tree.map(lambda every, mine: jnp.asarray(every).at[k].set(mine), optima, best)
 
     def observed(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> Observation:
         return self.at(problem, z, active)[2]
 
     def at(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> tuple[Numbers, Numbers, Observation]:
-        """As the protocol says, by the program of the searches."""
+        """Residuals, Jacobian and observation as in the protocol, by the program of the searches."""
         which = None if active is None else np.asarray(active)[None]
         evaluate = _evaluator(problem, np.asarray(problem.data.weight)[None], which)
         r, jacobian, seen = jax.tree.map(lambda x: x[0], evaluate(np.asarray(z)[None], np.zeros(1, int)))
-        return *counted(jnp.asarray(r), jnp.asarray(jacobian), penalties(problem.data)), seen
+        return *zero_inactive_residuals(jnp.asarray(r), jnp.asarray(jacobian), penalty_slice(problem.data)), seen
 
     def bases(self, columns: Mapping[str, np.ndarray], included: np.ndarray, robot: Robot) -> Bases:
-        """Curves and windows as of settled runs, over time too, and waves in the angle of a shaft. Over the voltage
-        are those over the motors' voltage where that is not the supply's."""
+        """Curves and windows as for settled runs, also over time, and waves over the angle of a shaft.
+
+        Curves over the voltage are over the motors' voltage if it differs from the supply's.
+        """
         rows = self.of_rows
         angle, electromotive, ways = jax.tree.map(lambda x: np.nan_to_num(np.asarray(x)), _turning(self, robot))
         if (rows.duty != 1).any():
@@ -701,13 +731,15 @@ class Histories(Observer):
             columns = {**columns, "supply_voltage_V": at_motors}
         which = self.conditions.configuration
         on_tracks = np.broadcast_to(jax.vmap(robot.chassis)(which).on_tracks > 0.5, np.shape(which))
-        waves = bases_room.waves(on_tracks[self.run], angle, np.asarray(self.rows_of), np.asarray(self.knots), robot)
+        waves = bases_room.wave_families(
+            on_tracks[self.run], angle, np.asarray(self.rows_of), np.asarray(self.knots), robot
+        )
         weight = included.astype(float)
         told = columns, weight, robot, None, ways
-        return (*bases_room.families(*told), *bases_room.windows(*told), *waves)
+        return (*bases_room.curve_families(*told), *bases_room.window_families(*told), *waves)
 
     def detail(self, bases: Bases, included: np.ndarray, before: Diagnosis, after: Diagnosis) -> TimeStatistics:
-        names = bases_room.names(bases)
+        names = bases_room.family_names(bases)
         orders = [w for w in bases_room.ORDERS if any(n[1] == w for n in names)]
 
         def strongest(diagnosis: Diagnosis, variable: str) -> Strongest:
@@ -734,40 +766,39 @@ class Histories(Observer):
 
 
 def _autocorrelation(linear: Linearization, lags: int) -> dict[str, list[float]]:
-    """Of each channel's residual over all runs, at lags 1 to `lags` samples."""
+    """Autocorrelation of each channel's residuals over all runs, at lags 1 to `lags` samples."""
     x = np.asarray(linear.series())
     power = np.maximum(np.sum(x**2, (0, 1)), 1e-12)
     by_lag = [np.sum(x[:, k:] * x[:, :-k], (0, 1)) / power for k in range(1, lags + 1)]
     return {name: [float(lag[k]) for lag in by_lag] for k, name in enumerate(linear.channels)}
 
 
-def _changes(runs: Runs, each: list[np.ndarray], rig: Rig) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Instants at which what drives the motors of each run changes at once [s], and by what share of its largest
-    value."""
+def _drive_jumps(runs: Runs, each: list[np.ndarray], rig: Rig) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Times of jumps of the drive of each run's motors [s], and the jumps as shares of its largest value."""
     driven, time = applied(runs), runs["time_s"]
-    # An imposed speed takes the current with it; what is on lines does not jump; what is not known is refused later.
+    # An imposed speed determines the current; a linear drive does not jump; an unknown drive is refused later.
     known = rig.imposed != "motor_speed" and rig.between_rows == "held" and np.isfinite(driven).all() and driven.any()
     coasts = runs["mode"] == "coast" if runs.has("mode") else np.zeros(len(runs), bool)
-    driven, found = driven if known else np.zeros(len(runs)), []
+    driven, jumps = driven if known else np.zeros(len(runs)), []
     for rows in each:
-        sizes = np.maximum(_jumps(driven[rows]), coasts[rows][1:] != coasts[rows][:-1])
-        found.append((time[rows[1:]][sizes > 0], sizes[sizes > 0]))
-    return found
+        sizes = np.maximum(_relative_jumps(driven[rows]), coasts[rows][1:] != coasts[rows][:-1])
+        jumps.append((time[rows[1:]][sizes > 0], sizes[sizes > 0]))
+    return jumps
 
 
-def _in_time(
+def _conditions_over_time(
     of_rows: Conditions,
     each: list[np.ndarray],
     time: np.ndarray,
     times: np.ndarray,
     on_lines: tuple[str, ...] = (),
 ) -> Conditions:
-    """Conditions of runs, from those of rows: of shape (runs,), those that change within one (runs, instants).
+    """Conditions of runs from those of rows, shape (runs,), or (runs, instants) if they change within a run.
 
     Args:
         of_rows: shape (rows,); each: rows of each run in the order of time.
         time: of rows; times: instants of each run [s].
-        on_lines: fields that go on straight lines from row to row: their mean over the step from each instant on.
+        on_lines: fields that are linear between rows: mean over the step that begins at each instant.
     """
     middle = np.concatenate([0.5 * (times[:, 1:] + times[:, :-1]), times[:, -1:]], 1)
     at = np.stack(
@@ -776,21 +807,21 @@ def _in_time(
             for rows, t in zip(each, times, strict=True)
         ]
     )
-    conditions = _some(of_rows, np.array([rows[0] for rows in each]))
+    conditions = _conditions_of_rows(of_rows, np.array([rows[0] for rows in each]))
     for name in CHANGING:
         x = None if getattr(of_rows, name) is None else np.asarray(getattr(of_rows, name))
         if x is not None and any(np.ptp(x[rows]) > 0 for rows in each):
-            values = x[at] if name not in on_lines else _on_lines(x, each, time, middle)
+            values = x[at] if name not in on_lines else _interpolate_at_instants(x, each, time, middle)
             conditions = eqx.tree_at(operator.attrgetter(name), conditions, jnp.asarray(values))
     if of_rows.motor_speed is None:
         return conditions
-    speed = _on_lines(np.asarray(of_rows.motor_speed), each, time, times)
+    speed = _interpolate_at_instants(np.asarray(of_rows.motor_speed), each, time, times)
     step = np.diff(times, axis=1)
     slope = np.where(step > 0, np.diff(speed, axis=1) / np.where(step > 0, step, 1.0), 0.0)
-    # An instant accelerates as the step that it begins; the last one begins none, and has that of the step before it.
+    # An instant has the acceleration of the step that it begins; the last begins none, and has that of the last step.
     last = np.maximum.accumulate(np.where(step > 0, np.arange(step.shape[1]), 0), 1)
     slope = np.take_along_axis(slope, np.concatenate([last, last[:, -1:]], 1), 1)
-    # Not by `dataclasses.replace`: its constructor broadcasts, and what does not change has no instants.
+    # Not by `dataclasses.replace`, because its constructor would broadcast constant conditions over the instants.
     return eqx.tree_at(
         lambda c: (c.motor_speed, c.motor_acceleration),
         conditions,
@@ -799,62 +830,64 @@ def _in_time(
     )
 
 
-def _some(conditions: Conditions, rows: np.ndarray) -> Conditions:
-    """Those of some rows; NumPy takes them, for which nothing is compiled."""
+def _conditions_of_rows(conditions: Conditions, rows: np.ndarray) -> Conditions:
+    """Conditions of some rows, selected by NumPy so that nothing is compiled."""
     return jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[rows]), conditions)
 
 
-def _on_lines(x: np.ndarray, each: list[np.ndarray], time: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Values of rows at instants of each run, on straight lines between the rows; shape (runs, instants)."""
+def _interpolate_at_instants(x: np.ndarray, each: list[np.ndarray], time: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Values at instants of each run, by linear interpolation between its rows; shape (runs, instants)."""
     return np.stack([np.interp(t, time[rows], x[rows]) for rows, t in zip(each, at, strict=True)])
 
 
-def begin_name(run: str) -> str:
-    """What the beginning of a run is called among the parameters of a rig."""
+def initial_state_name(run: str) -> str:
+    """Name of a run's initial state among the parameters of a rig."""
     return f"begin_{re.sub(r'[^A-Za-z0-9_-]', '_', run)}"
 
 
-#: Samples at the beginning of a run from which its beginning is measured, at most.
+#: Largest number of first samples that determine a run's initial state.
 FIRST_SAMPLES = 5
 
 
-def with_begins(robot: Robot, runs: Runs, noise: Noise) -> Robot:
-    """`robot` with the beginnings of a table's runs, where its rig says that they do not begin at rest: speed and
-    angle of the first samples, extrapolated to the first; free ones have the error of that as their prior."""
+def measure_initial_states(robot: Robot, runs: Runs, noise: Noise) -> Robot:
+    """`robot` with the initial states of a table's runs, if its rig says that they do not begin at rest.
+
+    Speed and angle of the first samples are extrapolated to the first; the error of that is the prior of free ones.
+    """
     if robot.rig.start == "rest" or not runs.sampled:
         return robot
     measured = runs.measured()
-    found, known = dict[str, Begin](), []
+    begins, stated = dict[str, Begin](), []
     rows = runs.configurations(robot)
     for name in np.unique(runs.run_names):
         mine = runs.in_order(name)
-        key = begin_name(str(name))
-        at: dict[str, tuple[float, float]] = {}
+        key = initial_state_name(str(name))
+        state: dict[str, tuple[float, float]] = {}
         for k, channel in enumerate(runs.channels):
             field = "motor_speed" if channel.settled else "angle"
             finite = mine[np.isfinite(measured[mine, k])][:FIRST_SAMPLES]
-            if channel.zero_at_rest and field not in at and len(finite):
+            if channel.zero_at_rest and field not in state and len(finite):
                 factor = 1 / _shown_of_unit(robot, int(rows[mine[0]]), channel)
                 value, sd = _extrapolated(runs["time_s"][finite] - runs["time_s"][mine[0]], measured[finite, k])
                 least = float(np.median(noise.sd[finite, k]))
-                at[field] = factor * value, abs(factor) * max(sd, least)
-        found[key] = Begin(**{field: value for field, (value, _) in at.items()})
-        known += [(f"rig.{key}.{field}", value, sd) for field, (value, sd) in at.items()]
-    priors = (*robot.rig.priors, *known) if robot.rig.start == "free" else robot.rig.priors
-    return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, begins=Begins(found), priors=priors))
+                state[field] = factor * value, abs(factor) * max(sd, least)
+        begins[key] = Begin(**{field: value for field, (value, _) in state.items()})
+        stated += [(f"rig.{key}.{field}", value, sd) for field, (value, sd) in state.items()]
+    priors = (*robot.rig.priors, *stated) if robot.rig.start == "free" else robot.rig.priors
+    return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, begins=Begins(begins), priors=priors))
 
 
 def _shown_of_unit(robot: Robot, configuration: int, channel: Channel) -> float:
-    """What a channel shows while the motor shafts turn by 1 rad/s, the load rolls with them and the output's angle is
-    1 rad [SI]."""
+    """Reading of a channel [SI] if the motor shafts turn at 1 rad/s, the load rolls with them and the output's angle
+    is 1 rad."""
     radius = float(robot.configurations.members[configuration].radius)
     none, one = jnp.zeros(()), jnp.ones(())
     rolling = State(none, one, radius / robot.gearbox.ratio, none, distance=radius)
-    return float(channel.read(robot, balances.begin(robot, Conditions(configuration), rolling)))
+    return float(channel.read(robot, balances.begin_signals(robot, Conditions(configuration), rolling)))
 
 
 def _extrapolated(time: np.ndarray, shown: np.ndarray) -> tuple[float, float]:
-    """Value at time 0 of a line through samples, and its error; of fewer than three their mean."""
+    """Value at time 0 of a line through samples, and its standard error; the mean of fewer than three samples."""
     if len(time) < 3:
         return float(np.mean(shown)), 0.0
     matrix = np.stack([np.ones_like(time), time], 1)
@@ -863,8 +896,8 @@ def _extrapolated(time: np.ndarray, shown: np.ndarray) -> tuple[float, float]:
     return float(line[0]), float(np.sqrt(scatter * np.linalg.inv(matrix.T @ matrix)[0, 0]))
 
 
-def _few(x: np.ndarray) -> np.ndarray:
-    """Numbers, each moved to the nearest of at most `LEVELS` where there are more."""
+def _merge_levels(x: np.ndarray) -> np.ndarray:
+    """Numbers, moved to the nearest of `LEVELS` levels if they have more distinct values."""
     if len(np.unique(x)) <= LEVELS:
         return x
     levels = np.linspace(x.min(), x.max(), LEVELS)
@@ -872,8 +905,10 @@ def _few(x: np.ndarray) -> np.ndarray:
 
 
 def _check_signs(runs: Runs) -> None:
-    """Refuse speeds and currents without a sign of runs that are driven backward: a rig's inertia may carry it on
-    for as long as a stretch lasts, but not in all of a table."""
+    """Refuse unsigned speeds and currents of runs that are driven backward.
+
+    A rig's inertia may carry it forwards during one interval, but not during all of a table.
+    """
     volts, measured = applied(runs), runs.measured()
     time, size = runs["time_s"], np.nanmax(np.abs(measured), 0, initial=0.0)
     unsigned = np.nanmin(measured, 0, initial=0.0) >= -RESTING * size
@@ -889,26 +924,26 @@ def _check_signs(runs: Runs) -> None:
                         f"{runs.source} row {rows[0] + 1}, {channel.column}: got "
                         f"{number(runs[channel.column][rows[0]])} {channel.unit} at {number(volts[rows[0]])} {unit}; "
                         "expected readings with a sign, negative backward; or state [instruments."
-                        f"{channel.name}] signed = false in the robot's file, if it shows magnitude alone"
+                        f"{channel.name}] signed = false in the robot's file, if it shows the magnitude only"
                     )
 
 
-def _stops(runs: Runs) -> list[Note | str]:
-    """What a run is followed by where its motors are not driven on a slope."""
+def _stop_notes(runs: Runs) -> list[Note | str]:
+    """Note on runs with motors that are not driven on a slope."""
     still = (applied(runs) == 0) & (runs["slope_deg"] != 0)
     if not still.any():
         return []
     return [StopsOnSlope(tuple(dict.fromkeys(str(n) or "(no run_id)" for n in runs.run_names[still])))]
 
 
-def _knots(rows: np.ndarray, most: int) -> np.ndarray:
-    """At most so many of a run's rows, evenly chosen, its first and last among them; the last again for the rest."""
+def _choose_knots(rows: np.ndarray, most: int) -> np.ndarray:
+    """At most `most` of a run's rows, evenly spaced, with its first and last; the last is repeated as padding."""
     chosen = rows[np.unique(np.round(np.linspace(0, len(rows) - 1, most)).astype(int))]
     return np.concatenate([chosen, np.repeat(chosen[-1], most - len(chosen))])
 
 
 def _changes_still(speeds: np.ndarray, half: np.ndarray, quarter: np.ndarray) -> bool:
-    """Whether a speed still changes by more than `STILL` in the later half of a stretch.
+    """True if a speed still changes by more than `STILL` in the later half of an interval.
 
     Args:
         speeds: shape (rows, channels); half, quarter: rows of the later half and of the last quarter.
@@ -919,32 +954,32 @@ def _changes_still(speeds: np.ndarray, half: np.ndarray, quarter: np.ndarray) ->
     return bool(np.any(np.abs(after - before) > STILL * np.abs(before + after) / 2))
 
 
-def _changed(runs: Runs, rows: np.ndarray, share: float = 0.0) -> np.ndarray:
-    """Whether what drives a run changes at each of its rows, what motors are given by more than a share of its
-    largest."""
+def _drive_changes(runs: Runs, rows: np.ndarray, share: float = 0.0) -> np.ndarray:
+    """True for rows of a run with a change of its drive (of the motors' supply: above a share of its largest)."""
     supplied = (runs.layout.imposed_column, SUPPLY, "duty")
-    found = differs(rows, (runs[column] for column in changing(runs) if column not in supplied))
-    found[1:] |= _jumps(applied(runs)[rows]) > share
-    return found
+    changes = differs(rows, (runs[column] for column in changing(runs) if column not in supplied))
+    changes[1:] |= _relative_jumps(applied(runs)[rows]) > share
+    return changes
 
 
-def _jumps(driven: np.ndarray) -> np.ndarray:
-    """By what share of its largest value what drives a run changes from row to row."""
+def _relative_jumps(driven: np.ndarray) -> np.ndarray:
+    """Change of a run's drive from row to row, as a share of its largest value."""
     return np.abs(np.diff(driven)) / max(float(np.abs(driven).max(initial=0.0)), 1e-300)
 
 
-def _usual(apart: np.ndarray) -> float:
-    """The usual one of the times between a run's rows, infinite where there is one row."""
+def _usual_interval(apart: np.ndarray) -> float:
+    """Median of the times between a run's rows; infinite for a single row."""
     return float(np.median(apart)) if len(apart) else np.inf
 
 
-def _longest(runs: Runs, robot: Robot) -> list[np.ndarray]:
-    """Longest step after each row of its log but the last, of each run in the order of their names [s].
+def _longest_steps(runs: Runs, robot: Robot) -> list[np.ndarray]:
+    """Longest step after each row of a run's log except the last, for each run in the order of their names [s].
 
-    Where the speed is imposed only what effects remember is followed. Where what drives a run changes its sign and
-    shafts and load do not move as one, friction jumps within a step as a speed passes through zero, so it has to be
-    short beside the time from reading to reading: where the table's speeds, or the rates of its angles and positions,
-    are low or change their sign, and as much earlier as the rig's delay may be. Where it shows neither, all along.
+    With an imposed speed only the memory of effects is simulated. If the drive of a run changes its sign and shafts
+    and load do not move as one, friction jumps as a speed passes through zero. Steps then have to be
+    short compared with the time between readings, near each such passage and as much earlier as the rig's delay may
+    be. A passage is where the table's speeds, or the rates of its angles and positions, are low or change their sign;
+    it may be anywhere in a table without these.
     """
     whole, rig, exact = runs.whole, robot.rig, robot.rig.imposed == "motor_speed"
     moved = [k for k, c in enumerate(runs.channels) if c.zero_at_rest and (c.directed or not c.settled)]
@@ -954,32 +989,32 @@ def _longest(runs: Runs, robot: Robot) -> list[np.ndarray]:
     for name in np.unique(runs.run_names):
         rows = whole.in_order(name)
         time = whole["time_s"][rows]
-        apart, wait = np.diff(time), _usual(np.diff(runs["time_s"][runs.in_order(name)]))
+        apart, wait = np.diff(time), _usual_interval(np.diff(runs["time_s"][runs.in_order(name)]))
         both_ways = driven is not None and driven[rows].min() < 0 < driven[rows].max()
         longest = np.full(len(apart), (FAST if both_ways else 1) * LONGEST)
         if driven is None:
             longest[:] = min(SLOWLY * LONGEST, wait / COARSELY)
         elif runs.log is not None:
-            begins = np.where(_changed(whole, rows, SMALL), np.arange(len(rows)), 0)
+            begins = np.where(_drive_changes(whole, rows, SMALL), np.arange(len(rows)), 0)
             since = time - time[np.maximum.accumulate(begins)]
             longest = np.maximum(longest, np.minimum(LATER * since[:-1], wait / BETWEEN))
         if both_ways and not robot.moves_as_one:
             speeds = measured[rows]
             speeds[:, rates] = np.gradient(speeds[:, rates], time, axis=0)
-            slow = _slow(speeds, SLOW[rig.imposed])
-            before = int(np.ceil(early / _usual(apart)))
+            slow = _may_pass_rest(speeds, SLOW[rig.imposed])
+            before = int(np.ceil(early / _usual_interval(apart)))
             slow = np.convolve(slow, np.ones(before + 1))[before:] > 0
             longest[slow] = min(LONGEST, wait / FINE)
         found.append(longest)
     return found
 
 
-def _slow(speeds: np.ndarray, share: float) -> np.ndarray:
-    """Whether a run may pass through rest between each of its rows and the next; all along where nothing is shown.
+def _may_pass_rest(speeds: np.ndarray, share: float) -> np.ndarray:
+    """True between rows where a run may pass through rest; all True if no reading shows it.
 
     Args:
         speeds: readings that are 0 at rest or their rates, shape (rows, channels); share: of their largest, below
-            which it may.
+            which a run may pass through rest.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # a channel without readings
@@ -988,30 +1023,32 @@ def _slow(speeds: np.ndarray, share: float) -> np.ndarray:
     return ~np.any((ways[1:] == ways[:-1]) & (ways[1:] != 0), 1)
 
 
-def _common(instants: int) -> int:
-    """The next of the lengths that grids have, an eighth of a power of two apart: logs of about one length share what
-    is compiled, for steps of no length, at most an eighth more."""
+def _common_length(instants: int) -> int:
+    """The next common length of grids, at eighths of powers of two.
+
+    Logs of similar length then share compiled programs, at the cost of at most an eighth more steps, of length zero.
+    """
     part = max(2 ** (instants.bit_length() - 1) // 8, 1)
     return -(-instants // part) * part
 
 
 def _reading(robot: Robot, signals: Signals) -> Float[Array, " channels"]:
     shown = balances.sensor(robot, signals)
-    return jnp.stack([shown[name] for name in channels.names(robot.channels)], -1)
+    return jnp.stack([shown[name] for name in channels.channel_names(robot.channels)], -1)
 
 
 def _readings(robot: Robot, signals: Signals) -> Float[Array, "instants channels"]:
     return jax.vmap(lambda s: _reading(robot, s))(signals)
 
 
-def _of_steps(robot: Robot, steps: Within) -> tuple[Array, ...]:
-    """What `Within.read` takes of readings."""
+def _readings_within_steps(robot: Robot, steps: StepCourse) -> tuple[Array, ...]:
+    """Readings as arguments of `Within.read`."""
     return *(_readings(robot, s) for s in (steps.first, steps.begin, steps.end)), steps.decays
 
 
 @functools.partial(compiled, options=OVER_TIME)
 def _turning(observe: Histories, robot: Robot) -> tuple[Array, Array, dict[str, Array]]:
-    """Angle of the driving shaft, back-EMF and ways of travel at every row."""
+    """Angle of the driving shaft, back-EMF and ways of travel at each row."""
     whole = observe.whole(robot)
     rows = observe.at_rows(whole)
     ways = {name: jnp.broadcast_to(getattr(rows, name), jnp.shape(rows.speed_motor)) for name in WAYS}
@@ -1024,7 +1061,7 @@ def _over_delays(problem: Problem, z: Array, data: Data, scanned: Array, values:
 
     def shown(z: Array) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
         robot = problem.robot(z)
-        of_run = lambda c, t, k: _of_steps(robot, within(robot, c, t, k))  # noqa: E731
+        of_run = lambda c, t, k: _readings_within_steps(robot, course_between_instants(robot, c, t, k))  # noqa: E731
         *every, decays = jax.vmap(of_run)(observe.conditions, observe.times, observe.known)
         return tuple(every), (*every, decays)
 
@@ -1040,38 +1077,38 @@ def _over_delays(problem: Problem, z: Array, data: Data, scanned: Array, values:
         jacobian = jnp.where(finite[..., None], (data.weight / data.sd)[..., None] * late[..., 1:], 0.0)
         residual = jnp.concatenate([error.ravel(), at - data.centre])
         whole = jnp.concatenate([jacobian.reshape(-1, z.size), jnp.eye(z.size)])
-        return _moved(residual, whole, at, scanned)
+        return _minimum_with_one_held(residual, whole, at, scanned)
 
     return jax.lax.map(one, values, batch_size=16)
 
 
 @compiled
-def _moved(residual: Array, jacobian: Array, z: Array, held: Array) -> tuple[Array, Array]:
-    """Objective at the minimum of a linearisation in which one coordinate is held, and the coordinates there."""
+def _minimum_with_one_held(residual: Array, jacobian: Array, z: Array, held: Array) -> tuple[Array, Array]:
+    """Objective at the minimum of a linearisation with one coordinate held, and the coordinates there."""
     free = jnp.where(held, 0.0, jacobian)
-    step = -solved(free.T @ free + jnp.diag(held.astype(float)), free.T @ residual)
+    step = -solve(free.T @ free + jnp.diag(held.astype(float)), free.T @ residual)
     return 0.5 * jnp.sum((residual + free @ step) ** 2), z + step
 
 
 def _evaluator(problem: Problem, weights: Numbers, active: Numbers | None) -> Evaluate:
-    """Evaluates members of a search, `TOGETHER` in one call of one program, calls side by side on the cores.
+    """Function that evaluates members of a search, `TOGETHER` in a call, with calls in parallel on the cores.
 
     Args:
-        weights, active: of every member, see `Histories.search`.
+        weights, active: of each member, see `Histories.search`.
     """
 
     weights, made = np.asarray(weights), threading.Event()
 
     def some(z: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray, Observation]:
         filled = np.resize(np.arange(len(members)), TOGETHER)
-        own = None if active is None else np.asarray(active)[members[filled]]
-        return jax.device_get(_evaluate(problem, z[filled], weights[members[filled]], own)[:3])
+        slots = None if active is None else np.asarray(active)[members[filled]]
+        return jax.device_get(_evaluate(problem, z[filled], weights[members[filled]], slots)[:3])
 
     def evaluate(z: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray, Observation]:
         parts = [(z[k : k + TOGETHER], members[k : k + TOGETHER]) for k in range(0, len(members), TOGETHER)]
         with Threads(CORES if made.is_set() else 1) as cores:
             found = list(cores.map(lambda part: some(*part), parts))
-        made.set()  # by its first call the program is compiled
+        made.set()  # the first call has compiled the program
         return jax.tree.map(lambda *x: np.concatenate(x)[: len(members)], *found)
 
     return evaluate
@@ -1080,17 +1117,17 @@ def _evaluator(problem: Problem, weights: Numbers, active: Numbers | None) -> Ev
 @functools.partial(compiled, options=OVER_TIME)
 def _evaluate(
     problem: Problem, z: Numbers, weights: Numbers, active: Numbers | None
-) -> tuple[Array, Array, Observation, Followed]:
-    """Of members of a search what `linearised_signed` returns, and their runs."""
+) -> tuple[Array, Array, Observation, LinearisedRun]:
+    """Result of `linearise_rollout` for members of a search, and their runs."""
 
-    def one(z: Array, weight: Array, which: Array | None) -> tuple[Array, Array, Observation, Followed]:
+    def one(z: Array, weight: Array, which: Array | None) -> tuple[Array, Array, Observation, LinearisedRun]:
         here = problem
         if which is not None:
             here = dataclasses.replace(problem, coordinates=problem.coordinates.with_effects(which))
         observe: Histories = problem.observe.following(here.robot(z))  # type: ignore[attr-defined]
         here = dataclasses.replace(here, observe=observe)
         assert observe.known is not None
-        return *linearised_signed(here, z, dataclasses.replace(problem.data, weight=weight)), observe.known
+        return *linearise_rollout(here, z, dataclasses.replace(problem.data, weight=weight)), observe.known
 
     return jax.vmap(one)(z, weights, active)
 
@@ -1099,28 +1136,28 @@ def _evaluate(
 def _responses(
     observe: Histories, robot: Robot, effects: tuple[ScoredEffect, ...], scale: Array
 ) -> tuple[Array, Array, Signals, Array]:
-    """Signatures and defects as of `HistoriesLinearization`, signals of every row, and the angle there.
+    """Signatures and defects of `HistoriesLinearization`, signals of each row, and the shaft's angle there.
 
     Args:
-        observe: whose runs are known; scale: of readings [1/SI], shape (rows, channels).
+        observe: with known runs; scale: of readings [1/SI], shape (rows, channels).
     """
-    defects, by_effects = observe.changes(robot, tuple(probe(b) for b in PROBED), effects)
+    defects, by_effects = observe.changes(robot, tuple(balance_probe(b) for b in PROBED), effects)
     rows_of, rows = observe.rows_of, len(scale)
     defects = jnp.where(rows_of[:, None, :, None] < 0, 0.0, defects * scale[rows_of][:, None])
     signatures = _by_row(by_effects, rows_of, rows) * scale[..., None]
     runs = observe.whole(robot)
     by_reading = signatures.reshape(scale.size, -1)
-    return finite(by_reading), finite(defects), observe.at_rows(runs), observe.angle(runs)
+    return finite_or_zero(by_reading), finite_or_zero(defects), observe.at_rows(runs), observe.angle(runs)
 
 
 class _Probed(NamedTuple):
-    """A robot with probes of balances, and the effects that change its readings by them.
+    """A robot with probes of balances, and the effects that change its readings through them.
 
     Attributes:
-        every: probes, those of which the defects are wanted first; size: how many these are.
-        effects: with the robot's shapes; entering: number of each instance's probe, shape (instances,).
-        enters: 1 where that balance has a probe, else 0, shape (instances,).
-        at_sensor: 1 where an instance is of a channel's instrument, else 0, shape (channels, instances).
+        every: probes, those with requested defects first; size: number of these.
+        effects: with the robot's shapes; entering: index of each instance's probe, shape (instances,).
+        enters: 1 if that balance has a probe, else 0, shape (instances,).
+        at_sensor: 1 if an instance is an error of a channel's instrument, else 0, shape (channels, instances).
     """
 
     robot: Robot
@@ -1133,22 +1170,22 @@ class _Probed(NamedTuple):
 
     @classmethod
     def of(cls, robot: Robot, probes: tuple[Effect, ...], effects: tuple[ScoredEffect, ...]) -> _Probed:
-        """With further probes for the balances that the effects enter."""
+        """Probes, with further ones for the balances that the effects enter."""
         others = dict.fromkeys(e.effect.balance for e in effects if e.effect.balance != "sensor")
-        entered = tuple(probe(b) for b in others if b not in {p.balance for p in probes})
+        entered = tuple(balance_probe(b) for b in others if b not in {p.balance for p in probes})
         every, size = (*probes, *entered), len(probes)
-        effects = tuple(shaped_as_in(robot, e) for e in effects)
+        effects = tuple(with_shape_of_robot(robot, e) for e in effects)
         counts, places = np.array([len(e.at) for e in effects], int), [p.balance for p in every]
         entering = np.array([places.index(b) if (b := e.effect.balance) in places else 0 for e in effects], int)
         entering = np.repeat(entering, counts)
         enters = np.repeat([1.0 * (e.effect.balance in places) for e in effects], counts)
-        shown = channels.names(robot.channels)
+        shown = channels.channel_names(robot.channels)
         at_sensor = np.array([[e.effect.channel == c for e in effects] for c in shown], float)
         at_sensor = np.repeat(at_sensor, counts, 1) if effects else np.zeros((len(shown), 0))
         return cls(robot, every, size, effects, entering, enters, at_sensor)
 
     def at(self, amplitude: Array) -> Robot:
-        """The robot with the probes at amplitudes [units of their balances], shape (probes,)."""
+        """Robot with the probes at amplitudes [units of their balances], shape (probes,)."""
         put = tuple(eqx.tree_at(lambda e: e.amplitude, p, a) for p, a in zip(self.every, amplitude, strict=True))
         return dataclasses.replace(self.robot, effects=(*self.robot.effects, *put))
 
@@ -1157,7 +1194,7 @@ class _Probed(NamedTuple):
         conditions: Conditions,
         clock: Array,
         instants: Array,
-        along: Followed,
+        along: LinearisedRun,
         times: Array,
         time: Array,
         *,
@@ -1173,34 +1210,34 @@ class _Probed(NamedTuple):
         remembered, hat = _remembered(robot, conditions, along, self.effects), _hats(clock)
 
         def terms(t: Array, y: Array, held: Conditions, way: Array | None = None) -> Array:
-            signals = moving(robot, held, state_of(robot, y), way)
-            return terms_of(robot, signals, self.effects, remembered(t))
+            signals = moving(robot, held, state_of_unknowns(robot, y), way)
+            return effect_terms(robot, signals, self.effects, remembered(t))
 
         def both(by_probes: Array, t: Array, term: Array) -> Array:
-            """Changes by defects of all knots and by every instance, by the change by each probe."""
+            """Changes by defects at all knots and by each instance, from the change by each probe."""
             knots = (by_probes[:, :size, None] * hat(t)).reshape(len(by_probes), -1)
             return jnp.concatenate([knots, by_probes[:, self.entering] * (self.enters * term)], 1)
 
         def source(t: Array, y: Array, held: Conditions, way: Array) -> Array:
-            by_probes = jax.jacfwd(lambda a: rates(self.at(a), held, y, way))(none)
+            by_probes = jax.jacfwd(lambda a: drive_rates(self.at(a), held, y, way))(none)
             return both(by_probes, t, terms(t, y, held, way))
 
         def seen(t: Array, y: Array, dy: Array, held: Conditions) -> Array:
-            """By the state, and at once: the current follows from torque where the speed is imposed."""
+            """Changes through the state, and immediate ones: with an imposed speed, current follows from torque."""
 
             def reading(y: Array, amplitude: Array) -> Array:
-                return _reading(robot, moving(self.at(amplitude), held, state_of(robot, y)))
+                return _reading(robot, moving(self.at(amplitude), held, state_of_unknowns(robot, y)))
 
             by_state, at_once = jax.jacfwd(reading, (0, 1))(y, none)
             term = terms(t, y, held)
             shows = jnp.concatenate([jnp.zeros((len(by_state), size * len(clock))), self.at_sensor * term], 1)
             return by_state @ dy + both(at_once, t, term) + shows
 
-        first, begins = at_first(robot, conditions)
-        by_probes = jax.jacfwd(lambda a: at_first(self.at(a), conditions)[1])(none)
+        first, begins = first_instant(robot, conditions)
+        by_probes = jax.jacfwd(lambda a: first_instant(self.at(a), conditions)[1])(none)
         begun = by_probes[:, self.entering] * (self.enters * terms(clock[0], begins, first))
         unmoved = jnp.concatenate([jnp.zeros((len(begins), size * len(clock))), begun], 1)
-        changed = respond(conditions, along, source, seen, unmoved)
+        changed = run_response(conditions, along, source, seen, unmoved)
         whole = jnp.concatenate([seen(clock[0], begins, unmoved, first)[None], changed])
         knots = whole[instants, :, : size * len(clock)].reshape(len(instants), -1, size, len(clock))
         mine = whole[:, :, size * len(clock) :]
@@ -1213,8 +1250,8 @@ class _Probed(NamedTuple):
 
 
 def _hats(clock: Array) -> Callable[[Array], Array]:
-    """For each knot a function of time that is 1 there and falls linearly to 0 at the next ones, shape (knots,)."""
-    # A run that ended early repeats its last knot; only the first of them is one.
+    """Function of time with a hat for each knot: 1 there, falling linearly to 0 at its neighbours, shape (knots,)."""
+    # A run that ended early repeats its last knot; only the first of these has a hat.
     real = jnp.concatenate([jnp.ones(1), (jnp.diff(clock) > 0).astype(clock.dtype)])
     before = jnp.concatenate([clock[:1], clock[:-1]])
     after = jnp.concatenate([clock[1:], clock[-1:] + 1.0])
@@ -1228,11 +1265,12 @@ def _hats(clock: Array) -> Callable[[Array], Array]:
 
 
 def _remembered(
-    robot: Robot, conditions: Conditions, along: Followed, effects: tuple[ScoredEffect, ...]
+    robot: Robot, conditions: Conditions, along: LinearisedRun, effects: tuple[ScoredEffect, ...]
 ) -> Callable[[Array], list[Array]]:
-    """What effects remember along a run that is known, each at every point of its grid, as a function of time.
+    """Memory of effects along a known run, at each point of their grids, as a function of time.
 
-    By the stages of the run (`histories.followed`); a rate is linear in what it is a rate of, or nearly so.
+    It follows the stages of the run (`histories.linearise_run`); a memory's rate is linear in the memory, or nearly
+    so.
     """
     mine = [e for e in effects if e.effect.memory_size is not None]
     counts = np.cumsum([len(e.at) for e in mine])
@@ -1244,18 +1282,18 @@ def _remembered(
         return jnp.split(memory, counts[:-1])
 
     def speeds(y: Array, held: Conditions, way: Array, memory: Array) -> Array:
-        signals = moving(robot, held, state_of(robot, y), way)
+        signals = moving(robot, held, state_of_unknowns(robot, y), way)
 
         def rate(effect: Effect, remembered: Array) -> Array:
             known = dataclasses.replace(signals, memory={**signals.memory, effect.name: remembered})
             return jnp.asarray(effect.rate(robot, known), float)
 
-        return jnp.concatenate([each_shape(e, rate, m) for e, m in zip(mine, split(memory), strict=True)])
+        return jnp.concatenate([map_over_shapes(e, rate, m) for e, m in zip(mine, split(memory), strict=True)])
 
     times = jnp.append(along.clock[:, 0], along.clock[-1, 2])
-    steps, constant = steps_of(conditions, times)
+    steps, constant = run_steps(conditions, times)
 
-    def after(memory: Array, step: tuple[Followed, Step]) -> tuple[Array, Array]:
+    def after(memory: Array, step: tuple[LinearisedRun, RunStep]) -> tuple[Array, Array]:
         here, taken = step
         held, spans, passes = taken.held(constant), jnp.diff(here.clock), here.sides[0] != here.sides[1]
 
@@ -1270,11 +1308,13 @@ def _remembered(
         last = stage(memory + ahead * (first - memory), span, here.places[1], here.sides[1])
         return last, jnp.stack([first, last])
 
-    begin = at_first(robot, conditions)[1]
-    angle = state_of(robot, begin).distance / robot.chassis(conditions.configuration).radius
+    begin = first_instant(robot, conditions)[1]
+    angle = state_of_unknowns(robot, begin).distance / robot.chassis(conditions.configuration).radius
     begun = jnp.concatenate(
         [
-            each_shape(e, lambda effect, _: jnp.asarray(effect.initial(robot, angle), float), jnp.zeros(len(e.at)))
+            map_over_shapes(
+                e, lambda effect, _: jnp.asarray(effect.initial(robot, angle), float), jnp.zeros(len(e.at))
+            )
             for e in mine
         ]
     )

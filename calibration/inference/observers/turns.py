@@ -1,4 +1,4 @@
-"""Settled turns: one row a run of a robot whose sides are driven apart, read when it circles."""
+"""Settled turns: one row a run of a robot with independently driven sides, read when it circles."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from calibration.inference.bases import Bases
 from calibration.inference.blocks import TURN
 from calibration.inference.linearization import PROBED, Linearization, ScoredEffect
 from calibration.inference.observers.base import SearchPolicy
-from calibration.inference.observers.settled import SettledLinearization, SettledRuns, shares
+from calibration.inference.observers.settled import SettledLinearization, SettledRuns, side_shares
 from calibration.inference.observers.time_histories import Histories
-from calibration.inference.optimizers import roots_of
+from calibration.inference.optimizers import solve_roots
 from calibration.inference.problem import Data, Observation, Problem
 from mmrjax import effects, fidelities
 from mmrjax.effects import Effect
 from mmrjax.effects.curve import IN_TURNS, VARIABLES_ROUND, WAYS
-from mmrjax.fidelities.steady import shown_batch
+from mmrjax.fidelities.steady import results_of_rows
 from mmrjax.model.balances import ROUND
 from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
@@ -35,8 +35,8 @@ from mmrjax.model.signals import NOT_SETTLED, Result, Signals
 VARIABLES = (*(v for v in IN_TURNS if v != "order"), *VARIABLES_ROUND)
 
 
-def by_point(signals: Signals, name: str) -> Float[Array, " points"]:
-    """A signal at every point [SI].
+def signal_by_point(signals: Signals, name: str) -> Float[Array, " points"]:
+    """A signal at each point [SI].
 
     Args:
         signals: shape (rows, sides).
@@ -45,8 +45,7 @@ def by_point(signals: Signals, name: str) -> Float[Array, " points"]:
 
 
 class TurnLinearization(SettledLinearization):
-    """Of settled turns: each side of each row is a point, and what each side has of `signals` is along their last
-    axis."""
+    """Linearization of settled turns: each side of each row is a point; `signals` have the sides as last axis."""
 
     probed: ClassVar[tuple[str, ...]] = (*PROBED, *ROUND)
 
@@ -61,19 +60,19 @@ class TurnLinearization(SettledLinearization):
         return np.any(points.reshape(-1, self.rows), axis=0)
 
     def variable(self, name: str) -> np.ndarray:
-        return np.asarray(by_point(self.signals, name), float)
+        return np.asarray(signal_by_point(self.signals, name), float)
 
     def shown(self, channel: Scalar | int, shapes: Array | np.ndarray) -> Float[Array, "readings terms"]:
         of_sides = shapes.reshape(-1, self.rows, shapes.shape[1])
-        each = np.stack([shares(name, len(of_sides)) for name in self.channels])
+        each = np.stack([side_shares(name, len(of_sides)) for name in self.channels])
         return super().shown(channel, jnp.tensordot(jnp.asarray(each)[channel], of_sides, 1))
 
 
 class SettledTurns(SettledRuns):
     """Observer of settled turns.
 
-    Contacts slide across the travel as far as the turn asks, so that the demand on adhesion, which bounds straight
-    travel, bounds nothing here.
+    Contacts slide sideways as far as the turn requires. So the demand on adhesion, a limit of straight travel, is no
+    limit here.
     """
 
     word: ClassVar[str] = "turns"
@@ -82,7 +81,7 @@ class SettledTurns(SettledRuns):
     library: ClassVar[Mapping[str, type[Effect]]] = effects.OF_TURNS
     menu: ClassVar[bool] = False
     policy: ClassVar[SearchPolicy] = SearchPolicy(searches=4)
-    searches: ClassVar[int | None] = 4  # a turn takes some hundred times as long to find as straight travel
+    searches: ClassVar[int | None] = 4  # solving a turn takes some hundred times as long as straight travel
     profiled: ClassVar[bool] = False
     linearization: ClassVar[type[SettledLinearization]] = TurnLinearization
     shape_sides: ClassVar[tuple[int, ...]] = (2,)
@@ -96,12 +95,12 @@ class SettledTurns(SettledRuns):
         first = fidelities.NAMES[0]
         if fidelity not in (None, first):
             raise BadConfiguration(f"{runs.source}: settled turns are fitted with --model {first}; got {fidelity}")
-        found = super().of(runs, robot, fidelity)
-        return cls(found.conditions, found.fidelity)
+        observer = super().of(runs, robot, fidelity)
+        return cls(observer.conditions, observer.fidelity)
 
     @classmethod
     def sizes(cls, runs: Runs) -> np.ndarray:
-        """The channel's root mean square: readings of turns either way cross zero."""
+        """Root mean square of each channel: readings of turns in either direction cross zero."""
         return Histories.sizes(runs)
 
     @classmethod
@@ -121,14 +120,14 @@ class SettledTurns(SettledRuns):
         return True
 
     def read(self, robot: Robot) -> Observation:
-        return self._observed(robot, shown_batch(robot, self.conditions)[0])
+        return self._observed(robot, results_of_rows(robot, self.conditions)[0])
 
     def draws(
         self, problem: Problem, z: Array, linear: Linearization, keys: Array, factors: np.ndarray
     ) -> tuple[Any, ...]:
-        """As the protocol says, with the roots at each refit."""
+        """Draws as in the protocol, with the roots at each refit."""
         drawn = super().draws(problem, z, linear, keys, factors)
-        return *drawn, roots_of(problem, drawn[2])
+        return *drawn, solve_roots(problem, drawn[2])
 
     def replicate(
         self,
@@ -145,15 +144,17 @@ class SettledTurns(SettledRuns):
         return super().unreachable(status) | (status == NOT_SETTLED)
 
     def bases(self, columns: Mapping[str, np.ndarray], included: np.ndarray, robot: Robot) -> Bases:
-        """As the protocol says: in the balances of both sides alike, and round the turn, over what each side does,
-        how fast the robot turns, and which side it is."""
+        """Bases as in the protocol, in the same balances of both sides and in those of the turn.
+
+        Curves are over each side's signals, the yaw rate, and the side.
+        """
         names = [v for v in VARIABLES if v != "voltage" or robot.rig.shows_voltage]
-        signals = shown_batch(robot, self.conditions)[1]
-        seen = {n: np.asarray(by_point(signals, n)) for n in (*names, *WAYS)}
+        signals = results_of_rows(robot, self.conditions)[1]
+        seen = {n: np.asarray(signal_by_point(signals, n)) for n in (*names, *WAYS)}
         points = {bases_room.VARIABLES[v]: seen[v] for v in names}
         points |= {c: np.tile(columns[c], 2) for c in ("configuration", "order") if c in columns}
         weight = np.tile(included.astype(float), 2)
         lacking = bases_room.balances_of(robot, (*bases_room.BALANCES, *bases_room.OF_TURNS))
         axes = (bases_room.axes_of(robot)[0], bases_room.VARIABLES["payload"], *VARIABLES_ROUND)  # what is imposed
         told = points, weight, robot, bases_room.Scope(lacking, axes), {way: seen[way] for way in WAYS}
-        return (*bases_room.families(*told), *bases_room.windows(*told))
+        return (*bases_room.curve_families(*told), *bases_room.window_families(*told))

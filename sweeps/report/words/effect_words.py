@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from mmrjax.effects import OF_TURNS, Effect
 from mmrjax.effects.base import THE_SIDE
-from mmrjax.model.channels import find
+from mmrjax.model.channels import find_channel
 from sweeps.report.words.experiment_words import ACTS, DOING
 
 #: What isolates a balance: rows of `experiments.DOING`, `weigh`, and of a channel of `sensor` rows of `ACTS`.
@@ -62,7 +62,7 @@ def tests(effect: type[Effect]) -> Iterator[str]:
         for name in CHECKED_BY.get(effect.channel, ()):
             yield ACTS[name].format("several values")
         if effect.channel not in CHECKED_BY:
-            shown = find(effect.channel)
+            shown = find_channel(effect.channel)
             yield from [ACTS["zero reading"].format(shown.label)] * shown.misses_zero
             yield COMPARE.format(shown.label)
         return

@@ -93,7 +93,7 @@ def _act(act: menu.Act) -> str:
         return _weigh(act)
     (kind,) = act.kinds
     if act.channel:
-        return ACTS[kind].format(channels.find(act.channel).label)
+        return ACTS[kind].format(channels.find_channel(act.channel).label)
     return ACTS[kind].format(amounts([v for (v,) in act.at], UNITS[kind]))
 
 
@@ -110,7 +110,7 @@ def _weigh(act: menu.Act) -> str:
 def _run(run: menu.Run) -> str:
     level = (run.imposed != "voltage" or bool(run.torque)) and not any(run.slope)
     where = "" if run.setup in setups.WEIGHTLESS or level else f" {slopes(run.slope)}"
-    read = both([channels.find(c).label for c in run.channels])
+    read = both([channels.find_channel(c).label for c in run.channels])
     turning = [menu.round_significant(v / RPM) for v in run.voltage]
     unit = {"voltage": "V", "motor_current": "A of each motor"}.get(run.imposed)
     at = amounts(turning, "rpm of the motor") if unit is None else amounts(run.voltage, unit)
@@ -171,14 +171,15 @@ def instruction(what: Instruction) -> str:
         return ". And: ".join(map(experiment, what.experiments))
     if isinstance(what, TooWeak):
         return f"A series in {what.variable} would show what is missing by {what.sigma:.1f} sigma"
-    return f"{more_runs(what)}; read every channel. What the {bases.in_words(what.place)} lacks then shows its shape"
+    place = bases.place_in_words(what.place)
+    return f"{more_runs(what)}; read every channel. What the {place} lacks then shows its shape"
 
 
 def more_runs(what: MoreRuns) -> str:
     """More runs along the variable of a discrepancy."""
     if what.variable in bases.ORDERS:
         return _steady_speeds(what)
-    happens = bases.window(what.variable)
+    happens = bases.window_from_name(what.variable)
     if happens is not None:
         return _again(happens)
     if what.within.imposed != "voltage":

@@ -10,7 +10,7 @@ import numpy as np
 from calibration.inference import blocks, fit_notes
 from calibration.inference.identifiability import HELD
 from calibration.inference.simulation_errors import root_mean_square
-from mmrjax.errors import counted
+from mmrjax.errors import count_noun
 from mmrjax.model import channels
 
 if TYPE_CHECKING:
@@ -50,8 +50,8 @@ def noise_off(note: fit_notes.NoiseOff) -> str:
             "conditions: are the sds right?"
         )
     return (
-        f"residuals of {channels.find(note.channel).label} are {note.factor:.2g} times the {note.source} sds, "
-        "under all conditions: are these sds right?"
+        f"residuals of {channels.find_channel(note.channel).label} are {note.factor:.2g} times the {note.source} "
+        "sds, under all conditions: are these sds right?"
     )
 
 
@@ -107,16 +107,16 @@ def product_alone(note: fit_notes.ProductAlone) -> str:
 def no_prediction(note: fit_notes.NoPrediction) -> str:
     """Rows that a fit without their block does not predict."""
     return (
-        f"held out by {blocks.in_words(note.kind)}: {note.rows} of {note.of} rows have no prediction, because the "
-        "robot fitted without them slides there; the errors leave them out"
+        f"held out by {blocks.kind_in_words(note.kind)}: {note.rows} of {note.of} rows have no prediction, because "
+        "the robot fitted without them slides there; the errors leave them out"
     )
 
 
 def same_predictions(note: fit_notes.SamePredictions) -> str:
     """Kinds of blocks that give the same predictions."""
     return (
-        f"held out by {' or by '.join(blocks.in_words(k) for k in note.others)}: the same predictions as held out by "
-        f"{blocks.in_words(note.kind)}, shown in their place; these runs do not vary them separately"
+        f"held out by {' or by '.join(blocks.kind_in_words(k) for k in note.others)}: the same predictions as held "
+        f"out by {blocks.kind_in_words(note.kind)}, shown in their place; these runs do not vary them separately"
     )
 
 
@@ -147,7 +147,7 @@ def generations(note: fit_notes.Generations) -> str:
     end = "the last gained nothing that counts"
     if not note.settled:
         end = "the last still gained: go on with more --generations"
-    return f"{counted(note.members, 'member')} in {counted(note.generations, 'generation')}; {end}"
+    return f"{count_noun(note.members, 'member')} in {count_noun(note.generations, 'generation')}; {end}"
 
 
 def lost_rows(note: fit_notes.LostRows) -> str:
@@ -183,7 +183,7 @@ def ended_at_edge(note: fit_notes.EndedAtEdge) -> str:
 
 def shown_by(test: fit_notes.Shown) -> str:
     """Result of the most significant test of residuals."""
-    whose = f"the residuals of {channels.find(test.channel).label}" if test.channel else ""
+    whose = f"the residuals of {channels.find_channel(test.channel).label}" if test.channel else ""
     return {
         "": "",
         "stated": "the residuals exceed the stated noise",
@@ -205,8 +205,8 @@ OBSTACLES = {
 def _misses(those: Sequence[Miss]) -> str:
     """`total current 74 % of its measured rms (32 % with the file as stated)`."""
     each = [
-        f"{channels.find(m.channel).label} {_percent(m.fitted)} of its measured rms ({_percent(m.as_stated)} with "
-        "the file as stated)"
+        f"{channels.find_channel(m.channel).label} {_percent(m.fitted)} of its measured rms ({_percent(m.as_stated)} "
+        "with the file as stated)"
         for m in those
     ]
     return ", ".join(each)
@@ -265,7 +265,7 @@ def calibration(found: CalibrationResult) -> str:
         return f"{_VERDICTS[found.adequacy.adequate]}; no row is reached both before and after."
     same = len(set(rows.values())) == 1
     errors = ", ".join(text + ("" if same else f" ({rows[label]} rows)") for label, text in each)
-    where = f"the same {counted(max(rows.values()), 'row')}" if same else "the same rows"
+    where = f"the same {count_noun(max(rows.values()), 'row')}" if same else "the same rows"
     return f"{_VERDICTS[found.adequacy.adequate]}; rms error before → after on {where}: {errors}."
 
 
@@ -275,7 +275,7 @@ LISTED = 6
 
 def residual_cluster(c: ResidualCluster) -> str:
     """Residuals that go with a column without a role."""
-    what = f"residuals of {channels.find(c.channel).label}"
+    what = f"residuals of {channels.find_channel(c.channel).label}"
     within = f" within {c.within}" if c.within else ""
     signs = ", with opposite signs in the two directions of travel" if c.reversing else ""
     p = f"p = {c.p:.1g}"

@@ -16,7 +16,7 @@ from calibration.discovery.settings import FIT, HELD_OUT, WITHOUT_NAME
 from calibration.inference import bases, blocks
 from calibration.inference.series_noise import SeriesNoise
 from mmrjax import effects
-from mmrjax.errors import counted
+from mmrjax.errors import count_noun
 from mmrjax.model import channels
 from sweeps.report.words import fit_words
 
@@ -84,7 +84,7 @@ def _verdict(said: loop_notes.Summary) -> str:
         return text
     names = [_named(one) for one in said.missing if one.established]
     in_model = _tentative([one for one in said.missing if not one.established], said.support)
-    left = "" if where is None else f" Something remains in the {bases.in_words(where.place)}."
+    left = "" if where is None else f" Something remains in the {bases.place_in_words(where.place)}."
     return f"Missing: {'; '.join(names)} (family-wise p {p_value(p)}).{in_model}{left}"
 
 
@@ -122,7 +122,7 @@ def _claim(sure: Sequence[str], others: Sequence[str]) -> str:
 def _undescribed(said: loop_notes.Summary) -> str:
     """Sentence on a model that does not describe the runs: the misfit and the checks."""
     each = [
-        f"{channels.find(m.channel).label} by {100 * m.error:.0f} % of its measured rms"
+        f"{channels.find_channel(m.channel).label} by {100 * m.error:.0f} % of its measured rms"
         + (f" (its noise is estimated as {100 * m.noise:.0f} %)" if m.noise > m.error else "")
         for m in said.missed
     ]
@@ -273,12 +273,12 @@ def so_far(effects: Sequence[str], families: Sequence[str]) -> str:
 
 
 def _without_name(where: DiscrepancyLocation, p: float, no_effect: str) -> str:
-    others = [bases.in_words(p).removesuffix(" balance") for p in where.alike if p != where.place]
+    others = [bases.place_in_words(p).removesuffix(" balance") for p in where.alike if p != where.place]
     also = f" (or {', '.join(others)}, which these data do not distinguish)" if others else ""
     what = f": {where.family}" if where.variable in bases.VARIABLES else ""
     return (
-        f"Something is missing in the {bases.in_words(where.place)}{also}, {_shown(where)}{what}; no effect of the "
-        f"library {no_effect} (family-wise p {p_value(p)})."
+        f"Something is missing in the {bases.place_in_words(where.place)}{also}, {_shown(where)}{what}; no effect of "
+        f"the library {no_effect} (family-wise p {p_value(p)})."
     )
 
 
@@ -290,13 +290,13 @@ def _shown(where: DiscrepancyLocation) -> str:
 
 def _within(where: DiscrepancyLocation) -> str:
     """The window of what happens for a while, after a comma; empty for other discrepancies."""
-    return "" if bases.window(where.variable) is None else f", {_shown(where)}"
+    return "" if bases.window_from_name(where.variable) is None else f", {_shown(where)}"
 
 
 def shown_over(variable: str, by_duty: bool = False) -> str:
     """Variable that shows a discrepancy; `by_duty`: only the duty changed the motors' voltage."""
     variable = "duty" if by_duty and variable == "voltage" else variable
-    happens = bases.window(variable)
+    happens = bases.window_from_name(variable)
     if variable == "side":
         return "unlike on the two sides"
     if happens is None:
@@ -344,7 +344,7 @@ def answer(found: DiscoveryResult) -> str:
             over = f", which {course(lacks)}" if course(lacks) else _within(lacks)
         return f"No: missing is a {' or a '.join(stated.families)}{over}. Its exact law is not established."
     if lacks is not None and not weak:
-        place = bases.in_words(lacks.channel or lacks.balance)
+        place = bases.place_in_words(lacks.channel or lacks.balance)
         return f"No. Something is missing in the {place}, and nothing in the library explains it."
     kinds = list(dict.fromkeys(map(_kind_of, sure)))
     perhaps = [k for k in dict.fromkeys(map(_kind_of, weak)) if k not in kinds]
@@ -380,7 +380,7 @@ def use_it(found: DiscoveryResult) -> list[str]:
     when = 1 if found.written else 0
     lines = [f"Within these conditions: {_rms(found.errors[when], len(found.runs))}."] * bool(found.errors[when])
     for kind, both in found.errors_held_out.items():
-        lines.append(f"Another {blocks.in_words(kind)}: {_rms(both[when], len(found.runs))}.")
+        lines.append(f"Another {blocks.kind_in_words(kind)}: {_rms(both[when], len(found.runs))}.")
     return lines
 
 
@@ -498,14 +498,14 @@ def doubts(test: loop_notes.NameTest | None) -> str:
 
 
 def _curve(c: loop_notes.CurveOver) -> str:
-    if bases.window(c.variables[0]) is not None:
-        return f"constant in the {bases.in_words(c.place)} {shown_over(c.variables[0])}"
+    if bases.window_from_name(c.variables[0]) is not None:
+        return f"constant in the {bases.place_in_words(c.place)} {shown_over(c.variables[0])}"
     return f"smooth {'curve' if len(c.variables) == 1 else 'surface'} in the {_over(c.place, *c.variables)}"
 
 
 def _over(place: str, *variables: str) -> str:
     """`slip balance over speed motor and slope`."""
-    return f"{bases.in_words(place)} over {' and '.join(v.replace('_', ' ') for v in variables)}"
+    return f"{bases.place_in_words(place)} over {' and '.join(v.replace('_', ' ') for v in variables)}"
 
 
 def standing(found: DiscoveryResult) -> str:
@@ -616,13 +616,13 @@ def worse(found: Sequence[Worse], predicted: Mapping[str, tuple[int, int]]) -> s
     parts = []
     for kind, (before, after) in predicted.items():
         mine = [w for w in found if w.kind == kind]
-        changes = [f"{channels.find(w.channel).label} {_change(w.before, w.after)} %" for w in mine]
+        changes = [f"{channels.find_channel(w.channel).label} {_change(w.before, w.after)} %" for w in mine]
         if mine:
             changes[-1] += f" (same {min(w.rows for w in mine)} rows)"
         if before > after:
-            changes.append(f"{counted(before - after, 'row')} fewer predicted")
+            changes.append(f"{count_noun(before - after, 'row')} fewer predicted")
         if changes:
-            parts.append(f"by {blocks.in_words(kind)} {', '.join(changes)}")
+            parts.append(f"by {blocks.kind_in_words(kind)} {', '.join(changes)}")
     return f"Predicts worse on held-out rows: {'; '.join(parts)}." if parts else ""
 
 
@@ -712,7 +712,7 @@ def kept_out(note: loop_notes.KeptOut) -> str:
 
 def still_lacks(note: loop_notes.StillLacks) -> str:
     """Sentence on the discrepancy that remains with the effects found."""
-    place, over = bases.in_words(note.place), note.variable.replace("_", " ")
+    place, over = bases.place_in_words(note.place), note.variable.replace("_", " ")
     return f"not everything is explained: an error in the {place} that varies with {over} remains"
 
 
@@ -794,7 +794,7 @@ SAID: dict[type, str | Callable[[Any], str]] = {
     loop_notes.Led: led,
     loop_notes.NotPredictable: lambda note: (
         f"not predictable from the others, so neither scored nor tested: blocks by "
-        f"{' and by '.join(blocks.in_words(kind) for kind in note.kinds)} that hold all runs of a configuration "
+        f"{' and by '.join(blocks.kind_in_words(kind) for kind in note.kinds)} that hold all runs of a configuration "
         "with parameters of its own"
     ),
     loop_notes.LostReplicates: "only {settled} of {asked} bootstrap tables could be fitted again; the thresholds are "

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from calibration.sensitivity import sensitivity_notes
-from mmrjax.errors import counted
+from mmrjax.errors import count_noun
 
 if TYPE_CHECKING:
     from calibration.sensitivity.result import Points, SensitivityResult
@@ -63,7 +63,7 @@ def points_studied(found: SensitivityResult) -> str:
     total = len(found.points)
     parts = {o.studied.tobytes(): o.studied for o in found.outputs.values() if not o.studied.all()}
     if not parts:
-        return f"At {counted(total, 'operating point')}"
+        return f"At {count_noun(total, 'operating point')}"
     why = "the robot does not travel" if found.method == "local" else "too many robots of the sample do not travel"
     fewest = min(int(x.sum()) for x in parts.values())
     if len(parts) > 1:

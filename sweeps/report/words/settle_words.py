@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from calibration.data.settling import RATES, Settled, Stretch
-from mmrjax.errors import counted
+from mmrjax.errors import count_noun
 
 #: Reasons that are none where the log itself is fitted, and what to do then.
 OF_LEVELS = ("changes", "short", "settling", "accelerates")
@@ -53,7 +53,7 @@ def statement(found: Settled) -> str:
     back = sum(s.imposed < 0 for s in kept)
     ways = f", {len(kept) - back} forward and {back} backward" if back else ""
     return (
-        f"{counted(len(kept), 'settled run')}{ways}, from {rows} of {len(found.runs)} samples "
+        f"{count_noun(len(kept), 'settled run')}{ways}, from {rows} of {len(found.runs)} samples "
         f"(each at least {found.shortest:.3g} s long, its means steady to {100 * found.drift:g} %)."
     )
 
@@ -92,8 +92,8 @@ def glitches(found: Settled) -> list[str]:
             counts = [s.glitches[channel.name] for s in mine]
             worst = mine[counts.index(max(counts))]
             said.append(
-                f"{channel.column}: {counted(sum(counts), 'reading')} in {counted(len(mine), 'settled run')} left "
-                f"out of the mean, far from the readings next to them; most in rows {worst.rows[0] + 1} to "
+                f"{channel.column}: {count_noun(sum(counts), 'reading')} in {count_noun(len(mine), 'settled run')} "
+                f"left out of the mean, far from the readings next to them; most in rows {worst.rows[0] + 1} to "
                 f"{worst.rows[-1] + 1} ({100 * max(counts) / len(worst.rows):.2g} %); look at the instrument, or log "
                 "a mean if they are pulses"
             )

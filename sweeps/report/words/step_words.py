@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from calibration.inference.fit_notes import Step
-from mmrjax.errors import counted
+from mmrjax.errors import count_noun
 
 STEPS = {
     # the loop
@@ -77,5 +77,5 @@ def expected(text: str, seconds: float) -> float | None:
 
 def still(doing: str, seconds: float, compiled: int) -> str:
     """Progress of a running step: its duration and the number of programs compiled."""
-    programs = f", {counted(compiled, 'program')} compiled" if compiled else ""
+    programs = f", {count_noun(compiled, 'program')} compiled" if compiled else ""
     return f"still {doing} ({seconds:.0f} s{programs})"

@@ -1,0 +1,233 @@
+"""Contents of a file of data: its signals with unit, rate, range and gaps, and which columns they may be."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calibration.data import delimited, presets_file
+from calibration.data.columns import Layout
+from calibration.data.input_errors import BadData
+from calibration.data.named_arrays import NamedArrays, numbers
+from calibration.data.sources import in_memory, one_clock, opening
+from calibration.data.sources.recorded_signals import Clock, Signal, Source, known, unit_of_clock
+from mmrjax.model import channels, quantities
+
+#: Usual steps beyond which samples are missing.
+GAP = 5.0
+#: Words in the name of a signal, and the columns that it may be then, without their unit. The first that fits wins.
+MEANINGS = (
+    (r"duty|pwm", ("duty",)),
+    (r"(supply|bus|bat|input|vin|vbus|pack).*(volt|_v\b)|vbat|vbus|volt|\bu\b|^v$", ("supply_voltage",)),
+    (r"(bat|input|supply|bus|total|dc|pack).*(cur|amp|_a\b)|ibat|ibus", ("total_current",)),
+    (r"motor.*(cur|amp)|iq\b|q_a\b|phase|cur|amps?\b|\bi\b", ("total_current",)),
+    (r"(wheel|output|joint|load).*(vel|speed|rpm|omega)", ("output_speed",)),
+    (r"erpm", ()),
+    (r"rpm|motor.*(vel|speed)|omega|(vel|speed)|^n$", ("motor_speed",)),
+    (r"torque|\btau\b", ("output_torque",)),
+    (r"angle|theta|position|\bpos\b", ("output_angle",)),
+    (r"slope|incline|grade|pitch", ("slope",)),
+    (r"payload", ("payload",)),
+    (r"winding|motor.*temp", ("winding_temperature",)),
+    (r"run_?id|episode|trial", ("run_id",)),
+)  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class SignalFacts:
+    """Facts about a signal of a file.
+
+    Attributes:
+        path: of it; unit: that the file states; samples: number of them; refused: why it cannot be read.
+        rate: of its clock [Hz], NaN where it has none.
+        gaps: number of steps of more than `GAP` usual ones, NaN without a clock.
+        least, greatest: of its numbers, NaN where it has none; missing: samples without a number.
+        words: some of its words, of a signal of words; clock: name of its clock.
+    """
+
+    path: str
+    unit: str
+    samples: int
+    refused: str = ""
+    rate: float = np.nan
+    gaps: float = np.nan
+    least: float = np.nan
+    greatest: float = np.nan
+    missing: int = 0
+    words: tuple[str, ...] = ()
+    clock: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class Contents:
+    """Contents of a file.
+
+    Attributes:
+        name, kind: of the file; signals: of it; notes: on how it was read.
+        preset: name of the packaged preset that its columns are of; empty: none.
+        proposed: lines of a table `[columns]`, for a person to check.
+    """
+
+    name: str
+    kind: str
+    signals: tuple[SignalFacts, ...]
+    notes: tuple[str, ...]
+    preset: str
+    proposed: tuple[str, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """The whole, for machines."""
+        return {"schema": "mmrjax.inspect/1", **dataclasses.asdict(self)}
+
+
+def inspect(source: str | Path | Any) -> Contents:
+    """Returns what a file or a table in memory holds.
+
+    Raises:
+        BadData: no such file, or an unreadable one.
+    """
+    found = _source(source)
+    times: dict[int, tuple[np.ndarray, str] | str] = {}
+    table = _clock_of_table(found)
+    facts = tuple(
+        _facts(signal, signal.clock or (None if signal is table else _clock(table)), times)
+        for signal in found.signals
+    )
+    clocks = {s.clock.name for s in found.signals if s.clock is not None}
+    notes = list(found.notes)
+    for signal in found.signals:
+        time = times.get(id(signal.clock)) if signal.clock is not None else None
+        if isinstance(time, str) and f"{found.name}: {time}" not in notes:
+            notes.append(f"{found.name}: {time}")
+    preset = presets_file.recognised([s.path for s in found.signals])
+    if len(clocks) > 1:
+        notes.append(f"{found.name}: signals have {len(clocks)} clocks; rows become those of the densest channel")
+    still = {fact.path for fact in facts if fact.least == fact.greatest}
+    moving = sorted(found.signals, key=lambda signal: signal.path in still)  # of several the first that changes
+    lines = dict(_proposed(moving))
+    proposed = tuple(lines[s.path] for s in found.signals if s.path in lines)
+    return Contents(found.name, found.kind, facts, tuple(notes), preset, () if preset else proposed)
+
+
+def _source(source: Any) -> Source:
+    if not isinstance(source, str | Path):
+        kind, signals = in_memory.of_object(source)
+        return Source(kind, kind, signals)
+    path, within = opening.split(str(source))
+    name = path.name or str(source)
+    if not path.exists():
+        raise BadData(f"{source}: no such file; expected a file of data, or the folder of a ROS 2 bag")
+    form = opening.format_of(path, name)
+    if form is not None:
+        return opening.opened(path, within, name, form)
+    found = _of_text(delimited.arrays(path, name))
+    return found.below(within) if within else found
+
+
+def _of_text(arrays: NamedArrays) -> Source:
+    """A table of texts as signals: numbers where most cells are."""
+    signals = []
+    for k, (name, raw) in enumerate(zip(arrays.header, arrays.values, strict=True)):
+        values = numbers(raw)
+        words = bool(len(values)) and not np.isfinite(values).any()
+        loaded = np.array(raw) if words else values
+        unit = arrays.units[k] if arrays.units else ""
+        signals.append(Signal(name, len(values), known(loaded), unit, words=words))
+    return Source(arrays.name, "a text file", tuple(signals), arrays.digest, arrays.notes)
+
+
+def _clock_of_table(source: Source) -> Signal | None:
+    """The signal of a table that is its time, by its name."""
+    if any(s.clock is not None for s in source.signals):
+        return None
+    return next((s for s in source.signals if _unit_of_time(s.name) is not None and not s.words), None)
+
+
+def _clock(signal: Signal | None) -> Clock | None:
+    unit = None if signal is None else _unit_of_time(signal.name)
+    return None if signal is None else Clock(signal.path, signal.load, unit or "")
+
+
+def _unit_of_time(name: str) -> str | None:
+    """Unit of a clock by its name, also as loggers name them; None if it is none."""
+    bare = name.casefold().replace("time (", "time_").rstrip(")")
+    return "ms" if bare == "ms_today" else unit_of_clock(bare)
+
+
+def _facts(signal: Signal, clock: Clock | None, times: dict[int, tuple[np.ndarray, str] | str]) -> SignalFacts:
+    found = SignalFacts(
+        signal.path, signal.unit, signal.length, signal.refused, clock="" if clock is None else clock.name
+    )
+    if signal.refused or not signal.length:
+        return found
+    if opening.VALUE * signal.length > opening.SHARE * opening.available():
+        return dataclasses.replace(found, refused="has more values than the free memory holds")
+    try:
+        values = signal.load()
+    except BadData as error:
+        return dataclasses.replace(found, refused=str(error))
+    if values.dtype.kind in "US":
+        return dataclasses.replace(found, words=tuple(map(str, dict.fromkeys(values[:10_000].tolist())))[:5])
+    if values.dtype.kind in "mM":
+        values = values.astype(np.int64)
+    values = np.asarray(values, float)
+    finite = np.isfinite(values)
+    ends = (float(values[finite].min()), float(values[finite].max())) if finite.any() else (np.nan, np.nan)
+    found = dataclasses.replace(found, least=ends[0], greatest=ends[1], missing=int((~finite).sum()))
+    if clock is None:
+        return found
+    if id(clock) not in times:
+        times[id(clock)] = _seconds(clock)
+    time = times[id(clock)]
+    if isinstance(time, str) or len(time[0]) != len(values):
+        return found
+    steps = np.diff(time[0])
+    usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else np.nan
+    return dataclasses.replace(found, rate=1 / usual, gaps=float((steps > GAP * usual).sum()))
+
+
+def _seconds(clock: Clock) -> tuple[np.ndarray, str] | str:
+    found = one_clock.seconds(clock)
+    back = np.flatnonzero(np.diff(found.time) < 0)
+    if back.size:
+        return f"{clock.name} goes back at sample {back[0] + 2}"
+    return found.time, found.unit
+
+
+def _proposed(signals: Sequence[Signal]) -> Iterator[tuple[str, str]]:
+    """Paths of signals whose names say what they may be, each with its line of a table `[columns]`."""
+    layout = Layout(channels=channels.EVERY)
+    every = layout.quantities()
+    spelled, taken = set(layout.spellings()), set[str]()
+    for signal in signals:
+        if signal.refused or signal.name in spelled:
+            taken |= {signal.name.rpartition("_")[0]}
+            continue
+        unit = _unit_of_time(signal.name)
+        if unit is not None and signal.clock is None and "time" not in taken:
+            unit = "s" if signal.words else unit or one_clock.guessed_unit(np.asarray(signal.load(), float))
+            yield signal.path, f'time_{unit} = "{signal.path}"'
+            taken.add("time")
+            continue
+        stems = next((stems for pattern, stems in MEANINGS if re.search(pattern, signal.name.casefold())), None)
+        if stems is None:  # of a field named data, the topic says it
+            stems = next((stems for pattern, stems in MEANINGS if re.search(pattern, signal.path.casefold())), ())
+        for stem in stems:
+            column = next((c for c, q in every.items() if (q.stem or q.name) == stem or c == stem), stem)
+            if stem in taken or (signal.words and stem != "run_id"):
+                continue
+            units = {} if column not in every else every[column].columns()
+            stated = (
+                quantities.unit_in_column(signal.unit)
+                if signal.unit
+                else quantities.unit_at_end(signal.name, set(units.values())) or ""
+            )
+            mine = next((c for c, u in units.items() if u == stated), column)
+            doubt = "" if stated and mine in units and units[mine] == stated else "  # unit not stated: check it"
+            yield signal.path, f'{mine} = "{signal.path}"{doubt if units else ""}'
+            taken.add(stem)

@@ -1,0 +1,268 @@
+"""Presets: TOML files that say which columns of a logger's files mean what, with unit and sign."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import string
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from calibration.data import input_files
+from calibration.data.columns import Layout
+from calibration.data.input_errors import BadConfiguration, allowed_words, parsed, stated_number
+from mmrjax.model import channels
+
+#: Presets that come with the package, in `calibration/data/presets/`.
+PACKAGED = (
+    "bam", "dynamixel", "lerobot", "moteus", "odrive", "px4", "rcbenchmark", "simplefoc", "sysid", "vesc",
+)  # fmt: skip
+#: Columns of a packaged preset that a source has at least for it to be recognised.
+OF_A_PRESET = 3
+#: Keys of a preset, and of one of its columns.
+KEYS, KEYS_OF_COLUMN = ("columns", "ask", "header"), ("column", "factor", "per", "times", "note")
+#: Keys of a number that a preset asks for.
+KEYS_OF_NUMBER = ("about", "usual")
+#: Between the name of a preset and the numbers that it asks for, `vesc,pole_pairs=7`.
+SEPARATOR = ","
+
+
+@dataclasses.dataclass(frozen=True)
+class PresetColumn:
+    """A column of this program, and where a logger's file has it.
+
+    Attributes:
+        mine: name of the column; theirs: names that it may have in the file; the first that it has is read.
+        factor: from its unit to that of `mine`; note: what it is, for a note.
+    """
+
+    mine: str
+    theirs: tuple[str, ...]
+    factor: float = 1.0
+    note: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class Preset:
+    """Columns of a logger's files.
+
+    Attributes:
+        name: of the preset or its file; columns: in its order.
+        header: names of the columns of a file without a header; empty: every file has one.
+    """
+
+    name: str
+    columns: tuple[PresetColumn, ...]
+    header: tuple[str, ...] = ()
+
+    def mapped(
+        self, found: Callable[[str], str | None], has_readings: Callable[[str], bool] | None = None
+    ) -> tuple[tuple[tuple[str, str, float], ...], tuple[str, ...]]:
+        """Returns columns of a source as `Layout.mapped` has them, and notes on what they are.
+
+        Args:
+            found: name of the source's column that a name means; None: it has none.
+            has_readings: False for a column of the source that is empty.
+        """
+        mapped, notes = [], []
+        for column in self.columns:
+            present = [name for name in map(found, column.theirs) if name is not None]
+            if has_readings is not None and len(present) > 1:
+                present = [name for name in present if has_readings(name)] or present
+            if present:
+                mapped.append((column.mine, present[0], column.factor))
+                if column.note:
+                    notes.append(f"{self.name}: {present[0]}, read as {column.mine}, {column.note}")
+            elif self.name not in PACKAGED:  # which has columns of several loggers
+                mapped.append((column.mine, column.theirs[0], column.factor))
+        return tuple(mapped), tuple(notes)
+
+
+def of_columns(columns: Mapping[str, Any], where: str = "the stated table") -> Preset:
+    """Returns the columns that a table `[columns]` states.
+
+    Raises:
+        BadConfiguration: as `read`.
+    """
+    return _parsed({"columns": dict(columns)}, where, {})
+
+
+def find(stated: str | Path) -> Preset:
+    """Returns a packaged preset by its name, or one of a file; numbers that it asks for may follow.
+
+    Args:
+        stated: `vesc,pole_pairs=7`, `mine.toml`.
+
+    Raises:
+        BadConfiguration: no such preset or file, a number that is missing or unknown, or as `read`.
+    """
+    name, *others = str(stated).split(SEPARATOR)
+    given: dict[str, float] = {}
+    for each in others:
+        key, equals, text = (part.strip() for part in each.partition("="))
+        try:
+            given[key] = stated_number(parsed(text), f"--columns {name}, {key}")
+        except ValueError as error:
+            got = f"{key}{equals}{text}"
+            raise BadConfiguration(
+                f"--columns {name}: got {got}; expected a name and a number, as pole_pairs=7"
+            ) from error
+    if name in PACKAGED:
+        return read(_packaged(name), name, given)
+    path = Path(name)
+    if not path.exists():
+        raise BadConfiguration(
+            f"--columns: got {name}; no such file and no packaged preset; {allowed_words(name, PACKAGED)}"
+        )
+    return read(input_files.toml_text(path, path.name), path.name, given)
+
+
+def recognised(names: Sequence[str]) -> str:
+    """Returns the packaged preset with most columns in a source, at least `OF_A_PRESET`; empty if no preset has.
+
+    Args:
+        names: of the source's columns, or paths of its signals.
+    """
+    best, most = "", OF_A_PRESET - 1
+    ends = {*names, *(re.split(r"[/.]", name)[-1] for name in names)}
+    for name in PACKAGED:
+        preset = find(SEPARATOR.join([name, *(f"{key}=1" for key in asked(name))]))
+        count = sum(any(theirs in ends for theirs in column.theirs) for column in preset.columns)
+        if count > most:
+            best, most = name, count
+    return best
+
+
+def asked(name: str) -> tuple[str, ...]:
+    """Returns names of the numbers that a packaged preset asks for, and has no usual value of."""
+    numbers = input_files.toml_content(_packaged(name), name).get("ask", {})
+    return tuple(key for key, stated in numbers.items() if isinstance(stated, str) or "usual" not in stated)
+
+
+def _packaged(name: str) -> str:
+    return (resources.files("calibration") / "data" / "presets" / f"{name}.toml").read_text("utf-8")
+
+
+def read(text: str, where: str, given: Mapping[str, float]) -> Preset:
+    """Returns the preset that a TOML text states.
+
+    Args:
+        where: opens the message of an error; given: numbers that it asks for, by name.
+
+    Raises:
+        BadConfiguration: no TOML, an unknown key, a column that this program does not have, or a number that it asks
+            for and does not get.
+    """
+    return _parsed(input_files.toml_content(text, where), where, given)
+
+
+def _parsed(content: Mapping[str, Any], where: str, given: Mapping[str, float]) -> Preset:
+    for key in content:
+        if key not in KEYS:
+            raise BadConfiguration(f"{where}: got the key {key}; {allowed_words(key, KEYS)}")
+    numbers = _numbers(content.get("ask", {}), where, given)
+    header = _texts(content.get("header", []), f"{where}, header")
+    columns = content.get("columns", {})
+    if not isinstance(columns, dict) or not columns:
+        raise BadConfiguration(f'{where}, columns: got {columns!r}; expected a table of columns, as time_s = "t"')
+    layout = Layout(channels=channels.EVERY)
+    known, found = layout.spellings(), []
+    for mine, theirs in columns.items():
+        if mine not in known:
+            listed = allowed_words(mine, known, shown=layout.known())
+            raise BadConfiguration(
+                f"{where}, columns.{mine}: no such column of a table; {listed}; also in other units"
+            )
+        found.append(_column(mine, theirs, f"{where}, columns.{mine}", numbers))
+    return Preset(where, tuple(found), header)
+
+
+def _numbers(asked: Any, where: str, given: Mapping[str, float]) -> dict[str, float]:
+    """Numbers that a preset asks for, by name."""
+    if not isinstance(asked, dict):
+        raise BadConfiguration(f"{where}, ask: got {asked!r}; expected a table")
+    for key in given:
+        if key not in asked:
+            listed = allowed_words(key, asked) if asked else "it asks for no number"
+            raise BadConfiguration(f"--columns {where}: got {key}; {listed}")
+    found: dict[str, float] = {}
+    for key, stated in asked.items():
+        table = {"about": stated} if isinstance(stated, str) else stated
+        if not isinstance(table, dict) or {*table} - {*KEYS_OF_NUMBER} or not isinstance(table.get("about"), str):
+            raise BadConfiguration(
+                f'{where}, ask.{key}: got {stated!r}; expected a sentence, or {{about = "...", usual = 1.0}}'
+            )
+        if key not in given and "usual" not in table:
+            raise BadConfiguration(
+                f"--columns {where}: {key} is missing, the {table['about']}; state it as "
+                f"--columns {where}{SEPARATOR}{key}=7"
+            )
+        value = given.get(key, table.get("usual"))
+        found[key] = stated_number(value, f"{where}, {key}")
+        if found[key] == 0 and key in given and "usual" not in table:
+            raise BadConfiguration(f"--columns {where}, {key}: got 0; expected a number that is not 0")
+    return found
+
+
+def _column(mine: str, theirs: Any, where: str, numbers: Mapping[str, float]) -> PresetColumn:
+    form = f'expected {mine} = "THEIRS", or {mine} = {{column = "THEIRS", factor = 0.001}}'
+    table = theirs if isinstance(theirs, dict) else {"column": theirs}
+    for key in table:
+        if key not in KEYS_OF_COLUMN:
+            raise BadConfiguration(f"{where}: got the key {key}; {allowed_words(key, KEYS_OF_COLUMN)}")
+    stated = table.get("column")
+    names = _texts([stated] if isinstance(stated, str) else stated, f"{where}.column", form)
+    factor = stated_number(table.get("factor", 1.0), f"{where}.factor")
+    for key in ("per", "times"):
+        if key in table:
+            if table[key] not in numbers:
+                raise BadConfiguration(
+                    f"{where}.{key}: got {table[key]}; expected a number that [ask] names; "
+                    f"{allowed_words(str(table[key]), numbers)}"
+                )
+            value = numbers[table[key]]
+            if key == "per" and not value:
+                raise BadConfiguration(f"{where}.{key}: {table[key]} is 0; expected a number that is not 0")
+            factor = factor * value if key == "times" else factor / value
+    if not factor:
+        raise BadConfiguration(f"{where}.factor: got 0; expected a number that is not 0")
+    note = table.get("note", "")
+    if not isinstance(note, str):
+        raise BadConfiguration(f"{where}.note: got {note!r}; expected a sentence")
+    return PresetColumn(mine, tuple(_filled(name, where, numbers) for name in names), factor, note)
+
+
+def _filled(name: str, where: str, numbers: Mapping[str, float]) -> str:
+    """A column's name with the whole numbers that it names in braces."""
+    try:
+        named = [field for _, field, _, _ in string.Formatter().parse(name) if field is not None]
+    except ValueError:
+        return name
+    for field in named:
+        if field in numbers:
+            name = name.replace(f"{{{field}}}", f"{numbers[field]:g}")
+    return name
+
+
+def _texts(stated: Any, where: str, form: str = "expected a list of names") -> tuple[str, ...]:
+    if not isinstance(stated, list) or not all(isinstance(each, str) and each for each in stated):
+        raise BadConfiguration(f"{where}: got {stated!r}; {form}")
+    return tuple(stated)
+
+
+def merged(
+    first: Iterable[tuple[str, str, float]], others: Iterable[tuple[str, str, float]]
+) -> tuple[tuple[str, str, float], ...]:
+    """Columns of two tables; those of `first` win where both have a column, or read the same one."""
+    first = tuple(first)
+    taken = {_bare(mine) for mine, _, _ in first} | {theirs for _, theirs, _ in first}
+    return (*first, *(c for c in others if _bare(c[0]) not in taken and c[1] not in taken))
+
+
+def _bare(mine: str) -> str:
+    """Name of a column without its unit, so that time_ms and time_s are the same."""
+    layout = Layout(channels=channels.EVERY)
+    found = layout.quantities()
+    return next((column for column, quantity in found.items() if mine in quantity.columns()), mine)

@@ -1,0 +1,165 @@
+"""NumPy, MATLAB and HDF5 files: named arrays."""
+
+from __future__ import annotations
+
+import functools
+import zipfile
+from collections.abc import Callable
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from calibration.data.input_errors import BadData
+from calibration.data.sources.recorded_signals import Signal, known, of_arrays
+
+#: What an array of objects is called.
+_OBJECTS = np.dtype(object)
+
+
+def of_npz(path: Path, name: str) -> tuple[Signal, ...]:
+    """Signals of an .npz archive; arrays of Python objects are never loaded.
+
+    Raises:
+        BadData: a member whose path leads out of the archive.
+    """
+    arrays: dict[str, tuple[tuple[int, ...], np.dtype, Callable[[], np.ndarray]]] = {}
+    with zipfile.ZipFile(path) as archive:
+        for member in archive.namelist():
+            where = PurePosixPath(member.replace("\\", "/"))
+            if where.is_absolute() or ".." in where.parts:
+                raise BadData(f"{name}, {member}: is a path that leads out of the archive; expected names of arrays")
+            if where.suffix != ".npy":
+                continue
+            with archive.open(member) as stream:
+                shape, dtype = _header(stream)
+            arrays[member.removesuffix(".npy")] = (shape, dtype, _member(path, member))
+    return of_arrays(arrays)
+
+
+def of_npy(path: Path, name: str) -> tuple[Signal, ...]:
+    """Signals of an .npy file: columns of its array, or fields of its records."""
+    with path.open("rb") as stream:
+        shape, dtype = _header(stream)
+    loaded = functools.cache(lambda: np.load(path, allow_pickle=False))
+    found = of_arrays({path.stem: (shape, dtype, loaded)})
+    return tuple(Signal(s.path.removeprefix(f"{path.stem}."), *_rest(s)) for s in found) if dtype.names else found
+
+
+def _rest(signal: Signal) -> tuple[Any, ...]:
+    return signal.length, signal.load, signal.unit, signal.clock, signal.words, signal.refused
+
+
+def _header(stream: Any) -> tuple[tuple[int, ...], np.dtype]:
+    version = np.lib.format.read_magic(stream)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = read(stream)
+    return shape, dtype
+
+
+def _member(path: Path, member: str) -> Callable[[], np.ndarray]:
+    def load() -> np.ndarray:
+        with zipfile.ZipFile(path) as archive, archive.open(member) as stream:
+            return np.lib.format.read_array(stream, allow_pickle=False)
+
+    return functools.cache(load)
+
+
+def of_matlab(path: Path, name: str) -> tuple[Signal, ...]:
+    """Signals of a MATLAB file up to version 7; fields of structures are named by path, `log.motor.speed`."""
+    from scipy import io
+
+    loaded = functools.cache(lambda: io.loadmat(path, squeeze_me=False, struct_as_record=True, chars_as_strings=True))
+    arrays: dict[str, tuple[tuple[int, ...], np.dtype, Callable[[], np.ndarray]]] = {}
+    plain = {"double", "single", "logical", "char", *(f"{sign}int{n}" for sign in ("", "u") for n in (8, 16, 32, 64))}
+    for variable, shape, kind in io.whosmat(path):
+        if kind == "struct":
+            for field, value in _fields(variable, loaded()[variable]):
+                arrays[field] = (value.shape, value.dtype, known(value))
+        else:
+            dtype = np.dtype(float) if kind in plain - {"char"} else np.dtype(str) if kind == "char" else _OBJECTS
+            arrays[variable] = (shape, dtype, _variable(loaded, variable))
+    return of_arrays(arrays)
+
+
+def _variable(loaded: Callable[[], dict[str, np.ndarray]], name: str) -> Callable[[], np.ndarray]:
+    return lambda: loaded()[name]
+
+
+def _fields(path: str, value: np.ndarray) -> list[tuple[str, np.ndarray]]:
+    """Arrays of a structure by path; of an array of structures each has its index."""
+    if value.dtype.names is None:
+        return [(path, value)]
+    found: list[tuple[str, np.ndarray]] = []
+    for k, each in enumerate(np.ravel(value)):
+        at = path if value.size == 1 else f"{path}[{k}]"
+        for field in value.dtype.names:
+            found += _fields(f"{at}.{field}", np.asarray(each[field]))
+    return found
+
+
+def of_hdf5(path: Path, name: str) -> tuple[Signal, ...]:
+    """Signals of an HDF5 file, or of a MATLAB file of version 7.3, by their path.
+
+    Raises:
+        BadData: a link, or storage of a dataset, in another file.
+    """
+    import h5py
+
+    arrays: dict[str, tuple[tuple[int, ...], np.dtype, Callable[[], np.ndarray]]] = {}
+    units: dict[str, str] = {}
+    with h5py.File(path, "r") as file:
+        matlab = any("MATLAB_class" in file[key].attrs for key in file if _inside(file, key, name))
+        _walk(file, "", name, arrays, units, path, matlab, h5py)
+    return of_arrays(arrays, units)
+
+
+def _inside(group: Any, key: str, name: str) -> bool:
+    import h5py
+
+    link = group.get(key, getlink=True)
+    if isinstance(link, h5py.ExternalLink):
+        raise BadData(
+            f"{name}, {group.name.rstrip('/')}/{key}: is a link to another file, {link.filename}; expected data in "
+            "this file; copy them into it"
+        )
+    return not isinstance(link, h5py.SoftLink) and not key.startswith("#")
+
+
+def _walk(
+    group: Any, at: str, name: str, arrays: dict[str, Any], units: dict[str, str], path: Path, matlab: bool, h5py: Any
+) -> None:
+    for key in group:
+        if not _inside(group, key, name):
+            continue
+        item, here = group[key], f"{at}/{key}"
+        if isinstance(item, h5py.Group):
+            _walk(item, here, name, arrays, units, path, matlab, h5py)
+            continue
+        if not isinstance(item, h5py.Dataset) or item.shape is None:
+            continue
+        if item.external or item.is_virtual:
+            raise BadData(
+                f"{name}, {here}: its values are in another file; expected data in this file; copy them into it"
+            )
+        words = h5py.check_string_dtype(item.dtype) is not None
+        char = matlab and item.attrs.get("MATLAB_class") == b"char"
+        dtype = np.dtype(str) if words or char else item.dtype
+        shape = item.shape[::-1] if matlab else item.shape
+        arrays[here] = (shape, dtype, _dataset(path, here, words, char, matlab))
+        stated = next((item.attrs[key] for key in ("unit", "units", "Unit", "Units") if key in item.attrs), "")
+        units[here] = stated.decode() if isinstance(stated, bytes) else str(stated)
+
+
+def _dataset(path: Path, at: str, words: bool, char: bool, matlab: bool) -> Callable[[], np.ndarray]:
+    def load() -> np.ndarray:
+        import h5py
+
+        with h5py.File(path, "r") as file:
+            values = np.asarray(file[at].asstr()[()], dtype=str) if words else file[at][()]
+        values = np.asarray(values)
+        if char:
+            return np.array(["".join(map(chr, row)) for row in np.atleast_2d(values.T)])
+        return values.T if matlab else values
+
+    return functools.cache(load)

@@ -1,0 +1,112 @@
+"""Parquet, Feather and Arrow files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calibration.data.sources.recorded_signals import Signal
+
+#: Elements of a list that are signals of their own, at most.
+MOST = 64
+#: Keys of a column's metadata that hold its unit.
+_UNITS = (b"unit", b"units", b"Unit")
+
+
+def of_parquet(path: Path, name: str) -> tuple[Signal, ...]:
+    """Signals of a Parquet file, read column by column."""
+    from pyarrow import parquet
+
+    file = parquet.ParquetFile(path, memory_map=True)
+    rows, schema = file.metadata.num_rows, file.schema_arrow
+
+    def column(field: str) -> Callable[[], np.ndarray]:
+        return lambda: of_column(file.read([field], use_threads=True).column(0))
+
+    return tuple(s for field in schema for s in _signals(field, rows, column(field.name), file.read))
+
+
+def of_arrow(path: Path, name: str) -> tuple[Signal, ...]:
+    """Signals of a Feather or Arrow file, or an Arrow stream."""
+    import pyarrow as pa
+
+    with pa.memory_map(str(path)) as probe:
+        stream = probe.read(6) != b"ARROW1"
+
+    mapped = pa.memory_map(str(path))
+    return of_table((pa.ipc.open_stream(mapped) if stream else pa.ipc.open_file(mapped)).read_all())
+
+
+def of_table(table: Any) -> tuple[Signal, ...]:
+    """Signals of a `pyarrow.Table`."""
+
+    def column(field: str) -> Callable[[], np.ndarray]:
+        return lambda: of_column(table.column(field))
+
+    return tuple(
+        s for field in table.schema for s in _signals(field, table.num_rows, column(field.name), table.select)
+    )
+
+
+def _signals(field: Any, rows: int, load: Callable[[], np.ndarray], read: Callable[[list[str]], Any]) -> list[Signal]:
+    """Signals of a column: of one of lists, each element has its own, `name[0]`."""
+    import pyarrow.types as kinds
+
+    kind = field.type
+    if not (kinds.is_list(kind) or kinds.is_large_list(kind) or kinds.is_fixed_size_list(kind)) or not rows:
+        return [_signal(field, rows, load)]
+    import pyarrow as pa
+    from pyarrow import compute
+
+    column = read([field.name]).column(0)
+    lengths = compute.unique(compute.list_value_length(column)).to_pylist()
+    if len(lengths) != 1 or not lengths[0]:
+        why = "holds lists of several lengths; expected one length in every row"
+        return [Signal(field.name, rows, load, refused=why)]
+
+    def element(k: int) -> Callable[[], np.ndarray]:
+        return lambda: of_column(compute.list_element(column, k))
+
+    return [
+        _signal(pa.field(f"{field.name}[{k}]", kind.value_type), rows, element(k))
+        for k in range(min(lengths[0], MOST))
+    ]
+
+
+def _signal(field: Any, rows: int, load: Callable[[], np.ndarray]) -> Signal:
+    import pyarrow.types as kinds
+
+    kind, stated = field.type, field.metadata or {}
+    unit = next((stated[key].decode("utf-8", "replace") for key in _UNITS if key in stated), "")
+    if kinds.is_dictionary(kind):
+        kind = kind.value_type
+    words = kinds.is_string(kind) or kinds.is_large_string(kind) or kinds.is_string_view(kind)
+    number = kinds.is_integer(kind) or kinds.is_floating(kind) or kinds.is_boolean(kind) or kinds.is_decimal(kind)
+    timed = kinds.is_timestamp(kind) or kinds.is_duration(kind)
+    refused = "" if words or number or timed or kinds.is_null(kind) else f"holds {kind}; expected numbers or words"
+    return Signal(field.name, rows, load, unit, words=words, refused=refused)
+
+
+def of_column(column: Any) -> np.ndarray:
+    """Values of a `pyarrow.ChunkedArray`: numbers, NaN for a missing one, words, or `datetime64`."""
+    import pyarrow as pa
+    import pyarrow.types as kinds
+    from pyarrow import compute
+
+    kind = column.type
+    if kinds.is_dictionary(kind):
+        column, kind = column.cast(kind.value_type), kind.value_type
+    if kinds.is_timestamp(kind):
+        return np.asarray(column.cast(pa.timestamp("ns")).to_numpy())
+    if kinds.is_duration(kind):
+        return np.asarray(column.cast(pa.duration("ns")).to_numpy())
+    if kinds.is_string(kind) or kinds.is_large_string(kind) or kinds.is_string_view(kind):
+        return np.asarray(compute.fill_null(column, "").to_pylist(), dtype=str)
+    if column.null_count:
+        column = compute.fill_null(column.cast(pa.float64()), np.nan)
+    elif kinds.is_boolean(kind) or kinds.is_decimal(kind):
+        column = column.cast(pa.float64())
+    return np.asarray(column.to_numpy())

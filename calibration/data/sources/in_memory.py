@@ -1,0 +1,118 @@
+"""Tables in memory: pandas, polars, Arrow, xarray, and dicts of arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from calibration.data.input_errors import BadData
+from calibration.data.sources import columnar, json_records
+from calibration.data.sources.recorded_signals import Clock, Signal, known, of_arrays, unit_of_clock
+
+EXPECTED = (
+    "a path, a pandas or polars DataFrame, an Arrow table, an xarray Dataset, a dict of arrays, or a list of records"
+)
+
+
+def of_object(source: Any) -> tuple[str, tuple[Signal, ...]]:
+    """Kind of an object in memory, and its signals.
+
+    Raises:
+        BadData: something else.
+    """
+    library = type(source).__module__.partition(".")[0]
+    kind = type(source).__name__
+    if library == "pandas" and kind == "DataFrame":
+        return "the DataFrame", _of_pandas(source)
+    if library == "polars" and kind in ("DataFrame", "LazyFrame"):
+        frame = source.collect() if kind == "LazyFrame" else source
+        return "the DataFrame", columnar.of_table(frame.to_arrow())
+    if library == "pyarrow" and kind in ("Table", "RecordBatch"):
+        import pyarrow as pa
+
+        return "the Arrow table", columnar.of_table(source if kind == "Table" else pa.Table.from_batches([source]))
+    if library == "xarray" and kind in ("Dataset", "DataArray"):
+        return f"the {kind}", _of_xarray(
+            source if kind == "Dataset" else source.to_dataset(name=source.name or "values")
+        )
+    if isinstance(source, np.ndarray) and source.dtype.names:
+        return "the array", of_arrays(
+            {n: (source.shape, source.dtype[n], known(source[n])) for n in source.dtype.names}
+        )
+    if isinstance(source, Mapping):
+        return "the dict", json_records.of_content(source, "the dict")
+    if isinstance(source, list | tuple) and source and all(isinstance(each, Mapping) for each in source):
+        return "the records", json_records.of_content(list(source), "the records")
+    raise BadData(f"the source: got {_called(source)}; expected {EXPECTED}")
+
+
+def _called(source: Any) -> str:
+    kind = type(source)
+    return kind.__name__ if kind.__module__ == "builtins" else f"{kind.__module__.partition('.')[0]} {kind.__name__}"
+
+
+def _of_pandas(frame: Any) -> tuple[Signal, ...]:
+    found = []
+    for level in range(frame.index.nlevels):
+        index = frame.index.get_level_values(level)
+        named = index.name is not None or index.dtype.kind in "mM"
+        if named:
+            found.append(_of_series(str(index.name or "time"), index, len(frame)))
+    found += [
+        _of_series(_column_name(column), frame.iloc[:, j], len(frame)) for j, column in enumerate(frame.columns)
+    ]
+    return tuple(found)
+
+
+def _column_name(column: Any) -> str:
+    return ".".join(str(part) for part in column if str(part)) if isinstance(column, tuple) else str(column)
+
+
+def _of_series(name: str, series: Any, rows: int) -> Signal:
+    dtype = series.dtype
+    kind = getattr(dtype, "kind", "O")
+    if kind in "mM":  # with a time zone too, which makes no difference to times that pass
+        return Signal(name, rows, lambda: np.asarray(series.to_numpy(dtype=f"{kind}8[ns]")))
+    words = str(dtype) in ("str", "string", "category") or str(dtype).startswith("string")
+    if kind == "O" and not words:
+        values = list(series)
+        missing = [value is None or value != value for value in values]
+        kinds = {type(value) for value, lost in zip(values, missing, strict=True) if not lost}
+        if kinds and kinds <= {str}:
+            words = True
+        elif kinds and not kinds <= {int, float, bool, np.float64, np.int64}:
+            return Signal(name, rows, lambda: np.empty(0), refused="holds objects; expected numbers or words")
+    if words:
+        return Signal(name, rows, _words(series), words=True)
+    return Signal(name, rows, lambda: np.asarray(series.to_numpy(dtype=float, na_value=np.nan)))
+
+
+def _words(series: Any) -> Callable[[], np.ndarray]:
+    return lambda: np.array(["" if value is None or value != value else str(value) for value in series])
+
+
+def _of_xarray(dataset: Any) -> tuple[Signal, ...]:
+    """Signals of a Dataset; where its variables have several dimensions of time, each has the clock of its own."""
+    dimensions = {d for v in dataset.data_vars.values() for d in v.dims}
+    several = len({dataset.sizes[d] for d in dimensions if dataset.sizes[d] > 1}) > 1 and len(dimensions) > 1
+    found: list[Signal] = []
+    for name, array in {**dataset.coords, **dataset.data_vars}.items():
+        if not array.dims:
+            continue
+        clock = None
+        time = array.dims[0]
+        if several and time in dataset.coords:
+            unit = str(dataset.coords[time].attrs.get("units", "")) or unit_of_clock(str(time)) or ""
+            clock = Clock(str(time), _values(dataset.coords[time]), unit)
+        shape, dtype = array.shape, array.dtype
+        signals = of_arrays(
+            {str(name): (shape, dtype, _values(array))}, {str(name): str(array.attrs.get("units", ""))}
+        )
+        found += [Signal(s.path, s.length, s.load, s.unit, clock, s.words, s.refused) for s in signals]
+    return tuple(found)
+
+
+def _values(array: Any) -> Callable[[], np.ndarray]:
+    return lambda: np.asarray(array.values)

@@ -1,0 +1,141 @@
+"""JSON: records, arrays by name, and both nested by path."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calibration.data import input_files
+from calibration.data.input_errors import BadData
+from calibration.data.sources.recorded_signals import Signal, group, known, of_arrays, parts
+
+#: Largest JSON file [bytes]: its objects take some ten times as much memory; most levels within one another.
+LARGEST, DEEPEST = 2**28, 16
+#: Column of the test that a row is of, where a file has several tables with the same columns.
+RUN = "run_id"
+
+
+def of_json(path: Path, name: str) -> tuple[Signal, ...]:
+    """Signals of a JSON file, or of one with an object in each line.
+
+    Raises:
+        BadData: text that is no JSON, or nested too deep.
+    """
+    content = input_files.content(path, name, largest=LARGEST)
+    try:
+        text = content.decode("utf-8-sig")
+        try:
+            found = json.loads(text)
+        except json.JSONDecodeError:
+            lines = [line for line in text.splitlines() if line.strip()]
+            if len(lines) < 2 or not lines[0].rstrip().endswith("}"):
+                raise
+            found = [json.loads(line) for line in lines]
+    except (ValueError, RecursionError) as error:
+        why = "nested too deep" if isinstance(error, RecursionError) else error
+        raise BadData(f"{name}: cannot be read as JSON ({why}); it may be cut off; export it again") from error
+    return of_content(found, name)
+
+
+def of_content(content: Any, name: str) -> tuple[Signal, ...]:
+    """Signals of lists and dicts of lists, numbers and arrays.
+
+    Raises:
+        BadData: nothing in it is a table.
+    """
+    arrays: dict[str, Any] = {}
+    _collect(content, "", arrays, name, 1)
+    arrays = _stacked({at: values for at, values in arrays.items() if len(values)})
+    if not arrays:
+        raise BadData(
+            f"{name}: holds no list of records and no arrays; expected "
+            '[{"time_s": 0.0, ...}, ...] or {"time_s": [...], ...}'
+        )
+    return of_arrays({at: (v.shape, v.dtype, known(v)) for at, v in arrays.items()})
+
+
+def _collect(value: Any, at: str, arrays: dict[str, np.ndarray], name: str, depth: int) -> None:
+    if depth > DEEPEST:
+        raise BadData(f"{name}, {at}: is nested too deep; expected at most {DEEPEST} levels")
+    if isinstance(value, Mapping):
+        value = _unfolded(value)
+        if isinstance(value, list):
+            arrays[at or "values"] = _array(value)
+            return
+        for key, inner in value.items():
+            _collect(inner, f"{at}.{key}" if at else str(key), arrays, name, depth + 1)
+    elif isinstance(value, Sequence) and not isinstance(value, str | bytes):
+        if value and all(isinstance(each, Mapping) for each in value):
+            _records(value, at, arrays, name)
+        elif value:
+            arrays[at or "values"] = _array(value)
+    elif hasattr(value, "__array__"):
+        arrays[at or "values"] = np.asarray(value)
+
+
+def _unfolded(value: Mapping[str, Any]) -> Mapping[str, Any] | list[Any]:
+    """A dict as pandas writes it, as arrays by name: a column by the numbers of its rows, or names next to rows."""
+    cells = [inner for inner in value.values() if isinstance(inner, str) or not isinstance(inner, Mapping | Sequence)]
+    if value and len(cells) == len(value) and all(isinstance(key, str) and key.isdigit() for key in value):
+        return cells
+    names, rows = value.get("columns"), value.get("data")
+    if not (isinstance(names, list) and isinstance(rows, list) and rows):
+        return value
+    if not all(isinstance(row, list) and len(row) == len(names) for row in rows):
+        return value
+    return dict(zip(map(str, names), map(list, zip(*rows, strict=True)), strict=True))
+
+
+def _records(records: Sequence[Mapping[str, Any]], at: str, arrays: dict[str, np.ndarray], name: str) -> None:
+    """Columns of records; what a record lacks is a missing reading."""
+    columns: dict[str, list[Any]] = {}
+    for k, record in enumerate(records):
+        for key, value in _leaves(record, "", name, 1):
+            columns.setdefault(key, [None] * len(records))[k] = value
+    for key, values in columns.items():
+        arrays[f"{at}.{key}" if at else key] = _array(values)
+
+
+def _leaves(record: Mapping[str, Any], at: str, name: str, depth: int) -> Iterable[tuple[str, Any]]:
+    if depth > DEEPEST:
+        raise BadData(f"{name}, {at}: is nested too deep; expected at most {DEEPEST} levels")
+    for key, value in record.items():
+        here = f"{at}.{key}" if at else str(key)
+        if isinstance(value, Mapping):
+            yield from _leaves(value, here, name, depth + 1)
+        else:
+            yield here, value
+
+
+def _array(values: Sequence[Any]) -> np.ndarray:
+    """An array of numbers, NaN for a missing one, or of words; of objects where it is neither."""
+    kinds = {type(value) for value in values}
+    if kinds <= {int, float, bool, type(None)}:
+        return np.array([np.nan if value is None else value for value in values], dtype=float)
+    if kinds <= {str, type(None)}:
+        return np.array(["" if value is None else value for value in values])
+    try:
+        found = np.array([[np.nan if x is None else x for x in v] if isinstance(v, list) else v for v in values])
+    except (ValueError, TypeError):  # lists of several lengths
+        found = np.empty(len(values), object)
+    return found if found.dtype.kind in "biufUS" else found.astype(object)
+
+
+def _stacked(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Tables of one form, side by side under one key each, as one table with the key as `RUN`: the tests of a file.
+
+    A file of WPILib SysId is such: «slow-forward», «fast-backward», ... are lists of rows.
+    """
+    shaped = {at: v for at, v in arrays.items() if v.ndim == 2 and v.dtype.kind in "iuf" and v.shape[1] > 1}
+    widths = {v.shape[1] for v in shaped.values()}
+    groups = {group(at) for at in shaped}
+    if len(shaped) < 2 or len(widths) > 1 or len(groups) > 1:
+        return arrays
+    (above,) = groups
+    rest = {at: v for at, v in arrays.items() if at not in shaped}
+    runs = np.concatenate([np.full(len(v), parts(at)[-1]) for at, v in shaped.items()])
+    return rest | {f"{above}rows": np.concatenate(list(shaped.values())), f"{above}{RUN}": runs}

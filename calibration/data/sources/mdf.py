@@ -1,0 +1,85 @@
+"""MDF version 4 (and 3), the measurement files of test benches and vehicles."""
+
+from __future__ import annotations
+
+import collections
+import contextlib
+import logging
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calibration.data.sources.recorded_signals import Clock, Signal
+
+
+def of_mdf(path: Path, name: str) -> tuple[Signal, ...]:
+    """Signals of an MDF file by channel; where groups have channels of one name, `group/channel`."""
+    found: list[Signal] = []
+    with _opened(path) as file:
+        count = collections.Counter(c.name for g in file.groups for c in g.channels)
+        for k, group in enumerate(file.groups):
+            master = file.masters_db.get(k)
+            rows = group.channel_group.cycles_nr
+            title = str(getattr(group.channel_group, "acq_name", "") or f"group{k}")
+            clock = None if master is None else Clock(group.channels[master].name, _time(path, k), "s")
+            for j, channel in enumerate(group.channels):
+                if j == master:
+                    continue
+                at = channel.name if count[channel.name] == 1 else f"{title}/{channel.name}"
+                unit = file.get_channel_unit(group=k, index=j) or ""
+                found.append(Signal(at, rows, _column(path, k, j), unit, clock))
+    clocks = {id(s.clock) for s in found}
+    if len(clocks) == 1 and found and found[0].clock is not None:  # a table
+        time = found[0].clock
+        found = [Signal("time_s", found[0].length, time.load, "s"), *(_in_table(s) for s in found)]
+    return tuple(found)
+
+
+def _in_table(signal: Signal) -> Signal:
+    return Signal(signal.path, signal.length, signal.load, signal.unit)
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Any:
+    from asammdf import MDF
+
+    logging.getLogger("asammdf").setLevel(logging.CRITICAL)  # its messages become this program's
+    with path.open("rb") as stream:  # of a path it may make and remove further files
+        try:
+            file = MDF(stream)
+        except Exception as error:
+            _close_half_made(error)
+            raise
+        with file:
+            yield file
+
+
+def _close_half_made(error: BaseException) -> None:
+    """Marks the object of a file that could not be opened as closed; its own closing fails, and says so on stderr."""
+    frame = error.__traceback__
+    while frame is not None:
+        for held in frame.tb_frame.f_locals.values():
+            if type(held).__module__.startswith("asammdf.") and hasattr(held, "_closed"):
+                held._closed = True
+                if (temporary := getattr(held, "_tempfile", None)) is not None:
+                    temporary.close()
+        frame = frame.tb_next
+
+
+def _time(path: Path, group: int) -> Callable[[], np.ndarray]:
+    def load() -> np.ndarray:
+        with _opened(path) as file:
+            return np.array(file.get_master(group))
+
+    return load
+
+
+def _column(path: Path, group: int, index: int) -> Callable[[], np.ndarray]:
+    def load() -> np.ndarray:
+        with _opened(path) as file:
+            values = np.asarray(file.get(group=group, index=index).samples)
+        return np.char.decode(values, "utf-8", "replace") if values.dtype.kind == "S" else values
+
+    return load

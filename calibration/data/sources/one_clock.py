@@ -1,0 +1,212 @@
+"""Signals with clocks of their own, brought to one grid of time: commands are held, states follow straight lines."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from calibration.data import counters
+from calibration.data.input_errors import BadData, number
+from calibration.data.sources.recorded_signals import UNITS, Clock, Signal
+from mmrjax.errors import count_noun
+
+#: Seconds since 1970 between which a clock may count from there: 1990 and 2100.
+EPOCH = (6.3e8, 4.2e9)
+#: Usual steps by which a sample may be recorded late.
+LATE = 20.0
+#: Share of a step of the grid by which stamps that are the same may differ.
+SAME = 1e-3
+#: Largest step of whole numbers that are ms, µs and ns: rates of 10 Hz to 10 kHz, and below.
+_STEPS = {"ms": 1e2, "us": 1e5, "ns": 1e8}
+
+
+class Elapsed(NamedTuple):
+    """Times of a clock.
+
+    Attributes:
+        time: since its first sample [s], shape (n,); first: that sample by the clock [s].
+        unit: of its numbers, empty for dates; period: of a counter that wraps, else 0.
+    """
+
+    time: np.ndarray
+    first: float
+    unit: str
+    period: float = 0.0
+
+
+def seconds(clock: Clock) -> Elapsed:
+    """Returns the times of a clock.
+
+    A clock that does not state its unit is read by its numbers: since 1970 by their size, else by their steps.
+    Numbers that are not whole are seconds. A counter that wraps goes on.
+    """
+    raw = np.asarray(clock.load())
+    if raw.dtype.kind in "Mm":
+        whole = raw.astype("datetime64[ns]" if raw.dtype.kind == "M" else "timedelta64[ns]").astype(np.int64)
+        return Elapsed((whole - whole[:1]) * 1e-9, float(whole[0]) * 1e-9, "")
+    if raw.dtype.kind in "iu":
+        raw = raw.astype(np.int64)
+    unit, period = clock.unit or guessed_unit(raw), 0.0
+    if (np.diff(raw) < 0).any():
+        raw, period = counters.unwrapped(raw.astype(float), np.zeros(len(raw), int))
+    one = UNITS[unit]
+    return Elapsed((raw - raw[:1]) * one, float(raw[0]) * one, unit, period)
+
+
+def guessed_unit(raw: np.ndarray) -> str:
+    """Unit of a clock by its numbers, a key of `recorded_signals.UNITS`."""
+    found = np.asarray(raw, float)
+    found = found[np.isfinite(found)]
+    if not len(found):
+        return "s"
+    for unit in ("s", "ms", "us", "ns"):
+        low, high = (limit / UNITS[unit] for limit in EPOCH)
+        if low <= found[0] <= high:
+            return unit
+    steps = np.diff(found)
+    steps = steps[steps > 0]
+    if not len(steps) or (found % 1).any():
+        return "s"
+    usual = float(np.median(steps))
+    return next((unit for unit, largest in _STEPS.items() if usual <= largest), "s")
+
+
+def on_one_grid(
+    name: str,
+    chosen: Mapping[str, Signal],
+    is_held: Callable[[str], bool],
+    is_measured: Callable[[str], bool],
+    grid: str,
+) -> tuple[np.ndarray, dict[str, np.ndarray], tuple[str, ...]]:
+    """Time [s] from the first row, values of each signal on it, and notes on what was resampled.
+
+    The grid is the time stamps of the densest measured signal, or of the stated clock. Signals on its clock stay as
+    they are. A command has the value of its last sample; rows before the first sample of a command are left out. A
+    reading is used once: in the row nearest to each of its samples, at the value of the straight line between samples
+    there; other rows have none.
+
+    Args:
+        name: of the source; chosen: signals by the name of their column, each with a clock.
+        is_held: True for a column whose values are held; is_measured: True for a column of readings.
+        grid: name of a clock that is the grid; empty: the densest.
+
+    Raises:
+        BadData: a clock that goes back, or clocks that have no time in common.
+    """
+    clocks = {id(s.clock): s.clock for s in chosen.values() if s.clock is not None}
+    read = {key: seconds(clock) for key, clock in clocks.items()}
+    begin = min(elapsed.first for elapsed in read.values())
+    times = {key: elapsed.time + (elapsed.first - begin) for key, elapsed in read.items()}
+    order = {key: _order(time) for key, time in times.items()}
+    late = {key: int(np.count_nonzero(np.diff(times[key]) < 0)) for key, rows in order.items() if rows is not None}
+    times = {key: time if order[key] is None else time[order[key]] for key, time in times.items()}
+    same = {key: next(k for k in times if np.array_equal(times[k], time)) for key, time in times.items()}
+    for key, time in times.items():
+        _check(name, clocks[key].name, time)
+    measured = {id(s.clock) for column, s in chosen.items() if is_measured(column)}
+    stated = [key for key, clock in clocks.items() if grid and clock.name == grid]
+    pool = stated or sorted(measured or times, key=lambda key: _step(times[key]))
+    main = pool[0]
+    rows = times[main]
+    held = {column for column in chosen if is_held(column)}
+    starts = [times[id(chosen[column].clock)][0] for column in held]
+    alike = SAME * min(_step(rows), 1.0)
+    kept = rows >= max(starts, default=-np.inf) - alike
+    for key, time in times.items():
+        if time[-1] < rows[kept][0] if kept.any() else True:
+            raise BadData(
+                f"{name}: {clocks[key].name} ends at {number(time[-1])} s, before {clocks[main].name} and "
+                "every command have begun; expected clocks with a time in common"
+            )
+    values: dict[str, np.ndarray] = {}
+    brought: dict[str, list[str]] = {}
+    for column, signal in chosen.items():
+        own, key, sorted_by = signal.load(), same[id(signal.clock)], order[id(signal.clock)]
+        own = own if sorted_by is None else own[sorted_by]
+        if key == same[main]:
+            values[column] = own[kept]
+            continue
+        on = rows[kept]
+        if column in held or own.dtype.kind not in "biuf":
+            values[column] = own[np.maximum(np.searchsorted(times[key], on + alike, side="right") - 1, 0)]
+            brought.setdefault("held", []).append(column)
+        else:
+            values[column] = used_once(on, times[key], own)
+            brought.setdefault("interpolated", []).append(column)
+    notes = []
+    if brought:
+        how = {
+            "held": "held from sample to sample",
+            "interpolated": "on the straight line between samples, each used once",
+        }
+        each = "; ".join(f"{', '.join(columns)} {how[kind]}" for kind, columns in brought.items())
+        notes.append(
+            f"{name}: signals have clocks of their own; rows are those of {clocks[main].name} ({_rate(rows)}): {each}"
+        )
+    if not kept.all():
+        notes.append(f"{name}: {np.count_nonzero(~kept)} rows before the first command are left out")
+    for key, clock in clocks.items():
+        unit, period = read[key].unit, read[key].period
+        if key in late:
+            notes.append(
+                f"{name}: {count_noun(late[key], 'sample')} of {clock.name} recorded late; sorted by their stamps"
+            )
+        if period:
+            notes.append(f"{name}: {clock.name} wraps at {period:.10g}; counted on from there")
+        if not clock.unit and unit not in ("", "s"):
+            notes.append(f"{name}: {clock.name} states no unit; its numbers are read as {unit} ({_rate(times[key])})")
+    on = rows[kept]
+    return on - on[0], values, tuple(notes)
+
+
+def used_once(rows: np.ndarray, time: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Readings in the rows nearest to their samples, on the straight line between these; NaN in other rows.
+
+    Args:
+        rows: time of the rows [s], shape (rows,); time, values: of the samples, shape (samples,).
+    """
+    own = np.asarray(values, float)
+    sound = np.isfinite(own)
+    time, own = time[sound], own[sound]
+    found = np.full(len(rows), np.nan)
+    if not len(time) or not len(rows):
+        return found
+    after = np.clip(np.searchsorted(rows, time), 1, max(len(rows) - 1, 1))
+    nearest = np.where(time - rows[after - 1] <= rows[np.minimum(after, len(rows) - 1)] - time, after - 1, after)
+    nearest = np.minimum(nearest, len(rows) - 1)
+    step = _step(rows)
+    near = np.unique(nearest[np.abs(rows[nearest] - time) <= max(step, 1e-9)])
+    near = near[(rows[near] >= time[0]) & (rows[near] <= time[-1])]
+    found[near] = np.interp(rows[near], time, own)
+    return found
+
+
+def _order(time: np.ndarray) -> np.ndarray | None:
+    """Order of samples by their stamps, where some were recorded a little late; None: they are in order, or the clock
+    was set back."""
+    step = np.diff(time)
+    if not (step < 0).any() or step.min() < -LATE * float(np.median(np.abs(step))):
+        return None
+    return np.argsort(time, kind="stable")
+
+
+def _step(time: np.ndarray) -> float:
+    return float(np.median(np.diff(time))) if len(time) > 1 else np.inf
+
+
+def _rate(time: np.ndarray) -> str:
+    step = _step(time)
+    return f"{number(round(1 / step, 3 if step > 1 else 0))} Hz" if 0 < step < np.inf else "one sample"
+
+
+def _check(name: str, clock: str, time: np.ndarray) -> None:
+    if not len(time):
+        raise BadData(f"{name}, {clock}: has no sample; expected time stamps")
+    if (back := np.flatnonzero(~(np.diff(time) >= 0))).size:
+        at = int(back[0])
+        raise BadData(
+            f"{name}, {clock}: goes back from {number(time[at])} to {number(time[at + 1])} s at sample {at + 2}; "
+            "expected time stamps that rise; sort the recording, or give each part its own file"
+        )

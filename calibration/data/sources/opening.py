@@ -1,0 +1,198 @@
+"""Opening of any source of data: its format is found from its first bytes, its signals are listed."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import importlib
+import os
+import stat
+import zipfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calibration.data import input_files
+from calibration.data.input_errors import BadData, InputError
+from calibration.data.sources.recorded_signals import Signal, Source
+
+#: Between the path of a file and that of signals in it.
+WITHIN = "::"
+
+
+@dataclasses.dataclass(frozen=True)
+class Format:
+    """A format of files.
+
+    Attributes:
+        kind: what a file of it is called; module, reader: the function that lists its signals.
+        library: that it needs; extra: of this package that installs it.
+    """
+
+    kind: str
+    module: str
+    reader: str
+    library: str = ""
+
+    def signals(self, path: Path, name: str) -> Any:
+        """Signals of a file.
+
+        Raises:
+            BadData: a library that is not installed, or a file that it cannot read.
+        """
+        try:
+            module = importlib.import_module(f"calibration.data.sources.{self.module}")
+            return getattr(module, self.reader)(path, name)
+        except InputError:
+            raise
+        except ImportError as error:
+            if not self.library:
+                raise
+            raise BadData(
+                f"{name}: is {self.kind}, which {self.library} reads, and it is not installed; install it with "
+                "pip install mmrjax[logs]"
+            ) from error
+        except Exception as error:  # each library has errors of its own
+            raise unreadable(name, self.kind, error) from error
+
+
+PARQUET = Format("a Parquet file", "columnar", "of_parquet")
+ARROW = Format("an Arrow file", "columnar", "of_arrow")
+HDF5 = Format("an HDF5 file", "arrays", "of_hdf5", "h5py")
+MATLAB = Format("a MATLAB file", "arrays", "of_matlab")
+NPZ = Format("an .npz archive", "arrays", "of_npz")
+NPY = Format("a NumPy file", "arrays", "of_npy")
+JSON = Format("a JSON file", "json_records", "of_json")
+BAG = Format("a ROS bag", "bags", "of_bag", "rosbags")
+MCAP = Format("an MCAP file", "bags", "of_bag", "rosbags")
+ULOG = Format("a ULog file", "ulog", "of_ulog", "pyulog")
+MDF = Format("an MDF file", "mdf", "of_mdf", "asammdf")
+
+#: First bytes of each format.
+BEGINNINGS = {
+    b"PAR1": PARQUET, b"ARROW1": ARROW, b"\xff\xff\xff\xff": ARROW, b"\x89HDF\r\n\x1a\n": HDF5,
+    b"MATLAB 7.3": HDF5, b"MATLAB 5.0": MATLAB, b"\x93NUMPY": NPY, b"#ROSBAG": BAG, b"\x89MCAP": MCAP,
+    b"ULog": ULOG, b"MDF     ": MDF, b"UnFinMF ": MDF,
+}  # fmt: skip
+#: Formats whose files begin with anything, by suffix.
+SUFFIXES = {".mat": MATLAB, ".db3": BAG, ".jsonl": JSON, ".ndjson": JSON}
+#: Bytes of a value, and share of the free memory that values may take; copies and checks take the rest.
+VALUE, SHARE = 8.0, 0.3
+#: File of a ROS 2 bag's folder that lists its contents.
+_METADATA = "metadata.yaml"
+
+
+def unreadable(name: str, kind: str, error: BaseException) -> BadData:
+    """The error of a file that its library refuses."""
+    why = " ".join(str(error).split()) or type(error).__name__
+    return BadData(f"{name}: cannot be read as {kind} ({why}); it may be cut off or damaged; export or copy it again")
+
+
+def split(source: str) -> tuple[Path, str]:
+    """Path of a file, and path of signals in it; empty if it is not stated."""
+    if Path(source).exists():
+        return Path(source), ""
+    file, _, within = source.partition(WITHIN)
+    return Path(file), within
+
+
+def format_of(path: Path, name: str) -> Format | None:
+    """Format of a file or of a bag's folder; None: text in columns.
+
+    Raises:
+        BadData: a pipe, a device, a folder that is no bag, or a file that the system does not open.
+    """
+    if path.is_dir() and (path / _METADATA).exists():
+        return BAG
+    begin = input_files.beginning(path, name)
+    for magic, found in BEGINNINGS.items():
+        if begin.startswith(magic):
+            return found
+    if begin.startswith(b"PK\x03\x04") and _is_npz(path):
+        return NPZ
+    if any(text.match(begin) for text, word in input_files.TEXTS.items() if word == "JSON"):
+        return JSON
+    return SUFFIXES.get(path.suffix.lower())
+
+
+def _is_npz(path: Path) -> bool:
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = archive.namelist()
+    except (zipfile.BadZipFile, OSError):
+        return path.suffix.lower() == ".npz"
+    return any(name.endswith(".npy") for name in names)
+
+
+def opened(path: Path, within: str, name: str, form: Format) -> Source:
+    """The signals of a file of a format other than text.
+
+    Args:
+        within: path of signals in it, empty for all; name: of the file, for messages.
+
+    Raises:
+        BadData: as `Format.signals`; no signal, or none below `within`.
+    """
+    if path.is_dir():
+        check_folder(path, name)
+    signals = tuple(form.signals(path, name))
+    if not signals:
+        raise BadData(f"{name}: is {form.kind} without signals; expected at least one column or array")
+    found = Source(name, form.kind, _guarded(signals, name, form.kind), digest(path))
+    return found.below(within) if within else found
+
+
+def _guarded(signals: Sequence[Signal], name: str, kind: str) -> tuple[Signal, ...]:
+    """Signals that raise `BadData` where their library cannot read their values; clocks that are shared stay so."""
+
+    def guarded(load: Callable[[], np.ndarray], path: str) -> Callable[[], np.ndarray]:
+        def read() -> np.ndarray:
+            try:
+                return load()
+            except InputError:
+                raise
+            except Exception as error:  # each library has errors of its own
+                raise unreadable(f"{name}, {path}", kind, error) from error
+
+        return read
+
+    clocks = {id(s.clock): s.clock for s in signals if s.clock is not None}
+    sound = {key: dataclasses.replace(clock, load=guarded(clock.load, clock.name)) for key, clock in clocks.items()}
+    return tuple(
+        dataclasses.replace(s, load=guarded(s.load, s.path), clock=None if s.clock is None else sound[id(s.clock)])
+        for s in signals
+    )
+
+
+def check_folder(path: Path, name: str) -> None:
+    """Refuse a bag whose folder has a file that is no regular file, or a link that leads out of it.
+
+    Raises:
+        BadData: it has.
+    """
+    for item in path.iterdir():
+        if item.is_symlink() and not (item.exists() and item.resolve().is_relative_to(path.resolve())):
+            raise BadData(f"{name}, {item.name}: is a link that leads out of the bag; expected the file itself")
+        if not stat.S_ISREG(item.stat().st_mode) and not item.is_dir():
+            raise BadData(f"{name}, {item.name}: is no regular file; expected the files of a bag")
+
+
+def digest(path: Path) -> str:
+    """SHA-256 of a file, or of the files of a folder in the order of their names."""
+    found = hashlib.sha256()
+    for file in sorted(path.iterdir()) if path.is_dir() else [path]:
+        if file.is_file():
+            with file.open("rb") as stream:
+                while block := stream.read(2**20):
+                    found.update(block)
+    return found.hexdigest()
+
+
+def available() -> float:
+    """Memory that is free on this machine [bytes]; infinite where the system does not tell."""
+    try:
+        return float(os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    except (ValueError, OSError, AttributeError):
+        return float("inf")

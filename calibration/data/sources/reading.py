@@ -1,0 +1,273 @@
+"""Named columns of any source: which of its signals are read, and how they become rows of one table."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calibration.data import delimited, presets_file
+from calibration.data.columns import SPEED, TIME, WHEN, WORDS, Layout
+from calibration.data.input_errors import BadData
+from calibration.data.named_arrays import NamedArrays, Raw, numbers
+from calibration.data.presets_file import Preset
+from calibration.data.sources import in_memory, one_clock, opening
+from calibration.data.sources.recorded_signals import Signal, Source, named, offered, one
+from mmrjax.model import channels, quantities
+
+#: Columns as `Layout.mapped` has them: name here, name in the source, factor from its unit.
+Mapped = tuple[tuple[str, str, float], ...]
+#: Values of columns without a role that are read for what residuals go with, at most.
+EXTRA_VALUES = 20_000_000
+
+
+@dataclasses.dataclass(frozen=True)
+class Reading:
+    """Columns of a source, and what they are read as.
+
+    Attributes:
+        arrays: the columns; mapped: columns that have other names in the source.
+    """
+
+    arrays: NamedArrays
+    mapped: Mapped
+
+
+def read(source: Any, layout: Layout, columns: Preset | None = None, between: str = "held") -> Reading:
+    """Returns the columns of a file or of a table in memory.
+
+    Args:
+        source: a path, perhaps with `::` and the path of signals in the file, or a table in memory
+            (`in_memory.EXPECTED`).
+        layout: of the table's robot.
+        columns: names of the source's columns, in addition to the robot's; they win over these.
+        between: `linear` where what is imposed follows straight lines between samples, as in `Rig.between_rows`.
+
+    Raises:
+        BadData: no such file, a format that is not read, a damaged file, a signal that is missing or of another kind,
+            or signals of several lengths.
+    """
+    if not isinstance(source, str | Path):
+        kind, signals = in_memory.of_object(source)
+        return _of_signals(Source(kind, kind, signals), layout, columns, between)
+    path, within = opening.split(str(source))
+    name = path.name or str(source)
+    form = opening.format_of(path, name)
+    if form is not None:
+        return _of_signals(opening.opened(path, within, name, form), layout, columns, between)
+    arrays = delimited.arrays(path, name)
+    if columns is not None and columns.header:
+        arrays = _with_header(arrays, columns)
+    return _of_table(arrays, layout, columns)
+
+
+def table(path: Path, within: str = "") -> NamedArrays | None:
+    """Returns every column of a table in a file, as it is; None for text, whose comments say more.
+
+    Raises:
+        BadData: as `read`; signals with clocks of their own, which make no one table.
+    """
+    name = path.name or str(path)
+    form = opening.format_of(path, name)
+    if form is None:
+        return None
+    source = opening.opened(path, within, name, form)
+    signals = {s.path if len(named(source.signals, s.name)) > 1 else s.name: s for s in source.signals}
+    for signal in signals.values():
+        if signal.refused or signal.clock is not None:
+            raise BadData(f"{name}, {signal.path}: {signal.refused or 'has a clock of its own; expected one table'}")
+    _check_memory(name, signals)
+    values = _in_rows(source, signals)
+    units = tuple(quantities.unit_in_column(signal.unit) for signal in signals.values())
+    return NamedArrays(
+        name, tuple(values), tuple(map(_raw, values.values())), units, "the source", digest=source.digest
+    )
+
+
+def _with_header(arrays: NamedArrays, columns: Preset) -> NamedArrays:
+    """A table whose first row is a row of numbers, with the names of a preset."""
+    if len(arrays.header) != len(columns.header) or not np.isfinite(numbers(list(arrays.header))).all():
+        return arrays
+    values = tuple([first, *rest] for first, rest in zip(arrays.header, arrays.values, strict=True))
+    note = f"{arrays.name}: has no header; its columns are read as {', '.join(columns.header)}"
+    return dataclasses.replace(arrays, header=columns.header, values=values, notes=(*arrays.notes, note))
+
+
+def _of_table(arrays: NamedArrays, layout: Layout, columns: Preset | None) -> Reading:
+    if columns is None:
+        return Reading(arrays, layout.mapped)
+    by_name = dict(zip(arrays.header, arrays.values, strict=True))
+
+    def has_readings(name: str) -> bool:
+        return any(cell not in ("", "0") for cell in by_name[name])
+
+    mapped, notes = columns.mapped(lambda name: name if name in by_name else None, has_readings)
+    if arrays.header and not any(theirs in by_name for _, theirs, _ in mapped):
+        raise _none_of(arrays.name, columns, arrays.header)
+    return Reading(
+        dataclasses.replace(arrays, notes=(*arrays.notes, *notes)), presets_file.merged(mapped, layout.mapped)
+    )
+
+
+def _none_of(name: str, columns: Preset, header: Sequence[str]) -> BadData:
+    wanted = ", ".join(column.theirs[0] for column in columns.columns[:6]) + (
+        ", ..." if len(columns.columns) > 6 else ""
+    )
+    has = ", ".join(header[:8]) + (", ..." if len(header) > 8 else "")
+    return BadData(
+        f"{name}: has none of the columns of {columns.name} ({wanted}), but {has}; choose another preset, or copy it "
+        "and change the names"
+    )
+
+
+def _of_signals(source: Source, layout: Layout, columns: Preset | None, between: str) -> Reading:
+    """Columns of the signals that mean something, and of few others."""
+    signals = source.signals
+
+    def found(name: str) -> str | None:
+        return name if named(signals, name) else None
+
+    mapped, notes = ((), ()) if columns is None else columns.mapped(found)
+    if columns is not None and not any(found(theirs) for _, theirs, _ in mapped):
+        raise _none_of(source.name, columns, [s.path for s in signals])
+    mapped = presets_file.merged(mapped, layout.mapped)
+    chosen, clock, missing = _chosen(source, mapped, layout)
+    for column, signal in chosen.items():
+        if signal.refused:
+            raise BadData(
+                f"{source.name}, {signal.path}: {signal.refused}"
+                + ("" if column == signal.path else f" (read as {column})")
+            )
+    own = [s for s in chosen.values() if s.clock is not None]
+    extras = _extras(source, chosen, own)
+    _check_memory(source.name, {**chosen, **extras})
+    if own:
+        values, more = _on_a_grid(source, chosen, layout, between, clock, mapped)
+    else:
+        values, more = _in_rows(source, chosen), ()
+        values |= _in_rows(source, extras, len(next(iter(values.values()), [])))
+    units = tuple(
+        quantities.unit_in_column(next((s.unit for c, s in chosen.items() if c == name), "")) for name in values
+    )
+    arrays = NamedArrays(
+        source.name,
+        tuple(values),
+        tuple(map(_raw, values.values())),
+        units,
+        "the source",
+        (*source.notes, *more, *notes, *missing),
+        source.digest,
+    )
+    return Reading(arrays, mapped)
+
+
+def _chosen(source: Source, mapped: Mapped, layout: Layout) -> tuple[dict[str, Signal], str, tuple[str, ...]]:
+    """Signals by the name of their column, the clock that is stated as the grid, and notes on missing signals.
+
+    A signal has a column if a table of columns names it, or if the last part of its path is a column's name.
+    """
+    chosen: dict[str, Signal] = {}
+    clock, missing = "", []
+    clocks = {s.clock.name for s in source.signals if s.clock is not None}
+    for mine, theirs, _ in mapped:
+        meant = {s.path for s in named(source.signals, theirs)}
+        if theirs in clocks or (meant and meant <= clocks):  # several: each signal has its own
+            clock = theirs if theirs in clocks else meant.pop() if len(meant) == 1 else ""
+        elif meant:
+            chosen[theirs] = one(source.signals, theirs, source.name)
+        else:
+            near = offered(theirs, [s.path for s in source.signals])
+            missing.append(f"{source.name}: no signal {theirs}, which {mine} is read from; {near}")
+    own = dataclasses.replace(layout, channels=channels.EVERY, mapped=()).spellings()
+    spelled = {name.casefold() for name in own}
+    taken = {id(signal) for signal in chosen.values()}
+    for signal in source.signals:
+        vague = signal.clock is not None and signal.name in (*WORDS, *WHEN)  # a topic's mode is something else
+        if signal.name.casefold() in spelled and id(signal) not in taken and not vague:
+            chosen.setdefault(signal.name, signal)
+    return chosen, clock, tuple(missing)
+
+
+def _extras(source: Source, chosen: Mapping[str, Signal], own: Sequence[Signal]) -> dict[str, Signal]:
+    """Further columns of a table, as long as the chosen ones, if there are few values."""
+    taken = {id(signal) for signal in chosen.values()}
+    lengths = {s.length for s in chosen.values() if s.length > 1} or {max(s.length for s in source.signals)}
+    others = [s for s in source.signals if id(s) not in taken and not s.refused and s.length in lengths]
+    if own or sum(s.length for s in others) > EXTRA_VALUES:
+        return {}
+    return {s.path: s for s in others}
+
+
+def _check_memory(name: str, signals: Mapping[str, Signal]) -> None:
+    """Refuse columns that need more memory than is free."""
+    size, free = opening.VALUE * sum(s.length for s in signals.values()), opening.available()
+    if size > opening.SHARE * free:
+        raise BadData(
+            f"{name}: {len(signals)} columns have {size / 1e9:.3g} GB, and {free / 1e9:.3g} GB of memory are free; "
+            f"expected at most {opening.SHARE * free / 1e9:.3g} GB; give a part of the recording, or every n-th row"
+        )
+
+
+def _in_rows(source: Source, signals: Mapping[str, Signal], rows: int = 0) -> dict[str, np.ndarray]:
+    """Values of the columns of a table; a single value is that of every row."""
+    lengths = {column: s.length for column, s in signals.items()}
+    rows = rows or max(lengths.values(), default=0)
+    for column, length in lengths.items():
+        if length not in (1, rows):
+            other = next((signals[c].path for c, n in lengths.items() if n == rows), "the time of the others")
+            raise BadData(
+                f"{source.name}, {signals[column].path}: has {length} values, and {other} has {rows}; "
+                "expected equal lengths, or time stamps of its own in the same group, an array named time"
+            )
+    found = {}
+    for column, signal in signals.items():
+        values = signal.load()
+        found[column] = values if len(values) == rows else np.repeat(values, rows)
+    return found
+
+
+def _on_a_grid(
+    source: Source, chosen: Mapping[str, Signal], layout: Layout, between: str, clock: str, mapped: Mapped
+) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
+    """Values of signals with clocks of their own, on one grid."""
+    meanings = dataclasses.replace(layout, mapped=mapped).meanings(source.name, list(chosen))
+    column_of = {c: "" if m is None else m.column for c, m in zip(chosen, meanings, strict=True)}
+    read = {*layout.measured_columns, *layout.deviation_columns}
+    over_time = {c: s for c, s in chosen.items() if s.clock is not None and column_of[c] not in TIME}
+    others = {c: s for c, s in chosen.items() if s.clock is None and column_of[c] not in TIME}
+    lines = {layout.imposed_column} if between == "linear" or layout.imposed_column == SPEED else set()
+
+    def is_measured(column: str) -> bool:
+        return column_of[column] in read
+
+    def is_held(column: str) -> bool:
+        return not is_measured(column) and column_of[column] not in lines
+
+    if not over_time:
+        raise BadData(f"{source.name}: no signal has a column's name; {_how_to_name(source)}")
+    time, values, notes = one_clock.on_one_grid(source.name, over_time, is_held, is_measured, clock)
+    return {"time_s": time, **values, **_in_rows(source, others, len(time))}, notes
+
+
+def _how_to_name(source: Source) -> str:
+    paths = [s.path for s in source.signals]
+    return (
+        f"{offered('', paths)}; say in the robot's file which is which, [columns] supply_voltage_V = "
+        f'"{paths[0]}" (mmrjax inspect proposes the lines)'
+    )
+
+
+def _raw(values: np.ndarray) -> Raw:
+    """Values as the checks of a table take them: numbers as an array, words and dates as a list."""
+    if values.dtype.kind in "US":
+        return [str(value).strip() for value in values.tolist()]
+    if values.dtype.kind == "M":  # dates are read as text; the clock counts from the first
+        whole, lost = values.astype("datetime64[ns]").astype(np.int64), np.isnat(values)
+        first = whole[~lost].min() if not lost.all() else 0
+        return np.where(lost, np.nan, (whole - first) * 1e-9)
+    if values.dtype.kind == "m":
+        return np.where(np.isnat(values), np.nan, values.astype("timedelta64[ns]").astype(np.int64) * 1e-9)
+    return values

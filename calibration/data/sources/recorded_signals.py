@@ -1,0 +1,228 @@
+"""Signals of a recording: each has a path, values that are read when needed, and perhaps a clock of its own."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+
+import numpy as np
+
+from calibration.data.input_errors import BadData
+from mmrjax.errors import similar_words
+
+#: Last parts of the paths of signals that are time stamps, without a unit behind them.
+CLOCKS = ("time", "t", "timestamp", "timestamps", "stamp", "elapsed", "clock", "timestamp_sample")
+#: Units that the name of a clock may end with, and the seconds of one.
+UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
+#: Paths that a message lists, at most.
+LISTED = 12
+#: What separates the parts of a path.
+_PARTS = re.compile(r"[/.]|::")
+_UNIT_OF_CLOCK = re.compile(r"(?:[_ ]?[\[(]?)(s|ms|us|µs|ns|sec|seconds|millis|micros)[\])]?$", re.IGNORECASE)
+_WORDS_OF_UNITS = {"sec": "s", "seconds": "s", "millis": "ms", "micros": "us"}
+
+
+@dataclasses.dataclass(frozen=True)
+class Clock:
+    """Time stamps that several signals share.
+
+    Attributes:
+        name: path of the time stamps, for messages; load: returns them, shape (n,), numbers or `datetime64`.
+        unit: of the numbers, a key of `UNITS`; empty where the recording does not state it.
+    """
+
+    name: str
+    load: Callable[[], np.ndarray]
+    unit: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class Signal:
+    """One signal of a recording.
+
+    Attributes:
+        path: its name in the recording; length: number of its samples.
+        load: returns the values, shape (length,): numbers, words or `datetime64`.
+        unit: that the recording states, empty where it states none.
+        clock: its own; None: its samples are rows of a table.
+        words: True if the values are text; refused: why it cannot be read, empty where it can.
+    """
+
+    path: str
+    length: int
+    load: Callable[[], np.ndarray]
+    unit: str = ""
+    clock: Clock | None = None
+    words: bool = False
+    refused: str = ""
+
+    @property
+    def name(self) -> str:
+        """Last part of the path."""
+        return parts(self.path)[-1]
+
+
+def known(values: np.ndarray) -> Callable[[], np.ndarray]:
+    """Returns a function that returns values which are in memory."""
+    return lambda: values
+
+
+def parts(path: str) -> list[str]:
+    """Returns the parts of a path, separated by slashes, points or double colons."""
+    return [part for part in _PARTS.split(path) if part] or [path]
+
+
+def named(signals: Iterable[Signal], name: str) -> list[Signal]:
+    """Signals that a name means: the one with this path, else those whose path ends with its parts."""
+    pool = list(signals)
+    if exact := [s for s in pool if s.path == name]:
+        return exact
+    wanted = parts(name)
+    return [s for s in pool if parts(s.path)[-len(wanted) :] == wanted]
+
+
+def one(signals: Sequence[Signal], name: str, where: str) -> Signal:
+    """The signal that a name means.
+
+    Raises:
+        BadData: none, or several.
+    """
+    found = named(signals, name)
+    if len(found) == 1:
+        return found[0]
+    if found:
+        listed = ", ".join(s.path for s in found[:8])
+        raise BadData(
+            f"{where}, {name}: got a name of {len(found)} signals, {listed}; expected the path of one of them"
+        )
+    raise BadData(f"{where}, {name}: no such signal; {offered(name, [s.path for s in signals])}")
+
+
+def offered(name: str, paths: Sequence[str]) -> str:
+    """Paths that a message offers for an unknown name: near ones, else the first."""
+    close = similar_words(name, paths, 3)
+    if close:
+        return f"did you mean {', '.join(close)}?"
+    return f"it has {', '.join(paths[:LISTED])}{', ...' if len(paths) > LISTED else ''}"
+
+
+def unit_of_clock(name: str) -> str | None:
+    """Unit that the name of a clock states, empty where it states none; None if it is not a name of a clock."""
+    bare = name.strip().casefold()
+    if bare in CLOCKS:
+        return ""
+    if bare in ("millis", "micros", "nanos"):
+        return {"millis": "ms", "micros": "us", "nanos": "ns"}[bare]
+    found = _UNIT_OF_CLOCK.search(bare)
+    if found and bare[: found.start()].rstrip("_ ") in CLOCKS:
+        unit = found.group(1)
+        return _WORDS_OF_UNITS.get(unit, unit.replace("µ", "u"))
+    return None
+
+
+def of_arrays(
+    arrays: Mapping[str, tuple[tuple[int, ...], np.dtype, Callable[[], np.ndarray]]],
+    units: Mapping[str, str] | None = None,
+) -> tuple[Signal, ...]:
+    """Signals of named arrays; columns of an array of two dimensions are signals of their own, `name[0]`.
+
+    Arrays of one group that are equally long share its time stamps: the array there whose name is a clock's. A group
+    without one, or a recording in which every array is equally long, is a table.
+
+    Args:
+        arrays: by path: shape, kind of numbers, and a function that returns the array.
+        units: that the recording states, by path.
+    """
+    units = units or {}
+    shapes = {path: (shape, dtype) for path, (shape, dtype, _) in arrays.items()}
+    lengths = {longest(shape) for shape, _ in shapes.values() if longest(shape) > 1}
+    clocks: dict[tuple[str, int], Clock] = {}
+    if len(lengths) > 1:
+        for path, (shape, dtype) in shapes.items():
+            unit = unit_of_clock(parts(path)[-1])
+            if unit is not None and dtype.kind in "iufM" and sum(n > 1 for n in shape) == 1:
+                clocks.setdefault((group(path), longest(shape)), Clock(path, _flat(arrays[path][2]), unit))
+    found: list[Signal] = []
+    for path, (shape, dtype, load) in arrays.items():
+        unit = units.get(path, "")
+        own = {name: clock for (name, n), clock in clocks.items() if n == longest(shape)}
+        clock = own.get(group(path)) or (next(iter(own.values())) if len(own) == 1 else None)
+        found += _of_array(path, shape, dtype, load, unit, clock)
+    return tuple(found)
+
+
+def group(path: str) -> str:
+    """Path without its last part."""
+    last = parts(path)[-1]
+    return path[: len(path) - len(last)] if path.endswith(last) else ""
+
+
+def longest(shape: tuple[int, ...]) -> int:
+    """Number of samples of an array: its first dimension, of a row the other one."""
+    if not shape:
+        return 1
+    return shape[1] if len(shape) == 2 and shape[0] == 1 else shape[0]
+
+
+def _flat(load: Callable[[], np.ndarray]) -> Callable[[], np.ndarray]:
+    return lambda: np.ravel(load())
+
+
+def _of_array(
+    path: str, shape: tuple[int, ...], dtype: np.dtype, load: Callable[[], np.ndarray], unit: str, clock: Clock | None
+) -> list[Signal]:
+    words, n = dtype.kind in "US", longest(shape)
+    refused = ""
+    if dtype.names:
+        return [
+            s
+            for name in dtype.names
+            for s in _of_array(f"{path}.{name}", shape, dtype[name], _field(load, name), "", clock)
+        ]
+    if dtype.kind not in "biufUSMm":
+        kinds = {"O": "objects", "c": "complex numbers", "V": "raw bytes"}
+        refused = f"holds {kinds.get(dtype.kind, f'values of type {dtype}')}; expected numbers or words"
+    elif len(shape) > 2:
+        refused = f"has {len(shape)} dimensions; expected one, or two for several signals"
+    if refused or len(shape) < 2 or 1 in shape:
+        return [Signal(path, n, _flat(load), unit, clock, words, refused)]
+    return [Signal(f"{path}[{j}]", n, _column(load, j), unit, clock, words) for j in range(shape[1])]
+
+
+def _column(load: Callable[[], np.ndarray], j: int) -> Callable[[], np.ndarray]:
+    return lambda: load()[:, j]
+
+
+def _field(load: Callable[[], np.ndarray], name: str) -> Callable[[], np.ndarray]:
+    return lambda: load()[name]
+
+
+@dataclasses.dataclass(frozen=True)
+class Source:
+    """A recording or a table: its signals, and how it was opened.
+
+    Attributes:
+        name: for messages; kind: of file, `a Parquet file` say.
+        signals: in the order of the recording; digest: SHA-256 of the file, empty of data in memory.
+        notes: sentences on how it was read.
+    """
+
+    name: str
+    kind: str
+    signals: tuple[Signal, ...]
+    digest: str = ""
+    notes: tuple[str, ...] = ()
+
+    def below(self, prefix: str) -> Source:
+        """The signals below a path.
+
+        Raises:
+            BadData: there are none.
+        """
+        wanted = parts(prefix)
+        found = tuple(s for s in self.signals if parts(s.path)[: len(wanted)] == wanted or s.path == prefix)
+        if not found:
+            groups = dict.fromkeys(group(s.path).rstrip("/.") or s.path for s in self.signals)
+            raise BadData(f"{self.name}::{prefix}: no such signal; {offered(prefix, list(groups))}")
+        return dataclasses.replace(self, signals=found)

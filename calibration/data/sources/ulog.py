@@ -1,0 +1,75 @@
+"""ULog, the logs of PX4: fields of the messages of each topic."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calibration.data.input_errors import BadData
+from calibration.data.sources.recorded_signals import Clock, Signal
+
+#: Bytes before the first message.
+HEADER = 16
+
+
+def of_ulog(path: Path, name: str) -> tuple[Signal, ...]:
+    """Signals of a ULog file, `topic.field`, of a second instance `topic[1].field`; time counts from the boot.
+
+    Raises:
+        BadData: a damaged file.
+    """
+    from pyulog import ULog
+
+    _check_end(path, name)
+    with contextlib.redirect_stdout(io.StringIO()):  # on which it reports damage
+        log = ULog(str(path))
+    if log.file_corruption or not log.data_list:
+        raise BadData(
+            f"{name}: is a damaged ULog file, or one without data; expected a whole log; download it again from the "
+            "autopilot"
+        )
+    found = []
+    for data in log.data_list:
+        topic = data.name if data.multi_id == 0 else f"{data.name}[{data.multi_id}]"
+        clock = Clock(f"{topic}.timestamp", _column(data, "timestamp"), "us")
+        for field in data.data:
+            if field != "timestamp":
+                values = data.data[field]
+                found.append(Signal(f"{topic}.{field}", len(values), _column(data, field), "", clock))
+    return tuple(found)
+
+
+def _check_end(path: Path, name: str) -> None:
+    """Refuse a file that ends within a message; the library does not report that.
+
+    Raises:
+        BadData: it does.
+    """
+    size, at = path.stat().st_size, HEADER
+    with path.open("rb") as stream:
+        stream.seek(at)
+        block, begin = b"", at
+        while at < size:
+            if at - begin + 3 > len(block):
+                stream.seek(at)
+                block, begin = stream.read(2**22), at
+            if len(block) - (at - begin) < 3:
+                break
+            after = at + 3 + int.from_bytes(block[at - begin : at - begin + 2], "little")
+            if after > size:
+                break
+            at = after
+    if at != size:
+        raise BadData(
+            f"{name}: ends within a message, at byte {at} of {size}, as if it is cut off; copy it again, or if the "
+            f"recorder lost its power, keep the whole messages: head -c {at} {name}"
+        )
+
+
+def _column(data: Any, field: str) -> Callable[[], np.ndarray]:
+    return lambda: np.asarray(data.data[field])

@@ -1,0 +1,60 @@
+"""The command `export`: a drive in the format of another simulator, with what the format loses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from calibration.data import robot_file
+from sweeps import config as configuration
+from sweeps.export.formats import Export, exported
+from sweeps.inputs import load_robot
+from sweeps.report import export_report
+from sweeps.report.words import export_words as words
+from sweeps.skeleton import leave, report
+from sweeps.store import open_folder
+
+
+def export(config: configuration.Export, out: Path | None, force: bool) -> int:
+    """Export a drive and leave a run folder with its files; returns the exit code, 0."""
+    file = load_robot(config)
+    with open_folder("export", config, file.robot, out, force) as folder:
+        found = exported(
+            file, config.to, configuration=config.configuration, data=config.data, at=config.joint,
+            draws=config.draws, seed=config.seed,
+        )  # fmt: skip
+        robot_file.write(file.robot, folder.partial / "robot.toml", note=f"what was exported, from {config.robot}")
+        for name, content in found.files.items():
+            folder.write_bytes(name, content if isinstance(content, bytes) else content.encode())
+        folder.write_text("LAW.md", words.law(found))
+        folder.write_json("result.json", to_json(found))
+        shown = report(export_report.document(found))
+        return leave(folder, config, {"seed": config.seed}, page=shown, runs=found.comparison.situation.runs)
+
+
+def to_json(found: Export) -> dict[str, Any]:
+    """`result.json`."""
+    compared = found.comparison
+    return {
+        "schema": "mmrjax.export/1",
+        "format": found.format,
+        "robot": found.joint.file.name,
+        "configuration": found.joint.configuration,
+        "statement": words.statement(found),
+        "runs": len(compared.situation.command),
+        "source": compared.situation.source,
+        "reference": compared.reference,
+        "errors_percent": {e.label: dict(e.percent) for e in compared.errors},
+        "translated": dict(compared.translated),
+        "refitted": dict(compared.refitted),
+        "effects": [
+            {"name": f.name, "verdict": f.verdict, "how": f.how, "share_kept": f.kept} for f in compared.fates
+        ],
+        "idle": list(found.joint.idle),
+        "checks": dict(found.checks),
+        "constants": [
+            {"name": c.name, "value": c.value, "unit": c.unit, "low": c.low, "high": c.high, "source": c.source}
+            for c in found.constants
+        ],
+        "files": sorted(found.files),
+    }

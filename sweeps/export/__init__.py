@@ -1,0 +1,1 @@
+"""A calibrated drive in the formats of other simulators."""

@@ -1,0 +1,222 @@
+"""Refit of a format's parameters to the native model, the fate of each effect, and the errors of an export."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Protocol
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+
+from calibration.inference import solvers
+from sweeps.export.joint import Joint, channels_of
+from sweeps.export.situation import AtJoint, Situation
+
+#: Share of an effect's change of current and speed below which the format does not hold it.
+LITTLE = 0.1
+#: Share from which on a format holds an effect but for rounding.
+NEARLY_ALL = 0.999
+#: Weight that keeps parameters near their translation where the runs do not determine them: a relative change of 1 of
+#: a parameter's root counts as much as this relative error of every reading.
+NEAR = 1e-3
+#: Residual below which translated parameters are exact, and no refit changes them.
+EXACT = 1e-7
+HELD, APPROXIMATED, DROPPED = "held", "approximated", "dropped"
+
+
+class FormatLaw(Protocol):
+    """Law of a format in steady travel, with the parameters that a refit may change.
+
+    Attributes:
+        names: of the parameters; start: their values by translation [SI], all positive or zero.
+    """
+
+    names: tuple[str, ...]
+    start: np.ndarray
+
+    def __call__(self, theta: Any, command: Any, load: Any, way: Any) -> tuple[Any, Any]:
+        """Current of one motor [A] and speed of the joint [rad/s], arrays of the shape of `command`."""
+        ...
+
+
+@dataclasses.dataclass(frozen=True)
+class Fate:
+    """Fate of an effect, or of a term of the base, in a format.
+
+    Attributes:
+        name: of the effect or term; verdict: `HELD`, `APPROXIMATED` or `DROPPED`; how: in words.
+        kept: share of its change of current and speed that the exported drive shows [-], NaN where it has none.
+    """
+
+    name: str
+    verdict: str
+    how: str
+    kept: float = np.nan
+
+
+@dataclasses.dataclass(frozen=True)
+class Errors:
+    """Error of one model against the reference of each channel, rms over rms [%], by the name of the channel."""
+
+    label: str
+    percent: Mapping[str, float]
+
+
+@dataclasses.dataclass(frozen=True)
+class Comparison:
+    """An exported drive compared with the native model.
+
+    Attributes:
+        situation: the runs; translated, refitted: parameters of the format by name [SI], before and after the refit.
+        fates: of base terms and effects; errors: of native, exported, translated, and exported without the effects.
+        reference: what errors are relative to, in words; readings: of the exported drive [SI], (runs, channels).
+        exported: at the joint.
+    """
+
+    situation: Situation
+    translated: Mapping[str, float]
+    refitted: Mapping[str, float]
+    fates: tuple[Fate, ...]
+    errors: tuple[Errors, ...]
+    reference: str
+    readings: np.ndarray
+    exported: AtJoint
+
+    def of(self, label: str) -> Mapping[str, float]:
+        """Errors of a model [%] by channel."""
+        return next(e.percent for e in self.errors if e.label == label)
+
+
+#: Labels of the models whose errors are stated.
+NATIVE, EXPORTED, TRANSLATED, WITHOUT = "native", "exported", "exported, not refitted", "exported without the effects"
+
+
+def compare(
+    situation: Situation,
+    law_of: Callable[[Joint, Mapping[str, float]], FormatLaw],
+    fates: Sequence[Fate],
+    held: Mapping[str, str],
+    approximated: Callable[[str], str],
+) -> Comparison:
+    """Compares a format with the native model over runs.
+
+    Args:
+        law_of: the format's law of a joint in which some amplitudes, by name of the effect, have other values.
+        fates: of terms that are no effects inside the joint.
+        held: effects that the format holds by a term of its own → words for that term.
+        approximated: words for the terms that replace an effect of a balance.
+    """
+    joint = situation.joint
+    law = law_of(joint, {})
+    inside = situation.inside
+    theta = refit(law, situation, inside)
+    names = tuple(e.name for e in joint.inside)
+    found = list(fates)
+    for effect in joint.inside:
+        own = situation.without((effect.name,))
+        kept = share_kept(law, law_of(joint, {effect.name: 0.0}), situation, inside, own)
+        verdict = HELD if effect.name in held else DROPPED if kept < LITTLE else APPROXIMATED
+        how = held.get(effect.name) or approximated(effect.balance)
+        if not np.isfinite(kept) and effect.name not in held:  # nothing of it shows in steady travel
+            verdict, how = DROPPED, "it shows only while the motion changes, and the format has no term for it"
+        found.append(Fate(effect.name, verdict, how, kept))
+    exported = _at(law, theta, situation)
+    models = {NATIVE: situation.native, EXPORTED: situation.readings(exported)}
+    if law.names:
+        models[TRANSLATED] = situation.readings(_at(law, law.start, situation))
+    if names:
+        plain = law_of(joint, dict.fromkeys(names, 0.0))
+        bare = refit(plain, situation, situation.without(names))
+        models[WITHOUT] = situation.readings(_at(plain, bare, situation))
+    reference = situation.measured if situation.is_measured else situation.native
+    return Comparison(
+        situation, dict(zip(law.names, map(float, law.start), strict=True)),
+        dict(zip(law.names, map(float, theta), strict=True)), tuple(found),
+        tuple(Errors(label, errors(joint, shown, reference)) for label, shown in models.items()),
+        "the measured readings" if situation.is_measured else "the native model",
+        models[EXPORTED], exported,
+    )  # fmt: skip
+
+
+def errors(joint: Joint, shown: np.ndarray, reference: np.ndarray) -> dict[str, float]:
+    """Rms of the difference over the rms of the reference [%], by channel that has readings."""
+    found = {}
+    for k, channel in enumerate(channels_of(joint)):
+        known = np.isfinite(reference[:, k]) & np.isfinite(shown[:, k])
+        size = float(np.sqrt(np.mean(reference[known, k] ** 2))) if known.any() else 0.0
+        if size > 0:
+            found[channel.name] = 100 * float(np.sqrt(np.mean((shown - reference)[known, k] ** 2))) / size
+    return found
+
+
+def _at(law: FormatLaw, theta: Any, situation: Situation) -> AtJoint:
+    current, speed = evaluated(law, jnp.asarray(theta), situation.command, situation.load, situation.way)
+    return AtJoint(np.asarray(current), np.asarray(speed))
+
+
+@eqx.filter_jit
+def evaluated(law: FormatLaw, theta: Any, command: Any, load: Any, way: Any) -> tuple[Any, Any]:
+    """Current of one motor [A] and speed of the joint [rad/s] by a format's law, compiled."""
+    return law(theta, *map(jnp.asarray, (command, load, way)))
+
+
+def refit(law: FormatLaw, situation: Situation, native: AtJoint) -> np.ndarray:
+    """Least-squares fit of a format's parameters to the native model's currents and speeds.
+
+    Residuals are relative to each quantity's rms. Parameters stay positive: each is the square of an unknown. No
+    reading enters, so errors against readings are as honest as those of the native model.
+    """
+    if not law.names:
+        return np.zeros(0)
+    given = (situation.command, situation.load, situation.way, native.current, native.speed)
+    least = 1e-3 * float(np.max(np.abs(situation.load))) + 1e-9
+    return np.asarray(_refitted(law, jnp.asarray(least), *map(jnp.asarray, given)))
+
+
+@eqx.filter_jit
+def _refitted(law: FormatLaw, least: Any, command: Any, load: Any, way: Any, current: Any, speed: Any) -> Any:
+    sizes = [jnp.sqrt(jnp.mean(x**2)) for x in (current, speed)]
+    scale = jnp.sqrt(jnp.maximum(law.start, least))
+
+    # A root has no slope at 0, so a parameter that is 0 starts a little above.
+    start = jnp.maximum(jnp.sqrt(law.start) / scale, 1e-3)
+
+    def residual(z: jax.Array, args: Any) -> jax.Array:
+        found = law((scale * z) ** 2, command, load, way)
+        apart = [(a - b) / s for a, b, s in zip(found, (current, speed), sizes, strict=True)]
+        return jnp.concatenate([*apart, NEAR * jnp.sqrt(1.0 * len(command)) * (z - start)])
+
+    solver: Any = solvers.solver_by_name("lm")
+    found: Any = optx.least_squares(residual, solver, start, max_steps=300, throw=False)
+    misfit = lambda z: jnp.sqrt(jnp.mean(residual(z, None) ** 2))  # noqa: E731
+    exact, better = misfit(jnp.sqrt(law.start) / scale) < EXACT, misfit(found.value) <= misfit(start)
+    return jnp.where(exact, law.start, (scale * jnp.where(better, found.value, start)) ** 2)
+
+
+def share_kept(law: FormatLaw, bare: FormatLaw, situation: Situation, native: AtJoint, native_bare: AtJoint) -> float:
+    """Share of an effect's change of current and speed that a refitted format shows [-], at most 1.
+
+    1 less the rms of what the change of the format's error by the effect is, over that of the change itself; NaN
+    where the effect changes nothing.
+    """
+    left = [
+        _stacked(exact) - _stacked(_at(model, refit(model, situation, exact), situation))
+        for model, exact in ((law, native), (bare, native_bare))
+    ]
+    change = (_stacked(native) - _stacked(native_bare)) / (sizes := _sizes(native))
+    size = float(np.sqrt(np.mean(change**2)))
+    if size < 1e-9:
+        return float("nan")
+    return 1 - float(np.sqrt(np.mean(((left[0] - left[1]) / sizes) ** 2))) / size
+
+
+def _stacked(found: AtJoint) -> np.ndarray:
+    return np.stack([found.current, found.speed], -1)
+
+
+def _sizes(found: AtJoint) -> np.ndarray:
+    return np.sqrt(np.mean(_stacked(found) ** 2, 0))

@@ -1,0 +1,64 @@
+"""An export from Python, in one call."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+from calibration.data import robot_file
+from calibration.data.input_errors import BadConfiguration
+from calibration.data.posterior_file import Posterior
+from calibration.data.robot_file import RobotFile
+from calibration.data.runs import Runs
+from calibration.data.writing import naming
+from mmrjax.model.robot import Robot
+from sweeps.export.formats import Export, exported
+from sweeps.report.words import export_words
+
+
+def export(
+    robot: Robot | str | Path,
+    to: str = "mujoco",
+    *,
+    out: str | Path | None = None,
+    data: Runs | str | None = None,
+    configuration: str | None = None,
+    joint: str = "drive",
+    posterior: Posterior | None = None,
+    draws: int = 1000,
+    seed: int = 0,
+) -> Export:
+    """Export a robot's drive as the actuator of one joint in another simulator, compared with the native model.
+
+    Args:
+        robot: a robot, the name of a packaged one, or its TOML file; the posterior next to it is read.
+        to: `mujoco`, `jax`, `onnx`, `mjlab`, `table` or `randomization` (docs/howto/export.md).
+        out: folder for the files and `LAW.md`, made if it does not exist; None: no files are written.
+        data: runs to compare with, or the file of a table or log; None: a grid of operating points.
+        configuration: which of the robot's; None: its first.
+        joint: name of the joint in the simulator's model, for `mujoco`.
+        posterior: of a robot that comes from no file, as a calibration or the loop returns it.
+        draws, seed: of `randomization`.
+
+    Returns:
+        The export: `files` by name, `comparison` with refitted parameters, fates of effects and errors in percent.
+
+    Raises:
+        BadConfiguration: an unknown format, a drive that is not one joint, a folder that holds some of these files.
+        BadData: a table that is refused.
+    """
+    file = RobotFile(robot, "robot") if isinstance(robot, Robot) else robot_file.find(str(robot))
+    found = exported(
+        file, to, configuration=configuration, data=data, at=joint, draws=draws, seed=seed, posterior=posterior
+    )
+    texts = {**found.files, "LAW.md": export_words.law(found)}
+    found = dataclasses.replace(found, files=texts)
+    if out is not None:
+        folder = Path(out)
+        if taken := next((folder / name for name in texts if (folder / name).exists()), None):
+            raise BadConfiguration(f"out: {taken} exists already; choose another folder, or remove it")
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, content in texts.items():
+            with naming(folder / name):
+                (folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+    return found

@@ -1,0 +1,390 @@
+"""Scalar functions of JAX as expressions, and expressions as source text of NumPy's dialects.
+
+A function is traced once (`jax.make_jaxpr`) and its equations are evaluated on symbols in place of numbers. So the
+text of a law follows from the code of the model, and a user's own effect needs no second definition.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from calibration.data.input_errors import BadConfiguration
+
+#: Operators with their precedence, and how they are written.
+_INFIX = {
+    "lt": (1, "<"), "le": (1, "<="), "gt": (1, ">"), "ge": (1, ">="), "eq": (1, "=="), "ne": (1, "!="),
+    "or": (2, "|"), "and": (3, "&"),
+    "add": (5, "+"), "sub": (5, "-"), "mul": (6, "*"), "div": (6, "/"), "neg": (7, "-"), "pow": (8, "**"),
+}  # fmt: skip
+_LOGICAL = frozenset(("or", "and", "not", "lt", "le", "gt", "ge", "eq", "ne"))
+_FUNCTIONS: dict[str, Callable[..., float]] = {
+    "sqrt": math.sqrt, "exp": math.exp, "log": math.log, "log1p": math.log1p, "expm1": math.expm1, "sin": math.sin,
+    "cos": math.cos, "tan": math.tan, "asin": math.asin, "acos": math.acos, "atan": math.atan, "tanh": math.tanh,
+    "abs": abs, "floor": math.floor, "max": max, "min": min, "sign": lambda x: float(np.sign(x)),
+    "not": lambda x: not x, "atan2": math.atan2,
+}  # fmt: skip
+_FOLDED: dict[str, Callable[..., Any]] = {
+    **_FUNCTIONS,
+    "add": lambda a, b: a + b, "sub": lambda a, b: a - b, "mul": lambda a, b: a * b, "div": lambda a, b: a / b,
+    "neg": lambda a: -a, "pow": lambda a, b: a**b, "lt": lambda a, b: a < b, "le": lambda a, b: a <= b,
+    "gt": lambda a, b: a > b, "ge": lambda a, b: a >= b, "eq": lambda a, b: a == b, "ne": lambda a, b: a != b,
+    "and": lambda a, b: a and b, "or": lambda a, b: a or b,
+}  # fmt: skip
+
+
+class Symbol:
+    """A node of an expression: a number, a name, or an operation on other nodes. Equal nodes are one object.
+
+    Attributes:
+        op: `const`, `name`, or an operation; args: operands; value: the number or the name.
+    """
+
+    __slots__ = ("args", "op", "value")
+    _known: ClassVar[dict[Any, Symbol]] = {}
+
+    def __init__(self, op: str, args: tuple[Symbol, ...], value: Any) -> None:
+        self.op, self.args, self.value = op, args, value
+
+    @classmethod
+    def of(cls, op: str, args: tuple[Symbol, ...] = (), value: Any = None) -> Symbol:
+        key = (op, args, value, type(value))
+        if key not in cls._known:
+            cls._known[key] = cls(op, args, value)
+        return cls._known[key]
+
+    @property
+    def is_const(self) -> bool:
+        return self.op == "const"
+
+
+def const(value: Any) -> Symbol:
+    """Returns the symbol of a number or a truth value."""
+    return Symbol.of("const", (), bool(value) if isinstance(value, bool | np.bool_) else float(value))
+
+
+def _is(x: Symbol, value: float) -> bool:
+    return x.is_const and x.value == value and not isinstance(x.value, bool)
+
+
+def apply(op: str, *args: Symbol) -> Symbol:
+    """Returns the symbol of an operation, simplified where an operand is 0, 1 or all are numbers."""
+    if all(a.is_const for a in args):
+        try:
+            return const(_FOLDED[op](*(a.value for a in args)))
+        except (ArithmeticError, ValueError):
+            return Symbol.of(op, args)
+    if (op == "add" and _is(args[0], 0)) or (op == "mul" and _is(args[0], 1)):
+        return args[1]
+    if (op in ("add", "sub") and _is(args[1], 0)) or (op in ("mul", "div", "pow") and _is(args[1], 1)):
+        return args[0]
+    if (op == "mul" and (_is(args[0], 0) or _is(args[1], 0))) or (op == "div" and _is(args[0], 0)):
+        return const(0.0)
+    if (op == "sub" and _is(args[0], 0)) or (op == "mul" and _is(args[0], -1)):
+        return apply("neg", args[1])
+    if op == "mul" and _is(args[1], -1):
+        return apply("neg", args[0])
+    if op == "neg" and args[0].op == "neg":
+        return args[0].args[0]
+    if op == "add" and args[1].op == "neg":
+        return apply("sub", args[0], args[1].args[0])
+    if op == "add" and args[0].op == "neg":
+        return apply("sub", args[1], args[0].args[0])
+    if op == "sub" and args[1].op == "neg":
+        return apply("add", args[0], args[1].args[0])
+    if op in ("and", "or") and any(a.is_const for a in args):
+        known, other = args if args[0].is_const else args[::-1]
+        return (other if known.value else known) if op == "and" else (known if known.value else other)
+    return Symbol.of(op, args)
+
+
+def where(condition: Symbol, yes: Symbol, no: Symbol) -> Symbol:
+    """Returns the symbol of a choice; that of one branch where both are equal or the condition is known."""
+    if condition.is_const:
+        return yes if condition.value else no
+    return yes if yes is no else Symbol.of("where", (condition, yes, no))
+
+
+def _each(function: Callable[..., Symbol], *arrays: np.ndarray) -> np.ndarray:
+    arrays = np.broadcast_arrays(*arrays)
+    found = np.empty(arrays[0].shape, object)
+    for k in np.ndindex(found.shape):
+        found[k] = function(*(a[k] for a in arrays))
+    return found
+
+
+def _power(x: Symbol, n: int) -> Symbol:
+    return apply("div", const(1.0), _power(x, -n)) if n < 0 else apply("pow", x, const(n))
+
+
+def _logistic(x: Symbol) -> Symbol:
+    return apply("div", const(1.0), apply("add", const(1.0), apply("exp", apply("neg", x))))
+
+
+def _converted(x: Symbol, kind: Any) -> Symbol:
+    if x.op in _LOGICAL and np.issubdtype(kind, np.number):
+        return where(x, const(1.0), const(0.0))
+    if x.is_const:
+        return const(bool(x.value) if kind == np.bool_ else float(x.value))
+    return x
+
+
+def _dot(a: np.ndarray, b: np.ndarray, dimensions: Any) -> np.ndarray:
+    ((left, right), (batch, _)) = dimensions
+    if batch or len(left) != 1:
+        raise NotImplementedError
+    a, b = np.moveaxis(a, left[0], -1), np.moveaxis(b, right[0], -1)
+    found = np.empty(a.shape[:-1] + b.shape[:-1], object)
+    for i in np.ndindex(a.shape[:-1]):
+        for j in np.ndindex(b.shape[:-1]):
+            found[i + j] = _total([apply("mul", x, y) for x, y in zip(a[i], b[j], strict=True)])
+    return found
+
+
+def _total(terms: Sequence[Symbol]) -> Symbol:
+    found = const(0.0)
+    for term in terms:
+        found = apply("add", found, term)
+    return found
+
+
+#: Primitives that apply one operation to each element.
+_SIMPLE = {
+    "add": "add", "add_any": "add", "sub": "sub", "mul": "mul", "div": "div", "neg": "neg", "pow": "pow",
+    "max": "max", "min": "min", "exp": "exp", "log": "log", "log1p": "log1p", "expm1": "expm1", "sin": "sin",
+    "cos": "cos", "tan": "tan", "asin": "asin", "acos": "acos", "atan": "atan", "atan2": "atan2", "tanh": "tanh",
+    "sqrt": "sqrt",
+    "abs": "abs", "floor": "floor", "sign": "sign", "lt": "lt", "le": "le", "gt": "gt", "ge": "ge", "eq": "eq",
+    "ne": "ne", "and": "and", "or": "or", "not": "not",
+}  # fmt: skip
+_SAME = frozenset(("copy", "copy_p", "stop_gradient", "optimization_barrier", "reduce_precision"))
+
+
+def _shaped(name: str, x: list[np.ndarray], p: Mapping[str, Any]) -> np.ndarray:
+    """Result of a primitive that only moves or joins elements."""
+    if name == "broadcast_in_dim":
+        shape = [1] * len(p["shape"])
+        for axis, size in zip(p["broadcast_dimensions"], x[0].shape, strict=True):
+            shape[axis] = size
+        return np.broadcast_to(x[0].reshape(shape), p["shape"])
+    if name in ("reshape", "squeeze", "expand_dims"):
+        return x[0].reshape(p["new_sizes"]) if name == "reshape" else x[0].reshape(_kept(name, x[0].shape, p))
+    if name == "stack":
+        return np.stack(x, p["axis"])
+    if name == "transpose":
+        return x[0].transpose(p["permutation"])
+    if name == "concatenate":
+        return np.concatenate(x, p["dimension"])
+    if name == "slice":
+        strides = p["strides"] or (1,) * x[0].ndim
+        return x[0][tuple(slice(*s) for s in zip(p["start_indices"], p["limit_indices"], strides, strict=True))]
+    raise NotImplementedError(name)
+
+
+def _kept(name: str, shape: tuple[int, ...], p: Mapping[str, Any]) -> tuple[int, ...]:
+    if name == "squeeze":
+        return tuple(n for k, n in enumerate(shape) if k not in p["dimensions"])
+    sizes = list(shape)
+    for axis in sorted(p["dimensions"]):
+        sizes.insert(axis, 1)
+    return tuple(sizes)
+
+
+def _evaluated(jaxpr: Any, consts: Sequence[Any], arguments: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Symbols of the outputs of a jaxpr, as arrays of objects."""
+    known: dict[Any, np.ndarray] = {}
+
+    def read(atom: Any) -> np.ndarray:
+        return _numbers(atom.val) if hasattr(atom, "val") else known[atom]
+
+    known.update(zip(jaxpr.constvars, map(_numbers, consts), strict=True))
+    known.update(zip(jaxpr.invars, arguments, strict=True))
+    for eqn in jaxpr.eqns:
+        x, name, p = [read(v) for v in eqn.invars], eqn.primitive.name, eqn.params
+        inner = next((p[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in p), None)
+        if name in _SIMPLE:
+            found = [_each(lambda *a, op=_SIMPLE[name]: apply(op, *a), *x)]
+        elif name in _SAME:
+            found = list(x)
+        elif name == "integer_pow":
+            found = [_each(lambda a, n=p["y"]: _power(a, n), x[0])]
+        elif name == "square":
+            found = [_each(lambda a: _power(a, 2), x[0])]
+        elif name == "rsqrt":
+            found = [_each(lambda a: apply("div", const(1.0), apply("sqrt", a)), x[0])]
+        elif name == "logistic":
+            found = [_each(_logistic, x[0])]
+        elif name == "select_n" and len(x) == 3:
+            found = [_each(lambda c, no, yes: where(_truth(c), yes, no), *x)]
+        elif name == "clamp":
+            found = [_each(lambda low, a, high: apply("min", apply("max", a, low), high), *x)]
+        elif name == "convert_element_type":
+            found = [_each(lambda a, kind=p["new_dtype"]: _converted(a, kind), x[0])]
+        elif name == "iota":
+            found = [_numbers(np.indices(p["shape"], float)[p["dimension"]])]
+        elif name == "reduce_sum":
+            rest = np.moveaxis(x[0], p["axes"], range(len(p["axes"])))
+            flat = rest.reshape(-1, *rest.shape[len(p["axes"]) :])
+            found = [_each(lambda *terms: _total(terms), *flat)]
+        elif name == "dot_general":
+            found = [_dot(x[0], x[1], p["dimension_numbers"])]
+        elif inner is not None:
+            closed = hasattr(inner, "consts")
+            found = _evaluated(inner.jaxpr if closed else inner, inner.consts if closed else (), x)
+        else:
+            found = [_shaped(name, x, p)]
+        known.update(zip(eqn.outvars, found, strict=True))
+    return [read(v) for v in jaxpr.outvars]
+
+
+def _truth(x: Symbol) -> Symbol:
+    return const(bool(x.value)) if x.is_const else x
+
+
+def _numbers(value: Any) -> np.ndarray:
+    value = np.asarray(value)
+    found = np.empty(value.shape, object)
+    for k in np.ndindex(value.shape):
+        found[k] = const(value[k].item())
+    return found
+
+
+def traced(function: Callable[..., Any], names: Sequence[str], what: str) -> Symbol:
+    """Returns a scalar function of scalars as an expression of their names.
+
+    Args:
+        function: traceable, of as many positional scalars; what: opens the message of an error.
+
+    Raises:
+        BadConfiguration: the function has a loop, or another operation that has no form as an expression.
+    """
+    closed = jax.make_jaxpr(lambda *x: jnp.asarray(function(*x)))(*(jnp.zeros(()) for _ in names))
+    arguments = []
+    for name in names:
+        cell = np.empty((), object)
+        cell[()] = Symbol.of("name", (), name)
+        arguments.append(cell)
+    try:
+        (result,) = _evaluated(closed.jaxpr, closed.consts, arguments)
+    except NotImplementedError as error:
+        raise BadConfiguration(
+            f"{what}: its equation uses {error or 'an operation'} of JAX, which has no closed form; rewrite it with "
+            "sums, products, powers and functions of numbers, or export without it"
+        ) from error
+    symbol: Any = result[()]
+    return symbol
+
+
+def names_of(*symbols: Symbol) -> list[str]:
+    """Names that expressions depend on, in the order of their first use."""
+    found: dict[str, None] = {}
+    seen: set[int] = set()
+
+    def visit(x: Symbol) -> None:
+        if id(x) in seen:
+            return
+        seen.add(id(x))
+        if x.op == "name":
+            found[x.value] = None
+        for a in x.args:
+            visit(a)
+
+    for symbol in symbols:
+        visit(symbol)
+    return list(found)
+
+
+#: The number 0.
+ZERO = const(0.0)
+
+
+class Dialect:
+    """How functions are written: `jnp.sqrt(x)`. Subclasses change single functions."""
+
+    def __init__(self, prefix: str) -> None:
+        self.prefix = prefix
+
+    def call(self, op: str, args: Sequence[str], constants: Sequence[bool]) -> str:
+        """Text of a function of arguments in text; `constants`: whether each is a number."""
+        name = {"max": "maximum", "min": "minimum", "asin": "arcsin", "acos": "arccos", "atan": "arctan",
+                "atan2": "arctan2", "not": "logical_not"}.get(op, op)  # fmt: skip
+        return f"{self.prefix}.{name}({', '.join(args)})"
+
+
+class Torch(Dialect):
+    """PyTorch, whose `maximum` takes tensors alone."""
+
+    def __init__(self) -> None:
+        super().__init__("torch")
+
+    def call(self, op: str, args: Sequence[str], constants: Sequence[bool]) -> str:
+        if op in ("max", "min") and any(constants):
+            tensor, number = (args[1], args[0]) if constants[0] else (args[0], args[1])
+            bound = "min" if op == "max" else "max"  # the larger of x and a number is x with that number as its least
+            return f"torch.clamp({tensor}, {bound}={number})"
+        name = {"max": "maximum", "min": "minimum", "not": "logical_not"}.get(op, op)
+        return f"torch.{name}({', '.join(args)})"
+
+
+NUMPY, JAX, TORCH = Dialect("np"), Dialect("jnp"), Torch()
+
+
+def number(value: Any) -> str:
+    """Shortest text of a number that reads back as the same number."""
+    return repr(value if isinstance(value, bool) else float(value))
+
+
+def lines_of(result: Symbol, dialect: Dialect, spelled: Callable[[str], str], indent: str = "    ") -> list[str]:
+    """Lines of a function body that returns an expression; what is used more than once is a local variable.
+
+    Args:
+        spelled: text of a name.
+    """
+    uses: dict[int, int] = {}
+
+    def count(x: Symbol) -> None:
+        uses[id(x)] = uses.get(id(x), 0) + 1
+        if uses[id(x)] == 1:
+            for a in x.args:
+                count(a)
+
+    count(result)
+    lines: list[str] = []
+    local: dict[int, str] = {}
+
+    def text(x: Symbol, outer: int = 0) -> str:
+        if id(x) in local:
+            return local[id(x)]
+        if x.is_const:
+            shown = number(x.value)
+            return f"({shown})" if shown.startswith("-") and outer >= 7 else shown
+        if x.op == "name":
+            return spelled(x.value)
+        own, written = _written(x, text, dialect)
+        if uses[id(x)] > 1:
+            local[id(x)] = f"x{len(local) + 1}"
+            lines.append(f"{indent}{local[id(x)]} = {written}")
+            return local[id(x)]
+        return f"({written})" if own < outer else written
+
+    last = text(result)
+    return [*lines, f"{indent}return {last}"]
+
+
+def _written(x: Symbol, text: Callable[..., str], dialect: Dialect) -> tuple[int, str]:
+    """Precedence and text of an operation."""
+    if x.op == "neg":
+        return 7, f"-{text(x.args[0], 7)}"
+    if x.op in _INFIX:
+        own, sign = _INFIX[x.op]
+        tighter = x.op in ("sub", "div") or own <= 3
+        left = text(x.args[0], own + 1 if x.op == "pow" or own <= 3 else own)
+        if x.op == "pow" and x.args[1].is_const and float(x.args[1].value).is_integer():
+            return own, f"{left} ** {int(x.args[1].value)}"
+        return own, f"{left} {sign} {text(x.args[1], own + 1 if tighter else own)}"
+    return 9, dialect.call(x.op, [text(a) for a in x.args], [a.is_const for a in x.args])

@@ -1,0 +1,215 @@
+"""A drive as tables: voltage, current, losses and efficiency over speed and torque of the joint, as CSV and C."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from types import ModuleType
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from calibration.data.writing import table_text
+from mmrjax import __version__
+from sweeps.export import jax_actuator
+from sweeps.export.comparison import APPROXIMATED, HELD, Fate
+from sweeps.export.joint import Joint
+from sweeps.export.law_source import Constant, executed, jax_source
+from sweeps.export.situation import Situation
+
+#: Points of an axis on either side of rest; how far beyond the runs the axes reach.
+POINTS, BEYOND = 20, 1.2
+#: Newton steps of the voltage at which a torque is given.
+STEPS = 30
+#: Columns of the table, with their units.
+COLUMNS = {
+    "voltage": "voltage_V", "current": "motor_current_A", "power": "power_W", "lost_winding": "lost_winding_W",
+    "lost_motor": "lost_motor_W", "lost_gearbox": "lost_gearbox_W", "lost_output": "lost_output_W",
+}  # fmt: skip
+
+
+class Map(eqx.Module):
+    """Steady states over a grid.
+
+    Attributes:
+        speed, torque: axes [rad/s], [N·m]; values: by name of the quantity, shape (speeds, torques).
+    """
+
+    speed: np.ndarray
+    torque: np.ndarray
+    values: dict[str, np.ndarray]
+
+    @property
+    def efficiency(self) -> np.ndarray:
+        """Power given over power taken [-], of a joint that drives; of one that is driven the other way round."""
+        out, taken = np.outer(self.speed, self.torque), self.values["power"]
+        share = np.where(out > 0, out / np.where(taken > 0, taken, np.inf), taken / np.where(out < 0, out, -np.inf))
+        return np.clip(share, 0.0, 1.0)
+
+
+def axis(largest: float) -> np.ndarray:
+    """Values from -`largest` to `largest`, 0 and both its neighbours close together, where friction turns round."""
+    half = np.linspace(0.0, largest, POINTS + 1)[1:]
+    near = np.array([1e-3 * largest])
+    return np.concatenate([-half[::-1], -near, [0.0], near, half])
+
+
+def mapped(module: ModuleType, params: Mapping[str, Any], speed: np.ndarray, torque: np.ndarray, guess: float) -> Map:
+    """Steady states at each speed [rad/s] and torque [N·m] of the joint; `guess`: resistance, of the first step."""
+    speeds, torques = (jnp.asarray(x.ravel()) for x in np.meshgrid(speed, torque, indexing="ij"))
+    params = {name: jnp.asarray(value, float) for name, value in params.items()}
+
+    @jax.jit
+    def solved(params: Any) -> dict[str, Any]:
+        def lacking(voltage: Any) -> Any:
+            return jax_actuator.settled(module, params, voltage, speeds)[0] - torques
+
+        def again(voltage: Any, _: None) -> tuple[Any, None]:
+            left, rise = jax.jvp(lacking, (voltage,), (jnp.ones_like(voltage),))
+            return voltage - left / jnp.where(rise > 1e-12, rise, 1e-12), None
+
+        constant, ratio = params["motor.torque_constant"], params["gearbox.ratio"]
+        start = constant * ratio * speeds + guess * torques / (constant * ratio)
+        voltage = jax.lax.scan(again, start, None, STEPS)[0]
+        return jax_actuator.settled(module, params, voltage, speeds)[1] | {"left": lacking(voltage)}
+
+    found = {name: np.asarray(x).reshape(len(speed), len(torque)) for name, x in solved(params).items()}
+    return Map(speed, torque, {name: found[name] for name in COLUMNS})
+
+
+class TableLaw(eqx.Module):
+    """The tables, read with straight lines between their points. Attributes: as of `comparison.FormatLaw`."""
+
+    speed: jax.Array
+    torque: jax.Array
+    voltage: jax.Array
+    current: jax.Array
+    names: tuple[str, ...] = eqx.field(static=True, default=())
+    start: jax.Array = eqx.field(default_factory=lambda: jnp.zeros(0))
+
+    def __call__(self, theta: Any, command: Any, load: Any, way: Any) -> tuple[Any, Any]:
+        # Voltage rises with speed at each torque: a bisection finds the speed.
+        low = jnp.where(way > 0, 0.0, self.speed[0]) + 0 * command
+        high = jnp.where(way > 0, self.speed[-1], 0.0) + 0 * command
+        for _ in range(50):
+            middle = 0.5 * (low + high)
+            more = self._read(self.voltage, middle, load) < command
+            low, high = jnp.where(more, middle, low), jnp.where(more, high, middle)
+        speed = 0.5 * (low + high)
+        return self._read(self.current, speed, load), speed
+
+    def _read(self, values: jax.Array, speed: Any, torque: Any) -> Any:
+        at = [jnp.interp(x, axis, jnp.arange(len(axis))) for x, axis in ((speed, self.speed), (torque, self.torque))]
+        return jax.scipy.ndimage.map_coordinates(values, at, order=1, mode="nearest")
+
+
+def map_of(situation: Situation, constants: Sequence[Constant], amplitudes: Mapping[str, float] | None = None) -> Map:
+    """The tables of a drive, as far as the runs reach and a little beyond."""
+    module = executed(jax_source(situation.joint, constants))
+    params = jax_actuator.steady_params(situation.joint, constants, amplitudes or {})
+    reach = float(np.max(np.abs(situation.inside.speed))) * BEYOND
+    most = max(float(np.max(np.abs(situation.load))), 1e-6) * BEYOND
+    return mapped(module, params, axis(reach), axis(most), float(situation.joint.robot.motor.resistance))
+
+
+def law_of(situation: Situation, constants: Sequence[Constant]) -> Any:
+    """Returns the function from a joint and amplitudes to the law of its tables."""
+
+    def law(joint: Joint, amplitudes: Mapping[str, float]) -> TableLaw:
+        found = map_of(situation, constants, amplitudes)
+        voltage, current = (jnp.asarray(found.values[name]) for name in ("voltage", "current"))
+        return TableLaw(jnp.asarray(found.speed), jnp.asarray(found.torque), voltage, current)
+
+    return law
+
+
+def fates(situation: Situation, constants: Sequence[Constant]) -> list[Fate]:
+    """Fates of the base's terms, and of effects outside the joint."""
+    joint = situation.joint
+    found = [f for f in jax_actuator.fates(joint) if f.name not in ("rotor inertia", "current limit of the driver")]
+    means = {c.name: c.value for c in constants}
+    changed = []
+    for fate in found:
+        if fate.name == "friction by the joint's surroundings":
+            values = ", ".join(f"{n.removeprefix('surroundings.')} = {means[n]:.4g}" for n in joint.surroundings())
+            changed.append(Fate(fate.name, APPROXIMATED, f"their mean over the runs: {values}"))
+        else:
+            changed.append(Fate(fate.name, fate.verdict, fate.how.replace("functions of the law", "the tables")))
+    how = "no table: add (armature) · acceleration to the torque"
+    lines = Fate("steady states", HELD, "straight lines between points")
+    return [*changed, Fate("rotor inertia", APPROXIMATED, how), lines]
+
+
+def held(joint: Joint) -> dict[str, str]:
+    """Words for each effect inside the joint without a memory; one with a memory is held at its settled value."""
+    settled = "its settled value: a table has no memory"
+    return {e.name: settled if e.memory_size is not None else "the tables" for e in joint.inside}
+
+
+def files(joint: Joint, found: Map, notes: Sequence[str]) -> dict[str, str | bytes]:
+    """The tables as CSV and as a C header that reads them."""
+    grid = np.meshgrid(found.speed, found.torque, indexing="ij")
+    columns = {"joint_speed_rad_s": grid[0].ravel(), "joint_torque_Nm": grid[1].ravel()}
+    columns |= {column: found.values[name].ravel() for name, column in COLUMNS.items()}
+    columns["efficiency"] = found.efficiency.ravel()
+    return {"feed_forward.csv": table_text(columns), "feed_forward.h": header(joint, found, notes)}
+
+
+def _array(values: np.ndarray) -> str:
+    return ", ".join(f"{x:.7g}f" if "." in f"{x:.7g}" or "e" in f"{x:.7g}" else f"{x:.7g}.0f" for x in values)
+
+
+def header(joint: Joint, found: Map, notes: Sequence[str]) -> str:
+    """Text of a C header: axes, tables, and a function that reads each of them."""
+    name = joint.name
+    guard = f"{name}_FEED_FORWARD_H".upper()
+    shape = f"[{len(found.speed)}][{len(found.torque)}]"
+    tables = {"voltage": found.values["voltage"], "current": found.values["current"], "efficiency": found.efficiency}
+    arrays = "\n".join(
+        f"static const float {name}_{key}{shape} = {{\n"
+        + ",\n".join(f"  {{{_array(row)}}}" for row in values)
+        + "\n};\n"
+        for key, values in tables.items()
+    )
+    units = {"voltage": "Voltage at the driver's output [V]", "current": "Current of one motor [A]",
+             "efficiency": "Power given over power taken [-]"}  # fmt: skip
+    readers = "\n".join(
+        f"/* {what} for a speed [rad/s] and a torque [N*m] of the joint; clamped to the tables' range. */\n"
+        f"static inline float {name}_get_{key}(float speed, float torque) {{\n"
+        f"  return {name}_read({name}_{key}, speed, torque);\n}}\n"
+        for key, what in units.items()
+    )
+    about = "\n".join(f" * {line}" for line in notes)
+    return f"""/* Feed-forward of {joint.file.name}, {joint.configuration}. Written by mmrjax {__version__}.
+{about}
+ * duty = {name}_get_voltage(speed, torque) / supply voltage; torque is that of the joint without its inertia.
+ */
+#ifndef {guard}
+#define {guard}
+
+static const float {name}_speed[{len(found.speed)}] = {{{_array(found.speed)}}};
+static const float {name}_torque[{len(found.torque)}] = {{{_array(found.torque)}}};
+
+{arrays}
+static inline int {name}_place(const float *axis, int points, float x, float *share) {{
+  int k = 0;
+  if (x <= axis[0]) {{ *share = 0.0f; return 0; }}
+  if (x >= axis[points - 1]) {{ *share = 1.0f; return points - 2; }}
+  while (axis[k + 1] < x) k++;
+  *share = (x - axis[k]) / (axis[k + 1] - axis[k]);
+  return k;
+}}
+
+static inline float {name}_read(const float table{shape}, float speed, float torque) {{
+  float a, b;
+  int i = {name}_place({name}_speed, {len(found.speed)}, speed, &a);
+  int j = {name}_place({name}_torque, {len(found.torque)}, torque, &b);
+  return (1 - a) * ((1 - b) * table[i][j] + b * table[i][j + 1])
+       + a * ((1 - b) * table[i + 1][j] + b * table[i + 1][j + 1]);
+}}
+
+{readers}
+#endif
+"""

@@ -1,0 +1,171 @@
+"""Formats by name, and the export of a drive to one of them."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from calibration.data.input_errors import BadConfiguration, allowed_words
+from calibration.data.posterior_file import Posterior
+from calibration.data.robot_file import RobotFile
+from calibration.data.runs import Runs
+from mmrjax.compile.precision import in_double
+from mmrjax.errors import count_noun
+from sweeps.export import comparison, feed_forward, jax_actuator, mjlab, mujoco, onnx, randomization
+from sweeps.export.comparison import Comparison, Fate
+from sweeps.export.constants import constants_of, posterior_of
+from sweeps.export.joint import Joint, joint
+from sweeps.export.law_source import Constant
+from sweeps.export.situation import AtJoint, Situation, situation
+
+#: Names of formats and what they are for.
+FORMATS = {
+    "mujoco": "MJCF with <dcmotor>, and a scene that runs",
+    "jax": "an actuator function in JAX, as source and as a serialised program",
+    "onnx": "the same step as an ONNX model, for Isaac Lab, Unity or C++",
+    "mjlab": "an actuator configuration for mjlab, in PyTorch",
+    "table": "feed-forward and efficiency maps, as CSV and as a C header",
+    "randomization": "draws of the posterior in the parameters of MuJoCo and of the actuator",
+}
+#: Most runs that are checked in MuJoCo C.
+CHECKED = 12
+
+
+@dataclasses.dataclass(frozen=True)
+class Export:
+    """An exported drive.
+
+    Attributes:
+        format: one of `FORMATS`; joint: what is exported; constants: of its law; posterior: of the robot, if any.
+        files: contents by name; comparison: with the native model; checks: numbers found with the files, by name.
+    """
+
+    format: str
+    joint: Joint
+    constants: tuple[Constant, ...]
+    posterior: Posterior | None
+    files: Mapping[str, str | bytes]
+    comparison: Comparison
+    checks: Mapping[str, float]
+
+
+@in_double
+def exported(
+    file: RobotFile,
+    to: str,
+    *,
+    configuration: str | None = None,
+    data: Runs | str | None = None,
+    at: str = "drive",
+    draws: int = 1000,
+    seed: int = 0,
+    posterior: Posterior | None = None,
+) -> Export:
+    """Returns the drive of a robot in a format, compared with the native model over runs.
+
+    Args:
+        to: one of `FORMATS`; configuration: name, None: the robot's first.
+        data: runs, or the file of a table or log; None: a grid of operating points.
+        at: name of the joint in the simulator's model; draws, seed: of `randomization`.
+        posterior: of the robot; None: what lies beside its file.
+
+    Raises:
+        BadConfiguration, BadData: a format, a drive or a table that is refused.
+    """
+    if to not in FORMATS:
+        raise BadConfiguration(f"--to: got {to}; {allowed_words(to, FORMATS)}")
+    if not at.isprintable() or not at or any(c in at for c in "\"'<>&"):
+        raise BadConfiguration(f"--joint: got {at!r}; expected the name of a joint, without quotes and brackets")
+    if to in ("mujoco", "randomization"):
+        mujoco.library()
+    drive = joint(file, configuration)
+    posterior = posterior_of(drive) if posterior is None else posterior
+    runs = situation(drive, data)
+    constants = constants_of(drive, runs.signals, posterior)
+    make = {
+        "mujoco": _mujoco, "randomization": _mujoco, "table": _table, "jax": _actuator, "onnx": _actuator,
+        "mjlab": _actuator,
+    }[to]  # fmt: skip
+    begun = Export(to, drive, constants, posterior, {}, None, {})  # type: ignore[arg-type]  # filled in below
+    return make(begun, runs, at, draws, seed)
+
+
+def notes_of(runs: Situation) -> list[str]:
+    """Sentences for the head of every file."""
+    command = runs.command
+    return [
+        f"Seen: {count_noun(len(command), 'run')} of {runs.source}, "
+        f"{np.min(command):.4g} to {np.max(command):.4g} V, "
+        f"{np.min(runs.load):.4g} to {np.max(runs.load):.4g} N·m at the joint. Nothing beyond was tested. "
+        "LAW.md has the equations, the intervals and what is lost."
+    ]
+
+
+def _mujoco(begun: Export, runs: Situation, at: str, draws: int, seed: int) -> Export:
+    drive = begun.joint
+    normal = float(np.mean(np.asarray(runs.signals.normal)))
+    found = comparison.compare(
+        runs, mujoco.law_of(normal), mujoco.fates(drive, normal), mujoco.TERMS, mujoco.approximated
+    )
+    motor, name = mujoco.motor(drive, found.refitted), f"{drive.name}_drive"
+    about = mujoco.attribute_notes(drive, begun.constants, found.translated, found.refitted)
+    mass = float(np.mean(np.asarray(runs.signals.mass)))
+    volts = float(drive.robot.motor.voltage_limit or np.max(np.abs(runs.command)))
+    middle = (float(np.mean(runs.command)), float(np.mean(runs.load)))
+    texts = {
+        "drive.xml": mujoco.fragment(drive, motor, about, notes_of(runs), name, at, volts),
+        "scene.xml": mujoco.scene(drive, mass, name, at, *middle),
+    }
+    checks = _checked(texts, motor, runs, found)
+    files: Mapping[str, str | bytes] = texts
+    if begun.format == "randomization":
+        values = randomization.drawn(drive, begun.posterior, begun.constants, found.refitted, normal, draws, seed)
+        files = randomization.files(values)
+    return dataclasses.replace(begun, files=files, comparison=found, checks=checks)
+
+
+def _checked(texts: Mapping[str, str], motor: mujoco.Motor, runs: Situation, found: Comparison) -> dict[str, float]:
+    """Largest differences of MuJoCo C from the format's law, and errors of both on the same runs [%]."""
+    rows = np.unique(np.linspace(0, len(runs.command) - 1, min(CHECKED, len(runs.command))).astype(int))
+    got = mujoco.run(texts, motor, runs, found.exported, rows.tolist())
+    law = AtJoint(found.exported.current[rows], found.exported.speed[rows])
+    native = AtJoint(runs.inside.current[rows], runs.inside.speed[rows])
+
+    def apart(a: np.ndarray, b: np.ndarray) -> float:
+        return 100 * float(np.sqrt(np.mean((a - b) ** 2)) / np.sqrt(np.mean(b**2)))
+
+    return {
+        "runs settled in MuJoCo C": float(len(rows)),
+        "current, law against native [%]": apart(law.current, native.current),
+        "current, MuJoCo C against native [%]": apart(got.current, native.current),
+        "speed, law against native [%]": apart(law.speed, native.speed),
+        "speed, MuJoCo C against native [%]": apart(got.speed, native.speed),
+    }
+
+
+def _actuator(begun: Export, runs: Situation, at: str, draws: int, seed: int) -> Export:
+    drive, constants, notes = begun.joint, begun.constants, notes_of(runs)
+    law, held = jax_actuator.law_of(runs, constants), jax_actuator.held(drive)
+    checks: dict[str, float] = {}
+    if begun.format == "jax":
+        files = jax_actuator.files(drive, constants, notes)
+    elif begun.format == "mjlab":
+        files = mjlab.files(drive, constants, notes)
+    else:
+        files = onnx.files(drive, constants)
+        model: Any = files["actuator.onnx"]
+        checks["ONNX against JAX, largest of 10,000 states [relative]"] = onnx.difference(drive, constants, model)
+    found = comparison.compare(runs, law, jax_actuator.fates(drive), held, mujoco.approximated)
+    return dataclasses.replace(begun, files=files, comparison=found, checks=checks)
+
+
+def _table(begun: Export, runs: Situation, at: str, draws: int, seed: int) -> Export:
+    drive, constants = begun.joint, begun.constants
+    law, held = feed_forward.law_of(runs, constants), feed_forward.held(drive)
+    fates: list[Fate] = feed_forward.fates(runs, constants)
+    found = comparison.compare(runs, law, fates, held, mujoco.approximated)
+    files = feed_forward.files(drive, feed_forward.map_of(runs, constants), notes_of(runs))
+    return dataclasses.replace(begun, files=files, comparison=found)

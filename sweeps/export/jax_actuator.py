@@ -1,0 +1,135 @@
+"""A drive as an actuator in JAX: readable source, a serialised program, and its law in steady travel."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from types import ModuleType
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sweeps.export.comparison import DROPPED, HELD, Fate
+from sweeps.export.joint import Joint, integrates
+from sweeps.export.law_source import Constant, executed, jax_source, numbers
+from sweeps.export.mujoco import outside
+from sweeps.export.situation import Situation
+
+#: Steps of a run to its steady state, and their length [s]: of an implicit step so long, Newton's method is left.
+SETTLING, LONG = 10, 1e9
+#: Newton steps of the speed at which a load is carried.
+STEPS = 25
+#: Platforms for which the serialised program is lowered.
+PLATFORMS = ("cpu", "cuda")
+
+
+class ActuatorLaw(eqx.Module):
+    """The generated actuator in steady travel; nothing of it is refitted. Attributes: as of `comparison.FormatLaw`.
+
+    params: of the actuator, of shape (runs,) where they differ; guess: speed of the joint near the solution [rad/s].
+    """
+
+    module: ModuleType = eqx.field(static=True)
+    params: dict[str, jax.Array]
+    guess: jax.Array
+    names: tuple[str, ...] = eqx.field(static=True, default=())
+    start: jax.Array = eqx.field(default_factory=lambda: jnp.zeros(0))
+
+    def __call__(self, theta: Any, command: Any, load: Any, way: Any) -> tuple[Any, Any]:
+        def torque(speed: Any) -> Any:
+            return settled(self.module, self.params, command, speed)[0] - load
+
+        def nearer(speed: Any, _: None) -> tuple[Any, None]:
+            left, rise = jax.jvp(torque, (speed,), (jnp.ones_like(speed),))
+            stride = jnp.where(rise != 0, -left / jnp.where(rise != 0, rise, 1.0), 0.0)
+            # Never across rest, where friction turns round.
+            return jnp.where(way * (speed + stride) > 0, speed + stride, 0.5 * speed), None
+
+        speed = jax.lax.scan(nearer, self.guess, None, STEPS)[0]
+        return settled(self.module, self.params, command, speed)[1]["current"], speed
+
+
+def settled(module: ModuleType, params: Mapping[str, Any], command: Any, speed: Any) -> tuple[Any, dict[str, Any]]:
+    """Torque [N·m] and inside of an actuator at a constant voltage [V] and speed of the joint [rad/s]."""
+    state = module.initial_state(jnp.shape(speed))
+
+    def again(state: Any, _: None) -> tuple[Any, None]:
+        return module.actuator(params, state, command, jnp.zeros_like(speed), speed, LONG)[1], None
+
+    state = jax.lax.scan(again, state, None, SETTLING)[0]
+    torque, _, info = module.actuator(params, state, command, jnp.zeros_like(speed), speed, LONG)
+    return torque, info
+
+
+def steady_params(joint: Joint, constants: Sequence[Constant], amplitudes: Mapping[str, float]) -> dict[str, Any]:
+    """Parameters of the actuator in steady travel: without what repeats with an angle, whose mean is 0."""
+    params = dict(numbers(constants))
+    waves = {p.name: 0.0 for p in joint.parts if integrates(p)}
+    for name, value in {**amplitudes, **waves}.items():
+        if f"effects.{name}.amplitude" in params:
+            params[f"effects.{name}.amplitude"] = value
+    return params
+
+
+def law_of(situation: Situation, constants: Sequence[Constant]) -> Any:
+    """Returns the function from a joint and amplitudes to the law of its actuator in these runs."""
+    module = executed(jax_source(situation.joint, constants))
+
+    def law(joint: Joint, amplitudes: Mapping[str, float]) -> ActuatorLaw:
+        params = steady_params(joint, constants, amplitudes)
+        for name in joint.surroundings():
+            value = np.asarray(getattr(situation.signals, name.removeprefix("surroundings.")), float)
+            params[name] = np.where(np.isfinite(value), value, params[name])
+        arrays = {n: jnp.asarray(v, float) for n, v in params.items()}
+        return ActuatorLaw(module, arrays, jnp.asarray(situation.inside.speed))
+
+    return law
+
+
+def fates(joint: Joint) -> list[Fate]:
+    """Fates of the base's terms, and of effects outside the joint."""
+    robot = joint.robot
+    found = [
+        Fate("motor, winding and gearbox", HELD, "functions of the law"),
+        Fate("rotor inertia", HELD, "`armature(params)`, to be set as the joint's own armature"),
+    ]
+    if joint.surroundings():
+        names = ", ".join(joint.surroundings())
+        found.append(Fate("friction by the joint's surroundings", HELD, f"parameters {names}, which you may change"))
+    if robot.has_ground:
+        how = "the simulator's own contact with the ground"
+        found.append(Fate("ground: slip and rolling resistance", DROPPED, how))
+    if robot.loose:
+        found.append(Fate("backlash", DROPPED, "the joint is rigid; it needs a second body"))
+    if joint.limit is not None:
+        found.append(Fate("current limit of the driver", HELD, "a bound of the current"))
+    return [*found, *outside(joint)]
+
+
+def held(joint: Joint) -> dict[str, str]:
+    """Words for each effect inside the joint; the law has all of them."""
+    return {e.name: "a function of the law" for e in joint.inside}
+
+
+def files(joint: Joint, constants: Sequence[Constant], notes: Sequence[str]) -> dict[str, str | bytes]:
+    """The actuator's source, and its program as `jax.export` serialises it."""
+    source = jax_source(joint, constants, notes)
+    return {"actuator.py": source, "actuator.jaxexport": serialised(executed(source))}
+
+
+def serialised(module: ModuleType) -> bytes:
+    """The actuator in single precision, of any number of joints, with first derivatives.
+
+    `jax.export.deserialize(bytes).call(params, state, command, joint_position, joint_velocity, dt)`.
+    """
+    from jax import export
+
+    with jax.enable_x64(False):
+        (many,) = export.symbolic_shape("n")
+        single, each = jax.ShapeDtypeStruct((), jnp.float32), jax.ShapeDtypeStruct((many,), jnp.float32)
+        params = dict.fromkeys(module.PARAMS, single)
+        state = dict.fromkeys(module.initial_state(), each)
+        made = export.export(jax.jit(module.actuator), platforms=PLATFORMS)(params, state, each, each, each, single)
+        return bytes(made.serialize(vjp_order=1))

@@ -1,0 +1,349 @@
+"""A robot's drive as the actuator of one joint, its driving wheel or shaft: parts of the law as expressions."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from calibration.data.input_errors import BadConfiguration, allowed_words
+from calibration.data.robot_file import RobotFile
+from mmrjax import effects as library
+from mmrjax.effects import Effect
+from mmrjax.model import balances, contact, params
+from mmrjax.model.channels import EVERY
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import Signals
+from sweeps.export.expressions import ZERO, Symbol, apply, const, names_of, traced
+
+#: Balances that a joint has; what enters another one belongs to what the joint moves, or to an instrument.
+INSIDE = ("supply", "electrical", "inductance", "motor", "gearbox", "track", "inertia")
+#: A driver's limit of current from which on there is none [A].
+UNLIMITED = 1000.0
+#: Variables of the law, and the signals that they are; the output's torques are `load` and, at the wheel, `pull`.
+VARIABLES = {
+    "current": "current",
+    "voltage": "voltage",
+    "motor_speed": "speed_motor",
+    "wheel_speed": "speed_wheel",
+    "way": "direction",
+    "angle": "angle",
+}
+#: Surroundings of an exported joint: an external supply, one configuration.
+_STILL = {"battery": 0.0, "discharge": 0.0, "order": 0.0, "configuration": 0}
+
+
+@dataclasses.dataclass(frozen=True)
+class Part:
+    """One equation of the law.
+
+    Attributes:
+        name: a word; balance: which it enters, or what it is; unit: of its value.
+        equation, meaning: in words, from the docstring of what it is made of.
+        value: as an expression; slope: its derivative by the variable `by`; rate, rate_slope: of its memory.
+        effect: name of the effect that it is of; empty: of the robot's base.
+    """
+
+    name: str
+    balance: str
+    unit: str
+    equation: str
+    meaning: str
+    value: Symbol
+    by: str = ""
+    slope: Symbol = ZERO
+    rate: Symbol | None = None
+    rate_slope: Symbol = ZERO
+    effect: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class Joint:
+    """A drive as the actuator of a joint.
+
+    Attributes:
+        file: the robot and what its file stated; configuration: name of its load.
+        robot: with this configuration and the effects inside alone.
+        inside, outside: effects that enter the balances of a joint, and the others.
+        idle: names of effects that do not act on this configuration.
+        parts: equations of the law in their order.
+    """
+
+    file: RobotFile
+    configuration: str
+    robot: Robot
+    inside: tuple[Effect, ...]
+    outside: tuple[Effect, ...]
+    idle: tuple[str, ...]
+    parts: tuple[Part, ...]
+
+    @property
+    def load(self) -> Any:
+        """The load of its configuration."""
+        return self.robot.configurations[self.configuration]
+
+    @property
+    def name(self) -> str:
+        """Name of the robot, as a word of letters, digits and underscores."""
+        stem = self.file.name.rpartition("/")[2].removesuffix(".toml")
+        return "".join(c if c.isalnum() and c.isascii() else "_" for c in stem) or "robot"
+
+    @property
+    def limit(self) -> float | None:
+        """Largest current of one motor that the driver lets flow [A]; None: no limit."""
+        limit = float(self.robot.driver.current_limit)
+        return limit if limit < UNLIMITED else None
+
+    @property
+    def remembering(self) -> tuple[Part, ...]:
+        """Parts that have a memory, in order."""
+        return tuple(p for p in self.parts if p.rate is not None)
+
+    def of(self, balance: str) -> tuple[Part, ...]:
+        """Parts of a balance, in order."""
+        return tuple(p for p in self.parts if p.balance == balance)
+
+    def with_robot(self, robot: Robot) -> Joint:
+        """The same joint of a robot with other numbers; its parts are expressions of names and stay."""
+        return dataclasses.replace(self, robot=robot, inside=robot.effects)
+
+    def parameters(self) -> dict[str, params.Parameter]:
+        """Parameters that the law depends on, by dotted name."""
+        known = {p.name: p for p in params.walk_parameters(self.robot)}
+        used = [n for part in self.parts for n in names_of(*_symbols(part))]
+        further = ["gearbox.ratio", "motor.inertia", "gearbox.efficiency_load"]
+        further += ["driver.current_limit"] * (self.limit is not None)
+        return {n: known[n] for n in dict.fromkeys((*further, *used)) if n in known}
+
+    def surroundings(self) -> tuple[str, ...]:
+        """Signals of the joint's surroundings that the law depends on, such as the normal load."""
+        used = [n for part in self.parts for n in names_of(*_symbols(part)) if n.startswith("surroundings.")]
+        return tuple(dict.fromkeys(used))
+
+
+def _symbols(part: Part) -> list[Symbol]:
+    return [part.value, part.slope, part.rate_slope, *([] if part.rate is None else [part.rate])]
+
+
+def joint(file: RobotFile, configuration: str | None = None) -> Joint:
+    """Returns the drive of a robot as the actuator of one joint.
+
+    Args:
+        configuration: its name; None: the robot's first.
+
+    Raises:
+        BadConfiguration: no such configuration; a drive that is not one joint or that no voltage drives; an effect
+            whose equation has no closed form.
+    """
+    robot = file.robot
+    name = robot.configurations.names[0] if configuration is None else configuration
+    if name not in robot.configurations:
+        raise BadConfiguration(
+            f"--configuration: got {name}; the robot has no such configuration; "
+            f"{allowed_words(name, robot.configurations)}"
+        )
+    if robot.unlike:
+        raise BadConfiguration(
+            f"{file.name}: {', '.join(robot.unlike)} makes its sides differ, and one joint has one drive; expected a "
+            "robot whose sides are alike: export a robot file of each side, without this effect"
+        )
+    if robot.rig.imposed != "voltage":
+        what = robot.rig.imposed.replace("_", " ")
+        raise BadConfiguration(
+            f"{file.name}, [rig] imposed: got {robot.rig.imposed}; expected voltage, the command of an exported "
+            f"drive. Where the {what} is imposed, the runs tell nothing about the winding"
+        )
+    if lacking := [n for n in ("motor.resistance", "motor.torque_constant") if n in robot.rig.unknown]:
+        raise BadConfiguration(f"{file.name}: {', '.join(lacking)} is missing, and a drive's law needs it; state it")
+    members: Any = {name: robot.configurations[name]}
+    one = dataclasses.replace(robot, configurations=members)
+    acting = tuple(e for e in robot.effects if _acts(one, e))
+    idle = tuple(e.name for e in robot.effects if e not in acting)
+    inside = tuple(e for e in acting if e.balance in INSIDE and not e.needs_battery and e.balance not in robot.lacks)
+    outside = tuple(e for e in acting if e not in inside)
+    one = dataclasses.replace(one, effects=inside)
+    found = Joint(file, name, one, inside, outside, idle, ())
+    return dataclasses.replace(found, parts=tuple(_parts(found)))
+
+
+def _acts(robot: Robot, effect: Effect) -> bool:
+    on_tracks = jnp.asarray(robot.configurations.members[0].on_tracks)
+    return effect.acts_everywhere or bool(effect.acts(robot, Signals(configuration=0, on_tracks=on_tracks)))
+
+
+class _Tracer:
+    """Traces functions of a robot and its signals into expressions of their names."""
+
+    def __init__(self, joint: Joint) -> None:
+        self.joint, self.at_wheel = joint, True
+        self.parameters = [p.name for p in params.walk_parameters(joint.robot)]
+        self.memories = [e.name for e in joint.robot.remembering]
+        taken = {*VARIABLES.values(), "memory", "temperature", "load_torque"}
+        self.around = [f.name for f in dataclasses.fields(Signals) if f.name not in taken]
+        self.names = [
+            *self.parameters,
+            *VARIABLES,
+            "load",
+            "pull",
+            *(f"memory.{n}" for n in self.memories),
+            *(f"surroundings.{n}" for n in self.around),
+        ]
+
+    def __call__(self, function: Callable[[Robot, Signals], Any], what: str, balance: str, by: str = "") -> Symbol:
+        """Expression of a function of robot and signals; of its derivative by a variable, where `by` names one."""
+        self.at_wheel = balance != "gearbox"
+
+        def value(*numbers: Any) -> Any:
+            return function(*self._given(dict(zip(self.names, numbers, strict=True))))
+
+        def slope(*numbers: Any) -> Any:
+            k = self.names.index(by)
+            at = lambda x: jnp.asarray(value(*numbers[:k], x, *numbers[k + 1 :]))  # noqa: E731
+            return jax.jvp(at, (numbers[k],), (jnp.ones_like(numbers[k]),))[1]
+
+        return traced(slope if by else value, self.names, what)
+
+    def _given(self, known: dict[str, Any]) -> tuple[Robot, Signals]:
+        robot = params.replace(self.joint.robot, {n: known[n] for n in self.parameters})
+        (load,) = robot.configurations.members
+        robot = robot.within(0)
+        around: dict[str, Any] = {n: _STILL.get(n, known[f"surroundings.{n}"]) for n in self.around}
+        around |= {field: known[name] for name, field in VARIABLES.items()}
+        around.update(
+            on_tracks=load.on_tracks,
+            direction_travel=known["way"],
+            speed_output=known["wheel_speed"],
+            speed_theoretical=load.radius * known["wheel_speed"],
+            speed=load.radius * known["wheel_speed"],
+            total_current=robot.sides * known["current"],
+            duty=1.0,
+            share_drawn=1.0,
+            voltage_source=known["voltage"],
+            voltage_back=robot.motor.voltage_back(known["motor_speed"]),
+            torque_electromagnetic=robot.motor.torque_electromagnetic(known["current"]),
+            # The gearbox reads the sum of both, which is the load at its output.
+            traction=known["pull"] / load.radius if self.at_wheel else jnp.zeros(()),
+            torque_track_loss=known["load"],
+            torque_load=known["load"],
+            memory={n: known[f"memory.{n}"] for n in self.memories},
+        )
+        return robot, Signals(**around)
+
+
+def _parts(joint: Joint) -> Iterator[Part]:
+    """Equations of the base, then those of the effects, each in the order of its balance."""
+    trace = _Tracer(joint)
+    bare = lambda robot: dataclasses.replace(robot, effects=())  # noqa: E731
+
+    rest = float(joint.load.speed_still) / float(joint.load.radius)
+    base: Sequence[tuple[str, str, str, str, str, str, Callable[[Robot, Signals], Any]]] = (
+        ("direction", "way", "-", "x (3 - x²) / 2, x = ω/ω_0 within ±1",
+         f"smooth sign of the speed, within ω_0 = {rest:.3g} rad/s of rest", "",
+         lambda r, s: contact.smooth_sign(s.speed_wheel, rest)),
+        ("back_emf", "back", "V", "E = C_m ω_m", "voltage that the turning motor induces", "",
+         lambda r, s: r.motor.voltage_back(s.speed_motor)),
+        ("winding", "electrical", "V", "U_R = R I", "voltage across the winding", "current",
+         lambda r, s: r.motor.voltage_winding(s.current)),
+        ("inductance", "inductance", "H", "L", "inductance of the winding", "",
+         lambda r, s: r.motor.inductance),
+        ("motor_torque", "torque", "N·m", "M = C_m I", "torque that the current makes", "",
+         lambda r, s: r.motor.torque_electromagnetic(s.current)),
+        ("motor_friction", "motor", "N·m", "M_f = M_0 sign ω + K ω", "friction of the motor, at its shaft", "",
+         lambda r, s: r.motor.torque_loss(s.speed_motor, s.direction)),
+        ("gear_idle", "idle", "N·m", "M_i = M_r0 sign ω + K_r ω", "idle friction of the gearbox, at its input",
+         "", lambda r, s: r.gearbox.torque_idle(s.speed_motor, s.direction)),
+        ("gear_efficiency", "efficiency", "-", "η where power flows to the wheel, 1/η_b where it flows back",
+         "share of the torque that the gearbox passes on; `load`: torque at its input", "",
+         lambda r, s: r.gearbox.efficiency_flow(s.torque_load, s.direction)),
+        ("output_friction", "track", "N·m", "M_t = M_t0 sign ω + K_t ω, and friction by the normal load",
+         "friction between the gearbox and the wheel's rim, at the wheel", "pull",
+         lambda r, s: balances.track(bare(r), r.chassis(0), s).torque_track_loss),
+    )  # fmt: skip
+    for name, balance, unit, equation, meaning, by, function in base:
+        yield _part(trace, name, balance, unit, equation, meaning, by, function)
+    variable = {"supply": "current", "electrical": "current", "gearbox": "load", "track": "pull"}
+    for effect in joint.inside:
+        alone = lambda r, e=effect: tuple(x for x in r.effects if x.name == e.name)  # noqa: E731
+        value = lambda r, s, e=effect, alone=alone: balances.effects_sum(  # noqa: E731
+            dataclasses.replace(r, effects=alone(r)), s, e.balance
+        )
+        rate = None
+        if effect.memory_size is not None:
+            rate = lambda r, s, alone=alone: alone(r)[0].rate(r, s)  # noqa: E731
+        yield _part(
+            trace, effect.name, effect.balance, balances.BALANCES[effect.balance][0], *described(effect),
+            variable.get(effect.balance, ""), value, rate, effect.name,
+        )  # fmt: skip
+
+
+def _part(
+    trace: _Tracer, name: str, balance: str, unit: str, equation: str, meaning: str, by: str,
+    function: Callable[[Robot, Signals], Any], rate: Callable[[Robot, Signals], Any] | None = None, effect: str = "",
+) -> Part:  # fmt: skip
+    value = trace(function, name, balance)
+    depends = by in names_of(value)
+    part = Part(name, balance, unit, equation, meaning, value, by if depends else "", effect=effect)
+    if depends:
+        part = dataclasses.replace(part, slope=trace(function, name, balance, by))
+    if rate is not None:
+        slope = trace(rate, name, balance, f"memory.{name}")
+        part = dataclasses.replace(part, rate=trace(rate, name, balance), rate_slope=slope)
+    return part
+
+
+def described(effect: Effect | type[Effect]) -> tuple[str, str]:
+    """Equation and meaning of an effect, from its docstring."""
+    kind = effect if isinstance(effect, type) else type(effect)
+    paragraphs = (inspect.getdoc(kind.plain or kind) or kind.name).split("\n\n")
+    head = " ".join(paragraphs[0].split())
+    second = " ".join(paragraphs[1].split()) if len(paragraphs) > 1 else ""
+    return head, "" if second.startswith("Source") else second
+
+
+def known_as(effect: Effect) -> bool:
+    """True if an effect is one of the library or of its curves, and not the user's own."""
+    return effect.name in library.BY_NAME or effect.name in library.BESIDE
+
+
+def integrates(part: Part) -> bool:
+    """True if a part's memory grows without end, as a phase does: it has no settled value but its mean, 0."""
+    return part.rate is not None and part.rate_slope.is_const and part.rate_slope.value == 0
+
+
+def values(joint: Joint) -> dict[str, float]:
+    """Numbers of the law's parameters [SI], by dotted name."""
+    return {n: float(p.value) for n, p in joint.parameters().items()}
+
+
+def typical(signals: Signals, names: Sequence[str]) -> dict[str, float]:
+    """Mean of signals of the surroundings over runs [SI], by name; 0 of one that is not known."""
+    found: dict[str, float] = {}
+    for name in names:
+        value = np.asarray(getattr(signals, name.removeprefix("surroundings.")), float)
+        mean = float(np.nanmean(value)) if np.isfinite(value).any() else 0.0
+        found[name] = mean
+    return found
+
+
+def channels_of(joint: Joint) -> tuple[Any, ...]:
+    """Channels of the robot's instruments, in the order of their table."""
+    shown = joint.file.robot.rig.channels
+    return tuple(c for c in EVERY if c.name in shown)
+
+
+def combined(parts: Sequence[Part], field: str) -> Symbol:
+    """Sum of a field of several parts."""
+    found = const(0.0)
+    for part in parts:
+        found = apply("add", found, getattr(part, field))
+    return found
+
+
+def merged(known: Mapping[str, float], more: Mapping[str, float]) -> dict[str, float]:
+    """Two tables of numbers as one; the second one's win."""
+    return {**known, **more}

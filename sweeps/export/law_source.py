@@ -1,0 +1,256 @@
+"""Source text of a joint's law: one readable file that needs only JAX, or only PyTorch."""
+
+from __future__ import annotations
+
+import dataclasses
+import textwrap
+from collections.abc import Callable, Mapping, Sequence
+from types import ModuleType
+from typing import Any
+
+from mmrjax import __version__
+from sweeps.export.expressions import JAX, TORCH, Dialect, Symbol, lines_of, names_of
+from sweeps.export.joint import VARIABLES, Joint, Part
+
+#: Newton steps by which torques of the gearbox and of the wheel follow from those that depend on them.
+STEPS = 3
+_ARGUMENTS = (*VARIABLES, "load", "pull")
+
+
+@dataclasses.dataclass(frozen=True)
+class Constant:
+    """A number of the law.
+
+    Attributes:
+        name: dotted; value: [SI]; unit, meaning, source: in words.
+        low, high: limits of its interval, None: not known; kind: of interval, in words.
+    """
+
+    name: str
+    value: float
+    unit: str
+    meaning: str
+    source: str
+    low: float | None = None
+    high: float | None = None
+    kind: str = ""
+
+    @property
+    def interval(self) -> str:
+        """Its interval in words; empty where none is known."""
+        return "" if self.low is None else f"{self.low:.4g} to {self.high:.4g} ({self.kind})"
+
+
+@dataclasses.dataclass(frozen=True)
+class _Library:
+    """Names that differ between array libraries."""
+
+    dialect: Dialect
+    imports: str
+    positive: Callable[[str], str]
+    clipped: Callable[[str, str], str]
+
+
+_JAX = _Library(
+    JAX, "import jax.numpy as jnp", lambda x: f"jnp.maximum({x}, 0.0)", lambda x, b: f"jnp.clip({x}, -{b}, {b})"
+)
+_TORCH = _Library(
+    TORCH, "import torch", lambda x: f"torch.clamp({x}, min=0.0)", lambda x, b: f"torch.clamp({x}, -{b}, {b})"
+)
+
+
+def arguments(symbol: Symbol) -> list[str]:
+    """Arguments of the function of an expression, besides its parameters."""
+    used = names_of(symbol)
+    found = [n for n in _ARGUMENTS if n in used]
+    return [*found, "memory"] if any(n.startswith("memory.") for n in used) else found
+
+
+def _function(name: str, symbol: Symbol, document: str, dialect: Dialect) -> str:
+    def spelled(word: str) -> str:
+        if word in _ARGUMENTS:
+            return word
+        return "memory" if word.startswith("memory.") else f'p["{word}"]'
+
+    head = f"def {name}({', '.join(['p', *arguments(symbol)])}):"
+    body = textwrap.indent(_wrapped(document), "    ")
+    return "\n".join([head, body, *lines_of(symbol, dialect, spelled)])
+
+
+def _wrapped(document: str) -> str:
+    lines = textwrap.wrap(document, 108)
+    if len(lines) == 1 and len(document) < 104:
+        return f'"""{document}"""'
+    return '"""' + "\n".join(lines) + '\n"""'
+
+
+def call(part: Part, suffix: str = "", memory: str | None = None) -> str:
+    """Text of the call of a part's function."""
+    symbol = {"": part.value, "_slope": part.slope, "_rate": part.rate, "_rate_slope": part.rate_slope}[suffix]
+    assert symbol is not None
+    given = ["p", *(("state" + f'["{part.name}"]' if memory is None else memory) if a == "memory" else a
+                    for a in arguments(symbol))]  # fmt: skip
+    return f"{part.name}{suffix}({', '.join(given)})"
+
+
+def _sum(parts: Sequence[Part], suffix: str = "", memory: Mapping[str, str] | None = None) -> str:
+    memory = memory or {}
+    terms = [call(p, suffix, memory.get(p.name)) for p in parts if suffix != "_slope" or p.by]
+    return " + ".join(terms) or "0.0"
+
+
+def functions(joint: Joint, dialect: Dialect) -> str:
+    """Text of the functions of all parts, with their derivatives and rates."""
+    found = []
+    for part in joint.parts:
+        unit = "" if part.unit == "-" else f" [{part.unit}]"
+        meaning = part.meaning if part.meaning.endswith(".") else f"{part.meaning}." if part.meaning else ""
+        document = f"{part.equation.rstrip('.')}{unit}. {meaning}".strip().replace("\\", "")
+        found.append(_function(part.name, part.value, document, dialect))
+        if part.by:
+            what = f"Derivative of `{part.name}` by `{part.by}`."
+            found.append(_function(f"{part.name}_slope", part.slope, what, dialect))
+        if part.rate is not None:
+            found.append(_function(f"{part.name}_rate", part.rate, f"Rate of the memory of `{part.name}`.", dialect))
+            what = f"Derivative of that rate by the memory of `{part.name}`."
+            found.append(_function(f"{part.name}_rate_slope", part.rate_slope, what, dialect))
+    return "\n\n\n".join(found)
+
+
+def step_lines(joint: Joint, library: _Library) -> list[str]:
+    """Lines of one step of the law, from `state`, `command`, `joint_position`, `joint_velocity` and `dt`."""
+    circuit = joint.of("supply") + joint.of("electrical")
+    gear, track = joint.of("gearbox"), joint.of("track")
+    later = {p.name: f'memory["{p.name}"]' for p in joint.remembering}
+    lines = [
+        "p, voltage, angle, wheel_speed = params, command, joint_position, joint_velocity",
+        'motor_speed = p["gearbox.ratio"] * wheel_speed',
+        f"way = {call(joint.of('way')[0])}",
+        "# Current of the winding: L dI/dt = U - E - U_R - ..., one implicit Euler step, linear in the current.",
+        'current = state["current"]',
+        f"left = voltage - {call(joint.of('back')[0])} - ({_sum(circuit)})",
+        f"slope = {library.positive(_sum(circuit, '_slope'))}",
+        f"current = current + dt * left / ({_sum(joint.of('inductance'))} + dt * slope)",
+    ]
+    if joint.limit is not None:
+        lines.append(
+            f"current = {library.clipped('current', 'p[' + chr(34) + 'driver.current_limit' + chr(34) + ']')}"
+        )
+    lines.append('memory = {"current": current}')
+    if joint.remembering:
+        lines.append("# Memories: one implicit Euler step each.")
+    lines += [
+        f'memory["{p.name}"] = state["{p.name}"] + dt * {call(p, "_rate")} / (1.0 - dt * {call(p, "_rate_slope")})'
+        for p in joint.remembering
+        if all(a not in ("load", "pull") for a in arguments(p.rate or p.value))
+    ]
+    lines += [
+        f"lost = {_sum(circuit, '', later)}",
+        "# Torques from the winding to the wheel.",
+        f"made = {call(joint.of('torque')[0])}",
+        f"at_shaft = made - ({_sum(joint.of('motor'), '', later)})",
+        f"load = at_shaft - {call(joint.of('idle')[0])}",
+        f'through = p["gearbox.ratio"] * {call(joint.of("efficiency")[0])} * load',
+        *_solved("load", "through", gear, later),
+        *_solved("pull", "load", track, later),
+        'info = {"current": current, "voltage": voltage, "motor_speed": motor_speed, "power": voltage * current,',
+        '        "lost_winding": lost * current, "lost_motor": (made - at_shaft) * motor_speed,',
+        '        "lost_gearbox": at_shaft * motor_speed - load * wheel_speed,',
+        '        "lost_output": (load - pull) * wheel_speed}',
+        "return pull, memory, info",
+    ]
+    return lines
+
+
+def _solved(name: str, given: str, parts: Sequence[Part], later: Mapping[str, str]) -> list[str]:
+    """Lines that find x with x + losses(x) = given."""
+    if not any(p.by for p in parts):
+        return [f"{name} = {given} - ({_sum(parts, '', later)})" if parts else f"{name} = {given}"]
+    left = f"({name} + {_sum(parts, '', later)} - {given})"
+    return [
+        f"{name} = {given}",
+        f"for _ in range({STEPS}):  # a loss that depends on the torque itself",
+        f"    {name} = {name} - {left} / (1.0 + {_sum(parts, '_slope', later)})",
+    ]
+
+
+def constants_text(constants: Sequence[Constant], name: str = "PARAMS") -> str:
+    """Text of the table of the law's numbers, each with its unit, meaning, interval and source."""
+    lines = [f"{name} = {{"]
+    for c in constants:
+        lines += [f"    # {text}" for text in textwrap.wrap(_about(c), 106)]
+        lines.append(f'    "{c.name}": {c.value!r},')
+    return "\n".join([*lines, "}"])
+
+
+def _about(c: Constant) -> str:
+    interval = f"; {c.interval}" if c.interval else ""
+    return f"{c.meaning} [{c.unit}]{interval}; {c.source}"
+
+
+def _header(joint: Joint, what: str, notes: Sequence[str]) -> str:
+    head = f"{what} of {joint.file.name}, {joint.configuration}. Written by mmrjax {__version__}."
+    body = "\n\n".join("\n".join(textwrap.wrap(n, 108)) for n in notes)
+    return f'"""{head}\n\n{body}\n"""\n'
+
+
+_DOCUMENT = '''"""One step of the drive: torque at the joint, state after the step, and what happens inside.
+
+    Args:
+        params: `PARAMS`, or with other numbers; each may be an array of the joint's shape.
+        state: from `initial_state` or the step before.
+        command: voltage at the driver's output [V]: its duty times the voltage of the supply.
+        joint_position: [rad]; joint_velocity: [rad/s], of the wheel or output shaft.
+        dt: length of the step [s].
+
+    Returns:
+        Torque that acts on the joint [N·m], friction included; the state; a dictionary with current [A], voltage [V],
+        motor_speed [rad/s], power taken [W] and power lost in winding, motor, gearbox and at the output [W]. Without
+        its armature: give the joint `armature(params)`.
+    """'''
+
+
+def jax_source(joint: Joint, constants: Sequence[Constant], notes: Sequence[str] = ()) -> str:
+    """Source of the law in JAX."""
+    return _source(joint, constants, _JAX, "Actuator", notes)
+
+
+def torch_source(
+    joint: Joint, constants: Sequence[Constant], notes: Sequence[str] = (), imports: str = _TORCH.imports
+) -> str:
+    """Source of the law in PyTorch."""
+    return _source(joint, constants, dataclasses.replace(_TORCH, imports=imports), "Actuator", notes)
+
+
+def _source(joint: Joint, constants: Sequence[Constant], library: _Library, what: str, notes: Sequence[str]) -> str:
+    states = ", ".join(f'"{n}": zero' for n in ("current", *(p.name for p in joint.remembering)))
+    added = "".join(f" + {call(p)}" for p in joint.of("inertia"))
+    body = textwrap.indent("\n".join(step_lines(joint, library)), "    ")
+    zero = "jnp.zeros(shape)" if library.dialect is JAX else "torch.zeros(shape, device=device)"
+    given = "shape=()" if library.dialect is JAX else "shape=(), device=None"
+    return (
+        f"{_header(joint, what, notes)}\n{library.imports}\n\n{constants_text(constants)}\n\n\n"
+        f"{functions(joint, library.dialect)}\n\n\n"
+        f"def armature(params):\n"
+        f'    """Inertia of the rotor at the joint, J i² η, for the joint\'s own armature [kg·m²]."""\n'
+        f"    p = params\n"
+        f'    return p["motor.inertia"] * p["gearbox.ratio"] ** 2 * p["gearbox.efficiency_load"]{added}\n\n\n'
+        f"def initial_state({given}):\n"
+        f'    """State at rest: current [A], and memories of effects."""\n'
+        f"    zero = {zero}\n"
+        f"    return {{{states}}}\n\n\n"
+        f"def actuator(params, state, command, joint_position, joint_velocity, dt):\n"
+        f"    {_DOCUMENT}\n{body}\n"
+    )
+
+
+def executed(source: str, name: str = "exported_law") -> ModuleType:
+    """Module of a source text."""
+    module = ModuleType(name)
+    exec(compile(source, f"<{name}>", "exec"), module.__dict__)
+    return module
+
+
+def numbers(constants: Sequence[Constant]) -> dict[str, Any]:
+    """Values of constants by name."""
+    return {c.name: c.value for c in constants}

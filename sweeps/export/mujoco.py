@@ -1,0 +1,463 @@
+"""A drive as a `<dcmotor>` of MuJoCo: an MJCF fragment to include, a scene that runs, its law in steady travel."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import textwrap
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from calibration.data.input_errors import BadConfiguration
+from mmrjax import __version__
+from mmrjax.model.chassis import inertia_reduced
+from sweeps.export.comparison import APPROXIMATED, DROPPED, HELD, Fate
+from sweeps.export.joint import Joint
+from sweeps.export.law_source import Constant
+from sweeps.export.situation import AtJoint, Situation
+
+#: First version that has `<dcmotor>`.
+FIRST = (3, 7, 0)
+#: Effects that the format has a term for, and which.
+TERMS = {
+    "series_resistance": "resistance",
+    "supply_sag": "resistance, for all motors that draw as much",
+    "armature_inductance": "inductance",
+    "rotating_inertia": "armature of the joint",
+    "thermal_drift": "thermal",
+    "cogging": "cogging, which does not fade at speed",
+    "presliding": "lugre",
+}
+#: Friction that falls with speed: amplitude at the motor's shaft, whether its speed is the motor's.
+STRIBECK = {
+    "stribeck_motor": (True, True),
+    "stribeck_gear": (False, True),
+    "stribeck_track": (False, False),
+    "stribeck_exponent": (False, False),
+}
+#: Turn of the joint over which a bristle yields where nothing states it [rad].
+YIELD = 0.02
+#: Least friction at speed of a bristle, as a share of what falls with speed.
+LEAST_SHARE = 0.05
+#: Fixed-point steps of heat and falling friction.
+STEPS = 12
+#: Names of the format's parameters.
+RESISTANCE, CONSTANT, FRICTION, DAMPING, SHARE = (
+    "resistance", "motorconst", "frictionloss", "damping", "current over act",
+)  # fmt: skip
+EXCESS, FADE, HEAT = "lugre F_S - F_C", "lugre v_S", "thermal R"
+
+
+class MujocoLaw(eqx.Module):
+    """Steady law of `<dcmotor>` on a joint with friction loss and damping.
+
+    U = R' I' + g K ω, g K I' = M + f sign ω + d ω, and I = c I'. Attributes: as of `comparison.FormatLaw`; ratio: g;
+    coefficient: of the resistance's temperature [1/K].
+    """
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    start: jax.Array
+    ratio: jax.Array
+    coefficient: jax.Array
+
+    def __call__(self, theta: Any, command: Any, load: Any, way: Any) -> tuple[Any, Any]:
+        given = dict(zip(self.names, theta, strict=True))
+        resistance, turns = given[RESISTANCE], self.ratio * given[CONSTANT]
+        hot, excess = jnp.ones_like(command), jnp.zeros_like(command)
+        current, speed = jnp.zeros_like(command), jnp.zeros_like(command)
+        for _ in range(STEPS if EXCESS in given or HEAT in given else 1):
+            carried = load + way * (given[FRICTION] + excess)
+            drop = hot * resistance / turns
+            speed = (command - drop * carried) / (turns + drop * given[DAMPING])
+            current = (carried + given[DAMPING] * speed) / turns
+            if HEAT in given:
+                hot = 1 + self.coefficient * given[HEAT] * hot * resistance * current**2
+            if EXCESS in given:
+                excess = given[EXCESS] * jnp.exp(-((speed / given[FADE]) ** 2))
+        return given[SHARE] * current, speed
+
+
+def _numbers(joint: Joint, amplitudes: Mapping[str, float]) -> dict[str, dict[str, float]]:
+    """Parameters of each effect inside, by its name, with some amplitudes replaced."""
+    found: dict[str, dict[str, float]] = {}
+    for effect in joint.inside:
+        own = {f.name: float(getattr(effect, f.name)) for f in dataclasses.fields(effect) if "spec" in f.metadata}
+        found[effect.name] = own | ({"amplitude": amplitudes[effect.name]} if effect.name in amplitudes else {})
+    return found
+
+
+def law_of(normal: float) -> Any:
+    """Returns the function from a joint and amplitudes to its law, at a normal load of one side [N]."""
+
+    def law(joint: Joint, amplitudes: Mapping[str, float]) -> MujocoLaw:
+        return translated(joint, normal, amplitudes)
+
+    return law
+
+
+def translated(joint: Joint, normal: float, amplitudes: Mapping[str, float] | None = None) -> MujocoLaw:
+    """Law of the format with the native law's parameters, for a motor that drives.
+
+    Losses in proportion to the load take a share 1 - η of the torque. `<dcmotor>` has one motor constant for torque
+    and voltage, so the current that it shows is I' = η I, and its resistance is R / η.
+    """
+    robot, load = joint.robot, joint.load
+    motor, gear = robot.motor, robot.gearbox
+    ratio, share = float(gear.ratio), float(gear.efficiency_load)
+    known = _numbers(joint, amplitudes or {})
+    number = lambda name, key="amplitude": known.get(name, {}).get(key, 0.0)  # noqa: E731
+    resistance = float(motor.resistance) + number("series_resistance") + float(robot.sides) * number("supply_sag")
+    at_output = ratio * share
+    dry = at_output * float(motor.friction_coulomb + gear.friction_coulomb)
+    damping = at_output * ratio * float(motor.friction_viscous + gear.friction_viscous)
+    if robot.has_ground:
+        dry += float(load.track.loss_coulomb) + float(load.track.force_guide(normal, 1.0)) * float(load.radius)
+        damping += float(load.track.loss_viscous)
+    else:
+        dry += float(load.loss_coulomb)
+        damping += float(load.loss_viscous)
+    names = [RESISTANCE, CONSTANT, FRICTION, DAMPING, SHARE]
+    start = [resistance / share, float(motor.torque_constant), dry, damping, 1 / share]
+    if excess := stribeck(joint, known):
+        names += [EXCESS, FADE]
+        start += [max(excess[0], 0.0), excess[1]]
+    if "thermal_drift" in known:
+        names.append(HEAT)
+        start.append(max(number("thermal_drift") * number("thermal_drift", "resistance_thermal"), 0.0) / share)
+    numbers = (start, ratio, float(motor.temperature_coefficient))
+    return MujocoLaw(tuple(names), *(jnp.asarray(x, float) for x in numbers))
+
+
+def stribeck(joint: Joint, known: Mapping[str, Mapping[str, float]]) -> tuple[float, float] | None:
+    """Excess of friction at a crawl [N·m] and its fading speed [rad/s], at the joint; None without such effects."""
+    gear = joint.robot.gearbox
+    ratio, share = float(gear.ratio), float(gear.efficiency_load)
+    found = [
+        (own["amplitude"] * (ratio * share if at_motor else 1.0), own["speed_fade"] / (ratio if by_motor else 1.0))
+        for name, own in known.items()
+        if name in STRIBECK
+        for at_motor, by_motor in (STRIBECK[name],)
+    ]
+    if not found:
+        return None
+    return sum(a for a, _ in found), max(v for _, v in found)
+
+
+def fates(joint: Joint, normal: float) -> list[Fate]:
+    """Fates of the base's terms, and of effects outside the joint."""
+    robot, load = joint.robot, joint.load
+    gear = robot.gearbox
+    found = [
+        Fate("winding and back-EMF", HELD, "resistance, motorconst, inductance"),
+        Fate("friction of motor and gearbox", HELD, "frictionloss and damping of the joint"),
+        Fate("rotor inertia", HELD, "armature of the joint, for a motor that drives"),
+    ]
+    if float(gear.efficiency_load) != 1:
+        found.append(
+            Fate(
+                "gearbox losses in proportion to the load", APPROXIMATED,
+                "resistance / η and current = act / η: exact while the motor drives the load; where the load drives "
+                "the motor, the joint is braked less than the real one",
+            )
+        )  # fmt: skip
+    if robot.has_ground:
+        found.append(Fate("internal losses of tracks", HELD, "frictionloss and damping of the joint"))
+        if float(load.track.guide_friction * load.track.guide_share) > 0:
+            how = f"frictionloss at the mean normal load of these runs, {normal:.4g} N a side"
+            found.append(Fate("friction of track guides", APPROXIMATED, how))
+        found.append(
+            Fate("ground: slip and rolling resistance", DROPPED, "the simulator's own contact with the ground")
+        )
+    if robot.loose:
+        found.append(Fate("backlash", DROPPED, "the joint is rigid; a format needs a second body for it"))
+    if joint.limit is not None:
+        found.append(Fate("current limit of the driver", HELD, "forcerange"))
+    return [*found, *outside(joint)]
+
+
+def outside(joint: Joint) -> list[Fate]:
+    """Fates of effects that no joint has."""
+    where = {
+        "sensor": "an error of an instrument, no part of a drive",
+        "supply": "the battery; the command is a voltage, so reduce that",
+        "mass": "the mass of the robot; state it in the simulator's model",
+    }
+    other = "a property of the ground, which the simulator's contact has to show"
+    return [Fate(e.name, DROPPED, where.get(e.balance, other)) for e in joint.outside]
+
+
+def approximated(balance: str) -> str:
+    """Terms that replace an effect of a balance."""
+    return "resistance" if balance in ("supply", "electrical") else "resistance, frictionloss and damping"
+
+
+@dataclasses.dataclass(frozen=True)
+class Motor:
+    """Numbers of the MJCF.
+
+    Attributes:
+        values: refitted parameters by name [SI]; ratio, inductance, armature: [-], [H], [kg·m²].
+        thermal, lugre, cogging: attributes of `<dcmotor>`, at the motor's shaft; empty where it has none.
+        limit: largest torque of the motor by its driver's limit [N·m]; None: no limit.
+    """
+
+    values: Mapping[str, float]
+    ratio: float
+    inductance: float
+    armature: float
+    thermal: tuple[float, ...] = ()
+    lugre: tuple[float, ...] = ()
+    cogging: tuple[float, ...] = ()
+    limit: float | None = None
+
+    @property
+    def friction(self) -> float:
+        """Friction loss of the joint [N·m], without what `lugre` carries."""
+        return self.values[FRICTION] - (self.lugre[2] * self.ratio if self.lugre else 0.0)
+
+
+def motor(joint: Joint, values: Mapping[str, float]) -> Motor:
+    """Numbers of the MJCF for refitted parameters."""
+    robot, known = joint.robot, _numbers(joint, {})
+    gear, share = robot.gearbox, float(robot.gearbox.efficiency_load)
+    ratio = float(gear.ratio)
+    number = lambda name, key="amplitude": known.get(name, {}).get(key, 0.0)  # noqa: E731
+    inductance = (float(robot.motor.inductance) + number("armature_inductance")) * values[SHARE]
+    inertia = float(inertia_reduced(robot.motor.inertia, gear.ratio, gear.efficiency_load, 0.0))
+    thermal: tuple[float, ...] = ()
+    if values.get(HEAT):
+        capacity = number("thermal_drift", "time_constant") / values[HEAT]
+        thermal = (values[HEAT], capacity, 0.0, float(robot.motor.temperature_coefficient), 25.0, 25.0)
+    lugre: tuple[float, ...] = ()
+    bristle = max(number("presliding"), 0.0)
+    excess = values.get(EXCESS, 0.0)
+    if bristle or excess:
+        # All dry friction goes through the bristle if it falls with speed: its steady curve needs a positive end.
+        coulomb = max(values[FRICTION], LEAST_SHARE * excess) if excess else min(bristle, values[FRICTION])
+        turn = number("presliding", "angle_breakaway") or YIELD
+        stiffness = (coulomb + excess) / turn
+        fade = values.get(FADE, 1.0)
+        lugre = (stiffness / ratio**2, 0.0, coulomb / ratio, (coulomb + excess) / ratio, fade * ratio)
+    cogging = (
+        (-number("cogging") * share, number("cogging", "ripples"), number("cogging", "phase"))
+        if number("cogging")
+        else ()
+    )
+    limit = None if joint.limit is None else values[CONSTANT] * joint.limit / values[SHARE]
+    return Motor(values, ratio, inductance, inertia + number("rotating_inertia"), thermal, lugre, cogging, limit)
+
+
+def _digits(*numbers: float) -> str:
+    return " ".join(f"{x:.9g}" for x in numbers)
+
+
+def _comment(lines: Sequence[str], indent: str) -> str:
+    text = [t.replace("--", "- -") for line in lines for t in textwrap.wrap(line, 104 - len(indent))]
+    return "".join(f"{indent}<!-- {t} -->\n" for t in text)
+
+
+def fragment(
+    joint: Joint, found: Motor, about: Mapping[str, str], notes: Sequence[str], name: str, at: str, volts: float
+) -> str:
+    """Text of the fragment that a model includes.
+
+    Args:
+        volts: highest voltage seen or allowed [V], which the control's range states and does not enforce.
+        about: words for the source and interval of each attribute; notes: of the header.
+        name: of the actuator and the default class; at: name of the joint.
+    """
+    v = found.values
+    share = v[SHARE]
+    attributes = {
+        "motorconst": (v[CONSTANT],), "resistance": (v[RESISTANCE],), "inductance": (found.inductance,),
+        "thermal": found.thermal, "lugre": found.lugre, "cogging": found.cogging,
+    }  # fmt: skip
+    limits = f' ctrllimited="false" ctrlrange="{_digits(-volts, volts)}"'
+    limits += "" if found.limit is None else f' forcelimited="true" forcerange="{_digits(-found.limit, found.limit)}"'
+    written = "".join(f' {key}="{_digits(*x)}"' for key, x in attributes.items() if x)
+    head = [
+        f"Drive of {joint.file.name}, {joint.configuration}. Written by mmrjax {__version__}; MuJoCo {_version()} "
+        f"or later.",
+        f'In the model: <include file="drive.xml"/> before <worldbody>, and class="{name}" on the joint "{at}".',
+        "Command: voltage at the driver's output [V], its duty times the supply's voltage.",
+        f"Current of the motor [A]: {share:.6g} times the actuator's last activation, or "
+        f"{share / v[CONSTANT]:.6g} times its force.",
+        *notes,
+    ]
+    about_motor = [
+        f"{key}: {about[key]}" for key in ("gear", *(k for k, x in attributes.items() if x)) if key in about
+    ]
+    return (
+        "<mujocoinclude>\n"
+        + _comment(head, "  ")
+        + f'  <default>\n    <default class="{name}">\n'
+        + _comment([f"{k}: {about[k]}" for k in ("frictionloss", "damping", "armature")], "      ")
+        + f'      <joint frictionloss="{_digits(max(found.friction, 0.0))}" damping="{_digits(v[DAMPING])}" '
+        f'armature="{_digits(found.armature)}"/>\n    </default>\n  </default>\n  <actuator>\n'
+        + _comment(about_motor, "    ")
+        + f'    <dcmotor name="{name}" joint="{at}" gear="{_digits(found.ratio)}"{written}{limits}/>\n'
+        + "  </actuator>\n</mujocoinclude>\n"
+    )
+
+
+def _version() -> str:
+    return ".".join(map(str, FIRST[:2]))
+
+
+def scene(joint: Joint, mass: float, name: str, at: str, command: float, load: float) -> str:
+    """Text of a model of one joint that runs: what the drive moves as a body that turns with it.
+
+    A vehicle rolls without sliding, so one side's share of its mass acts at the wheel as m r². The actuator
+    `load` gives the torque of slope and ground.
+
+    Args:
+        mass: of the vehicle [kg]; command, load: of the key frame `run` [V], [N·m].
+    """
+    moved = joint.load
+    if joint.robot.has_ground:
+        radius = float(moved.radius)
+        inertia = float(moved.inertia) + mass / float(joint.robot.sides) * radius**2
+        head = f"One side of the robot: its wheel, with {mass:.4g} kg / {float(joint.robot.sides):g} rolling along"
+        weight, arm, angle = 0.0, radius, 0.0
+    else:
+        inertia, weight, angle = float(moved.inertia), float(moved.torque_gravity), float(moved.angle_zero)
+        head, arm = "The rig's shaft", 0.05
+    body = _body(inertia, weight, angle)
+    return (
+        "<mujoco>\n"
+        + _comment([f"{head}. Try: python -m mujoco.viewer --mjcf=scene.xml, key frame run."], "  ")
+        + '  <include file="drive.xml"/>\n'
+        '  <compiler angle="radian"/>\n'
+        '  <option timestep="0.001" integrator="implicitfast"/>\n'
+        '  <visual><headlight ambient="0.5 0.5 0.5"/></visual>\n'
+        "  <worldbody>\n"
+        '    <geom name="floor" type="plane" size="1 1 0.01" pos="0 0 -0.3" rgba="0.9 0.9 0.9 1" contype="0" '
+        'conaffinity="0"/>\n'
+        '    <body name="output">\n'
+        f'      <joint name="{at}" class="{name}" type="hinge" axis="0 1 0"/>\n'
+        f"{body}"
+        f'      <geom type="cylinder" size="{_digits(arm)} 0.015" euler="1.5707963 0 0" rgba="0.2 0.4 0.7 1" '
+        'contype="0" conaffinity="0" mass="0"/>\n'
+        f'      <geom type="capsule" size="0.004" fromto="0 -0.02 0 {_digits(arm)} -0.02 0" rgba="0.8 0.3 0.1 1" '
+        'contype="0" conaffinity="0" mass="0"/>\n'
+        "    </body>\n"
+        "  </worldbody>\n"
+        "  <actuator>\n"
+        + _comment(["Torque that acts against forward rotation [N·m]: slope, rolling resistance, a brake."], "    ")
+        + f'    <motor name="load" joint="{at}" gear="-1"/>\n'
+        "  </actuator>\n"
+        "  <sensor>\n"
+        f'    <jointvel name="speed" joint="{at}"/>\n'
+        f'    <actuatorfrc name="motor_torque" actuator="{name}"/>\n'
+        "  </sensor>\n"
+        "  <keyframe>\n"
+        f'    <key name="run" ctrl="{_digits(command, load)}"/>\n'
+        "  </keyframe>\n"
+        "</mujoco>\n"
+    )
+
+
+def _body(inertia: float, weight: float, angle: float) -> str:
+    """Inertia of the body about its joint [kg·m²], its centre of mass where an arm hangs at `angle` [rad]."""
+    if weight <= 0:
+        return f'      <inertial pos="0 0 0" mass="1" diaginertia="{_digits(inertia, inertia, inertia)}"/>\n'
+    gravity = 9.81  # MuJoCo's default
+    arm = inertia * gravity / (2 * weight)  # half of the inertia is that of the mass on its arm
+    mass = weight / (gravity * arm)
+    rest = inertia - mass * arm**2
+    place = _digits(arm * math.sin(angle), 0.0, -arm * math.cos(angle))
+    return f'      <inertial pos="{place}" mass="{_digits(mass)}" diaginertia="{_digits(rest, rest, rest)}"/>\n'
+
+
+def attribute_notes(
+    joint: Joint, constants: Sequence[Constant], translated: Mapping[str, float], values: Mapping[str, float]
+) -> dict[str, str]:
+    """Words for where each attribute comes from, with intervals of what it is made of."""
+    known = {c.name: c for c in constants}
+
+    def made_of(*names: str) -> str:
+        found = [known[n] for n in names if n in known]
+        return "; ".join(f"{c.name} {c.value:.5g} {c.unit}{f', {c.interval}' if c.interval else ''}" for c in found)
+
+    def fitted(key: str) -> str:
+        return f" (translated {translated[key]:.5g}, refitted to the native model {values[key]:.5g})"
+
+    friction = [n for n in known if n.rpartition(".")[2] in ("friction_coulomb", "loss_coulomb", "guide_friction")]
+    viscous = [n for n in known if n.rpartition(".")[2] in ("friction_viscous", "loss_viscous")]
+    effects = lambda *names: [n for n in known if n.split(".")[1:2] and n.split(".")[1] in names]  # noqa: E731
+    return {
+        "gear": f"ratio motor to joint [-]; {made_of('gearbox.ratio')}",
+        "motorconst": f"[N·m/A] = [V·s/rad]; {made_of('motor.torque_constant')}{fitted(CONSTANT)}",
+        "resistance": "[ohm], of the winding and in series with it, over the gearbox's efficiency; "
+        + made_of("motor.resistance", "gearbox.efficiency_load", *effects("series_resistance", "supply_sag"))
+        + fitted(RESISTANCE),
+        "inductance": f"[H], likewise; {made_of('motor.inductance', *effects('armature_inductance'))}",
+        "frictionloss": f"[N·m] at the joint; {made_of(*friction)}{fitted(FRICTION)}",
+        "damping": f"[N·m·s/rad] at the joint; {made_of(*viscous)}{fitted(DAMPING)}",
+        "armature": f"[kg·m^2] at the joint; {made_of('motor.inertia', *effects('rotating_inertia'))}",
+        "thermal": "thermal resistance [K/W], capacity [J/K], -, [1/K], two temperatures [C]; "
+        + made_of(*effects("thermal_drift")),
+        "lugre": "stiffness, damping, Coulomb and static friction, Stribeck speed, at the motor's shaft; "
+        + made_of(*effects("presliding", *STRIBECK)),
+        "cogging": f"amplitude [N·m], periods a turn, phase; {made_of(*effects('cogging'))}",
+    }
+
+
+def library() -> Any:
+    """Returns the module of MuJoCo.
+
+    Raises:
+        BadConfiguration: it is missing, or older than `<dcmotor>`.
+    """
+    try:
+        import mujoco as found
+    except ImportError as error:
+        raise BadConfiguration("--to mujoco: mujoco is not installed; pip install mujoco") from error
+    if tuple(int(x) for x in found.__version__.split(".")[:3]) < FIRST:
+        raise BadConfiguration(
+            f"--to mujoco: got MuJoCo {found.__version__}, which has no <dcmotor>; expected {_version()} or later: "
+            "pip install -U mujoco"
+        )
+    return found
+
+
+def compiled(files: Mapping[str, str]) -> Any:
+    """Model of a scene and the fragment that it includes, in memory."""
+    assets = {name: text.encode() for name, text in files.items()}
+    return library().MjModel.from_xml_string(files["scene.xml"], assets)
+
+
+def run(files: Mapping[str, str], found: Motor, at: Situation, expected: AtJoint, rows: Sequence[int]) -> AtJoint:
+    """Current and speed of some runs, settled in MuJoCo C by the scene.
+
+    Args:
+        expected: by the steady law, near which each run begins; rows: which runs.
+    """
+    mujoco, model = library(), compiled(files)
+    model.opt.gravity[:] = 0  # an arm's weight is part of the stated load
+    data = mujoco.MjData(model)
+    current, speed = np.empty(len(rows)), np.empty(len(rows))
+    period = model.opt.timestep
+    total = float(model.dof_armature[0] + model.body_inertia[1, 1])
+    turns = found.ratio * found.values[CONSTANT]
+    settle = 12 * total * found.values[RESISTANCE] / turns**2
+    steps = int(np.clip(settle / period, 500, 20_000))
+    for k, row in enumerate(rows):
+        mujoco.mj_resetData(model, data)
+        data.ctrl[:] = at.command[row], at.load[row]
+        data.qvel[0] = 0.9 * expected.speed[row]
+        if found.thermal:  # in its settled state, as the steady law
+            heat = found.values[RESISTANCE] * (expected.current[row] / found.values[SHARE]) ** 2 * found.thermal[0]
+            data.act[0] = heat / (1 - found.thermal[3] * heat)
+        if model.na:
+            data.act[-1] = expected.current[row] / found.values[SHARE]
+        for _ in range(steps):
+            mujoco.mj_step(model, data)
+        current[k] = found.values[SHARE] * data.act[-1]
+        speed[k] = data.qvel[0]
+    return AtJoint(current, speed)

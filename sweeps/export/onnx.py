@@ -1,0 +1,99 @@
+"""A drive's step as an ONNX model in single precision."""
+
+from __future__ import annotations
+
+import contextlib
+import warnings
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from calibration.data.input_errors import BadConfiguration
+from sweeps.export.joint import Joint
+from sweeps.export.law_source import Constant, executed, jax_source
+
+#: Version of the operators, which onnxruntime has had since 1.14.
+OPSET = 18
+#: Random states with which the model is compared with JAX, and their seed.
+STATES, SEED = 10_000, 0
+EXTRA = 'pip install "mmrjax[export]"'
+
+
+def _library(name: str) -> Any:
+    try:
+        return __import__(name)
+    except ImportError as error:
+        raise BadConfiguration(f"--to onnx: {name} is not installed; {EXTRA}") from error
+
+
+@contextlib.contextmanager
+def _single() -> Iterator[None]:
+    """Context of single precision, without JAX's warnings that a stated double becomes single."""
+    with jax.enable_x64(False), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Explicitly requested dtype", UserWarning)
+        yield
+
+
+def step_of(joint: Joint, constants: Sequence[Constant]) -> tuple[Any, list[str], list[str]]:
+    """Returns the step as a function of arrays, and the names of its inputs and outputs.
+
+    Inputs are the state, the command, position and velocity of the joint, each of shape (joints,), and the step's
+    length, of shape (1,); outputs are torque, state, voltage taken and power.
+    """
+    module = executed(jax_source(joint, constants))
+    states = list(module.initial_state())
+
+    def step(*given: Any) -> tuple[Any, ...]:
+        state, rest = dict(zip(states, given, strict=False)), given[len(states) :]
+        command, position, velocity, dt = rest
+        params = {name: jnp.asarray(value, velocity.dtype) for name, value in module.PARAMS.items()}
+        torque, after, info = module.actuator(params, state, command, position, velocity, dt)
+        return (torque, *(after[s] for s in states), info["power"])
+
+    inputs = [*states, "command", "joint_position", "joint_velocity", "dt"]
+    return step, inputs, ["torque", *(f"next_{s}" for s in states), "power"]
+
+
+def files(joint: Joint, constants: Sequence[Constant]) -> dict[str, str | bytes]:
+    """The model as a file, checked by ONNX.
+
+    Raises:
+        BadConfiguration: the libraries are not installed.
+    """
+    jax2onnx, onnx = _library("jax2onnx"), _library("onnx")
+    step, inputs, outputs = step_of(joint, constants)
+    shapes: list[tuple[int | str, ...]] = [("joints",)] * (len(inputs) - 1) + [(1,)]
+    with _single():
+        model = jax2onnx.to_onnx(
+            step, shapes, model_name=joint.name, opset=OPSET, input_names=inputs, output_names=outputs
+        )
+    onnx.checker.check_model(model)
+    return {"actuator.onnx": model.SerializeToString()}
+
+
+def difference(joint: Joint, constants: Sequence[Constant], model: bytes) -> float:
+    """Largest difference of the model's outputs from JAX's over random states, relative to each output's rms."""
+    runtime = _library("onnxruntime")
+    step, inputs, _ = step_of(joint, constants)
+    given = random_states(joint, len(inputs))
+    with _single():
+        expected = [np.asarray(x) for x in jax.jit(step)(*given)]
+    session = runtime.InferenceSession(model, providers=["CPUExecutionProvider"])
+    found = session.run(None, dict(zip(inputs, given, strict=True)))
+    sizes = [float(np.sqrt(np.mean(np.square(x)))) or 1.0 for x in expected]
+    return max(float(np.max(np.abs(a - b))) / s for a, b, s in zip(found, expected, sizes, strict=True))
+
+
+def random_states(joint: Joint, inputs: int) -> list[np.ndarray]:
+    """Random inputs of the step: currents, memories, voltages and speeds in both directions."""
+    rng = np.random.default_rng(SEED)
+    motor, ratio = joint.robot.motor, float(joint.robot.gearbox.ratio)
+    volts = float(motor.voltage_limit or 24.0)
+    fastest = volts / float(motor.torque_constant) / ratio
+    scales = [2.0, *(1.0 for _ in joint.remembering), volts, 3.0, fastest]
+    assert len(scales) == inputs - 1
+    given = [(s * rng.uniform(-1, 1, STATES)).astype(np.float32) for s in scales]
+    return [*given, np.full(1, 1e-3, np.float32)]

@@ -1,0 +1,80 @@
+"""Draws of a drive's posterior as parameters of the other formats, for domain randomization."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from calibration.data.input_errors import BadConfiguration
+from calibration.data.posterior_file import FILE, Posterior
+from mmrjax.model import params
+from sweeps.export import mujoco
+from sweeps.export.joint import Joint
+from sweeps.export.law_source import Constant
+
+#: Limits of draws: as many as environments that are trained at the same time.
+MOST = 1_000_000
+
+
+def drawn(
+    joint: Joint,
+    posterior: Posterior | None,
+    constants: Sequence[Constant],
+    refitted: Mapping[str, float],
+    normal: float,
+    draws: int,
+    seed: int,
+) -> dict[str, np.ndarray]:
+    """Draws by format and name, `mujoco/resistance` and `actuator/motor.resistance`, each of shape (draws,).
+
+    All numbers of a draw belong together, so they are correlated as the posterior is. A parameter of MuJoCo is
+    translated from the draw, times the ratio of its refitted to its translated value at the posterior's centre.
+
+    Raises:
+        BadConfiguration: there is no posterior.
+    """
+    if posterior is None:
+        raise BadConfiguration(
+            f"--to randomization: no {FILE} next to {joint.file.source}, so the spread of its parameters is unknown; "
+            "expected FOLDER/robot.toml of calibrate or loop"
+        )
+    values = posterior.draw(draws, seed)
+    own = {p.name for p in params.walk_parameters(joint.robot)}
+    columns = {name: values[:, k] for k, name in enumerate(posterior.names) if name in own}
+    centre = mujoco.translated(joint, normal)
+    factors = {
+        n: refitted[n] / x if (x := float(v)) > 0 else 1.0 for n, v in zip(centre.names, centre.start, strict=True)
+    }
+    found: dict[str, list[float]] = {}
+    for k in range(draws):
+        robot = params.replace(joint.robot, {name: np.asarray(x[k]) for name, x in columns.items()})
+        other = joint.with_robot(robot)
+        law = mujoco.translated(other, normal)
+        theta = {n: factors[n] * float(v) for n, v in zip(law.names, law.start, strict=True)}
+        motor = mujoco.motor(other, theta)
+        numbers = {
+            "gear": motor.ratio, "motorconst": theta[mujoco.CONSTANT], "resistance": theta[mujoco.RESISTANCE],
+            "inductance": motor.inductance, "armature": motor.armature, "frictionloss": motor.friction,
+            "damping": theta[mujoco.DAMPING], "current_over_act": theta[mujoco.SHARE],
+        }  # fmt: skip
+        for name, value in numbers.items():
+            found.setdefault(f"mujoco/{name}", []).append(value)
+    law_names = {c.name for c in constants}
+    actuator = {f"actuator/{n}": x for n, x in columns.items() if n in law_names}
+    return {name: np.asarray(x) for name, x in found.items()} | actuator
+
+
+def files(found: Mapping[str, np.ndarray]) -> dict[str, str | bytes]:
+    """The draws as NumPy's archive and as JSON."""
+    stream = io.BytesIO()
+    arrays: Any = dict(found)
+    np.savez(stream, **arrays)
+    nested: dict[str, dict[str, list[float]]] = {}
+    for name, values in found.items():
+        format_, key = name.split("/", 1)
+        nested.setdefault(format_, {})[key] = [float(f"{x:.9g}") for x in values]
+    return {"draws.npz": stream.getvalue(), "draws.json": json.dumps(nested, ensure_ascii=False) + "\n"}

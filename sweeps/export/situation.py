@@ -1,0 +1,182 @@
+"""Runs for the comparison of an exported drive with the native model, and the native model's results in them."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from calibration.data.input_errors import BadData
+from calibration.data.runs import Runs
+from mmrjax.fidelities.steady import results_of_rows
+from mmrjax.model import balances, params
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import Signals, is_done
+from sweeps.config import GridPart
+from sweeps.export.joint import Joint, channels_of
+from sweeps.inputs import read_runs
+from sweeps.points.grid import grid
+
+
+@dataclasses.dataclass(frozen=True)
+class AtJoint:
+    """Current and speed of a drive in each run, by one model; arrays of shape (runs,).
+
+    Attributes:
+        current: of one motor [A]; speed: of the joint [rad/s].
+    """
+
+    current: np.ndarray
+    speed: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
+class Situation:
+    """Runs of one configuration, and the native model in them.
+
+    Attributes:
+        joint: the drive; source: of the runs, in words; runs: the table, its rows chosen.
+        conditions: of all rows of the table; kept: mask of those that are compared.
+        signals: of the joint's own model, with the effects inside alone, of shape (runs,).
+        native: readings of the whole model [SI], shape (runs, channels); measured: likewise, NaN where there is none.
+        command: mean voltage at the driver's output [V]; load: torque that the joint has to give at the wheel [N·m].
+    """
+
+    joint: Joint
+    source: str
+    runs: Runs
+    conditions: Conditions
+    kept: np.ndarray
+    signals: Signals
+    native: np.ndarray
+    measured: np.ndarray
+    command: np.ndarray
+    load: np.ndarray
+
+    @property
+    def inside(self) -> AtJoint:
+        """The joint's own model."""
+        ratio = float(self.joint.robot.gearbox.ratio)
+        return AtJoint(np.asarray(self.signals.current), np.asarray(self.signals.speed_motor) / ratio)
+
+    @property
+    def way(self) -> np.ndarray:
+        """Direction in which the joint turns, -1 or 1."""
+        return np.sign(self.inside.speed)
+
+    @property
+    def is_measured(self) -> bool:
+        """True if there are readings to compare with."""
+        return bool(np.isfinite(self.measured).any())
+
+    def without(self, names: tuple[str, ...]) -> AtJoint:
+        """The joint's own model with amplitudes of some of its effects at 0."""
+        _, signals = _solved(_absent(self.joint, names), self.conditions)
+        ratio = float(self.joint.robot.gearbox.ratio)
+        return AtJoint(np.asarray(signals.current)[self.kept], np.asarray(signals.speed_motor)[self.kept] / ratio)
+
+    def readings(self, found: AtJoint) -> np.ndarray:
+        """Readings of the instruments for an exported drive [SI], shape (runs, channels).
+
+        The wheel or shaft is read at its rim: what slips on the ground is the simulator's.
+        """
+        robot = self.joint.file.robot
+        radius, ratio = float(self.joint.load.radius), float(robot.gearbox.ratio)
+        share = jnp.asarray(self.signals.share_drawn)
+        current, speed = jnp.asarray(found.current), jnp.asarray(found.speed)
+        signals = dataclasses.replace(
+            self.signals,
+            current=current,
+            total_current=robot.sides * current * share,
+            speed_motor=speed * ratio,
+            speed_wheel=speed,
+            speed_output=speed,
+            speed_theoretical=speed * radius,
+            speed=speed * radius,
+        )
+        shown = jax.vmap(lambda s: balances.sensor(robot, s))(signals)
+        return np.stack([np.asarray(shown[c.name]) for c in channels_of(self.joint)], -1)
+
+
+def _absent(joint: Joint, names: tuple[str, ...] = ()) -> Robot:
+    """The whole robot with amplitudes at 0: of effects outside the joint, and of others by name.
+
+    It keeps these effects, so that all models of a comparison are one compiled program.
+    """
+    outside = tuple(e.name for e in joint.outside)
+    return params.replace(joint.file.robot, {f"effects.{n}.amplitude": jnp.zeros(()) for n in (*outside, *names)})
+
+
+def _solved(robot: Robot, conditions: Conditions) -> tuple[np.ndarray, Signals]:
+    """Mask of the runs that end as their conditions ask, and the signals of all."""
+    result, signals = results_of_rows(robot, conditions)
+    return np.asarray(is_done(result.status)), signals
+
+
+def situation(joint: Joint, data: Runs | str | None) -> Situation:
+    """Returns the runs of a table in the joint's configuration, or of a grid where there is no table.
+
+    Raises:
+        BadData: a table that is refused, without runs of this configuration, or of a robot that is no single joint.
+    """
+    robot = joint.file.robot
+    if data is None:
+        runs = grid(GridPart.model_construct(configurations=(joint.configuration,)), robot)
+        source = "a grid of operating points, without readings"
+    else:
+        runs = _table(data, joint)
+        source = runs.source
+    conditions = runs.conditions(robot)
+    moves, whole = _solved(robot, conditions)
+    turns, signals = _solved(_absent(joint), conditions) if joint.outside else (moves, whole)
+    channels = channels_of(joint)
+    shown = jax.vmap(lambda s: balances.sensor(robot, s))(whole)
+    native = np.stack([np.asarray(shown[c.name]) for c in channels], -1)
+    kept = moves & turns & np.asarray(np.abs(signals.speed_motor) > 0) & (np.asarray(conditions.open) < 0.5)
+    if not kept.any():
+        raise BadData(f"{source}: the model settles in none of its runs, so there is nothing to compare with")
+    signals = jax.tree.map(lambda x: x[kept] if np.shape(x) else x, signals)
+    chosen = runs.where(kept)
+    radius = float(joint.load.radius)
+    given = (signals.voltage_source, signals.duty, signals.pause, signals.voltage_back)
+    command = robot.driver.voltage(*map(jnp.asarray, given))
+    measured = _measured(chosen, channels) if data is not None else np.full((len(chosen), len(channels)), np.nan)
+    return Situation(
+        joint, source, chosen, conditions, kept, signals, native[kept], measured, np.asarray(command),
+        radius * np.asarray(signals.demand),
+    )  # fmt: skip
+
+
+def _measured(runs: Runs, channels: tuple[Any, ...]) -> np.ndarray:
+    known = {c.name: runs.measured()[:, k] for k, c in enumerate(runs.channels)}
+    return np.stack([known.get(c.name, np.full(len(runs), np.nan)) for c in channels], -1)
+
+
+def _table(data: Runs | str, joint: Joint) -> Runs:
+    """Runs of a table in the joint's configuration; of a log its settled stretches."""
+    robot = joint.file.robot
+    runs = read_runs(data, robot, measured=True, series=True) if isinstance(data, str) else data.of(robot)
+    if runs.turns:
+        raise BadData(
+            f"{runs.source}: its runs drive the sides independently, and one joint has one drive; expected straight "
+            "travel"
+        )
+    if levers := [name for name in runs.axes if name.startswith("lever")]:
+        raise BadData(
+            f"{runs.source}, {levers[0]}: the levers' posture moves the load, and one joint has one drive; expected "
+            "runs without columns of the levers"
+        )
+    if runs.sampled:
+        from calibration.data import settling
+        from sweeps.commands import settle
+
+        found = settling.settle(runs, inertia=settle.inertia(robot), rolling=settle.rolling(robot))
+        runs = found.settled_runs()
+    here = runs.configurations_named(robot) == joint.configuration
+    if not here.any():
+        raise BadData(f"{runs.source}: no run of {joint.configuration}; expected runs of the exported configuration")
+    return runs.where(here)

@@ -1,0 +1,220 @@
+"""The English of an export: its statement, its remarks, and the page LAW.md."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calibration.data.input_errors import rounded
+from mmrjax import __version__
+from mmrjax.errors import count_noun
+from mmrjax.model import channels
+from sweeps.export.comparison import APPROXIMATED, DROPPED, EXPORTED, HELD, NATIVE, Fate
+from sweeps.export.formats import FORMATS, Export
+from sweeps.export.joint import INSIDE
+
+#: How a file of each format is used, in a paragraph of LAW.md.
+USE = {
+    "mujoco": (
+        'Put `<include file="drive.xml"/>` before `<worldbody>` of your model and `class="{name}_drive"` on the '
+        "joint. The control is the voltage at the driver's output: duty times supply voltage. `scene.xml` runs as it "
+        "is: `python -m mujoco.viewer --mjcf=scene.xml`, key frame `run`."
+    ),
+    "jax": (
+        "`from actuator import PARAMS, actuator, initial_state`, or without any source "
+        '`jax.export.deserialize(open("actuator.jaxexport", "rb").read()).call`, in single precision, for arrays of '
+        "joints. Add the torque to `qfrc_applied` of the joint at each step, and set the joint's armature to "
+        "`armature(PARAMS)` once."
+    ),
+    "onnx": (
+        "Inputs are the state, `command` [V], `joint_position` [rad], `joint_velocity` [rad/s], each of shape "
+        "(joints,), and `dt` [s] of shape (1,). Outputs are `torque` [N·m], the next state, and the power taken [W]. "
+        "The state at rest is 0. All numbers are single precision. The joint needs the rotor's inertia as armature: "
+        "{armature:.4g} kg·m²."
+    ),
+    "mjlab": (
+        "`from mjlab_actuator import DriveActuatorCfg`, then "
+        '`DriveActuatorCfg(target_names_expr=("{at}",))` among the actuators of an entity. The effort target is the '
+        "voltage [V]. It was tested against mjlab's interface by a stand-in, not within mjlab."
+    ),
+    "table": (
+        "Read the voltage for a speed and a torque of the joint, and divide by the supply's voltage for the duty. "
+        "The torque is that at the joint; add (inertia · acceleration) of what turns: the rotor has {armature:.4g} "
+        "kg·m² at the joint."
+    ),
+    "randomization": (
+        '`numpy.load("draws.npz")`: each array has one number a draw; take all numbers of one draw together, since '
+        "they are correlated. `mujoco/…` are attributes of `drive.xml` as the format mujoco writes it; `actuator/…` "
+        "are keys of `PARAMS`."
+    ),
+}
+NOT_TESTED = (
+    "Voltages, loads and temperatures outside the runs above.",
+    "Fast changes: the comparison is of settled runs, so inductance and inertia rest on their stated values.",
+)
+BACKWARD = "Runs in which the load drives the motor: none is among those above."
+
+
+def statement(found: Export) -> str:
+    """One sentence: what was exported, and its error compared with the native model."""
+    compared = found.comparison
+    exported, native = compared.of(EXPORTED), compared.of(NATIVE)
+    channels_shown = ", ".join(
+        f"{channels.find_channel(n).label} {rounded(exported[n])} %"
+        + (f" (native {rounded(native[n])} %)" if compared.situation.is_measured else "")
+        for n in exported
+    )
+    drive = found.joint
+    return (
+        f"The drive of {drive.file.name}, {drive.configuration}, as {FORMATS[found.format]}: its error against "
+        f"{compared.reference} over {count_noun(len(compared.situation.command), 'run')} is {channels_shown}."
+    )
+
+
+def kept(fate: Fate) -> str:
+    """Share of an effect that is kept, in percent; empty where none was computed."""
+    return f"{100 * fate.kept:.0f} %" if np.isfinite(fate.kept) else ""
+
+
+def errors_title(found: Export) -> str:
+    """Title of the table of errors."""
+    compared = found.comparison
+    return f"error against {compared.reference}, rms over rms"
+
+
+def remarks(found: Export) -> list[str]:
+    """What to know of an export."""
+    compared, drive = found.comparison, found.joint
+    said = []
+    if not compared.situation.is_measured:
+        said.append("no readings were given, so the reference is the native model; give runs with --data")
+    else:
+        said.append(
+            "the refit used no reading: these are hold-out errors if the robot's own fit has not seen these runs"
+        )
+    lost = [f.name for f in compared.fates if f.verdict == DROPPED]
+    if lost:
+        said.append(f"dropped: {', '.join(lost)}")
+    if drive.idle:
+        said.append(f"{', '.join(drive.idle)}: not exported, since it does not act on {drive.configuration}")
+    if found.posterior is None and drive.file.source.endswith(".toml"):
+        said.append("no posterior.nc next to the robot's file: intervals are those of the priors")
+    return said
+
+
+def conditions_seen(found: Export) -> list[str]:
+    """Ranges of the compared runs, a line each."""
+    runs = found.comparison.situation
+    lines = [
+        f"{count_noun(len(runs.command), 'settled run')} of {runs.source}",
+        f"voltage at the driver's output {_span(runs.command)} V",
+        f"torque at the joint {_span(runs.load)} N·m",
+        f"speed of the joint {_span(runs.inside.speed)} rad/s",
+        f"current of one motor {_span(runs.inside.current)} A",
+    ]
+    if found.joint.robot.has_ground:
+        lines.append(f"slope {_span(np.degrees(np.asarray(runs.signals.slope)))} deg")
+        lines.append(f"normal load of one side {_span(np.asarray(runs.signals.normal))} N")
+    return lines
+
+
+def _span(values: np.ndarray) -> str:
+    low, high = float(np.min(values)), float(np.max(values))
+    return f"{low:.4g}" if np.isclose(low, high) else f"{low:.4g} to {high:.4g}"
+
+
+def not_tested(found: Export) -> list[str]:
+    """Limits of the comparison, a sentence each."""
+    runs = found.comparison.situation
+    backward = bool(np.any(runs.load * runs.inside.speed < 0))
+    return [*NOT_TESTED, *([] if backward else [BACKWARD])]
+
+
+def armature(found: Export) -> float:
+    """Inertia of the rotor at the joint [kg·m²], of a motor that drives."""
+    robot = found.joint.robot
+    value = float(robot.motor.inertia) * float(robot.gearbox.ratio) ** 2 * float(robot.gearbox.efficiency_load)
+    return value + sum(float(e.amplitude) for e in found.joint.inside if e.balance == "inertia")
+
+
+def equations(found: Export) -> list[str]:
+    """The law's equations in words, in the order in which they are computed."""
+    robot = found.joint.robot
+    lines = [
+        "ω is the speed of the joint [rad/s], ω_m = i ω that of the motor; sign ω fades to 0 at rest.",
+        "Winding: L dI/dt = U - C_m ω_m - R I - further drops. [V]",
+        "Motor: M_d = C_m I - (M_0 sign ω + K ω_m) - further losses, at its shaft. [N·m]",
+        "Gearbox: M_r = i η (M_d - M_r0 sign ω - K_r ω_m) - further losses, at its output. η turns to 1/η_b where "
+        "the load drives the motor. [N·m]",
+        "Output: M = M_r - (M_t0 sign ω + K_t ω) - further losses: the torque on the joint. [N·m]",
+    ]
+    if robot.has_ground:
+        lines.append("Guides: friction μ_t · share · normal load · radius, among the losses of the output. [N·m]")
+    where = {"supply": "winding", "electrical": "winding", "inductance": "winding", "motor": "motor",
+             "gearbox": "gearbox", "track": "output", "inertia": "armature"}  # fmt: skip
+    for part in found.joint.parts:
+        if part.effect and part.balance in INSIDE:
+            lines.append(
+                f"`{part.name}`, in {where[part.balance]}: {part.equation} [{part.unit}] {part.meaning}".rstrip()
+            )
+    if found.format == "mujoco":
+        lines += [
+            "MuJoCo's form of it: U = R' I' + L' dI'/dt + g K ω and M = g K I' - f sign ω - d ω, with R' = R/η, "
+            "L' = L/η, and the motor's current I = c I'. Its numbers are refitted to the law above.",
+        ]
+    return lines
+
+
+def law(found: Export) -> str:
+    """Text of LAW.md."""
+    drive, compared = found.joint, found.comparison
+    about = {"name": drive.name, "at": "drive", "armature": armature(found)}
+    verdicts = {HELD: "held by", APPROXIMATED: "approximated by", DROPPED: "dropped:"}
+    constants = "\n".join(
+        f"| `{c.name}` | {c.value:.6g} | {c.unit} | {c.interval or '–'} | {c.meaning} | {c.source} |"
+        for c in found.constants
+    )
+    refitted = "\n".join(f"| {n} | {compared.translated[n]:.6g} | {v:.6g} |" for n, v in compared.refitted.items())
+    table = f"\n| of the format | translated | refitted |\n|---|---|---|\n{refitted}\n" if refitted else ""
+    errors = "\n".join(
+        f"| {e.label} | {' | '.join(f'{x:.3g}' for x in e.percent.values())} |" for e in compared.errors
+    )
+    names = [f"{channels.find_channel(n).label} [%]" for n in compared.errors[0].percent]
+    fates = "\n".join(
+        f"* {f.name}: {verdicts[f.verdict]} {f.how}{f' ({kept(f)} of its change is kept)' if kept(f) else ''}"
+        for f in compared.fates
+    )
+    bullets = lambda lines: "\n".join(f"* {line}" for line in lines)  # noqa: E731
+    return f"""# The law of this drive
+A motor with its gearbox on one joint: {drive.file.name}, {drive.configuration}. A program, mmrjax {__version__},
+found its numbers from measurements or data sheets, and wrote it as {FORMATS[found.format]}. You need no other file of
+that program. All units are SI; the joint is the driven wheel or output shaft.
+
+## How to use it
+{USE[found.format].format(**about)}
+
+## Equations
+{bullets(equations(found))}
+
+## Constants
+| name | value | unit | interval | meaning | source |
+|---|---|---|---|---|---|
+{constants}
+{table}
+## What this format holds
+{fates}
+
+Percentages compare currents and speeds of settled runs with and without the effect.
+
+## How good it is
+{errors_title(found).capitalize()}:
+
+| model | {" | ".join(names)} |
+|---|{"---|" * len(names)}
+{errors}
+
+## Conditions seen
+{bullets(conditions_seen(found))}
+
+## Not tested
+{bullets(not_tested(found))}
+"""

@@ -1,0 +1,561 @@
+"""Exported drives against the native model: the law's text, MuJoCo C, tables, draws, and what is refused."""
+
+from __future__ import annotations
+
+import ast
+import csv
+import dataclasses
+import importlib
+import io
+import json
+import shutil
+import subprocess
+import sys
+import types
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from calibration.data import posterior_file, robot_file
+from calibration.data.input_errors import BadConfiguration, BadData
+from calibration.inference import priors
+from calibration.inference.fit_posterior import posterior_of_coordinates
+from mmrjax import effects
+from mmrjax.model import balances, paper_robots, params
+from mmrjax.model.signals import Signals
+from sweeps.commands import rig_from_model
+from sweeps.export import (
+    comparison,
+    constants,
+    expressions,
+    feed_forward,
+    formats,
+    jax_actuator,
+    law_source,
+    mjlab,
+    mujoco,
+    onnx,
+    randomization,
+    situation,
+)
+from sweeps.export import joint as joints
+
+WHEELS, TRACKS = "4W2T", "6T2A"
+#: Effects of the drive under test: one that MuJoCo has a term for, one that it can stand in for, one with a memory.
+AMPLITUDES = {"series_resistance": 0.3, "churning": 2e-4, "presliding": 0.05}
+
+
+def of_effects(amplitudes):
+    """The packaged robot's file with some effects."""
+    known = {**effects.BY_NAME, **effects.BESIDE}
+    having = tuple(known[name](amplitude=a) for name, a in amplitudes.items())
+    return dataclasses.replace(
+        robot_file.find("nominal"), robot=dataclasses.replace(paper_robots.nominal(), effects=having)
+    )
+
+
+def compared(file):
+    """A drive on wheels and the native model over Table 8."""
+    drive = joints.joint(file, WHEELS)
+    runs = situation.situation(drive, None)
+    return drive, runs, constants.constants_of(drive, runs.signals, None)
+
+
+@pytest.fixture(scope="module")
+def with_effects():
+    return compared(of_effects(AMPLITUDES))
+
+
+@pytest.fixture(scope="module")
+def plain():
+    # The same effects, absent: all robots here are one compiled program.
+    return compared(of_effects(dict.fromkeys(AMPLITUDES, 0.0)))
+
+
+def translated(drive, runs):
+    """Comparison with MuJoCo, its files and its numbers."""
+    normal = float(np.mean(runs.signals.normal))
+    found = comparison.compare(
+        runs, mujoco.law_of(normal), mujoco.fates(drive, normal), mujoco.TERMS, mujoco.approximated
+    )
+    motor = mujoco.motor(drive, found.refitted)
+    about = dict.fromkeys(("frictionloss", "damping", "armature"), "")
+    files = {
+        "drive.xml": mujoco.fragment(drive, motor, about, [], "motor", "drive", 33.0),
+        "scene.xml": mujoco.scene(drive, 11.5, "motor", "drive", 24.0, 0.5),
+    }
+    return found, motor, files
+
+
+def apart(a, b):
+    """Rms of the difference over the rms of the second."""
+    return float(np.sqrt(np.mean((a - b) ** 2)) / np.sqrt(np.mean(b**2)))
+
+
+def test_text_of_every_effect_computes_what_the_balances_do():
+    """Values, slopes and rates of all parts of the law as written, at random signals, against the model's code."""
+    kinds = {
+        name: kind
+        for name, kind in effects.BY_NAME.items()
+        if kind.balance in joints.INSIDE and not kind.needs_battery
+    }
+    kinds |= {n: effects.UNNAMED[n] for n in ("curve_track_speed", "wave_electrical")}
+    drive = joints.joint(of_effects(dict.fromkeys(kinds, 0.1)), TRACKS)
+    assert {p.effect for p in drive.parts} - {""} == set(kinds)
+    text = expressions_text(drive)
+    rng = np.random.default_rng(1)
+    for sense in (1.0, -1.0):
+        at = {
+            "current": 2.0 * rng.uniform(), "voltage": 24.0, "motor_speed": sense * rng.uniform(100, 600), "angle": 0.3,
+            "wheel_speed": sense * rng.uniform(2, 12), "way": sense, "load": rng.uniform(-2, 2), "pull": rng.uniform(-2, 2),
+        }  # fmt: skip
+        for part in drive.parts:
+            if not part.effect:
+                continue
+            memory = float(rng.uniform(-1, 1))
+            given = {**at, "memory": memory}
+
+            def native(changed, part=part, given=given):
+                return term(drive, part, {**given, **changed})
+
+            assert text(part, "", given) == pytest.approx(float(native({})), rel=1e-9, abs=1e-15), part.name
+            if part.by and sense > 0:
+                slope = jax.grad(lambda x, part=part, native=native: native({part.by: x}))(given[part.by])
+                assert text(part, "_slope", given) == pytest.approx(float(slope), rel=1e-9, abs=1e-15), part.name
+            if part.rate is not None and sense > 0:
+                rate = jax.value_and_grad(
+                    lambda m, part=part, given=given: term(drive, part, {**given, "memory": m}, rate=True)
+                )(memory)
+                found = text(part, "_rate", given), text(part, "_rate_slope", given)
+                assert found == pytest.approx([float(x) for x in rate], rel=1e-9, abs=1e-15), part.name
+
+
+def expressions_text(drive):
+    """Function from part, suffix and signals to the number that its text computes."""
+    known = [
+        law_source.Constant(n, x, "", "", "")
+        for n, x in {**joints.values(drive), **dict.fromkeys(drive.surroundings(), 0.7)}.items()
+    ]
+    source = law_source.jax_source(drive, known)
+    module = law_source.executed(
+        source.replace("import jax.numpy as jnp", "import numpy as jnp")
+    )  # it compiles nothing
+
+    def text(part, suffix, given):
+        symbol = {"": part.value, "_slope": part.slope, "_rate": part.rate, "_rate_slope": part.rate_slope}[suffix]
+        words = [given[name] for name in law_source.arguments(symbol)]
+        return float(getattr(module, part.name + suffix)(module.PARAMS, *words))
+
+    return text
+
+
+def term(drive, part, given, rate=False):
+    """What an effect adds to its balance, or its memory's rate, by the model itself."""
+    robot = drive.robot.within(0)
+    (effect,) = (e for e in robot.effects if e.name == part.name)
+    load = robot.chassis(0)
+    at_wheel = part.balance != "gearbox"
+    around = {n.removeprefix("surroundings."): 0.7 for n in drive.surroundings()}
+    signals = Signals(
+        **around, configuration=0, on_tracks=load.on_tracks, direction_travel=given["way"], battery=0.0,
+        speed=load.radius * given["wheel_speed"], total_current=robot.sides * given["current"],
+        traction=given["pull"] / load.radius if at_wheel else 0.0, torque_track_loss=given["load"],
+        memory={part.name: given["memory"]}, current=given["current"], speed_motor=given["motor_speed"],
+        speed_wheel=given["wheel_speed"], direction=given["way"], voltage=given["voltage"],
+    )  # fmt: skip
+    if rate:
+        return jnp.asarray(effect.rate(robot, signals))
+    return jnp.asarray(balances.effects_sum(dataclasses.replace(robot, effects=(effect,)), signals, part.balance))
+
+
+def test_mujoco_runs_the_drive_as_the_native_model_over_table_8(plain):
+    drive, runs, _ = plain
+    found, motor, files = translated(drive, runs)
+    rows = np.linspace(0, len(runs.command) - 1, 6).astype(int)
+    got = mujoco.run(files, motor, runs, found.exported, rows.tolist())
+    assert apart(got.current, runs.inside.current[rows]) < 1e-3
+    assert apart(got.speed, runs.inside.speed[rows]) < 1e-3
+    assert found.translated == found.refitted  # exact already: no refit changes it
+    wrong = dataclasses.replace(motor, values={**motor.values, mujoco.RESISTANCE: 0.9})
+    other = mujoco.fragment(
+        drive, wrong, dict.fromkeys(("frictionloss", "damping", "armature"), ""), [], "motor", "drive", 33.0
+    )
+    assert apart(mujoco.run({**files, "drive.xml": other}, wrong, runs, found.exported, rows[:2].tolist()).speed,
+                 runs.inside.speed[rows[:2]]) > 1e-3  # fmt: skip
+
+
+def test_stated_loss_of_mujoco_is_the_measured_one(with_effects):
+    drive, runs, _ = with_effects
+    found, motor, files = translated(drive, runs)
+    rows = np.linspace(0, len(runs.command) - 1, 8).astype(int)
+    got = mujoco.run(files, motor, runs, found.exported, rows.tolist())
+    for mine, law, native in (
+        (got.current, found.exported.current, runs.inside.current),
+        (got.speed, found.exported.speed, runs.inside.speed),
+    ):
+        stated = apart(law[rows], native[rows])
+        assert stated > 1e-4  # churning is lost in part
+        assert apart(mine, native[rows]) == pytest.approx(stated, rel=0.1)
+    verdicts = {f.name: f for f in found.fates}
+    assert verdicts["series_resistance"].verdict == comparison.HELD
+    assert verdicts["series_resistance"].kept > 0.97
+    assert verdicts["presliding"].verdict == comparison.HELD  # by lugre, although settled runs do not show it
+    assert verdicts["churning"].verdict == comparison.APPROXIMATED
+    errors = {e.label: e.percent["total_current"] for e in found.errors}
+    assert errors[comparison.EXPORTED] < 0.2 * min(errors[comparison.TRANSLATED], errors[comparison.WITHOUT])
+
+
+def test_actuator_is_the_native_law_and_needs_jax_alone(with_effects):
+    drive, runs, known = with_effects
+    law = jax_actuator.law_of(runs, known)(drive, {})
+    current, speed = comparison.evaluated(law, law.start, runs.command, runs.load, runs.way)
+    np.testing.assert_allclose(current, runs.inside.current, rtol=1e-9)
+    np.testing.assert_allclose(speed, runs.inside.speed, rtol=1e-9)
+    source = law_source.jax_source(drive, known)
+    imported = [n for n in ast.walk(ast.parse(source)) if isinstance(n, ast.Import | ast.ImportFrom)]
+    assert [ast.unparse(n) for n in imported] == ["import jax.numpy as jnp"]
+    module = law_source.executed(source)
+
+    def power(voltage):
+        state, speed = module.initial_state(), jnp.asarray(0.0)
+        for _ in range(5):
+            torque, state, _ = module.actuator(module.PARAMS, state, voltage, 0.0, speed, 1e-2)
+            speed = speed + 1e-2 * torque / 0.05
+        return speed
+
+    rise = jax.grad(power)(24.0)
+    assert float(rise) == pytest.approx(float((power(24.001) - power(23.999)) / 0.002), rel=1e-5)
+
+
+def test_energy_of_the_actuator_is_what_is_given_and_lost(with_effects):
+    drive, _, known = with_effects
+    module = law_source.executed(law_source.jax_source(drive, known))
+    speed = jnp.asarray([3.0, 8.0, -5.0])
+    torque, info = jax_actuator.settled(module, module.PARAMS, jnp.asarray([12.0, 24.0, -15.0]), speed)
+    lost = sum(info[name] for name in info if name.startswith("lost"))
+    np.testing.assert_allclose(info["power"], torque * speed + lost, rtol=1e-9)
+
+
+def test_serialised_actuator_computes_what_its_source_does(with_effects):
+    drive, _, known = with_effects
+    files = jax_actuator.files(drive, known, [])
+    module = law_source.executed(files["actuator.py"])
+    with jax.enable_x64(False):
+        kept = jax.export.deserialize(bytearray(files["actuator.jaxexport"]))
+        numbers = {n: jnp.float32(v) for n, v in module.PARAMS.items()}
+        many = jnp.linspace(-8, 8, 5, dtype=jnp.float32)
+        state = {n: jnp.zeros(5, jnp.float32) for n in module.initial_state()}
+        given = (numbers, state, 24.0 + 0 * many, 0 * many, many, jnp.float32(1e-3))
+        np.testing.assert_allclose(kept.call(*given)[0], module.actuator(*given)[0], rtol=1e-5, atol=1e-5)
+
+
+def test_tables_read_in_c_as_in_csv(with_effects, tmp_path):
+    drive, runs, known = with_effects
+    found = feed_forward.map_of(runs, known)
+    files = feed_forward.files(drive, found, [])
+    rows = list(csv.DictReader(io.StringIO(files["feed_forward.csv"])))
+    assert len(rows) == len(found.speed) * len(found.torque)
+    row = next(r for r in rows if float(r["joint_speed_rad_s"]) > 5 and float(r["joint_torque_Nm"]) > 0.5)
+    given = {n: float(v) for n, v in row.items()}
+    lost = sum(v for n, v in given.items() if n.startswith("lost"))
+    assert given["power_W"] == pytest.approx(given["joint_speed_rad_s"] * given["joint_torque_Nm"] + lost, rel=1e-5)
+    law = feed_forward.law_of(runs, known)(drive, {})
+    current, speed = comparison.evaluated(law, law.start, runs.command, runs.load, runs.way)
+    assert (
+        apart(np.asarray(speed), runs.inside.speed) < 2e-3 and apart(np.asarray(current), runs.inside.current) < 1e-2
+    )
+    compiler = shutil.which("cc")
+    if compiler is None:
+        pytest.skip("no C compiler")
+    (tmp_path / "f.h").write_text(files["feed_forward.h"])
+    (tmp_path / "f.c").write_text(
+        '#include <stdio.h>\n#include "f.h"\nint main(void) { printf("%.6f", '
+        f"{drive.name}_get_voltage({row['joint_speed_rad_s']}f, {row['joint_torque_Nm']}f)); return 0; }}\n"
+    )
+    subprocess.run([compiler, "-Wall", "-Werror", "-Wno-unused-function", "-o", "f", "f.c"], cwd=tmp_path, check=True)
+    printed = subprocess.run([str(tmp_path / "f")], capture_output=True, check=True).stdout
+    assert float(printed) == pytest.approx(given["voltage_V"], rel=1e-5)
+
+
+@pytest.mark.slow
+def test_onnx_model_is_the_step_of_jax(with_effects):
+    pytest.importorskip("jax2onnx")
+    pytest.importorskip("onnxruntime")
+    drive, _, known = with_effects
+    files = onnx.files(drive, known)
+    assert onnx.difference(drive, known, files["actuator.onnx"]) < 1e-5
+
+
+def test_missing_onnx_library_names_the_extra(with_effects, monkeypatch):
+    drive, _, known = with_effects
+    monkeypatch.setitem(sys.modules, "jax2onnx", None)
+    with pytest.raises(BadConfiguration, match=r'jax2onnx is not installed; pip install "mmrjax\[export\]"'):
+        onnx.files(drive, known)
+
+
+def stand_in(monkeypatch):
+    """Modules named torch and mjlab with the interface that the exported file uses, on NumPy."""
+    torch = types.ModuleType("torch")
+    torch.clamp = lambda x, min=None, max=None: np.clip(x, min, max)
+    torch.full = lambda shape, value, device=None: np.full(shape, value)
+    torch.zeros = lambda shape, device=None: np.zeros(shape)
+    for name in ("where", "sign", "abs", "sqrt", "exp", "maximum", "minimum"):
+        setattr(torch, name, getattr(np, name))
+
+    class Actuator:
+        def __init__(self, cfg, entity, target_ids, target_names):
+            self.cfg, self._target_ids_list, self._mjs_actuators = cfg, target_ids, []
+
+        def initialize(self, mj_model, model, data, device):
+            pass
+
+        def reset(self, env_ids=None):
+            pass
+
+    @dataclasses.dataclass(kw_only=True)
+    class ActuatorCfg:
+        target_names_expr: tuple[str, ...]
+
+    base = types.ModuleType("mjlab.actuator.actuator")
+    base.Actuator, base.ActuatorCfg = Actuator, ActuatorCfg
+    for name, module in {
+        "torch": torch, "mjlab": types.ModuleType("mjlab"), "mjlab.actuator": types.ModuleType("mjlab.actuator"),
+        "mjlab.actuator.actuator": base,
+    }.items():  # fmt: skip
+        monkeypatch.setitem(sys.modules, name, module)
+
+
+def test_mjlab_actuator_gives_the_torque_of_jax_within_a_stand_in(with_effects, monkeypatch, tmp_path):
+    import mujoco as library
+
+    stand_in(monkeypatch)
+    drive, _, known = with_effects
+    (tmp_path / "mjlab_actuator.py").write_text(mjlab.files(drive, known, [])["mjlab_actuator.py"])
+    monkeypatch.syspath_prepend(tmp_path)
+    module = importlib.import_module("mjlab_actuator")
+    cfg = module.DriveActuatorCfg(target_names_expr=("left", "right"))
+    actuator = cfg.build(None, [0, 1], ["left", "right"])
+    spec = library.MjSpec.from_string(
+        '<mujoco><worldbody><body><joint name="left"/><geom size="1"/><body><joint name="right"/><geom size="1"/>'
+        "</body></body></worldbody></mujoco>"
+    )
+    actuator.edit_spec(spec, ["left", "right"])
+    model = spec.compile()
+    assert model.nu == 2 and model.dof_armature[0] == pytest.approx(3.35e-6 * 48**2 * 0.74)
+    actuator.initialize(model, None, types.SimpleNamespace(nworld=3), "cpu")
+    rng = np.random.default_rng(3)
+    native = law_source.executed(law_source.jax_source(drive, known))
+    state = native.initial_state((3, 2))
+    for _ in range(3):
+        volts, speeds = rng.uniform(-24, 24, (3, 2)), rng.uniform(-8, 8, (3, 2))
+        found = actuator.compute(types.SimpleNamespace(effort_target=volts, pos=0 * volts, vel=speeds))
+        torque, state, _ = native.actuator(native.PARAMS, state, volts, 0 * volts, speeds, model.opt.timestep)
+        np.testing.assert_allclose(found, torque, rtol=1e-9)
+    # A tensor has `clone`, an array has `copy`.
+    actuator.state = {
+        n: x.view(type("Tensor", (np.ndarray,), {"clone": np.ndarray.copy})) for n, x in actuator.state.items()
+    }
+    actuator.reset([1])
+    assert not actuator.state["current"][1].any() and actuator.state["current"][0].any()
+
+
+def test_draws_are_correlated_as_the_posterior_and_in_both_formats(plain, tmp_path):
+    drive, runs, known = plain
+    names = ("motor.resistance", "motor.friction_coulomb")
+    at = priors.parameter_coordinates(drive.file.robot, names, {})
+    spread = np.array([[0.3, 0.0], [-0.24, 0.18]])
+    posterior = posterior_of_coordinates(at, np.zeros(2), spread @ spread.T)
+    normal = float(np.mean(runs.signals.normal))
+    law = mujoco.translated(drive, normal)
+    refitted = dict(zip(law.names, map(float, law.start), strict=True))
+    refitted[mujoco.RESISTANCE] *= 1.1  # as if a refit had found more
+    found = randomization.drawn(drive, posterior, known, refitted, normal, 400, 7)
+    resistance, friction = found["actuator/motor.resistance"], found["actuator/motor.friction_coulomb"]
+    np.testing.assert_allclose(found["mujoco/resistance"], 1.1 * resistance / 0.74, rtol=1e-9)
+    assert np.corrcoef(resistance, friction)[0, 1] == pytest.approx(-0.8, abs=0.06)
+    assert np.corrcoef(found["mujoco/resistance"], found["mujoco/frictionloss"])[0, 1] == pytest.approx(
+        -0.8, abs=0.06
+    )
+    files = randomization.files(found)
+    kept = np.load(io.BytesIO(files["draws.npz"]))
+    assert set(kept) == set(found)
+    assert len(json.loads(files["draws.json"])["mujoco"]["motorconst"]) == 400
+    with pytest.raises(BadConfiguration, match=f"no {posterior_file.FILE} next to"):
+        randomization.drawn(drive, None, known, refitted, normal, 4, 0)
+
+
+RIG = """
+schema = "mmrjax.robot/2"
+base = "none"
+sides = 1
+imposed = "voltage"
+channels = ["total_current", "motor_speed"]
+[motor]
+resistance = 1.7
+torque_constant = 0.031
+inductance = 3e-4
+inertia = 2.5e-6
+voltage_limit = 12.0
+[gearbox]
+ratio = 19.7
+efficiency_load = 1.0
+[arm]
+load = "shaft"
+inertia = 0.0123
+loss_coulomb = 0.21
+loss_viscous = 0.0071
+torque_gravity = 0.6
+angle_zero = 0.4
+[effects.presliding]
+amplitude = 0.05
+angle_breakaway = 0.03
+[effects.thermal_drift]
+amplitude = 1.0
+resistance_thermal = 1.3
+time_constant = 20.0
+"""
+
+
+@pytest.fixture
+def rig(tmp_path):
+    path = tmp_path / "rig.toml"
+    path.write_text(RIG)
+    return path
+
+
+def xml_of(file):
+    """MJCF of a rig by translation alone."""
+    drive = joints.joint(robot_file.find(str(file)))
+    law = mujoco.translated(drive, 0.0)
+    motor = mujoco.motor(drive, dict(zip(law.names, map(float, law.start), strict=True)))
+    about = dict.fromkeys(("frictionloss", "damping", "armature"), "")
+    return {
+        "drive.xml": mujoco.fragment(drive, motor, about, [], "motor", "drive", 12.0),
+        "scene.xml": mujoco.scene(drive, 0.0, "motor", "drive", 12.0, 0.1),
+    }
+
+
+def test_rig_that_was_exported_comes_back_to_the_last_digit(rig, tmp_path):
+    first = xml_of(rig)
+    for name, text in first.items():
+        (tmp_path / name).write_text(text)
+    again = tmp_path / "again.toml"
+    again.write_text(rig_from_model.text(tmp_path / "scene.xml", "drive"))
+    second = xml_of(again)
+    lines = [[line for line in f["drive.xml"].splitlines() if "<!--" not in line] for f in (first, second)]
+    assert lines[0] == lines[1]
+    before, after = (robot_file.find(str(f)).robot for f in (rig, again))
+    numbers = {p.name: float(p.value) for p in params.walk_parameters(after)}
+    for p in params.walk_parameters(before):
+        name = p.name.replace("arm.", "joint.")
+        if not name.startswith(("battery", "running_gear", "motor.resistance_thermal", "motor.time", "rig")):
+            assert numbers[name] == pytest.approx(float(p.value), rel=1e-8), name
+
+
+@pytest.mark.parametrize(
+    ("source", "joint", "message"),
+    [
+        ("scene.xml", "drve", r"--joint: got drve; .* has no such joint; did you mean drive\?"),
+        ("scene.obj", None, r"--from: got .*; expected a model that ends with .xml"),
+        ("none.xml", None, r"none.xml: cannot be read"),
+        ("bad.xml", None, r"bad.xml: MuJoCo does not read it"),
+        ("motor.xml", "drive", r"--joint: got drive, which no <dcmotor> of .* drives, so its winding is not known"),
+        ("motor.xml", None, r"--joint: missing, and .* has no <dcmotor> on a joint"),
+    ],
+)
+def test_models_without_a_driven_joint_are_refused_in_a_sentence(source, joint, message, rig, tmp_path):
+    for name, text in xml_of(rig).items():
+        (tmp_path / name).write_text(text)
+    (tmp_path / "bad.xml").write_text("<mujoco><worldbody>")
+    body = '<body><joint name="drive"/><geom size="1"/></body>'
+    (tmp_path / "motor.xml").write_text(
+        f'<mujoco><worldbody>{body}</worldbody><actuator><motor joint="drive"/></actuator></mujoco>'
+    )
+    with pytest.raises(BadConfiguration, match=message):
+        rig_from_model.text(tmp_path / source, joint)
+
+
+def test_older_mujoco_is_refused_with_the_version_that_it_takes(monkeypatch, rig):
+    import mujoco as library
+
+    monkeypatch.setattr(library, "__version__", "3.6.0")
+    with pytest.raises(BadConfiguration, match=r"got MuJoCo 3.6.0, which has no <dcmotor>; expected 3.7 or later"):
+        formats.exported(robot_file.find(str(rig)), "mujoco")
+
+
+@pytest.mark.parametrize(
+    ("amplitudes", "configuration", "message"),
+    [
+        ({"side_friction": 1e-3}, None, r"side_friction makes its sides differ, and one joint has one drive"),
+        ({}, "4W2", r"--configuration: got 4W2; .* did you mean 4W2T\?"),
+    ],
+)
+def test_drives_that_are_no_joint_are_refused_in_a_sentence(amplitudes, configuration, message):
+    with pytest.raises(BadConfiguration, match=message):
+        joints.joint(of_effects(amplitudes), configuration)
+
+
+def test_rig_with_another_command_is_refused(rig):
+    rig.write_text(RIG.replace('imposed = "voltage"', 'imposed = "motor_current"'))
+    with pytest.raises(BadConfiguration, match=r"\[rig\] imposed: got motor_current; expected voltage"):
+        joints.joint(robot_file.find(str(rig)))
+
+
+@pytest.mark.parametrize(
+    ("header", "row", "message"),
+    [
+        ("configuration,supply_voltage_V,total_mass_kg,payload_kg,slope_deg,duty_left,duty_right,total_current_A", f"{WHEELS},24,11.5,0,0,1,0.5,3", "independently"),
+        ("configuration,supply_voltage_V,total_mass_kg,payload_kg,slope_deg,total_current_A,lever_front_deg,lever_rear_deg",
+         f"{TRACKS},24,13,0,0,3,30,-10", "levers"),
+        ("configuration,supply_voltage_V,total_mass_kg,payload_kg,slope_deg,total_current_A", f"{TRACKS},24,13,0,0,3", f"no run of {WHEELS}"),
+    ],
+)  # fmt: skip
+def test_runs_of_more_than_one_joint_are_refused(header, row, message, tmp_path):
+    (tmp_path / "runs.csv").write_text(f"{header}\n{row}\n")
+    drive = joints.joint(of_effects({}), TRACKS if message == "levers" else WHEELS)
+    with pytest.raises(BadData, match=message):
+        situation.situation(drive, str(tmp_path / "runs.csv"))
+
+
+def test_command_leaves_the_files_the_law_and_a_page(mmrjax, rig):
+    code, out, _ = mmrjax("export", rig, "--to", "mujoco", "--out", "out", "--joint", "wheel")
+    assert code == 0 and "series_resistance" not in out
+    folder = rig.parent / "out"
+    result = json.loads((folder / "result.json").read_text())
+    assert result["errors_percent"]["exported"]["motor_speed"] < 0.01
+    assert {e["name"]: e["verdict"] for e in result["effects"]}["thermal_drift"] == "held"
+    law = (folder / "LAW.md").read_text()
+    for heading in (
+        "How to use it",
+        "Equations",
+        "Constants",
+        "What this format holds",
+        "Conditions seen",
+        "Not tested",
+    ):
+        assert f"## {heading}" in law
+    assert "| `motor.resistance` | 1.7 | ohm |" in law
+    assert 'joint="wheel"' in (folder / "drive.xml").read_text()
+    assert "thermal_drift" in (folder / "report.html").read_text()
+
+
+def test_command_that_is_refused_leaves_nothing(mmrjax, rig):
+    code, _, error = mmrjax("export", rig, "--to", "mujoco", "--configuration", "leg", "--out", "out")
+    assert code == 2 and error.startswith("mmrjax: --configuration: got leg; the robot has no such configuration")
+    assert not (rig.parent / "out").exists()
+    code, _, error = mmrjax("export", rig, "--to", "usd", "--out", "out")
+    assert code == 2 and "mujoco" in error
+
+
+def test_symbols_fold_numbers_and_keep_the_order_of_operations():
+    a, b = (expressions.Symbol.of("name", (), n) for n in "ab")
+    two = expressions.const(2.0)
+    assert expressions.apply("mul", a, expressions.ZERO) is expressions.ZERO
+    assert expressions.apply("add", a, expressions.ZERO) is a
+    difference = expressions.apply("sub", a, expressions.apply("sub", b, two))
+    text = expressions.lines_of(expressions.apply("mul", difference, difference), expressions.NUMPY, str)
+    assert text == ["    x1 = a - (b - 2.0)", "    return x1 * x1"]
+    with pytest.raises(BadConfiguration, match="mine: its equation uses"):
+        expressions.traced(lambda x: jnp.sort(jnp.stack([x, 1.0]))[0], ["x"], "mine")

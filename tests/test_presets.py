@@ -1,0 +1,152 @@
+"""Presets of loggers: names, units and signs of their columns, and the numbers that they ask for."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from calibration.data import presets_file, robot_file
+from calibration.data import runs as records
+from calibration.data.input_errors import BadConfiguration, BadData
+
+RIG = """
+base = "none"
+channels = [{channels}]
+[motor]
+resistance = 2.0
+torque_constant = 0.05
+[gearbox]
+ratio = 1
+efficiency_load = 1.0
+[bench]
+load = "shaft"
+inertia = 0.001
+loss_coulomb = 0.01
+"""
+VESC = {
+    "ms_today": [52895688, 52895828, 52895968], "input_voltage": [50.8, 50.8, 50.7], "current_motor": [0.31, 0.4, 0.5],
+    "current_in": [0.08, 0.1, 0.2], "erpm": [700.0, 1400.0, 2100.0], "duty_cycle": [0.1, 0.2, 0.3],
+    "ms_today_setup": [52844318, 52844318, 52844318],
+}  # fmt: skip
+
+
+def robot(tmp_path, *channels):
+    (tmp_path / "rig.toml").write_text(RIG.format(channels=", ".join(f'"{c}"' for c in channels)), encoding="utf-8")
+    return robot_file.read(tmp_path / "rig.toml")
+
+
+@pytest.mark.parametrize("name", presets_file.PACKAGED)
+def test_every_packaged_preset_can_be_read(name):
+    given = ",".join([name, *(f"{key}=2" for key in presets_file.asked(name))])
+    found = presets_file.find(given)
+    assert found.columns and all(column.factor and column.theirs for column in found.columns)
+
+
+def test_vesc_counts_electrical_turns_and_has_two_clocks(tmp_path):
+    pd.DataFrame(VESC).to_csv(tmp_path / "log.csv", index=False, sep=";")
+    rig = robot(tmp_path, "total_current", "motor_current", "motor_speed")
+    found = records.read(tmp_path / "log.csv", rig, columns="vesc,pole_pairs=7")
+    np.testing.assert_allclose(found["motor_speed_rpm"], [100, 200, 300])
+    np.testing.assert_allclose(found["time_s"], [0, 0.14, 0.28])
+    np.testing.assert_allclose(found["duty"], [0.1, 0.2, 0.3])
+    np.testing.assert_allclose(found["motor_current_A"], VESC["current_motor"])
+    assert any("erpm, read as motor_speed_rpm, is electrical" in note for note in found.notes)
+    with pytest.raises(
+        BadConfiguration, match=r"pole_pairs is missing, the pairs of poles .* --columns vesc,pole_pairs=7"
+    ):
+        records.read(tmp_path / "log.csv", rig, columns="vesc")
+
+
+def test_simplefoc_prints_milliamperes_and_no_header(tmp_path):
+    (tmp_path / "log.txt").write_text("2.0\t2.00\t0\t150\t0\t10.0\t0.1\n3.0\t3.00\t0\t250\t0\t15.0\t0.2\n")
+    found = records.read(tmp_path / "log.txt", robot(tmp_path, "motor_current", "motor_speed"), columns="simplefoc")
+    np.testing.assert_allclose(found["motor_current_A"], [0.15, 0.25])
+    np.testing.assert_allclose(found["motor_speed_rpm"], np.array([10.0, 15.0]) * 30 / np.pi)
+    np.testing.assert_allclose(found["supply_voltage_V"], [2, 3])
+
+
+def test_sysid_has_a_run_for_each_test(tmp_path):
+    test = [[0.02 * k, 0.5 * k, 0.1 * k, 1.0 * k] for k in range(4)]
+    (tmp_path / "log.json").write_text(json.dumps({"sysid": True, "slow-forward": test, "fast-forward": test}))
+    found = records.read(tmp_path / "log.json", robot(tmp_path, "output_speed"), columns="sysid")
+    assert dict.fromkeys(found["run_id"].tolist()).keys() == {"slow-forward", "fast-forward"}
+    np.testing.assert_allclose(found["output_speed_rpm"], np.tile([0.0, 60, 120, 180], 2))
+
+
+def test_bam_has_entries_with_a_duty(tmp_path):
+    entries = [
+        {"position": 0.1 * k, "speed": 1.0 * k, "load": 102.3 * k, "input_volts": 15.0, "timestamp": 0.01 * k}
+        for k in range(4)
+    ]
+    (tmp_path / "log.json").write_text(json.dumps({"mass": 0.5, "entries": entries}))
+    found = records.read(tmp_path / "log.json", robot(tmp_path, "output_speed"), columns="bam,load_limit=1023")
+    np.testing.assert_allclose(found["duty"], [0, 0.1, 0.2, 0.3])
+    np.testing.assert_allclose(found["output_speed_rpm"], np.arange(4) * 30 / np.pi)
+
+
+def test_lerobot_has_a_run_for_each_episode(tmp_path):
+    states = [[1.0 * k, 10.0 * k] for k in range(4)]
+    data = {"observation.state": states, "timestamp": [0.0, 0.1, 0.0, 0.1], "episode_index": [0, 0, 1, 1]}
+    pd.DataFrame({**data, "supply_voltage_V": 12.0}).to_parquet(tmp_path / "file-000.parquet")
+    found = records.read(tmp_path / "file-000.parquet", robot(tmp_path, "output_angle"), columns="lerobot,joint=1")
+    assert found["run_id"].tolist() == ["0", "0", "1", "1"]
+    np.testing.assert_allclose(found["output_angle_deg"], [0, 10, 20, 30])
+
+
+def test_an_optical_speed_without_readings_gives_way_to_the_electrical(tmp_path):
+    columns = {
+        "Time (s)": [0.0, 0.1], "Voltage (V)": [16.0, 16.0], "Current (A)": [1.0, 2.0],
+        "Motor Electrical Speed (RPM)": [1000.0, 2000.0], "Motor Optical Speed (RPM)": [0, 0],
+    }  # fmt: skip
+    pd.DataFrame(columns).to_csv(tmp_path / "log.csv", index=False)
+    found = records.read(tmp_path / "log.csv", robot(tmp_path, "motor_speed"), columns="rcbenchmark")
+    np.testing.assert_allclose(found["motor_speed_rpm"], [1000, 2000])
+
+
+def test_columns_of_ones_own_win_over_those_of_the_robots_file(tmp_path):
+    rig = robot(tmp_path, "motor_speed")
+    mine = {"supply_voltage_V": "u", "motor_speed_rad_s": {"column": "w", "factor": -1.0}}
+    found = records.read({"u": [1.0, -2.0], "w": [-3.0, 4.0], "speed": [1.0, 1.0]}, rig, columns=mine)
+    np.testing.assert_allclose(found["motor_speed_rpm"], np.array([3.0, -4.0]) * 30 / np.pi)
+
+
+WRONG = {
+    "another name": ("vesk", r"got vesk; no such file and no packaged preset; did you mean vesc\?"),
+    "a number that is none": ("vesc,pole_pairs=x", "got pole_pairs=x; expected a name and a number"),
+    "no poles": ("vesc,pole_pairs=0", "pole_pairs: got 0; expected a number that is not 0"),
+    "another number": ("moteus,pole_pairs=7", "got pole_pairs; it asks for no number"),
+}
+FILES = {
+    "another column": ('[columns]\nmotor_sped_rpm = "n"', "columns.motor_sped_rpm: no such column of a table"),
+    "another key": ('[colums]\ntime_s = "t"', r"got the key colums; did you mean columns\?"),
+    "a list of numbers": ("[columns]\ntime_s = [1]", 'expected time_s = "THEIRS"'),
+    "a factor of nothing": ('[columns]\ntime_s = {column = "t", factor = 0}', "factor: got 0; expected a number"),
+    "a number without a name": (
+        '[columns]\ntime_s = {column = "t", per = "n"}',
+        r"got n; expected a number that \[ask\] names",
+    ),
+    "nothing": ("", "expected a table of columns"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_a_preset_that_cannot_be_is_refused(case):
+    stated, says = WRONG[case]
+    with pytest.raises(BadConfiguration, match=says):
+        presets_file.find(stated)
+
+
+@pytest.mark.parametrize("case", FILES)
+def test_a_presets_file_that_cannot_be_is_refused(tmp_path, case):
+    text, says = FILES[case]
+    (tmp_path / "mine.toml").write_text(text)
+    with pytest.raises(BadConfiguration, match=says):
+        presets_file.find(tmp_path / "mine.toml")
+
+
+def test_a_file_of_another_logger_is_refused_with_its_columns(tmp_path):
+    with pytest.raises(BadData, match=r"has none of the columns of vesc \(ms_today, .*\), but a, b"):
+        records.read({"a": [1.0, 2.0], "b": [1.0, 2.0]}, robot(tmp_path, "motor_speed"), columns="vesc,pole_pairs=7")
