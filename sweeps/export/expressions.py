@@ -304,7 +304,7 @@ ZERO = const(0.0)
 
 
 class Dialect:
-    """How functions are written: `jnp.sqrt(x)`. Subclasses change single functions."""
+    """Notation of functions: `jnp.sqrt(x)`. Subclasses change single functions."""
 
     def __init__(self, prefix: str) -> None:
         self.prefix = prefix

@@ -51,7 +51,7 @@ NOT_TESTED = (
     "Voltages, loads and temperatures outside the runs above.",
     "Fast changes: the comparison is of settled runs, so inductance and inertia rest on their stated values.",
 )
-BACKWARD = "Runs in which the load drives the motor: none is among those above."
+BACKWARD = "Runs in which the load drives the motor: the runs above include none."
 
 
 def statement(found: Export) -> str:
@@ -82,7 +82,7 @@ def errors_title(found: Export) -> str:
 
 
 def remarks(found: Export) -> list[str]:
-    """What to know of an export."""
+    """Remarks on an export."""
     compared, drive = found.comparison, found.joint
     said = []
     if not compared.situation.is_measured:
