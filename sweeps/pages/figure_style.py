@@ -69,8 +69,8 @@ _RC: dict[Any, Any] = {
 }
 
 
-#: Width of a figure with stacked panels, for phones [inches].
-NARROW = 4.3
+#: Width of a figure with stacked panels, for phones [inches], and characters in a line of its names at the left.
+NARROW, LONGEST = 4.3, 20
 
 
 @contextmanager
@@ -118,7 +118,7 @@ def can_stack(fig: Figure) -> bool:
 
 
 def with_labels(fig: Figure) -> Figure:
-    """A stacked figure in which each panel has the labels that its row or column shared."""
+    """A stacked figure in which each panel has the labels of its row or column; long names have several lines."""
     grid: Any = vars(fig)["panels"]
     for i, j in np.ndindex(grid.shape):
         axes = grid[i, j]
@@ -128,6 +128,9 @@ def with_labels(fig: Figure) -> Figure:
             axes.set_ylabel(grid[i, 0].get_ylabel())
         if not axes.get_xlabel():
             axes.set_xlabel(grid[-1, j].get_xlabel())
+        names = [tick.get_text() for tick in axes.get_yticklabels()]
+        if max(map(len, names), default=0) > LONGEST:
+            axes.set_yticks(axes.get_yticks(), [textwrap.fill(name, LONGEST) for name in names])
     return fig
 
 
