@@ -6,6 +6,7 @@ import html
 import io
 import json
 import re
+import textwrap
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -70,6 +71,8 @@ _RC: dict[Any, Any] = {
 
 #: Width of a figure with stacked panels, for phones [inches].
 NARROW = 4.3
+#: Letters of a line across it.
+LETTERS = 42
 
 
 @contextmanager
@@ -108,17 +111,20 @@ def can_stack(fig: Figure) -> bool:
     return pages.FOR_PHONES and hasattr(fig, "panels")
 
 
-def with_labels(fig: Figure) -> Figure:
-    """A stacked figure in which each panel has the labels that its row or column shared."""
+def fit_for_phones(fig: Figure) -> Figure:
+    """A narrow figure with wrapped labels and titles; stacked panels have the labels that they shared."""
     grid: Any = vars(fig)["panels"]
     for i, j in np.ndindex(grid.shape):
         axes = grid[i, j]
         if not axes.axison:
             continue
-        if not axes.get_ylabel():
-            axes.set_ylabel(grid[i, 0].get_ylabel())
-        if not axes.get_xlabel():
-            axes.set_xlabel(grid[-1, j].get_xlabel())
+        if grid.shape[1] > 1:
+            axes.set_ylabel(axes.get_ylabel() or grid[i, 0].get_ylabel())
+            axes.set_xlabel(axes.get_xlabel() or grid[-1, j].get_xlabel())
+        axes.set_xlabel("\n".join(textwrap.wrap(axes.get_xlabel(), LETTERS)))
+        axes.set_title("\n".join(textwrap.wrap(axes.get_title(loc="left"), LETTERS - 12)))
+    for legend in fig.legends:
+        legend.set_ncols(1)
     return fig
 
 
