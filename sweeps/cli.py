@@ -475,26 +475,63 @@ rig = typer.Typer(
 app.add_typer(rig, name="rig")
 
 
-@rig.command(epilog="Example: mmrjax rig new my-rig.toml --kind wheeled")
+_SHEET = "Data sheet"
+
+
+@rig.command(
+    epilog="Example: mmrjax rig new my-rig.toml --from robot.urdf --joint left_wheel_joint --voltage 24V "
+    "--no-load-speed 8810rpm --no-load-current 164mA --stall-torque 1020mNm --stall-current 39.3A "
+    "--resistance 0.611ohm"
+)
 def new(
     file: Annotated[Path, typer.Argument(metavar="FILE.toml", help="The file to write.")],
     kind: Annotated[
-        str, typer.Option(help="tracked, wheeled, bench, dyno, pendulum, servo, linear or carriage.")
-    ] = "bench",
-    source: Annotated[
-        Path | None, typer.Option("--from", help="A model of MuJoCo (.xml) whose driven joint is the rig.")
+        str | None,
+        typer.Option(
+            help="tracked, wheeled, bench, dyno, pendulum, servo, linear or carriage.  "
+            "\\[default: what the joint of --from moves, else bench]"
+        ),
     ] = None,
-    joint: Annotated[str | None, typer.Option(help="Name of that joint.")] = None,
+    source: Annotated[
+        Path | None, typer.Option("--from", help="A URDF or a model of MuJoCo with the driven joint.")
+    ] = None,
+    joint: Annotated[
+        str | None, typer.Option(help="Name of that joint; it turns.  \\[default: the only driven one]")
+    ] = None,
+    from_sheet: Annotated[
+        bool,
+        typer.Option("--from-sheet", help="Read a motor; the numbers below imply it.", rich_help_panel=_SHEET),
+    ] = False,
+    voltage: Annotated[
+        str | None, typer.Option(help="Voltage of the numbers below: V, mV.", rich_help_panel=_SHEET)
+    ] = None,
+    no_load_speed: Annotated[str | None, typer.Option(help="rpm, 1/min or rad/s.", rich_help_panel=_SHEET)] = None,
+    no_load_current: Annotated[str | None, typer.Option(help="A or mA; required.", rich_help_panel=_SHEET)] = None,
+    stall_torque: Annotated[
+        str | None, typer.Option(help="Nm, mNm, Ncm, kg·cm, g·cm, oz·in or lb·in.", rich_help_panel=_SHEET)
+    ] = None,
+    stall_current: Annotated[str | None, typer.Option(help="A or mA.", rich_help_panel=_SHEET)] = None,
+    resistance: Annotated[
+        str | None, typer.Option(help="Terminal resistance: ohm or mohm.", rich_help_panel=_SHEET)
+    ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace the file where there is one.")] = False,
 ) -> int:
     """Write a rig's file to fill in, with units and where each number comes from; it asks nothing.
 
     As written it can be read, with numbers of an example. Units are SI but where a comment says another.
-    With --from the numbers are those of a model's joint, as export --to mujoco writes them.
+
+    --kind wheeled writes the file of a kind. --from reads a joint: mass, inertia, radius, ratio, friction, damping,
+    armature. --from-sheet reads a motor from four to six numbers with units; a contradiction above 10 % is refused.
+    Both can be combined. Each number has its source and a wide ±. The command lists what it did not find.
     """
     from sweeps.commands import rig_new
 
-    return rig_new.new(file, kind, force, source, joint)
+    given = {
+        "voltage": voltage, "no-load-speed": no_load_speed, "no-load-current": no_load_current,
+        "stall-torque": stall_torque, "stall-current": stall_current, "resistance": resistance,
+    }  # fmt: skip
+    sheet = {name: text for name, text in given.items() if text is not None}
+    return rig_new.new(file, kind, force, source, joint, sheet if sheet or from_sheet else None)
 
 
 @rig.command("check", epilog="Example: mmrjax rig check my-rig.toml my-runs.csv")

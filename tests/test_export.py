@@ -25,7 +25,7 @@ from calibration.inference.fit_posterior import posterior_of_coordinates
 from mmrjax import effects
 from mmrjax.model import balances, paper_robots, params
 from mmrjax.model.signals import Signals
-from sweeps.commands import rig_from_model
+from sweeps.commands import rig_new
 from sweeps.export import (
     comparison,
     constants,
@@ -442,14 +442,14 @@ def test_rig_that_was_exported_comes_back_to_the_last_digit(rig, tmp_path):
     for name, text in first.items():
         (tmp_path / name).write_text(text)
     again = tmp_path / "again.toml"
-    again.write_text(rig_from_model.text(tmp_path / "scene.xml", "drive"))
+    again.write_text(rig_new.text(None, tmp_path / "scene.xml", "drive", None))
     second = xml_of(again)
     lines = [[line for line in f["drive.xml"].splitlines() if "<!--" not in line] for f in (first, second)]
     assert lines[0] == lines[1]
     before, after = (robot_file.find(str(f)).robot for f in (rig, again))
     numbers = {p.name: float(p.value) for p in params.walk_parameters(after)}
     for p in params.walk_parameters(before):
-        name = p.name.replace("arm.", "joint.")
+        name = p.name
         if not name.startswith(("battery", "running_gear", "motor.resistance_thermal", "motor.time", "rig")):
             assert numbers[name] == pytest.approx(float(p.value), rel=1e-8), name
 
@@ -458,23 +458,25 @@ def test_rig_that_was_exported_comes_back_to_the_last_digit(rig, tmp_path):
     ("source", "joint", "message"),
     [
         ("scene.xml", "drve", r"--joint: got drve; .* has no such joint; did you mean drive\?"),
-        ("scene.obj", None, r"--from: got .*; expected a model that ends with .xml"),
+        ("scene.obj", None, r"scene.obj: not a readable XML file \(.*\); expected URDF or MuJoCo's XML"),
+        ("page.xml", None, r"page.xml: got <html>; expected <robot> of URDF or <mujoco>"),
         ("none.xml", None, r"none.xml: cannot be read"),
         ("bad.xml", None, r"bad.xml: MuJoCo does not read it"),
-        ("motor.xml", "drive", r"--joint: got drive, which no <dcmotor> of .* drives, so its winding is not known"),
-        ("motor.xml", None, r"--joint: missing, and .* has no <dcmotor> on a joint"),
+        ("two.xml", None, r"--joint: missing, and two.xml has drive, other; expected the name of one joint"),
+        ("two.xml", "slide", r"--joint: got slide, which slides or is free; expected a hinge"),
     ],
 )
 def test_models_without_a_driven_joint_are_refused_in_a_sentence(source, joint, message, rig, tmp_path):
     for name, text in xml_of(rig).items():
         (tmp_path / name).write_text(text)
     (tmp_path / "bad.xml").write_text("<mujoco><worldbody>")
-    body = '<body><joint name="drive"/><geom size="1"/></body>'
-    (tmp_path / "motor.xml").write_text(
-        f'<mujoco><worldbody>{body}</worldbody><actuator><motor joint="drive"/></actuator></mujoco>'
-    )
+    (tmp_path / "scene.obj").write_text("v 0 0 0")
+    (tmp_path / "page.xml").write_text("<html/>")
+    body = "<body><joint {}/><geom size='1'/></body>"
+    bodies = "".join(map(body.format, ("name='drive'", "name='other'", "name='slide' type='slide'")))
+    (tmp_path / "two.xml").write_text(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
     with pytest.raises(BadConfiguration, match=message):
-        rig_from_model.text(tmp_path / source, joint)
+        rig_new.text(None, tmp_path / source, joint, None)
 
 
 def test_older_mujoco_is_refused_with_the_version_that_it_takes(monkeypatch, rig):

@@ -29,14 +29,12 @@ from mmrjax.model.driver import FAST
 from mmrjax.model.motor import UNLIMITED
 from mmrjax.model.robot import Robot
 from mmrjax.model.shaft import Shaft
+from sweeps.commands.rig_template import EXAMPLE
 from sweeps.config import RobotPart
 from sweeps.console import say
 from sweeps.inputs import load_robot, read_runs
 from sweeps.pages import words
 from sweeps.report.words import fit_words
-
-#: Of the templates: what stands beside a number that is not the user's yet.
-EXAMPLE = "example: yours"
 
 
 @dataclasses.dataclass(frozen=True)

@@ -2,42 +2,98 @@
 
 from __future__ import annotations
 
-from importlib import resources
+import io
+from collections.abc import Mapping
 from pathlib import Path
+from xml.etree import ElementTree
 
 from calibration.data.input_errors import BadConfiguration, allowed_words
+from calibration.data.input_files import content
+from sweeps.commands.rig_joint import JointNumbers
+from sweeps.commands.rig_template import KINDS, Stated, examples, filled, template
 from sweeps.console import say
 
-#: Kinds of rig, in words.
-KINDS = {
-    "bench": "a motor with its gearbox that turns a shaft: brake, disk, worm, winch",
-    "dyno": "a motor against a brake whose torque is set and read",
-    "pendulum": "a servo with an arm that gravity pulls",
-    "servo": "a servo driven by PWM, whose angle is logged",
-    "linear": "a carriage on a screw, a belt or a rope",
-    "carriage": "the same on an amplifier that controls the current, with its position logged",
-    "wheeled": "a robot on wheels",
-    "tracked": "a robot on tracks",
-}
+#: Kind of rig if neither an option nor a model states one.
+USUAL = "bench"
+#: Largest model that is read [bytes].
+LARGEST = 2**26
 
 
-def template(kind: str) -> str:
-    """The file of a kind, to fill in."""
-    return resources.files("sweeps").joinpath("rigs", f"{kind}.toml").read_text(encoding="utf-8")
-
-
-def new(file: Path, kind: str, force: bool, source: Path | None = None, joint: str | None = None) -> int:
-    """Write a rig's file to fill in, or the file of a joint of a model; returns 0.
+def joint_of(source: Path, joint: str | None) -> JointNumbers:
+    """Returns the numbers of a driven joint of a URDF or of a model of MuJoCo, by the first element of the file.
 
     Args:
-        source: the model; None: a file of a kind; joint: its name in the model.
+        joint: by name, None: the only driven one.
 
     Raises:
-        BadConfiguration: no such kind, model, joint or folder, or a file that exists without `force`.
+        BadConfiguration: no file, no such format, or a joint that it does not have or that does not turn.
+    """
+    text = content(source, source, BadConfiguration, LARGEST)
+    try:
+        _, root = next(ElementTree.iterparse(io.BytesIO(text), ("start",)))
+        if root.tag == "robot":
+            from sweeps.commands import rig_from_urdf
+
+            return rig_from_urdf.read(ElementTree.fromstring(text), source.name, joint)
+    except (ElementTree.ParseError, ValueError, LookupError) as error:  # an encoding that Python does not know
+        raise BadConfiguration(
+            f"{source}: not a readable XML file ({error}); expected URDF or MuJoCo's XML"
+        ) from error
+    if root.tag != "mujoco":
+        raise BadConfiguration(f"{source}: got <{root.tag}>; expected <robot> of URDF or <mujoco>")
+    from sweeps.commands import rig_from_mujoco
+
+    return rig_from_mujoco.read(source, joint)
+
+
+def text(kind: str | None, source: Path | None, joint: str | None, sheet: Mapping[str, str] | None) -> str:
+    """Text of a rig's file, with the numbers of a joint and of a data sheet in their lines.
+
+    Args:
+        kind: None: what the joint moves, else `USUAL`; source: a model; joint: by name; sheet: numbers by name.
+
+    Raises:
+        BadConfiguration: as `joint_of` and `rig_from_sheet.read`.
+    """
+    numbers: dict[str, Stated] = {}
+    origins = []
+    if source is not None:
+        found = joint_of(source, joint)
+        kind = found.kind(kind)
+        numbers |= found.numbers(kind)
+        origins.append(f"joint {found.joint} of {found.file}")
+    if sheet is not None:
+        from sweeps.commands import rig_from_sheet
+
+        numbers |= rig_from_sheet.read(sheet)
+        origins.append("a data sheet")
+    kind = kind or USUAL
+    if not origins:
+        return template(kind)
+    origin = f"kind {kind}, filled in from {' and '.join(origins)}"
+    return filled(kind, numbers, f"{origin}; a comment names the source of each number, ± is a guess.")
+
+
+def new(
+    file: Path,
+    kind: str | None,
+    force: bool,
+    source: Path | None = None,
+    joint: str | None = None,
+    sheet: Mapping[str, str] | None = None,
+) -> int:
+    """Write a rig's file to fill in, or one with the numbers of a model or data sheet; returns 0.
+
+    Args:
+        kind, source, joint, sheet: as of `text`.
+
+    Raises:
+        BadConfiguration: no such kind, model, joint or folder, a contradictory sheet, or a file that exists without
+            `force`.
     """
     if joint is not None and source is None:
         raise BadConfiguration(f"--joint: got {joint} without --from; expected a model that has this joint")
-    if kind not in KINDS:
+    if kind is not None and kind not in KINDS:
         each = "; ".join(f"{name}: {what}" for name, what in KINDS.items())
         raise BadConfiguration(f"--kind: got {kind}; {allowed_words(kind, KINDS)} ({each})")
     if file.exists() and (file.is_dir() or not force):
@@ -45,12 +101,13 @@ def new(file: Path, kind: str, force: bool, source: Path | None = None, joint: s
         raise BadConfiguration(f"{file}: {what}")
     if not file.parent.is_dir():
         raise BadConfiguration(f"{file}: no such folder as {file.parent}; make it first")
-    if source is None:
-        written, what = template(kind), f"{KINDS[kind]}. Fill in what is marked example: yours, then"
+    written = text(kind, source, joint, sheet)
+    if source is None and sheet is None:
+        what = f"{KINDS[kind or USUAL]}. Fill in what is marked example: yours, then"
     else:
-        from sweeps.commands import rig_from_model
-
-        written, what = rig_from_model.text(source, joint), f"the joint of {source}. Next"
+        lacking = ", ".join(examples(written))
+        what = written.removeprefix("# ").partition("; a comment")[0]
+        what += f"; not found, so fill in: {lacking}. Then" if lacking else ". Next"
     try:
         file.write_text(written, encoding="utf-8")
     except OSError as error:

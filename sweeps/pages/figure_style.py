@@ -69,8 +69,10 @@ _RC: dict[Any, Any] = {
 }
 
 
-#: Width of a figure with stacked panels, for phones [inches], and characters in a line of its names at the left.
-NARROW, LONGEST = 4.3, 20
+#: Width of a figure with stacked panels, for phones [inches].
+NARROW = 4.3
+#: Letters of a line across it, and of a line of the names at its left.
+LETTERS, NAMES = 42, 20
 
 
 @contextmanager
@@ -117,20 +119,23 @@ def can_stack(fig: Figure) -> bool:
     return pages.FOR_PHONES and hasattr(fig, "panels")
 
 
-def with_labels(fig: Figure) -> Figure:
-    """A stacked figure in which each panel has the labels of its row or column; long names have several lines."""
+def fit_for_phones(fig: Figure) -> Figure:
+    """A narrow figure with wrapped labels and titles; stacked panels have the labels that they shared."""
     grid: Any = vars(fig)["panels"]
     for i, j in np.ndindex(grid.shape):
         axes = grid[i, j]
         if not axes.axison:
             continue
-        if not axes.get_ylabel():
-            axes.set_ylabel(grid[i, 0].get_ylabel())
-        if not axes.get_xlabel():
-            axes.set_xlabel(grid[-1, j].get_xlabel())
+        if grid.shape[1] > 1:
+            axes.set_ylabel(axes.get_ylabel() or grid[i, 0].get_ylabel())
+            axes.set_xlabel(axes.get_xlabel() or grid[-1, j].get_xlabel())
+        axes.set_xlabel("\n".join(textwrap.wrap(axes.get_xlabel(), LETTERS)))
+        axes.set_title("\n".join(textwrap.wrap(axes.get_title(loc="left"), LETTERS - 12)))
         names = [tick.get_text() for tick in axes.get_yticklabels()]
-        if max(map(len, names), default=0) > LONGEST:
-            axes.set_yticks(axes.get_yticks(), [textwrap.fill(name, LONGEST) for name in names])
+        if max(map(len, names), default=0) > NAMES:
+            axes.set_yticks(axes.get_yticks(), [textwrap.fill(name, NAMES) for name in names])
+    for legend in fig.legends:
+        legend.set_ncols(1)
     return fig
 
 

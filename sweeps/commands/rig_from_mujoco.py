@@ -1,0 +1,207 @@
+"""Numbers of a driven joint of a model of MuJoCo, the way back from `export --to mujoco`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calibration.data.input_errors import BadConfiguration, allowed_words
+from sweeps.commands.rig_joint import Found, JointNumbers, hanging, is_round
+from sweeps.commands.rig_template import Stated
+from sweeps.export import mujoco
+
+#: Largest vertical component of the axis of a wheel, and largest relative difference between radii of equal wheels.
+LEVEL, EQUAL = 0.1, 0.01
+
+
+def read(source: Path, joint: str | None) -> JointNumbers:
+    """Returns the numbers of a hinge, defaults resolved by MuJoCo's compiler.
+
+    With a `<dcmotor>` on the hinge, its winding and effects are those of the motor.
+
+    Args:
+        source: the model; joint: by name, None: the only driven one.
+
+    Raises:
+        BadConfiguration: a model that MuJoCo refuses, or a joint that it does not have or that is no hinge.
+    """
+    library = mujoco.library()
+    try:
+        model = library.MjModel.from_xml_path(str(source))
+    except ValueError as error:
+        raise BadConfiguration(f"{source}: MuJoCo does not read it ({' '.join(str(error).split())})") from error
+    return _Model(library, model, source.name).numbers(joint)
+
+
+class _Model:
+    def __init__(self, library: Any, model: Any, file: str) -> None:
+        self.library, self.model, self.file = library, model, file
+        self.data = library.MjData(model)
+        library.mj_forward(model, self.data)
+        self.joints = [self._name(library.mjtObj.mjOBJ_JOINT, k) for k in range(model.njnt)]
+        on_joint = [int(library.mjtTrn.mjTRN_JOINT), int(library.mjtTrn.mjTRN_JOINTINPARENT)]
+        self.is_motor = model.actuator_gaintype == int(library.mjtGain.mjGAIN_DCMOTOR)
+        #: Actuator of each driven joint, a `<dcmotor>` before others.
+        self.actuators = {
+            int(model.actuator_trnid[k, 0]): k
+            for k in sorted(range(model.nu), key=lambda k: (self.is_motor[k], -k))
+            if model.actuator_trntype[k] in on_joint
+        }
+
+    def _name(self, kind: Any, k: int) -> str:
+        return self.library.mj_id2name(self.model, kind, k) or ""
+
+    def _chosen(self, joint: str | None) -> int:
+        model, hinge = self.model, int(self.library.mjtJoint.mjJNT_HINGE)
+        hinges = [k for k in range(model.njnt) if model.jnt_type[k] == hinge and self.joints[k]]
+        driven = [k for k in hinges if k in self.actuators] or hinges
+        if joint is None:
+            if len(driven) != 1:
+                found = f"has {', '.join(self.joints[k] for k in driven)}" if driven else "has no named hinge"
+                raise BadConfiguration(f"--joint: missing, and {self.file} {found}; expected the name of one joint")
+            return driven[0]
+        known = [self.joints[k] for k in hinges]
+        if joint not in self.joints:
+            raise BadConfiguration(
+                f"--joint: got {joint}; {self.file} has no such joint; "
+                f"{allowed_words(joint, known) if known else 'the file has no named hinge'}"
+            )
+        if joint not in known:
+            raise BadConfiguration(f"--joint: got {joint}, which slides or is free; expected a hinge")
+        return self.joints.index(joint)
+
+    def numbers(self, name: str | None) -> JointNumbers:
+        joint = self._chosen(name)
+        model, library, named = self.model, self.library, f"joint {self.joints[joint]}"
+        dof = model.jnt_dofadr[joint]
+        armature = float(model.dof_armature[dof])
+        inertia, weight = self._load(joint, dof, armature)
+        if not inertia > 0:
+            raise BadConfiguration(f"{self.file}, {named}: nothing with mass turns with it; expected an inertia")
+        actuator = self.actuators.get(joint)
+        gear = 1.0 if actuator is None else abs(float(model.actuator_gear[actuator, 0]))
+        drive: dict[str, Stated] = {}
+        if actuator is not None and self.is_motor[actuator]:
+            drive = _dc_motor(model, actuator, dof, gear, self.file)
+        stated = lambda value, what: (float(value), f"{named}, {what}") if value else None  # noqa: E731
+        root = model.body_rootid[model.jnt_bodyid[joint]]
+        free = any(
+            model.jnt_type[k] == int(library.mjtJoint.mjJNT_FREE) and model.jnt_bodyid[k] == root
+            for k in range(model.njnt)
+        )
+        radius = self._radius(joint)
+        rolls = free and radius is not None and abs(float(self.data.xaxis[joint][2])) <= LEVEL
+        weight = None if rolls else weight
+        return JointNumbers(
+            self.file, self.joints[joint], rolls,
+            mass=(float(model.body_subtreemass[root]), "mass of its tree of bodies"),
+            sides=self._sides(joint, radius) if rolls else None, radius=radius,
+            inertia=(inertia, f"{named}, what turns with it, without armature"),
+            ratio=(gear, f"{named}, gear of its actuator") if gear > 1 or drive else None,
+            friction=stated(model.dof_frictionloss[dof], "frictionloss"),
+            damping=stated(np.ravel(model.dof_damping[dof])[0], "damping"),
+            armature=stated(armature, "armature"),
+            weight=None if weight is None else (weight[0], f"{named}, largest torque of its weight"),
+            angle=None if weight is None else (weight[1], f"{named}, where it hangs"),
+            drive=drive,
+        )  # fmt: skip
+
+    def _load(self, joint: int, dof: int, armature: float) -> tuple[float, tuple[float, float] | None]:
+        """Inertia of what turns and its weight as `hanging`, other joints at rest in the reference pose."""
+        model, data, place = self.model, self.data, self.model.jnt_qposadr[joint]
+        weights = []
+        for angle in (np.pi / 2, 0.0):
+            data.qpos[place] = model.qpos0[place] + angle
+            self.library.mj_forward(model, data)
+            weights.append(-float(data.qfrc_bias[dof]))
+        mass = np.zeros((model.nv, model.nv))
+        full = self.library.mj_fullM
+        full(model, mass, data.qM) if hasattr(data, "qM") else full(model, data, mass)
+        return float(mass[dof, dof]) - armature, hanging(weights[1], weights[0])
+
+    def _radius(self, joint: int) -> Found | None:
+        """Radius of the largest cylinder or sphere about the axis, of collisions if there are any."""
+        model, data, geom = self.model, self.data, self.library.mjtGeom
+        welded = model.body_weldid[model.jnt_bodyid[joint]]
+        found: list[tuple[bool, float, str]] = []
+        for k in range(model.ngeom):
+            kind = int(model.geom_type[k])
+            rigid = model.body_weldid[model.geom_bodyid[k]] == welded
+            if not rigid or kind not in (geom.mjGEOM_CYLINDER, geom.mjGEOM_SPHERE):
+                continue
+            along = data.geom_xmat[k].reshape(3, 3)[:, 2] if kind == geom.mjGEOM_CYLINDER else None
+            radius, centre = float(model.geom_size[k, 0]), data.geom_xpos[k] - data.xanchor[joint]
+            if is_round(centre, data.xaxis[joint], radius, along):
+                shape = "sphere" if along is None else "cylinder"
+                named = self._name(self.library.mjtObj.mjOBJ_GEOM, k)
+                collides = bool(model.geom_contype[k] or model.geom_conaffinity[k])
+                found.append((collides, radius, " ".join(filter(None, ("geom", named, f"({shape})")))))
+        return max(found)[1:] if found else None
+
+    def _sides(self, joint: int, radius: Found | None) -> Found | None:
+        """Number of wheels of the same radius and parallel axis that are as driven as this one."""
+        if radius is None:
+            return None
+        equal, driven = [], joint in self.actuators
+        for k, name in enumerate(self.joints):
+            if self.model.jnt_type[k] != self.model.jnt_type[joint] or (k in self.actuators) != driven:
+                continue
+            other, along = self._radius(k), abs(float(self.data.xaxis[k] @ self.data.xaxis[joint]))
+            if other is not None and abs(other[0] / radius[0] - 1) <= EQUAL and along > 1 - EQUAL:
+                equal.append(name or "one without a name")
+        return len(equal), f"equal wheels: {', '.join(equal)}"
+
+
+def _dc_motor(model: Any, actuator: int, dof: int, ratio: float, file: str) -> dict[str, Stated]:
+    """Numbers of a `<dcmotor>` by dotted name; losses of its bristles act at the joint."""
+    every = (model.actuator_gainprm, model.actuator_dynprm, model.actuator_biasprm)
+    gain, dynamic, bias = (x[actuator] for x in every)
+    resistance, constant = float(gain[0]), float(gain[1])
+    effects = _effects(dynamic, bias, ratio)
+    friction = float(model.dof_frictionloss[dof]) + (float(bias[3]) * ratio if float(dynamic[5]) > 0 else 0.0)
+    number = lambda value, unit, what, width="": Stated(float(value), unit, f"{file}, {what}", width)  # noqa: E731
+    found = {
+        "motor.resistance": number(resistance, "ohm", "<dcmotor> resistance", "10 %"),
+        "motor.torque_constant": number(constant, "N·m/A", "<dcmotor> motorconst", "10 %"),
+        "motor.inertia": number(float(model.dof_armature[dof]) / ratio**2, "kg·m^2", "armature / gear²", "50 %"),
+        "motor.friction_coulomb": number(0.0, "N·m", "all friction is at the joint"),
+        "motor.friction_viscous": number(0.0, "N·m·s", "all damping is at the joint"),
+        "gearbox.efficiency_load": number(1.0, "-", "no loss in proportion to the torque: state one if you know it"),
+        "load.loss_coulomb": number(friction, "N·m", "frictionloss and lugre of the joint", "100 %"),
+        "load.loss_viscous": number(np.ravel(model.dof_damping[dof])[0], "N·m·s", "damping of the joint", "100 %"),
+    }
+    inductance = float(dynamic[0]) * resistance
+    voltage = float(np.max(np.abs(model.actuator_ctrlrange[actuator])))
+    if inductance > 0:
+        found["motor.inductance"] = number(inductance, "H", "<dcmotor> inductance", "50 %")
+    if voltage > 0:
+        found["motor.voltage_limit"] = number(voltage, "V", "<dcmotor> ctrlrange")
+    if model.actuator_forcelimited[actuator]:
+        limit = float(np.max(np.abs(model.actuator_forcerange[actuator]))) / constant
+        found["driver.current_limit"] = number(limit, "A", "<dcmotor> forcerange / motorconst")
+    for name, fields in effects.items():
+        found |= {f"effects.{name}.{key}": number(value, "SI", "<dcmotor>") for key, value in fields.items()}
+    return found
+
+
+def _effects(dynamic: Sequence[float], bias: Sequence[float], ratio: float) -> dict[str, dict[str, float]]:
+    """Effects of a `<dcmotor>`: name → fields."""
+    found: dict[str, dict[str, float]] = {}
+    resistance_thermal, capacity, stiffness = (float(dynamic[k]) for k in (2, 3, 5))
+    amplitude, ripples, phase, coulomb, static, fade = (float(x) for x in bias[:6])
+    if resistance_thermal > 0:
+        found["thermal_drift"] = {
+            "amplitude": 1.0, "resistance_thermal": resistance_thermal,
+            "time_constant": resistance_thermal * capacity,
+        }  # fmt: skip
+    if amplitude:
+        found["cogging"] = {"amplitude": -amplitude, "ripples": ripples, "phase": phase}
+    if stiffness > 0:  # of the motor's shaft, here at the joint
+        found["presliding"] = {"amplitude": coulomb * ratio, "angle_breakaway": static / stiffness / ratio}
+        if static > coulomb:
+            excess = (static - coulomb) * ratio
+            found["stribeck_exponent"] = {"amplitude": excess, "speed_fade": fade / ratio, "exponent": 2.0}
+    return found

@@ -1,0 +1,164 @@
+"""Constants of a motor from the six usual numbers of its data sheet."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+from collections.abc import Mapping
+
+from calibration.data.input_errors import BadConfiguration, parsed, rounded
+from sweeps.commands.rig_template import Stated
+
+_GRAVITY, _POUND_FORCE, _INCH = 9.80665, 4.4482216, 0.0254
+#: Units of torque: as read, without dots and capitals, and in N·m.
+TORQUES = {
+    "Nm": 1.0, "mNm": 1e-3, "Ncm": 1e-2, "kg·cm": 1e-2 * _GRAVITY, "kgf·cm": 1e-2 * _GRAVITY,
+    "g·cm": 1e-5 * _GRAVITY, "gf·cm": 1e-5 * _GRAVITY, "oz·in": _POUND_FORCE / 16 * _INCH,
+    "ozf·in": _POUND_FORCE / 16 * _INCH, "lb·in": _POUND_FORCE * _INCH, "lbf·in": _POUND_FORCE * _INCH,
+}  # fmt: skip
+_CURRENTS = {"A": 1.0, "mA": 1e-3}
+#: Numbers of a sheet, as options are called: units in SI.
+NUMBERS: dict[str, dict[str, float]] = {
+    "voltage": {"V": 1.0, "mV": 1e-3},
+    "no-load-speed": {"rpm": math.pi / 30, "1/min": math.pi / 30, "rad/s": 1.0},
+    "no-load-current": _CURRENTS,
+    "stall-torque": TORQUES,
+    "stall-current": _CURRENTS,
+    "resistance": {"ohm": 1.0, "Ω": 1.0, "mohm": 1e-3, "mΩ": 1e-3},
+}
+#: Largest relative difference between two numbers of a sheet that should be equal.
+LARGEST = 0.1
+#: Least widths of resistance and torque constant; makers print three digits and allow 5 to 10 % between motors [%].
+WIDTH_RESISTANCE, WIDTH_CONSTANT = 5.0, 3.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Sheet:
+    """Numbers of a sheet [SI], None where it has none."""
+
+    voltage: float | None
+    speed: float | None
+    idle: float | None
+    torque: float | None
+    stall: float | None
+    resistance: float | None
+
+
+def _units(text: str) -> str:
+    return re.sub(r"[\s·.*-]", "", text).casefold()
+
+
+def _number(name: str, text: str) -> float:
+    units = NUMBERS[name]
+    expected = f"expected a number more than 0 with its unit: {', '.join(units)}"
+    split = re.fullmatch(r"\s*([-+\d.][\d.]*(?:[eE][-+]?\d+)?)\s*(.*?)\s*", text)
+    factor = None if split is None else {_units(u): f for u, f in units.items()}.get(_units(split[2]))
+    try:
+        value = parsed(split[1]) if split is not None and factor is not None else math.nan
+    except ValueError:
+        value = math.nan
+    if not (0 < value < math.inf) or factor is None:
+        raise BadConfiguration(f"--{name}: got {text}; {expected}")
+    return value * factor
+
+
+def read(stated: Mapping[str, str]) -> dict[str, Stated]:
+    """Returns resistance, torque constant and friction of a motor as lines of a rig's file.
+
+    U = R I_s at stall; U = R I_0 + k ω_0 and friction k I_0 at no load; M_s = k (I_s - I_0) at the stalled shaft.
+
+    Args:
+        stated: text with unit of each of `NUMBERS`.
+
+    Raises:
+        BadConfiguration: text without number or unit, too few numbers, or numbers that differ by more than
+            `LARGEST` where these equations make them equal.
+    """
+    if not stated:
+        others = ", ".join(f"--{name}" for name in NUMBERS if name != "no-load-current")
+        raise BadConfiguration(f"--from-sheet: no numbers; expected --no-load-current and three or more of {others}")
+    numbers = {name: _number(name, text) for name, text in stated.items()}
+    sheet = Sheet(*(numbers.get(name) for name in NUMBERS))
+    drop = _current(sheet)
+    voltage, idle = sheet.voltage, sheet.idle
+    assert idle is not None
+    resistances = [(sheet.resistance, "resistance"), (_ratio(voltage, sheet.stall), "voltage / stall current")]
+    if sheet.resistance is None and sheet.stall is None:
+        resistances.append((_ratio(voltage, idle + drop), "voltage and power at no load"))
+    if voltage is None and sheet.resistance is None and sheet.speed is not None and sheet.torque is not None:
+        resistances.append((sheet.torque * sheet.speed / drop**2, "stall torque, no-load speed and stall current"))
+    given = [(value, source) for value, source in resistances if value is not None]
+    resistance = given[0][0]
+    back = resistance * drop if voltage is None else voltage - resistance * idle
+    constants = [
+        (_ratio(back, sheet.speed), "voltage / no-load speed"),
+        (_ratio(sheet.torque, drop), "stall torque / stall current"),
+    ]
+    known = [(value, source) for value, source in constants if value is not None]
+    _refuse_contradictions((given, "resistance", "ohm"), (known, "torque constant", "N·m/A"))
+    constant = known[0][0]
+
+    def line(value: float, unit: str, source: str, width: float) -> Stated:
+        return Stated(float(f"{value:.4g}"), unit, f"data sheet, {source}", f"{width:.2g} %")
+
+    spread = [100 * _difference(pairs) for pairs in (given, known)]
+    return {
+        "motor.resistance": line(resistance, "ohm", given[0][1], max(WIDTH_RESISTANCE, spread[0])),
+        "motor.torque_constant": line(constant, "N·m/A", known[0][1], max(WIDTH_CONSTANT, spread[1])),
+        "motor.friction_coulomb": line(constant * idle, "N·m", "torque constant × no-load current", 30.0),
+        "motor.friction_viscous": Stated(0.0, "N·m·s", "one no-load current cannot split it from friction_coulomb"),
+    }
+
+
+def _ratio(one: float | None, other: float | None) -> float | None:
+    return None if one is None or other is None else one / other
+
+
+def _current(sheet: Sheet) -> float:
+    """Stall current less no-load current [A].
+
+    Raises:
+        BadConfiguration: numbers that do not determine it, or a no-load current that is not the smaller one.
+    """
+    if sheet.idle is None:
+        raise BadConfiguration("--no-load-current: missing; the friction of the motor follows from it alone")
+    missing = [name for name, value in zip(NUMBERS, dataclasses.astuple(sheet), strict=True) if value is None]
+    if sheet.speed is None and sheet.torque is None:
+        raise BadConfiguration("--no-load-speed and --stall-torque: both missing; the torque constant needs one")
+    totals = [x for x in (sheet.stall, _ratio(sheet.voltage, sheet.resistance)) if x is not None]
+    if totals and min(totals) <= sheet.idle:
+        raise BadConfiguration(f"--no-load-current: got {rounded(sheet.idle)} A, and the stall current is "
+                               f"{rounded(min(totals))} A; expected less")  # fmt: skip
+    total = totals[0] if totals else None
+    if total is not None and (sheet.resistance is not None or sheet.voltage is not None):
+        return total - sheet.idle
+    if sheet.speed is not None and sheet.torque is not None:
+        power = sheet.torque * sheet.speed
+        if total is not None:
+            return total - sheet.idle
+        if sheet.resistance is not None:
+            return math.sqrt(power / sheet.resistance)
+        if sheet.voltage is not None:  # U D² = M_s ω_0 (D + I_0)
+            return (power + math.sqrt(power**2 + 4 * sheet.voltage * power * sheet.idle)) / (2 * sheet.voltage)
+    lacking = ", ".join(f"--{name}" for name in missing)
+    raise BadConfiguration(
+        f"--from-sheet: missing {lacking}; the others do not determine resistance and torque constant; state one more"
+    )
+
+
+def _difference(pairs: list[tuple[float, str]]) -> float:
+    values = [value for value, _ in pairs]
+    return max(values) / min(values) - 1
+
+
+def _refuse_contradictions(*groups: tuple[list[tuple[float, str]], str, str]) -> None:
+    found = [
+        f"{name} is {' and '.join(f'{rounded(value)} {unit} ({source})' for value, source in pairs)}, "
+        f"{100 * _difference(pairs):.0f} % apart"
+        for pairs, name, unit in groups
+        if _difference(pairs) > LARGEST
+    ]
+    if found:
+        raise BadConfiguration(f"--from-sheet: contradiction: {'; '.join(found)}; expected {100 * LARGEST:.0f} % at "
+                               "most; all numbers must be of the motor's own shaft at one voltage")  # fmt: skip

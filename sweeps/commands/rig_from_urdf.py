@@ -1,0 +1,332 @@
+"""Numbers of a driven joint of a robot in URDF."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from calibration.data.input_errors import BadConfiguration, allowed_words
+from mmrjax.model.signals import GRAVITY
+from sweeps.commands.rig_joint import Found, JointNumbers, hanging, is_round
+
+#: Types of a joint that turns.
+TURNS = ("revolute", "continuous")
+#: Name of a root link that stands still.
+FIXED_ROOT = "world"
+#: Largest vertical component of the axis of a wheel.
+LEVEL = 0.1
+#: Spellings of the reduction of a transmission, of ROS 1 and ROS 2.
+REDUCTIONS = ("mechanicalReduction", "mechanical_reduction")
+#: Least inertia of what turns [kg·m²]; less is rounding of a rotation.
+LEAST_INERTIA = 1e-12
+#: Largest relative difference between radii of equal wheels.
+EQUAL = 0.01
+
+#: A rotation, shape (3, 3), and a position [m], shape (3,).
+Pose = tuple[np.ndarray, np.ndarray]
+
+
+def read(root: Element, file: str, joint: str | None) -> JointNumbers:
+    """Returns the numbers of a joint of a robot.
+
+    Args:
+        root: element `<robot>`; file: its name; joint: by name, None: the only driven one.
+
+    Raises:
+        BadConfiguration: an unknown joint, a joint that does not turn, a loop of links, a number that is wrong or
+            negative, or no inertia.
+    """
+    robot = _Urdf(root, file)
+    return robot.numbers(robot.chosen(joint))
+
+
+class _Urdf:
+    def __init__(self, root: Element, file: str) -> None:
+        self.root, self.file = root, file
+        if any("xacro}" in element.tag for element in root.iter()):
+            raise BadConfiguration(f"{file}: has elements of xacro; run xacro {file} > robot.urdf, and state that")
+        self.links, self.joints = self._named("link"), self._named("joint")
+        for name, element in self.joints.items():
+            for end in ("parent", "child"):
+                self._link(element, end, name)
+        self.above = {self._link(j, "child", name): name for name, j in self.joints.items()}
+        self.below: dict[str, list[str]] = {link: [] for link in self.links}
+        for name, j in self.joints.items():
+            self.below[self._link(j, "parent", name)].append(name)
+
+    def _named(self, tag: str) -> dict[str, Element]:
+        found: dict[str, Element] = {}
+        for element in self.root.findall(tag):
+            name = element.get("name", "")
+            if not name or name in found:
+                what = f"two are called {name}" if name else "one has no name"
+                raise BadConfiguration(f"{self.file}, <{tag}>: {what}; expected different names")
+            found[name] = element
+        if not found:
+            raise BadConfiguration(f"{self.file}: has no <{tag}>; expected a robot with links and joints")
+        return found
+
+    def _link(self, joint: Element, end: str, name: str) -> str:
+        element = joint.find(end)
+        link = "" if element is None else element.get("link", "")
+        if link not in self.links:
+            raise BadConfiguration(f"{self.file}, joint {name}, <{end}>: got {link or 'no link'}; "
+                                   f"{allowed_words(link, self.links)}")  # fmt: skip
+        return link
+
+    def chosen(self, joint: str | None) -> str:
+        """Name of a joint that turns.
+
+        Raises:
+            BadConfiguration: an unknown joint, or one that is fixed or slides.
+        """
+        turning = [name for name, element in self.joints.items() if element.get("type") in TURNS]
+        candidates = [name for name in turning if self._driven(name)] or turning
+        if joint is None:
+            if len(candidates) != 1:
+                found = f"has {', '.join(candidates)}" if candidates else "has no joint that turns"
+                raise BadConfiguration(f"--joint: missing, and {self.file} {found}; expected the name of one joint")
+            return candidates[0]
+        if joint not in self.joints:
+            raise BadConfiguration(
+                f"--joint: got {joint}; {self.file} has no such joint; {allowed_words(joint, turning)}"
+            )
+        if joint not in turning:
+            kind = self.joints[joint].get("type") or "without a type"
+            slides = "; for a carriage: mmrjax rig new --kind linear" if kind == "prismatic" else ""
+            raise BadConfiguration(f"--joint: got {joint}, which is {kind}; expected one that turns: "
+                                   f"{', '.join(candidates) or 'the file has none'}{slides}")  # fmt: skip
+        return joint
+
+    def numbers(self, joint: str) -> JointNumbers:
+        element, link = self.joints[joint], self._link(self.joints[joint], "child", joint)
+        axis = self._axis(joint)
+        to_root, root_link = self._to_root(joint)
+        moved = list(self._moved(link))
+        inertia, moment, count = 0.0, np.zeros(3), 0
+        for name, pose in moved:
+            mass, about, first = self._inertial(name, pose, axis)
+            inertia, moment, count = inertia + about, moment + first, count + (mass > 0)
+        named = f"link {link}" if len(moved) == 1 else f"link {link} and {len(moved) - 1} that it carries"
+        if count == 0:
+            raise BadConfiguration(f"{self.file}, {named}: no <inertial>; expected its <mass> and <inertia>")
+        if inertia < LEAST_INERTIA:
+            got = f"{round(inertia, 12):g} kg·m² about the axis of {joint}"
+            raise BadConfiguration(f"{self.file}, {named}, <inertia>: got {got}; expected more than 0")
+        radius = self._radius(joint)
+        level = abs(float((to_root[0] @ axis)[2])) <= LEVEL
+        rolls = radius is not None and level and root_link != FIXED_ROOT and element.get("type") == "continuous"
+        weight = None if rolls else _weight(to_root[0].T @ [0.0, 0.0, -GRAVITY], axis, moment)
+        return JointNumbers(
+            self.file, joint, rolls,
+            mass=self._mass(), sides=self._sides(joint, radius) if rolls else None, radius=radius,
+            inertia=(inertia, f"{named}, <inertia> about the axis"), ratio=self._ratio(joint),
+            friction=self._dynamics(element, "friction"), damping=self._dynamics(element, "damping"),
+            armature=self._armature(joint),
+            weight=None if weight is None else (weight[0], f"{named}, <mass> and its lever"),
+            angle=None if weight is None else (weight[1], f"{named}, where it hangs"),
+        )  # fmt: skip
+
+    # --- frames
+
+    def _axis(self, joint: str) -> np.ndarray:
+        element = self.joints[joint].find("axis")
+        axis = self._vector(element, "xyz", f"joint {joint}, <axis>", (1.0, 0.0, 0.0))
+        length = float(np.linalg.norm(axis))
+        if length == 0:
+            raise BadConfiguration(f"{self.file}, joint {joint}, <axis>: got 0 0 0; expected a direction")
+        return axis / length
+
+    def _origin(self, owner: Element, where: str) -> Pose:
+        element = owner.find("origin")
+        roll, pitch, yaw = self._vector(element, "rpy", f"{where}, <origin>", (0.0, 0.0, 0.0))
+        turned = _about(2, yaw) @ _about(1, pitch) @ _about(0, roll)
+        return turned, self._vector(element, "xyz", f"{where}, <origin>", (0.0, 0.0, 0.0))
+
+    def _moved(self, link: str, rigid: bool = False) -> Iterator[tuple[str, Pose]]:
+        """Links that turn with a link, or are fixed to it, and their poses in its frame, other joints at zero."""
+        left: list[tuple[str, Pose]] = [(link, (np.eye(3), np.zeros(3)))]
+        met: set[str] = set()
+        while left:
+            name, pose = left.pop()
+            self._once(name, met)
+            yield name, pose
+            left += [
+                (self._link(self.joints[j], "child", j), _then(pose, self._origin(self.joints[j], f"joint {j}")))
+                for j in self.below[name]
+                if not rigid or self.joints[j].get("type") == "fixed"
+            ]
+
+    def _once(self, link: str, met: set[str]) -> None:
+        if link in met:
+            raise BadConfiguration(f"{self.file}: link {link} is part of a loop; expected a tree")
+        met.add(link)
+
+    def _to_root(self, joint: str) -> tuple[Pose, str]:
+        """Pose of a joint in the frame of the root link, and the name of that."""
+        pose: Pose = (np.eye(3), np.zeros(3))
+        at: str | None = joint
+        link, met = "", set[str]()
+        while at is not None:
+            pose = _then(self._origin(self.joints[at], f"joint {at}"), pose)
+            link = self._link(self.joints[at], "parent", at)
+            self._once(link, met)
+            at = self.above.get(link)
+        return pose, link
+
+    # --- numbers
+
+    def _mass(self) -> Found | None:
+        masses = [self._link_mass(name) for name in self.links]
+        stated = [m for m in masses if m]
+        lacking = f", {len(masses) - len(stated)} more state none" if len(stated) < len(masses) else ""
+        return (math.fsum(stated), f"sum of <mass> of {len(stated)} links{lacking}") if stated else None
+
+    def _link_mass(self, link: str) -> float:
+        element = self.links[link].find("inertial/mass")
+        return self._number(element, "value", f"link {link}, <mass>", "kg", 0.0)
+
+    def _inertial(self, link: str, pose: Pose, axis: np.ndarray) -> tuple[float, float, np.ndarray]:
+        """Mass, inertia about the axis, and first moment of a link; it adds none without `<inertial>`."""
+        inertial = self.links[link].find("inertial")
+        if inertial is None:
+            return 0.0, 0.0, np.zeros(3)
+        mass = self._link_mass(link)
+        turned, centre = _then(pose, self._origin(inertial, f"link {link}"))
+        entries = inertial.find("inertia")
+        where = f"link {link}, <inertia>"
+        xx, yy, zz = (self._number(entries, f"i{a}{a}", where, "kg·m²", 0.0) for a in "xyz")
+        xy, xz, yz = (self._number(entries, f"i{a}", where, "kg·m²", None) for a in ("xy", "xz", "yz"))
+        tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        own = turned.T @ axis
+        lever = np.cross(axis, centre)
+        return mass, float(own @ tensor @ own + mass * lever @ lever), mass * centre
+
+    def _radius(self, joint: str) -> Found | None:
+        """Radius of the largest cylinder or sphere about the axis: of collisions, else of what is shown."""
+        axis = self._axis(joint)
+        link = self._link(self.joints[joint], "child", joint)
+        for tag in ("collision", "visual"):
+            found: list[Found] = []
+            for name, pose in self._moved(link, rigid=True):
+                for shape in self.links[name].findall(tag):
+                    turned, centre = _then(pose, self._origin(shape, f"link {name}, <{tag}>"))
+                    for kind, along in (("cylinder", turned[:, 2]), ("sphere", None)):
+                        where = f"link {name}, <{tag}> <{kind}>"
+                        element = shape.find(f"geometry/{kind}")
+                        radius = self._number(element, "radius", where, "m", 0.0)
+                        if radius > 0 and is_round(centre, axis, radius, along):
+                            found.append((radius, where))
+            if found:
+                return max(found)
+        return None
+
+    def _sides(self, joint: str, radius: Found | None) -> Found | None:
+        """Number of wheels of the same radius and parallel axis that are as driven as this one."""
+        axis = self._to_root(joint)[0][0] @ self._axis(joint)
+        equal = []
+        for name, element in self.joints.items():
+            if element.get("type") not in TURNS or self._driven(name) != self._driven(joint) or radius is None:
+                continue
+            other, other_axis = self._radius(name), self._to_root(name)[0][0] @ self._axis(name)
+            if other is not None and abs(other[0] / radius[0] - 1) <= EQUAL and abs(axis @ other_axis) > 1 - EQUAL:
+                equal.append(name)
+        return len(equal), f"equal wheels: {', '.join(equal)}"
+
+    def _transmissions(self, joint: str) -> Iterator[Element]:
+        for element in self.root.iter("transmission"):
+            if joint in [j.get("name") for j in element.findall("joint")]:
+                yield element
+
+    def _driven(self, joint: str) -> bool:
+        commanded = any(
+            each.get("name") == joint and each.find("command_interface") is not None
+            for each in self.root.iterfind("ros2_control/joint")
+        )
+        return commanded or any(True for _ in self._transmissions(joint))
+
+    def _ratio(self, joint: str) -> Found | None:
+        """Product of the reductions on the way from the motor to the joint."""
+        for element in self._transmissions(joint):
+            shared = len(element.findall("joint")) > 1  # then actuators belong to no single joint
+            of_joint = [j for j in element.findall("joint") if j.get("name") == joint]
+            owners = of_joint if shared else [element, *of_joint, *element.findall("actuator")]
+            texts = [(owner.findtext(tag), tag) for owner in owners for tag in REDUCTIONS]
+            stated = [(text, tag) for text, tag in texts if text is not None]
+            if not stated:
+                continue
+            name = f"transmission {element.get('name', '')}, <{stated[0][1]}>".replace(" ,", ",")
+            ratio = math.prod(abs(self._parsed(text, name, "")) for text, _ in stated)
+            if not ratio >= 1:
+                raise BadConfiguration(f"{self.file}, {name}: got {ratio:g}; expected turns of the motor for one of "
+                                       "the joint, 1 or more")  # fmt: skip
+            return ratio, name + (": 1 is often a placeholder" if ratio == 1 else "")
+        return None
+
+    def _dynamics(self, joint: Element, key: str) -> Found | None:
+        unit = {"friction": "N·m"}.get(key, "N·m·s")
+        where = f"joint {joint.get('name')}, <dynamics {key}>"
+        value = self._number(joint.find("dynamics"), key, where, unit, 0.0)
+        return (value, where) if value else None
+
+    def _armature(self, joint: str) -> Found | None:
+        """Inertia of the rotor at the joint: an attribute `armature` of its dynamics."""
+        where = f"joint {joint}, <dynamics armature>"
+        value = self._number(self.joints[joint].find("dynamics"), "armature", where, "kg·m²", 0.0)
+        return (value, where) if value else None
+
+    # --- cells
+
+    def _number(self, element: Element | None, key: str, where: str, unit: str, least: float | None) -> float:
+        text = None if element is None else element.get(key)
+        if text is None:
+            return 0.0
+        value = self._parsed(text, f"{where} {key}" if key not in where else where, unit)
+        if least is not None and value < least:
+            raise BadConfiguration(f"{self.file}, {where}: got {key} {value:g}; expected {least:g} {unit} or more")
+        return value
+
+    def _vector(self, element: Element | None, key: str, where: str, usual: Sequence[float]) -> np.ndarray:
+        text = None if element is None else element.get(key)
+        if text is None:
+            return np.array(usual)
+        values = [self._parsed(word, f"{where} {key}", "") for word in text.split()]
+        if len(values) != len(usual):
+            raise BadConfiguration(f"{self.file}, {where} {key}: got {text!r}; expected {len(usual)} numbers")
+        return np.array(values)
+
+    def _parsed(self, text: str | None, where: str, unit: str) -> float:
+        try:
+            value = float(text or "")
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            xacro = "; run xacro on it first" if text and "${" in text else ""
+            expected = f"a number [{unit}]" if unit else "a number"
+            raise BadConfiguration(f"{self.file}, {where}: got {text!r}; expected {expected}{xacro}")
+        return value
+
+
+def _about(axis: int, angle: float) -> np.ndarray:
+    """Rotation about a coordinate axis, shape (3, 3)."""
+    one, other = (axis + 1) % 3, (axis + 2) % 3
+    turned = np.eye(3)
+    turned[one, one] = turned[other, other] = math.cos(angle)
+    turned[other, one] = math.sin(angle)
+    turned[one, other] = -math.sin(angle)
+    return turned
+
+
+def _then(outer: Pose, inner: Pose) -> Pose:
+    """A pose in the frame of another one."""
+    return outer[0] @ inner[0], outer[1] + outer[0] @ inner[1]
+
+
+def _weight(gravity: np.ndarray, axis: np.ndarray, moment: np.ndarray) -> tuple[float, float] | None:
+    """As `hanging`, of a first moment [kg·m] under gravity [m/s²], both in the frame of the joint."""
+    across = np.cross(axis, moment)
+    flat = np.cross(across, axis)  # the moment without its part along the axis
+    return hanging(float(axis @ np.cross(flat, gravity)), float(axis @ np.cross(across, gravity)))

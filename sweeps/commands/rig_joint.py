@@ -1,0 +1,124 @@
+"""Numbers at one driven joint of a model, and the lines of a rig's file that follow from them."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from calibration.data.input_errors import BadConfiguration, allowed_words
+from sweeps.commands.rig_template import Stated
+
+#: A number and the element of the model that states it.
+Found = tuple[float, str]
+
+#: Kinds of rig on the ground, and kinds that a joint which turns can be.
+VEHICLES = ("wheeled", "tracked")
+TURNING = (*VEHICLES, "bench", "dyno", "pendulum", "servo")
+#: Least torque of gravity that counts as an arm [N·m].
+LEAST_WEIGHT = 1e-9
+#: Largest distance of a wheel's centre from its axis, as a share of its radius; largest sine between their axes.
+OFF_AXIS = 0.02
+#: Width of each number: models round masses and guess losses.
+WIDTHS = {
+    "mass": "20 %", "radius": "5 %", "inertia": "50 %", "ratio": "5 %", "armature": "50 %", "friction": "100 %",
+    "damping": "100 %", "weight": "20 %", "angle": "0.1",
+}  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class JointNumbers:
+    """Numbers of a joint and of what it moves [SI]; None where the model has none.
+
+    Attributes:
+        file, joint: names; rolls: True if the joint turns a wheel of a body that is free to move.
+        mass: of the whole model; sides: joints that are equal, as a wheel on the other side.
+        inertia: of what turns with the joint, about its axis, without `armature`; radius: of the wheel.
+        ratio: turns of the motor for one of the joint.
+        friction, damping, armature: at the joint.
+        weight: largest torque of gravity; angle: of the load at rest under gravity.
+        drive: numbers of the motor by dotted name; they replace what follows from the others.
+    """
+
+    file: str
+    joint: str
+    rolls: bool
+    mass: Found | None
+    inertia: Found
+    sides: Found | None = None
+    radius: Found | None = None
+    ratio: Found | None = None
+    friction: Found | None = None
+    damping: Found | None = None
+    armature: Found | None = None
+    weight: Found | None = None
+    angle: Found | None = None
+    drive: Mapping[str, Stated] = dataclasses.field(default_factory=dict)
+
+    def kind(self, stated: str | None) -> str:
+        """The kind of rig: `stated`, or else what the joint moves.
+
+        Raises:
+            BadConfiguration: a kind whose load slides.
+        """
+        if stated is None:
+            return "wheeled" if self.rolls else "bench" if self.weight is None else "pendulum"
+        if stated not in TURNING:
+            raise BadConfiguration(f"--kind: got {stated} with --from, which reads a joint that turns; "
+                                   f"{allowed_words(stated, TURNING)}")  # fmt: skip
+        return stated
+
+    def numbers(self, kind: str) -> dict[str, Stated]:
+        """Lines of a rig's file of a kind, by dotted name."""
+        found: dict[str, Stated] = {}
+
+        def put(name: str, unit: str, key: str, number: Found | None, source: str = "") -> None:
+            if number is not None:
+                found[name] = Stated(number[0], unit, f"{self.file}, {number[1]}{source}", WIDTHS.get(key, ""))
+
+        moving = kind in VEHICLES
+        losses = "load.track" if moving else "load"
+        if moving:
+            put("load.mass", "kg", "mass", self.mass)
+            put("load.radius", "m", "radius", self.radius)
+        else:
+            put("load.torque_gravity", "N·m", "weight", self.weight)
+            put("load.angle_zero", "rad", "angle", self.angle)
+        if self.sides is not None:
+            found["sides"] = Stated(int(self.sides[0]), "-", f"{self.file}, {self.sides[1]}")
+        put(f"{losses}.loss_coulomb", "N·m", "friction", self.friction)
+        put(f"{losses}.loss_viscous", "N·m·s", "damping", self.damping)
+        put("gearbox.ratio", "-", "ratio", self.ratio)
+        inertia = self.inertia
+        if self.armature is not None and self.ratio is not None:
+            rotor = (self.armature[0] / self.ratio[0] ** 2, self.armature[1])
+            put("motor.inertia", "kg·m^2", "armature", rotor, " / ratio²")
+        elif self.armature is not None:
+            inertia = (inertia[0] + self.armature[0], f"{inertia[1]}, and armature")
+            found["motor.inertia"] = Stated(0.0, "kg·m^2", "no ratio found, so the load's inertia contains it")
+        put("load.inertia", "kg·m^2", "inertia", inertia)
+        return found | dict(self.drive)
+
+
+def hanging(torque: float, torque_quarter: float) -> tuple[float, float] | None:
+    """Largest torque of gravity M and angle θ_0 where it hangs, of -M sin(θ - θ_0) [N·m], [rad]; None: no weight.
+
+    Args:
+        torque, torque_quarter: of gravity about the axis at θ = 0 and at a quarter turn [N·m].
+    """
+    weight = math.hypot(torque, torque_quarter)
+    return (weight, math.atan2(torque, -torque_quarter)) if weight > LEAST_WEIGHT else None
+
+
+def is_round(centre: np.ndarray, axis: np.ndarray, radius: float, along: np.ndarray | None) -> bool:
+    """True if a cylinder or sphere turns about its own axis.
+
+    Args:
+        centre: from a point of the joint's axis; axis: of the joint; along: of the cylinder, None: a sphere. Axes are
+            unit vectors, shape (3,).
+    """
+    off = np.linalg.norm(np.cross(axis, centre))
+    tilted = 0.0 if along is None else np.linalg.norm(np.cross(axis, along))
+    return bool(off <= OFF_AXIS * radius and tilted <= OFF_AXIS)

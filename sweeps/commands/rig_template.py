@@ -1,0 +1,98 @@
+"""Templates of rig files, and their lines filled in with numbers of a model or data sheet."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Mapping
+from importlib import resources
+
+#: Kinds of rig, in words.
+KINDS = {
+    "bench": "a motor with its gearbox that turns a shaft: brake, disk, worm, winch",
+    "dyno": "a motor against a brake whose torque is set and read",
+    "pendulum": "a servo with an arm that gravity pulls",
+    "servo": "a servo driven by PWM, whose angle is logged",
+    "linear": "a carriage on a screw, a belt or a rope",
+    "carriage": "the same on an amplifier that controls the current, with its position logged",
+    "wheeled": "a robot on wheels",
+    "tracked": "a robot on tracks",
+}
+#: Comment of a line whose number is an example's.
+EXAMPLE = "example: yours"
+#: Name of the load's table in the names of numbers; the template's own name replaces it.
+LOAD = "load"
+
+_HEADER = re.compile(r"(?:# )?\[([\w.]+)\]$")
+
+
+@dataclasses.dataclass(frozen=True)
+class Stated:
+    """A number for a line of a rig's file.
+
+    Attributes: value: in `unit`; source: file and element; width: text after ±, empty: none.
+    """
+
+    value: float
+    unit: str
+    source: str
+    width: str = ""
+
+    @property
+    def text(self) -> str:
+        """The number as the file has it; 0 has no share of itself as its width."""
+        number = repr(self.value if isinstance(self.value, int) else float(f"{self.value:.12g}"))
+        exact = not self.width or (self.value == 0 and self.width.endswith("%"))
+        return number if exact else f'"{number} ± {self.width}"'
+
+
+def template(kind: str) -> str:
+    """The file of a kind, to fill in."""
+    return resources.files("sweeps").joinpath("rigs", f"{kind}.toml").read_text(encoding="utf-8")
+
+
+def filled(kind: str, numbers: Mapping[str, Stated], heading: str) -> str:
+    """Returns the file of a kind with numbers in their lines.
+
+    A number whose line the template lacks is added at the end of its table.
+
+    Args:
+        numbers: by dotted name, `load.` for the table of the load; heading: sentence for the first line.
+    """
+    lines = template(kind).splitlines()
+    at = next(k for k, line in enumerate(lines) if line.startswith("load = "))
+    load = lines[at - 1].strip("[]")
+    for name, number in numbers.items():
+        table, _, key = re.sub(rf"^{LOAD}\.", f"{load}.", name).rpartition(".")
+        _put(lines, table, key, f"{key} = {number.text}  # [{number.unit}] {_one_line(number.source)}")
+    return "\n".join([f"# {_one_line(heading)}", *lines]) + "\n"
+
+
+def _one_line(text: str) -> str:
+    """Text for a comment: names of a model may have line breaks, which would end it."""
+    return "".join(letter if letter.isprintable() else " " for letter in text)
+
+
+def _put(lines: list[str], table: str, key: str, line: str) -> None:
+    if table and f"[{table}]" not in lines:
+        lines += ["", f"[{table}]"]
+    start = lines.index(f"[{table}]") + 1 if table else 0
+    end = next((k for k in range(start, len(lines)) if _HEADER.match(lines[k])), len(lines))
+    known = [k for k in range(start, end) if re.match(rf"(# )?{key} = ", lines[k])]
+    if known:
+        lines[known[0]] = line
+        return
+    while end > start and (not lines[end - 1] or lines[end - 1].startswith("#")):
+        end -= 1  # comments below belong to the next table
+    lines.insert(end, line)
+
+
+def examples(text: str) -> tuple[str, ...]:
+    """Returns names and units of the numbers that are still those of an example, as `motor.resistance [ohm]`."""
+    found, table = [], ""
+    for line in text.splitlines():
+        if not line.startswith("#") and (header := _HEADER.match(line)):
+            table = f"{header[1]}."
+        if EXAMPLE in line and (key := re.match(r"(\w+) = .*?# (\[[^\]]*\])?", line)):
+            found.append(f"{table}{key[1]} {key[2] or ''}".rstrip())
+    return tuple(found)

@@ -1,0 +1,93 @@
+"""Motors from the six numbers of a data sheet: constants, contradictions, and what is refused."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+
+import pytest
+
+from calibration.data import robot_file
+from calibration.data.input_errors import BadConfiguration
+from sweeps.commands import rig_from_sheet
+
+#: maxon RE30 310007, as printed.
+RE30 = {
+    "voltage": "24 V", "no-load-speed": "8810 rpm", "no-load-current": "164 mA", "stall-torque": "1020 mNm",
+    "stall-current": "39.3 A", "resistance": "0.611 Ω",
+}  # fmt: skip
+#: A motor of 2 Ω, 0.05 N·m/A and 0.6 A at no load, to the last digit.
+EXACT = {
+    "voltage": "12V", "no-load-speed": "216 rad/s", "no-load-current": "600mA", "stall-torque": "27 Ncm",
+    "stall-current": "6A", "resistance": "2ohm",
+}  # fmt: skip
+SUBSETS = [n for size in (4, 5, 6) for n in itertools.combinations(EXACT, size) if "no-load-current" in n]
+SILENT = ("voltage", "no-load-current", "stall-current", "resistance")
+
+
+@pytest.mark.parametrize("names", [n for n in SUBSETS if n != SILENT], ids="+".join)
+def test_each_sheet_that_determines_the_motor_gives_its_constants(names):
+    found = rig_from_sheet.read({name: EXACT[name] for name in names})
+    values = {name.removeprefix("motor."): number.value for name, number in found.items()}
+    assert values == {
+        "resistance": pytest.approx(2), "torque_constant": pytest.approx(0.05),
+        "friction_coulomb": pytest.approx(0.03), "friction_viscous": 0,
+    }  # fmt: skip
+
+
+def test_printed_sheet_gives_the_makers_torque_constant():
+    found = rig_from_sheet.read(RE30)
+    assert found["motor.torque_constant"].value == pytest.approx(25.9e-3, rel=1e-3)
+    assert found["motor.torque_constant"].source == "data sheet, voltage / no-load speed"
+
+
+@pytest.mark.parametrize(
+    ("text", "torque"), [("1 Nm", 1.0), ("10 kg.cm", 0.980665), ("100 oz-in", 0.70615518), ("100N·cm", 1.0)]
+)
+def test_torques_are_read_in_the_units_of_makers(text, torque):
+    sheet = {"voltage": "12V", "no-load-current": "1A", "resistance": "1 ohm", "stall-torque": text}
+    assert rig_from_sheet.read(sheet)["motor.torque_constant"].value == pytest.approx(torque / 11, rel=1e-3)
+
+
+def test_numbers_that_differ_widen_the_constant():
+    found = rig_from_sheet.read(RE30 | {"stall-torque": "1090 mNm"})
+    assert float(found["motor.torque_constant"].width.split()[0]) == pytest.approx(7.5, abs=0.3)
+    assert rig_from_sheet.read(RE30)["motor.torque_constant"].width == "3 %"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"resistance": "1.2 ohm"}, r"resistance is 1.2 ohm \(resistance\) and 0.611 ohm \(voltage / stall current\), 96 %"),
+        ({"stall-torque": "0.5 Nm"}, r"torque constant is 0.0259 N·m/A .* and 0.0128 N·m/A .*, 103 % apart; expected 10 %"),
+        ({"no-load-current": "40 A"}, r"--no-load-current: got 40 A, and the stall current is 39.3 A; expected less"),
+        ({"voltage": "24"}, r"--voltage: got 24; expected a number more than 0 with its unit: V, mV"),
+        ({"no-load-speed": "-3 rpm"}, r"--no-load-speed: got -3 rpm; expected a number more than 0"),
+        ({"stall-current": "39,3 A"}, r"--stall-current: got 39,3 A; expected a number more than 0"),
+        ({"no-load-speed": None, "stall-torque": None}, r"--no-load-speed and --stall-torque: both missing"),
+        ({"no-load-current": None}, r"--no-load-current: missing; the friction"),
+        ({"voltage": None, "resistance": None, "stall-current": None}, r"missing --voltage, --stall-current, --resistance"),
+    ],
+)  # fmt: skip
+def test_sheets_that_contradict_themselves_or_lack_numbers_are_refused(change, message):
+    with pytest.raises(BadConfiguration, match=message):
+        rig_from_sheet.read({name: text for name, text in (RE30 | change).items() if text is not None})
+
+
+def test_sheet_without_numbers_leaves_no_file(mmrjax, tmp_path):
+    code, _, err = mmrjax("rig", "new", "r.toml", "--from-sheet")
+    assert code == 2 and "--from-sheet: no numbers; expected --no-load-current and three or more of" in err
+    assert not list(tmp_path.iterdir())
+
+
+def test_rig_new_lists_what_robot_and_sheet_do_not_state(mmrjax, tmp_path):
+    robot = str(Path(__file__).parent / "data" / "diffbot.urdf")
+    sheet = [word for name, text in RE30.items() for word in (f"--{name}", text)]
+    code, out, err = mmrjax("rig", "new", "r.toml", "--from", robot, "--joint", "left_wheel_joint", *sheet)
+    said = " ".join(out.split())
+    assert (code, err) == (0, "")
+    assert "not found, so fill in: motor.inertia [kg·m^2], gearbox.efficiency_load [-], rover." in said
+    text = (tmp_path / "r.toml").read_text()
+    assert text.startswith("# kind wheeled, filled in from joint left_wheel_joint of diffbot.urdf and a data sheet;")
+    found = robot_file.read(tmp_path / "r.toml")
+    assert (float(found.motor.resistance), float(found.gearbox.ratio)) == (0.611, 34.0)

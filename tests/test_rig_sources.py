@@ -1,0 +1,156 @@
+"""Rig files from URDF and from MuJoCo's models: numbers, their sources, and one sentence for each mistake."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibration.data import robot_file
+from calibration.data.input_errors import BadConfiguration
+from mmrjax.model import params
+from mmrjax.model.signals import GRAVITY
+from sweeps.commands import rig_from_mujoco, rig_new
+from sweeps.commands.rig_template import examples
+
+DIFFBOT = Path(__file__).parent / "data" / "diffbot.urdf"
+FREE = """<mujoco>
+  <default>
+    <default class="wheel">
+      <joint damping="0.02" frictionloss="0.05" armature="0.0016" axis="0 1 0"/>
+      <geom type="cylinder" size="0.08 0.02" euler="90 0 0" mass="0.5"/>
+    </default>
+  </default>
+  <worldbody>
+    <body pos="0 0 0.1"><freejoint/><geom type="box" size="0.2 0.1 0.05" mass="5"/>
+      <body pos="0 0.15 0"><joint name="left" class="wheel"/><geom name="tyre" class="wheel"/></body>
+      <body pos="0 -0.15 0"><joint name="right" class="wheel"/><geom class="wheel"/></body>
+    </body>
+  </worldbody>
+  <actuator><motor joint="left" gear="20"/><motor joint="right" gear="20"/></actuator>
+</mujoco>"""
+
+
+def values(text, tmp_path):
+    """Parameters of a rig's text by name, after it was read."""
+    path = tmp_path / "rig.toml"
+    path.write_text(text, encoding="utf-8")
+    robot = robot_file.read(path)
+    numbers = {"sides": float(robot.sides), **{p.name: float(p.value) for p in params.walk_parameters(robot)}}
+    return numbers, {name: sd for name, _, sd in robot.rig.priors}
+
+
+def test_wheel_of_a_urdf_is_a_robot_on_wheels_with_sources(tmp_path):
+    text = rig_new.text(None, DIFFBOT, "left_wheel_joint", None)
+    found, sds = values(text, tmp_path)
+    expected = {
+        "sides": 2, "rover.mass": 5.2, "rover.radius": 0.065, "rover.inertia": 6.8e-4, "gearbox.ratio": 34,
+        "rover.track.loss_coulomb": 0.03, "rover.track.loss_viscous": 0.012,
+    }  # fmt: skip
+    assert {name: found[name] for name in expected} == pytest.approx(expected, rel=1e-9)
+    assert sds["rover.inertia"] == pytest.approx(3.4e-4) and sds["rover.mass"] == pytest.approx(1.04)
+    assert '"34.0 ± 5 %"  # [-] diffbot.urdf, transmission left_drive, <mechanicalReduction>' in text
+    assert "equal wheels: left_wheel_joint, right_wheel_joint" in text
+    assert {name.split()[0] for name in examples(text)} == {
+        "motor.resistance", "motor.torque_constant", "motor.friction_coulomb", "motor.friction_viscous",
+        "motor.inertia", "gearbox.efficiency_load", "rover.ground.rolling_resistance", "rover.ground.friction.static",
+    }  # fmt: skip
+
+
+def test_arm_of_a_urdf_carries_what_is_fixed_to_it(tmp_path):
+    found, _ = values(rig_new.text(None, DIFFBOT, "arm_joint", None), tmp_path)
+    assert found["arm.inertia"] == pytest.approx(7e-4 + 0.2 * 0.1**2 + 2e-5 + 0.1 * 0.2**2)
+    assert found["arm.torque_gravity"] == pytest.approx((0.2 * 0.1 + 0.1 * 0.2) * GRAVITY)
+    assert found["arm.angle_zero"] == pytest.approx(math.pi / 2)  # it points forward, and turns down
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_urdf_agrees_with_mujoco_in_any_frames(seed, tmp_path):
+    draw = np.random.default_rng(seed)
+    some = lambda: " ".join(f"{x:.4f}" for x in draw.normal(0, 0.5, 3))  # noqa: E731
+    text = f'<robot name="r"><mujoco><option gravity="0 0 {-GRAVITY}"/></mujoco><link name="l0"/>'
+    for k, kind in enumerate(("fixed", "revolute", "fixed", "revolute"), 1):
+        text += f"""<link name="l{k}"><inertial><origin xyz="{some()}" rpy="{some()}"/><mass value="{k}"/>
+            <inertia ixx="0.2" iyy="0.3" izz="0.25" ixy="0.01" ixz="-0.02" iyz="0.03"/></inertial></link>
+            <joint name="j{k}" type="{kind}"><parent link="l{k - 1}"/><child link="l{k}"/>
+            <origin xyz="{some()}" rpy="{some()}"/><axis xyz="{some()}"/><limit lower="-1" upper="1" effort="1"
+            velocity="1"/><dynamics damping="0.1" friction="0.2"/></joint>"""
+    (tmp_path / "r.urdf").write_text(text + "</robot>")
+    for joint in ("j2", "j4"):
+        ours, theirs = rig_new.joint_of(tmp_path / "r.urdf", joint), rig_from_mujoco.read(tmp_path / "r.urdf", joint)
+        for key in ("inertia", "weight", "angle", "friction", "damping"):
+            assert getattr(ours, key)[0] == pytest.approx(getattr(theirs, key)[0], rel=1e-6), (joint, key)
+
+
+def test_wheel_of_a_mujoco_model_has_the_numbers_of_its_default_class(tmp_path):
+    (tmp_path / "free.xml").write_text(FREE)
+    text = rig_new.text(None, tmp_path / "free.xml", "left", None)
+    found, _ = values(text, tmp_path)
+    expected = {
+        "sides": 2, "rover.mass": 6.0, "rover.radius": 0.08, "rover.inertia": 0.5 * 0.5 * 0.08**2,
+        "gearbox.ratio": 20, "motor.inertia": 4e-6, "rover.track.loss_coulomb": 0.05, "rover.track.loss_viscous": 0.02,
+    }  # fmt: skip
+    assert {name: found[name] for name in expected} == pytest.approx(expected, rel=1e-6)
+    assert "free.xml, geom tyre (cylinder)" in text and "motor.resistance [ohm]" in examples(text)
+
+
+def test_armature_without_a_ratio_turns_with_the_load(tmp_path):
+    (tmp_path / "free.xml").write_text(FREE.replace(' gear="20"', ""))
+    found, _ = values(rig_new.text("bench", tmp_path / "free.xml", "left", None), tmp_path)
+    assert found["motor.inertia"] == 0
+    assert found["bench.inertia"] == pytest.approx(0.5 * 0.5 * 0.08**2 + 0.0016, rel=1e-6)
+
+
+def test_name_with_a_line_break_stays_in_its_comment(tmp_path):
+    robot = DIFFBOT.read_text().replace("left_wheel", "left&#10;mass = 1 #")
+    (tmp_path / "r.urdf").write_text(robot)
+    found, _ = values(rig_new.text(None, tmp_path / "r.urdf", "left\nmass = 1 #_joint", None), tmp_path)
+    assert found["rover.mass"] == pytest.approx(5.2)
+
+
+# --- bad robots -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "joint", "message"),
+    [
+        ("", "", "left_whel_joint", r"no such joint; did you mean left_wheel_joint\?"),
+        ("", "", "caster_joint", r"--joint: got caster_joint, which is fixed; expected one that turns: left_wheel_joint"),
+        ("", "", None, r"--joint: missing, and r.urdf has left_wheel_joint, right_wheel_joint;"),
+        ('type="continuous"', 'type="prismatic"', "left_wheel_joint", r"which is prismatic; .*rig new --kind linear"),
+        ('<mass value="0.32"/>', '<mass value="-1"/>', "left_wheel_joint", r"link left_wheel, <mass>: got value -1; expected 0 kg"),
+        ('<mass value="0.32"/>', '<mass value="${m}"/>', "left_wheel_joint", r"got '\$\{m\}'; expected a number \[kg\]; run xacro"),
+        ('izz="6.8e-4"', 'izz="0"', "left_wheel_joint", r"<inertia>: got 0 kg·m² about the axis of left_wheel_joint"),
+        ('<link name="tool">', '<a:arg xmlns:a="http://www.ros.org/wiki/xacro"/><link name="tool">', "arm_joint", r"r.urdf: has elements of xacro; run"),
+        ("inertial>", "inert>", "left_wheel_joint", r"link left_wheel: no <inertial>"),
+        ("<robot", "<robot><joint", "arm_joint", r"r.urdf: not a readable XML file \(mismatched tag"),
+        ("mechanicalReduction>34", "mechanicalReduction>0.1", "left_wheel_joint", r"left_drive, <mechanicalReduction>: got 0.1;"),
+        ('<child link="arm"/>', '<child link="am"/>', "arm_joint", r"joint arm_joint, <child>: got am; did you mean arm\?"),
+        ('<child link="tool"/>', '<child link="base_link"/>', "arm_joint", r"link \w+ is part of a loop; expected a tree"),
+        ('<axis xyz="0 1 0"/>', '<axis xyz="0 1"/>', "arm_joint", r"<axis> xyz: got '0 1'; expected 3 numbers"),
+        ('<link name="tool">', '<link name="arm">', "arm_joint", r"<link>: two are called arm"),
+    ],
+)  # fmt: skip
+def test_robots_with_a_mistake_are_refused_in_a_sentence(old, new, joint, message, tmp_path):
+    text = DIFFBOT.read_text()
+    assert old in text
+    (tmp_path / "r.urdf").write_text(text.replace(old, new))
+    with pytest.raises(BadConfiguration, match=message) as refusal:
+        rig_new.text(None, tmp_path / "r.urdf", joint, None)
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--from", "none.urdf"), "none.urdf: cannot be read"),
+        (("--from", str(DIFFBOT)), "--joint: missing"),
+        (("--from", str(DIFFBOT), "--joint", "arm_joint", "--kind", "linear"), "--kind: got linear with --from"),
+        (("--joint", "arm_joint"), "--joint: got arm_joint without --from"),
+    ],
+)
+def test_rig_new_that_is_refused_leaves_nothing_behind(mmrjax, tmp_path, options, message):
+    code, _, err = mmrjax("rig", "new", "r.toml", *options)
+    assert code == 2 and message in err and not list(tmp_path.iterdir())
