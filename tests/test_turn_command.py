@@ -251,7 +251,7 @@ def test_options_of_one_run_are_refused_beside_a_table(tmp_path, mmrjax):
     path.write_text(f"{HEADER}{SIDED}\n6T2A,33,0,0,1,0.5\n")
     for more in ((), ("--profile", "patrol", "--battery")):
         code, _, err = mmrjax("simulate", "--runs", path, "--voltage", "4", "--mass", "12", *more)
-        assert code == 2 and "--voltage, --mass: got it beside --runs" in err
+        assert code == 2 and "--voltage, --mass: not allowed with --runs" in err
 
 
 @pytest.mark.parametrize(

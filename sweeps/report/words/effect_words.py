@@ -57,7 +57,7 @@ def declared(effect: type[Effect]) -> Iterator[str]:
 
 
 def tests(effect: type[Effect]) -> Iterator[str]:
-    """Sentences on bench tests that distinguish an effect: isolating its balance, and varying its causes."""
+    """Bench tests that distinguish it from other effects: how to isolate its balance, and the change to make."""
     if effect.channel:
         for name in CHECKED_BY.get(effect.channel, ()):
             yield ACTS[name].format("several values")

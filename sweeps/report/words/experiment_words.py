@@ -1,4 +1,4 @@
-"""Advice on next experiments: calibration acts and runs of the menu, readings, signs to watch, and more runs."""
+"""Instructions for an engineer: calibration acts, runs of the menu, readings to take and limits to watch."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ DOING = {
 
 
 def experiment(e: menu.Experiment) -> str:
-    """Instructions, readings, and signs to watch."""
+    """Instruction of one experiment: the run, the readings, and the limits to watch."""
     return _act(e) if isinstance(e, menu.Act) else _run(e)
 
 
@@ -160,7 +160,7 @@ def _allowed(temperature: float) -> str:
 
 
 def instruction(what: Instruction) -> str:
-    """Instructions and readings."""
+    """Instruction for one calibration act: the steps and the readings."""
     if isinstance(what, NothingPossible):
         return "Every experiment of the menu is forbidden or beyond reach"
     if isinstance(what, NoMenu):
@@ -191,7 +191,7 @@ def more_runs(what: MoreRuns) -> str:
 
 
 def _steady_speeds(what: MoreRuns) -> str:
-    """Speeds for the record of a wave."""
+    """Speeds for measuring a wave."""
     three = [f"{menu.round_significant(v):g}" for v in (what.low, 0.5 * (what.low + what.high), what.high)]
     return (
         f"Mark the driving shaft, start every run from the mark, and record steady travel at {', '.join(three[:2])} "

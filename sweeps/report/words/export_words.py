@@ -51,7 +51,7 @@ NOT_TESTED = (
     "Voltages, loads and temperatures outside the runs above.",
     "Fast changes: the comparison is of settled runs, so inductance and inertia rest on their stated values.",
 )
-BACKWARD = "Runs in which the load drives the motor: the runs above contain none."
+BACKWARD = "Runs in which the load drives the motor: the runs above include none."
 
 
 def statement(found: Export) -> str:

@@ -120,7 +120,7 @@ def _claim(sure: Sequence[str], others: Sequence[str]) -> str:
 
 
 def _undescribed(said: loop_notes.Summary) -> str:
-    """A model that does not describe the runs: its misfit, and checks to make."""
+    """Sentence on a model that does not describe the runs: the misfit and the checks."""
     each = [
         f"{channels.find_channel(m.channel).label} by {100 * m.error:.0f} % of its measured rms"
         + (f" (its noise is estimated as {100 * m.noise:.0f} %)" if m.noise > m.error else "")
@@ -283,7 +283,7 @@ def _without_name(where: DiscrepancyLocation, p: float, no_effect: str) -> str:
 
 
 def _shown(where: DiscrepancyLocation) -> str:
-    """Variable that shows a discrepancy best, and equally significant others."""
+    """Variable that shows a discrepancy, and equally significant others."""
     well = [shown_over(v, where.by_duty).removeprefix("best shown ") for v in where.variables_alike]
     return shown_over(where.variable, where.by_duty) + (f" (as well {', '.join(well)})" if well else "")
 
@@ -294,7 +294,7 @@ def _within(where: DiscrepancyLocation) -> str:
 
 
 def shown_over(variable: str, by_duty: bool = False) -> str:
-    """Variable that shows a discrepancy best; `by_duty`: only the duty changed the motors' voltage."""
+    """Variable that shows a discrepancy; `by_duty`: only the duty changed the motors' voltage."""
     variable = "duty" if by_duty and variable == "voltage" else variable
     happens = bases.window_from_name(variable)
     if variable == "side":
@@ -391,7 +391,7 @@ def _rms(errors: Errors, total: int) -> str:
         return "no row is reached"
     rms, worst, rows = (max(float(e[name]) for e in known) for name in ("rms_percent", "max_percent", "rows"))
     few = f" ({rows:.0f}/{total} reached)" if rows < total else ""
-    return f"rms up to {rms:.1f} %, worst reading {worst:.1f} %{few}"
+    return f"rms ≤ {rms:.1f} %, worst {worst:.1f} %{few}"
 
 
 def largest_share(found: DiscoveryResult) -> str:
@@ -475,7 +475,7 @@ def _strength(test: loop_notes.NameTest) -> str:
 
 #: Evidence against a single effect: short, and in words.
 DOUBTS = {
-    "chance": ("chance", "explains {0.root:.1f} σ{beside}, and chance reaches {0.needed:.1f}"),
+    "chance": ("chance", "explains {0.root:.1f} σ{beside}; chance alone reaches {0.needed:.1f}"),
     "curve": ("a curve", "is a worse explanation than a smooth curve in its place"),
     "row": ("{0.what} {0.rests_on}", "rests on {0.what} {0.rests_on}"),
     "blocks": ("blocks", "is chosen again in {again:.0f} % of the data with a block left out"),
@@ -617,13 +617,13 @@ def worse(found: Sequence[Worse], predicted: Mapping[str, tuple[int, int]]) -> s
     for kind, (before, after) in predicted.items():
         mine = [w for w in found if w.kind == kind]
         changes = [f"{channels.find_channel(w.channel).label} {_change(w.before, w.after)} %" for w in mine]
-        if any(w.rows < max(before, after) for w in mine):
-            changes[-1] += f" (of the {min(w.rows for w in mine)} rows that both predict)"
+        if mine:
+            changes[-1] += f" (same {min(w.rows for w in mine)} rows)"
         if before > after:
             changes.append(f"{count_noun(before - after, 'row')} fewer predicted")
         if changes:
             parts.append(f"by {blocks.kind_in_words(kind)} {', '.join(changes)}")
-    return f"Held out, what was found predicts worse: {'; '.join(parts)}." if parts else ""
+    return f"Predicts worse on held-out rows: {'; '.join(parts)}." if parts else ""
 
 
 def _change(before: float, after: float) -> str:
@@ -711,7 +711,7 @@ def kept_out(note: loop_notes.KeptOut) -> str:
 
 
 def still_lacks(note: loop_notes.StillLacks) -> str:
-    """Discrepancy that remains with the identified effects."""
+    """Sentence on the discrepancy that remains with the effects found."""
     place, over = bases.place_in_words(note.place), note.variable.replace("_", " ")
     return f"not everything is explained: an error in the {place} that varies with {over} remains"
 
