@@ -39,17 +39,17 @@ RESTS_ON: dict[str, tuple[str, ...]] = {
 
 
 def _nothing(robot: Robot) -> dict[str, float]:
-    """Parameters of a rig of which nothing is known but its loads."""
+    """Parameters of a rig whose file states its loads only."""
     return {p.name: float(p.value) for p in params.walk_parameters(blank_robot(robot.configurations, rig=robot.rig))}
 
 
 def states(robot: Robot, prefix: str) -> bool:
-    """Whether any parameter whose name begins so is known of a robot, by its file or its base."""
+    """True if the robot's file or its base states any parameter whose name begins so."""
     return any(p.name.startswith(prefix) and robot.knows([p.name]) for p in params.walk_parameters(robot))
 
 
 def battery(robot: Robot) -> bool:
-    """Whether it has a battery of its own."""
+    """True if the robot has its own battery."""
     if robot.rig.inherits:
         return True
     nothing, other = Battery(), "battery.current_other"  # `rig_file.DEFAULTS` states that one
@@ -62,8 +62,7 @@ def battery(robot: Robot) -> bool:
 
 
 def unknown(robot: Robot) -> list[str]:
-    """What of a run's numbers is not known of a robot, as its file leaves open what that rests on: a sentence, or
-    none."""
+    """Sentences on results that are unknown because the robot's file does not state their parameters."""
     gone = [output for output in outputs.FURTHER if not robot.knows(output.rests_on)]
     lacking = dict.fromkeys(name for output in gone for name in robot.unknown(output.rests_on))
     labels = "; ".join(output.label for output in gone)

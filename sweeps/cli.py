@@ -53,7 +53,7 @@ _Columns = Annotated[
 
 
 class Told(NamedTuple):
-    """What a command is told: its configuration, what changes no number beside it, and the file of both, if any."""
+    """Input of a command: its configuration, options that change no number, and the file of both, if any."""
 
     config: Any
     beside: Any
@@ -61,7 +61,7 @@ class Told(NamedTuple):
 
     @property
     def where(self) -> str:
-        """Where the configuration stands, for messages."""
+        """Origin of the configuration, for messages."""
         return "options" if self.file is None else self.file.name
 
 
@@ -74,13 +74,13 @@ def _command(
     arguments: tuple[str, ...] = (),
     resolve: Callable[..., config.Part] | None = None,
 ) -> Callable[[Callable[..., int]], Callable[..., int]]:
-    """A command whose options are the fields of a configuration: beside what its function states itself.
+    """Decorator for a command whose options are the fields of a configuration, in addition to its function's own.
 
     Its function is called with `Told`, once jax is ready, and with its own options and arguments by name.
 
     Args:
         kind: of the configuration; failure: what exit code 3 means.
-        beside: of what changes no number, of which a file has `[solver]` alone.
+        beside: configuration of options that change no number; a file may state its `[solver]` only.
         arguments: fields that are arguments; a `plan` of the function's own is the file, as --config is.
         resolve: in place of `config.resolve`.
     """
@@ -167,7 +167,7 @@ def simulate(
     if runs is not None and stated:
         options = flags_of(config.OneRun)
         raise InputError(
-            f"{', '.join(options[column] for column in cells if column in stated)}: got it beside --runs, whose "
+            f"{', '.join(options[column] for column in cells if column in stated)}: not allowed with --runs, whose "
             f"columns state the conditions of each run; state it there, or leave out --runs"
         )
     given = cells if runs is None else str(runs)
@@ -273,7 +273,7 @@ def render(
     ] = None,
     end: Annotated[float | None, typer.Option(help="Last instant of a film (s).  \\[default: begin + 0.1]")] = None,
     slow: Annotated[
-        float | None, typer.Option(help="How many times slower than life a film runs.  \\[default: 20]", min=0.01)
+        float | None, typer.Option(help="Slow-motion factor of a film.  \\[default: 20]", min=0.01)
     ] = None,
     climb: Annotated[
         Path | None,
@@ -410,8 +410,8 @@ def sensitivity(told: Told, out: _Out = None, force: _Force = False) -> int:
 def resonance(told: Told, out: _Out = None, force: _Force = False) -> int:
     """Say which speeds to avoid: ripple of reaction, current and speed over speed and payload, by the track model.
 
-    A Campbell diagram sets the frequency at which grousers pass, and its harmonics, against bounce and pitch of the
-    robot on its contacts. An axis is 0,5,10 or first:last:step. Writes result.json, report.html, points.csv,
+    A Campbell diagram compares the grouser-passing frequency and its harmonics with the bounce and pitch modes of
+    the robot on its contacts. An axis is 0,5,10 or first:last:step. Writes result.json, report.html, points.csv,
     modes.csv and peaks.csv; the points of Table 8 are run too. About a minute on two cores.
     """
     from sweeps.commands import resonance as room
@@ -616,8 +616,10 @@ WHOLE = 1_000_000
 
 
 def _start_jax(no_cache: bool, flags: tuple[str, ...] = (), options: tuple[str, ...] = ()) -> None:
-    """Import jax with double precision, by flags of XLA and options beside that of `SOUND_AT_LEVEL_0`, and with the
-    compilation cache unless it is not wanted."""
+    """Import jax with double precision, XLA flags and the compilation cache, unless `no_cache`.
+
+    Compiler options are added to that of `SOUND_AT_LEVEL_0`.
+    """
     _refuse_little_memory()
     if "jax" not in sys.modules:  # which takes it when it starts
         flags = ",".join((SOUND_AT_LEVEL_0, *options)), *flags
@@ -728,7 +730,7 @@ def _memory_exhausted(error: BaseException | None) -> bool:
 
 
 def _no_number(error: Any) -> str:
-    """What to say of a text where an option takes a number, which most often has its unit."""
+    """Error message for a text in place of a number; most often the text includes a unit."""
     option = getattr(error, "param", None)
     if option is None or not re.search(r"valid (number|float|integer)", str(getattr(error, "message", ""))):
         return ""

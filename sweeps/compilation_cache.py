@@ -1,6 +1,6 @@
 """The compilation cache: programs that XLA has compiled, kept on disk so that the next process reads them.
 
-It lies in `$MMRJAX_CACHE`, else `$XDG_CACHE_HOME/mmrjax`, else `~/.cache/mmrjax`; `MMRJAX_CACHE=off` switches it off.
+Folder: `$MMRJAX_CACHE`, else `$XDG_CACHE_HOME/mmrjax`, else `~/.cache/mmrjax`; `MMRJAX_CACHE=off` switches it off.
 JAX keys an entry by program, compiler version, flags and device; a folder of its own for each version of jaxlib and
 each kind of processor keeps native code of one machine from another with the same home. Programs are native code: a
 folder that others could change is not used (`mmrjax.compile.private`). Importable without jax.
@@ -51,7 +51,7 @@ def location(path: Path | None = None) -> Path | None:
 
 
 def _processor() -> str:
-    """What of this processor native code depends on, as a short word."""
+    """Short hash of the processor features that native code depends on."""
     try:
         known = re.findall(r"^(?:flags|Features)\s*:.*", Path("/proc/cpuinfo").read_text(encoding="utf-8"), re.M)[:1]
     except OSError:
@@ -61,7 +61,7 @@ def _processor() -> str:
 
 
 def keep_programs() -> Path | None:
-    """Keep every compiled program, however small, and read those that earlier processes kept, as the commands do.
+    """Keep every compiled program, however small, and read programs kept by earlier processes, as the commands do.
 
     To be called before anything compiles. A cache that JAX has been given by its own settings
     (`JAX_COMPILATION_CACHE_DIR`) stays. An entry that cannot be read is compiled again. `MMRJAX_CACHE` is the folder
@@ -144,7 +144,7 @@ def _prune(caches: Path) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class Contents:
-    """What the cache holds.
+    """Contents of the cache.
 
     Attributes:
         path: its folder; None where it is switched off.
@@ -166,7 +166,7 @@ class Contents:
 
 
 def describe(path: Path | None = None) -> Contents:
-    """Where the cache lies and what it holds."""
+    """Returns the folder of the cache and its contents."""
     folder = location(path)
     entries = [] if folder is None else _entries(folder)
     exposed = "" if folder is None else exposure_reason(folder)

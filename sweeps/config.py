@@ -1,4 +1,4 @@
-"""What a command is told: options and TOML files, checked into one frozen record of the parts that apply."""
+"""Configurations of commands: options and TOML files, checked and merged into one frozen record."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ Seed = Annotated[int, Field(ge=0, le=2**32 - 1)]
 
 
 def about(default: Any, description: str, **extra: Any) -> Any:
-    """A field, with all that is said of it: options, their help and the schema are made of it (`sweeps.options`).
+    """Field with its description; options, their help and the schema are made from it (`sweeps.options`).
 
     Args:
-        default: where it is not stated; description: what it is, its unit aside, which its name ends with.
-        extra: `usual`, what a default of None comes to, in words; `flag`, its option, where that is not its name;
+        default: value if not stated; description: meaning without the unit (the name ends with the unit).
+        extra: `usual`, the meaning of a default of None, in words; `flag`, its option, if it differs from its name;
             `solver`, how its command solves, which few need: hidden in `--help`, and a key of `[solver]`;
             `verbatim`, a list each of whose texts may have commas; `metavar` of an argument; `format`, such as path;
             `minimum`, where the command asks for more than the field; `executes`, whose value is code that is run,
@@ -61,7 +61,7 @@ class Part(BaseModel):
 
 
 class RobotPart(Part):
-    """Which robot."""
+    """Robot."""
 
     robot: str = about("nominal", "nominal, sm1, sm2, or a robot's TOML file")
     set: dict[str, bool | float] = about(
@@ -84,7 +84,7 @@ class DataPart(Part):
 
 
 class ModelPart(Part):
-    """Which fidelity, one of `mmrjax.fidelities`."""
+    """Fidelity, one of `mmrjax.fidelities`."""
 
     model: str = about(fidelities.NAMES[0], f"Fidelity: {', '.join(fidelities.NAMES)}")
 
@@ -134,7 +134,7 @@ Duration = Annotated[float, Field(gt=0, le=_most("duration"), allow_inf_nan=Fals
 
 
 class FidelityPart(ModelPart):
-    """Which fidelity simulates, and its options; None takes the fidelity's default."""
+    """Fidelity of the simulation and its options; None takes the fidelity's default."""
 
     duration_s: Duration | None = about(None, "Length of a run", usual=_usual("duration", SHOWN))
     step_s: Annotated[float, Field(gt=0, le=_most("step"), allow_inf_nan=False)] | None = about(
@@ -163,7 +163,7 @@ class FidelityPart(ModelPart):
 
 
 class BatchPart(FidelityPart):
-    """How many runs at once; None takes the fidelity's."""
+    """Number of runs in one batch; None takes the fidelity's."""
 
     chunk: Annotated[int, Field(ge=1, le=1_000_000_000)] | None = about(
         None,
@@ -174,7 +174,7 @@ class BatchPart(FidelityPart):
 
 
 class SupplyPart(Part):
-    """What feeds the motors."""
+    """Supply of the motors."""
 
     battery: bool = about(False, "Supply from the on-board battery")
     discharge_mAh: Annotated[float, Field(ge=0, le=100_000)] = about(0.0, "Charge already taken from the battery")
@@ -204,7 +204,7 @@ def _shown(values: Iterable[float]) -> str:
 class OneRun(Part):
     """The conditions of one run, by the columns of a table of runs; None is left to the robot.
 
-    What it may be is said where the run is made (`inputs.one_run`), as of a row of a table.
+    The run itself checks its values (`inputs.one_run`), like a row of a table.
     """
 
     configuration: str | None = about(
@@ -270,7 +270,7 @@ class GridPart(Part):
 
 
 class InferencePart(Part):
-    """What is known before the data speak."""
+    """Prior knowledge and data of a fit."""
 
     prior: tuple[str, ...] = about(
         (), "A prior in SI units, repeatable: 6T2A.ground.friction.static=0.45±0.05", verbatim=True
@@ -282,13 +282,13 @@ class InferencePart(Part):
         "times too), and without such assumes 2, 0.5, 1 %, halved and doubled",
     )
     rows: Annotated[int, Field(ge=100, le=1_000_000)] = about(
-        ROWS, "Rows of a log over time from which on readings are used of fewer, evenly in time"
+        ROWS, "Largest number of rows used of a log over time; a longer log is thinned evenly in time"
     )
-    seed: Seed = about(0, "Of everything random")
+    seed: Seed = about(0, "Random seed")
 
 
 class MembersPart(Part):
-    """Where a population keeps its runs, which changes no number."""
+    """Folder in which a population keeps its runs; it changes no number."""
 
     members: Path | None = about(
         None, "File that keeps the population's runs; the same command with it goes on from there", solver=True
@@ -296,7 +296,7 @@ class MembersPart(Part):
 
 
 class LoopBeside(MembersPart):
-    """What changes no number of the loop."""
+    """Options of the loop that change no number."""
 
     within: Annotated[str, Field(pattern=r"^\d+(\.\d+)?(s|min|h)?$")] | None = about(
         None, "Wall-clock time after which it ends with the best that there is, as 90s, 5min or 1h"
@@ -316,7 +316,7 @@ Duty = Annotated[float, Field(ge=_DUTY[0], le=_DUTY[1], allow_inf_nan=False)]
 
 
 class TurnPart(Part):
-    """How the sides of one run are driven apart; None: alike."""
+    """Different drive of the two sides of one run; None: the same."""
 
     left_V: Voltage | None = about(None, "Voltage of the left motor (V); with --right the robot is free to turn")
     right_V: Voltage | None = about(None, "Voltage of the right motor (V)")
@@ -334,12 +334,12 @@ class TurnPart(Part):
 
     @property
     def demands(self) -> bool:
-        """Whether it is stated how the robot turns, and not what drives its sides."""
+        """True if the configuration states the turn itself and not the drive of each side."""
         return self.speed_m_s is not None
 
     @property
     def turns(self) -> bool:
-        """Whether the robot is free to turn."""
+        """True if the robot is free to turn."""
         return any(getattr(self, name) is not None for name in TurnPart.model_fields)
 
     def refuse_volts(self, battery: bool) -> None:
@@ -366,29 +366,29 @@ class TurnPart(Part):
 
 
 class PosteriorPart(Part):
-    """Whether results come with the uncertainty of a calibrated robot."""
+    """Uncertainty of results from the posterior of a calibrated robot."""
 
     posterior: Annotated[int, Field(ge=10, le=100_000)] | None = about(
-        None, "Give results with ± from so many robots drawn from the posterior.nc beside the calibrated --robot"
+        None, "Give results with ±, from this number of robots drawn from the posterior.nc of the calibrated --robot"
     )
 
 
 class OutputPart(Part):
-    """What is written beside the numbers."""
+    """Files written in addition to the numbers."""
 
     report: bool = about(True, "Write report.html")
     table: Literal["csv", "parquet"] = about("csv", "Tables of the folder: CSV, or Parquet too")
 
 
 class ProfilePart(FidelityPart):
-    """Which mission the runs follow."""
+    """Mission that the runs follow."""
 
     profile: Annotated[str, Field(min_length=1)] | None = about(
         None,
         "A mission over time: a CSV with time_s (s) and any of speed_mm_s, motor_speed_rpm, duty, mode, "
         "supply_voltage_V, slope_deg, payload_kg, load_torque_Nm, surface, current_other_A; with sides duty_left and "
         "duty_right, "
-        "voltage_left_V and voltage_right_V, or yaw_rate_rad_s beside speed; or stair, stop_and_go, shuttle, patrol "
+        "voltage_left_V and voltage_right_V, or yaw_rate_rad_s with a speed; or stair, stop_and_go, shuttle, patrol "
         "(docs/reference/profiles.md)",
     )
 
@@ -472,7 +472,7 @@ class Resonance(RobotPart, FidelityPart, OutputPart):
     configuration: str | None = about(None, "One of the robot's", usual="its first")
     voltages_V: Voltages = about(
         tuple(10.0 + k for k in range(31)),
-        "Supply voltages (V), at least 5 of them, by which the speed is set",
+        "Supply voltages (V) that set the speed, at least 5 of them",
         usual="10:40:1, that is 31",
         minimum=0,
     )
@@ -559,7 +559,7 @@ class Reproduce(RobotPart, ModelPart):
 
 
 class Calibrate(RobotPart, DataPart, InferencePart, OutputPart):
-    """A calibration beside its data; None leaves what has it to the fidelity and the data."""
+    """Options of a calibration; for None the fidelity or the data decide."""
 
     model: Annotated[str, AfterValidator(_fidelity)] | None = about(
         None, f"Fidelity: {', '.join(fidelities.NAMES)}", usual="drive for a log over time, else steady"
@@ -592,7 +592,7 @@ class Calibrate(RobotPart, DataPart, InferencePart, OutputPart):
 
 
 class Settle(RobotPart, DataPart, OutputPart):
-    """A log over time, from which settled runs are taken."""
+    """Options for extracting settled runs from a log over time."""
 
     shortest_s: Annotated[float, Field(gt=0, le=3600, allow_inf_nan=False)] | None = about(
         None, "Shortest stretch that is taken for settled", usual="0.3, and at least 20 samples"
@@ -619,7 +619,7 @@ class Export(RobotPart, OutputPart):
 
 
 class Loop(RobotPart, DataPart, InferencePart, OutputPart):
-    """The closed loop beside its data."""
+    """Options of the closed loop."""
 
     replicates: Annotated[int, Field(ge=250, le=100_000)] = about(
         500, "Tables of the bootstrap; of time histories at least 333 are made", solver=True
@@ -646,7 +646,7 @@ class Loop(RobotPart, DataPart, InferencePart, OutputPart):
 
 
 class RequirementsPart(Part):
-    """What a robot is asked to do."""
+    """Requirements on a robot."""
 
     requirements: str = about(
         "paper",
@@ -666,7 +666,7 @@ class Check(RequirementsPart, RobotPart, OutputPart):
 class Size(RequirementsPart, RobotPart, OutputPart):
     """A search for a robot that meets requirements."""
 
-    objective: str = about("mass", "What is made small: mass (kg), energy (Wh/m), cost (EUR)")
+    objective: str = about("mass", "Quantity to minimise: mass (kg), energy (Wh/m), cost (EUR)")
     pareto: tuple[str, ...] = about((), "Two objectives, comma-separated, for a front of both instead")
     motors: tuple[str, ...] = about((), "Motors to choose from, comma-separated", usual="all of the sheets")
     starts: Annotated[int, Field(ge=1, le=100_000)] = about(256, "Searches in one batch")
@@ -712,14 +712,14 @@ class Sensitivity(RobotPart, DataPart, FidelityPart, SupplyPart, OutputPart):
         None, "Model evaluations, at least, in all", usual="1000000; shapley 300000; runs over time 100000"
     )
     seed: Seed = about(0, "Of the sample")
-    posterior: bool = about(False, "The inputs are the posterior.nc beside the calibrated --robot")
+    posterior: bool = about(False, "Take the inputs from the posterior.nc of the calibrated --robot")
     candidates: str = about(
         "",
         "CSV of runs that could be made next",
         usual="Table 8; of a rig the operating points",
         format="path",
     )
-    runs: Annotated[int, Field(ge=1, le=100)] = about(5, "How many of them to propose")
+    runs: Annotated[int, Field(ge=1, le=100)] = about(5, "Number of runs to propose")
     noise: str = about("", "Sd of their readings", usual="current=2%,motor_speed=0.5%,speed=1%")
 
     @model_validator(mode="before")
@@ -749,7 +749,7 @@ def solver_keys(kind: type[Part]) -> list[str]:
 
 
 def fields_with(kind: type[Part], fact: str) -> list[str]:
-    """The fields of a configuration of which a fact is stated (`about`)."""
+    """Names of the fields whose `about` states a fact."""
     extra = {name: f.json_schema_extra for name, f in kind.model_fields.items()}
     return [name for name, said in extra.items() if isinstance(said, dict) and said.get(fact)]
 
@@ -794,8 +794,8 @@ def resolve(
     """The configuration of a command: defaults, then the file's keys, then the options given (not None).
 
     Args:
-        beside: what else the command is told, whose keys the file's table `[solver]` may have too.
-        trust: whether the file may state what is executed, else options alone may.
+        beside: further options of the command; the file's table `[solver]` may state them too.
+        trust: true if the file may state code to execute; otherwise only options may.
 
     Raises:
         BadConfiguration: unreadable file, unknown key, a value out of range, or what a file may not state.

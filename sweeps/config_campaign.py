@@ -1,4 +1,4 @@
-"""What a sweep into a store is told: its own tables, or the grid of the options, and how it is run."""
+"""Configuration of a sweep into a store: its tables or the grid of the options, and its execution."""
 
 from __future__ import annotations
 
@@ -33,7 +33,8 @@ SIZE = "obstacle_mm"
 
 
 class Obstacle(Part):
-    """What every point of a sweep climbs (`sweeps.points.climbs`); its size is the axis `obstacle_mm`, or found."""
+    """Obstacle that every point of a sweep climbs (`sweeps.points.climbs`); its size is the axis `obstacle_mm`, or
+    found by a search."""
 
     kind: Literal["step", "stairs", "gap"]
     find: bool = False
@@ -57,7 +58,7 @@ class Campaign(RobotPart, ProfilePart, BatchPart, OutputPart):
     """A sweep of any size over any names, into a Zarr store; `sweeps.points.axes` reads its tables.
 
     Attributes:
-        conditions: those that do not vary, by name.
+        conditions: constant conditions, by name.
         axes: of the grid, by name: a list, `first:last:step`, or a table with start, stop, number and scale.
         samples: a sampled design: design, number, seed, over (distributions by name), posterior.
         outputs: names of `mmrjax.fidelities.outputs.output_table()`, of columns of the fidelity, or flags; empty: the
@@ -89,7 +90,7 @@ class SharePart(Part):
 
 @dataclasses.dataclass(frozen=True)
 class How:
-    """How a sweep is run and kept, which does not change its numbers.
+    """Execution and storage options of a sweep; they do not affect results.
 
     Attributes:
         shard: this process's share of the chunks, k of n; scheduler: address of a dask scheduler.
@@ -116,7 +117,7 @@ def how(
     """The options of a sweep, checked.
 
     Raises:
-        BadConfiguration: a share that is none, an unknown kind of file.
+        BadConfiguration: an invalid share, an unknown kind of file.
     """
     share = None
     if shard is not None:
@@ -128,13 +129,13 @@ def how(
         if kind not in EXPORTS:
             raise BadConfiguration(f"--export: got {kind}; {allowed_words(kind, EXPORTS)}")
     if share is not None and scheduler is not None:
-        raise BadConfiguration("--shard: got it beside --scheduler, which shares out the chunks itself; expected one")
+        raise BadConfiguration("--shard: not allowed with --scheduler, which shares out the chunks; give one of them")
     wanted = () if outputs is None else tuple(name.strip() for name in outputs.split(","))
     return How(share, scheduler, tuple(dict.fromkeys(export or ())), dry_run, zarr, wanted)
 
 
 def is_campaign(file: Path | None) -> bool:
-    """Whether a file states axes or samples of its own, or anything else that only a store has.
+    """True if a file states its own axes or samples, or anything else that only a store has.
 
     Raises:
         BadConfiguration: the file cannot be read.
@@ -148,7 +149,7 @@ def resolve_campaign(file: Path | None, options: dict[str, Any], trust: bool = F
     A grid is one of a store's once the robot is known (`of_grid`).
 
     Raises:
-        BadConfiguration: as `resolve`; an option of the grid beside a file with axes of its own.
+        BadConfiguration: as `resolve`; an option of the grid with a file that has its own axes.
     """
     if is_campaign(file):
         assert file is not None

@@ -138,7 +138,7 @@ def stage(number: int, total: int, doing: str, silent: bool = False) -> Iterator
 
 
 class RateColumn(ProgressColumn):
-    """How many a second."""
+    """Column with the rate per second."""
 
     def render(self, task: Task) -> Text:
         """Of the latest minute, and of the whole at the end."""

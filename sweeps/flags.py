@@ -1,4 +1,4 @@
-"""What the fields of configurations are called as options of the command line."""
+"""Names of configuration fields as options of the command line."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ UNITS = {
 
 
 def facts(kind: type[BaseModel]) -> dict[str, dict[str, Any]]:
-    """What the schema of a configuration says of each field, in the order of its parts, its own first."""
+    """Schema of each field of a configuration, in the order of its parts, its own first."""
     schema = kind.model_json_schema()["properties"]
     own = [
         name for part in kind.__mro__ if issubclass(part, BaseModel) for name in vars(part).get("__annotations__", {})

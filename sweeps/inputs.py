@@ -1,4 +1,4 @@
-"""What comes in: the robot that a configuration names, tables of runs, and single runs from options."""
+"""Inputs of commands: the robot that a configuration names, tables of runs, and single runs from options."""
 
 from __future__ import annotations
 
@@ -56,8 +56,7 @@ def load_robot(config: RobotPart) -> RobotFile:
 
 
 def _unlike(name: str, robot: Robot) -> tuple[str, ...]:
-    """A sentence on a robot whose sides differ, of whatever travels straight: how it turns where they are driven
-    alike."""
+    """Sentence for straight travel: how a robot with different sides turns if both are driven the same."""
     if not robot.unlike or not robot.has_ground:
         return ()
     if why := turn_error(robot, robot.configurations):
@@ -69,11 +68,11 @@ def _unlike(name: str, robot: Robot) -> tuple[str, ...]:
 
 
 def beside_robot(file: RobotFile) -> Posterior:
-    """The posterior that lies beside the file of a calibrated robot.
+    """Posterior from the folder of a calibrated robot's file.
 
     Raises:
-        BadConfiguration: the robot is none of a file.
-        BadData: there is none, it cannot be read, or it is of another robot.
+        BadConfiguration: the robot is not from a file.
+        BadData: the posterior is missing, unreadable, or of another robot.
     """
     if Path(file.source).suffix != ".toml":
         raise BadConfiguration(
@@ -106,13 +105,13 @@ def check_configurations(robot: Robot, names: tuple[str, ...], where: str) -> No
 
 
 def check_surface(robot: Robot, names: Collection[str], surface: str | None, where: str) -> None:
-    """Refuse a surface of which neither Table 5 nor a configuration of the robot says how it holds.
+    """Refuse a surface whose adhesion neither Table 5 nor a configuration of the robot states.
 
     Args:
         names: of the configurations that are simulated.
 
     Raises:
-        BadConfiguration: says `where`, and which there are.
+        BadConfiguration: the message has `where` and the known surfaces.
     """
     known = surface is None or surface in SURFACES or not robot.rig.scales_adhesion
     if not known and not all(surface_labels.named(name, str(surface)) in robot.configurations for name in names):
@@ -131,7 +130,7 @@ def read_runs(
     battery: bool = False,
     of_turns: bool = False,
 ) -> records.Runs:
-    """Read a table, and say on stderr which of its columns are not used.
+    """Read a table and list its unused columns on stderr.
 
     Args:
         source: a file of any format, or a packaged table.
@@ -139,7 +138,7 @@ def read_runs(
         measured: whether readings are needed; series: whether time histories are taken.
         columns: a preset or its file, see `records.read`.
         battery: whether the runs are on the battery, see `records.read`.
-        of_turns: whether a table of turns has every channel of either side, and of the yaw, of which it has a column.
+        of_turns: whether a table of turns has each channel of both sides, and of the yaw, for which it has a column.
 
     Raises:
         BadData: what `records.read` refuses, time histories where none are taken, or a configuration that the
@@ -167,12 +166,12 @@ def one_run(
         elsewhere: columns that a profile states.
 
     Raises:
-        BadConfiguration: a value out of range, a configuration that the robot does not have, a voltage beside the
-            battery, a condition that does not act on the robot, or nothing imposed where its file states no limit.
+        BadConfiguration: a value out of range, an unknown configuration, a voltage together with the battery, a
+            condition that does not act on the robot, or nothing imposed and no limit in its file.
     """
     if battery and cells.get("supply_voltage_V") is not None:
         raise BadConfiguration(
-            f"--voltage: got {cells['supply_voltage_V']:g} beside --battery, whose voltage is that of its charge; "
+            f"--voltage: got {cells['supply_voltage_V']:g} with --battery, whose charge sets the voltage; "
             "give one of them"
         )
     stated = cells.get("configuration")

@@ -1,4 +1,4 @@
-"""Options of the command line made of the fields of configurations, which state all that is said of them."""
+"""Command-line options made from configuration fields, which state their type, default and help."""
 
 from __future__ import annotations
 

@@ -71,7 +71,7 @@ def read(file: Path) -> Any:
 
 
 def read_arrays(file: Path) -> dict[str, np.ndarray]:
-    """Arrays of a file of `np.savez`, none of which is of objects; raises whatever a damaged file comes to."""
+    """Arrays of a file of `np.savez` without objects; a damaged file raises whatever NumPy raises."""
     with file.open("rb") as stream, np.load(stream, allow_pickle=False) as arrays:
         return {key: arrays[key] for key in arrays.files}
 

@@ -185,7 +185,7 @@ def holds_work(partial: Path) -> bool:
 
 
 def share_at_work(partial: Path, own: Path | None = None) -> str | None:
-    """A share of a sweep on which another process works; None if there is none.
+    """Share of a sweep that another process is computing; None: no such share.
 
     Args:
         own: journal of this process.
@@ -315,7 +315,7 @@ class RunFolder(Folder):
             self._lock = None
 
     def chunk(self, name: str) -> dict[str, np.ndarray] | None:
-        """A chunk that an interrupted run finished; None if there is none that can be read."""
+        """Chunk finished by an interrupted run; None if missing or unreadable."""
         from sweeps import stage_files
 
         file = self.partial / CHUNKS / f"{name}.npz"
@@ -386,11 +386,12 @@ class RunFolder(Folder):
 def open_folder(
     command: str, config: RobotPart, robot: Robot, out: Path | None, force: bool, runs: Runs | None = None
 ) -> RunFolder:
-    """The run folder of a command, whose identity is what it was told and the program's source: what another version
-    has kept is not gone on with.
+    """Run folder of a command. Its identity is the configuration and the program's source.
+
+    Files kept by another version are not continued.
 
     Args:
-        command: its name; config: its configuration; robot: the one that the configuration names, changes and all.
+        command: its name; config: its configuration; robot: of the configuration, with its changes.
         out: where the folder is to appear; None: a new one below `runs/`; force: replace an existing run folder.
         runs: the table that it was given, if any.
     """
@@ -428,7 +429,7 @@ def provenance() -> dict[str, Any]:
 
 
 def rows_of_fit(robot: Path) -> frozenset[str]:
-    """Hashes of the tables that a robot was fitted to, by the manifest in its folder; empty if none is recorded."""
+    """Hashes of the tables that a robot was fitted to, from the manifest in its folder; may be empty."""
     found = _json(robot.parent / "manifest.json") if robot.is_file() else {}
     hashes, arguments = found.get("hashes"), found.get("arguments")
     if not isinstance(hashes, dict) or not isinstance(arguments, list) or arguments[:1] not in FITS:

@@ -121,6 +121,7 @@ MEASURE = r"""
 (() => {
   const wrong = {sideways: [], outside: [], clipped: [], overlapping: [], contrast: [], small: []};
   const width = document.documentElement.clientWidth, paper = matchMedia("print").matches;
+  const least = width < 400 ? 10.95 : 9.95;
   if (document.documentElement.scrollWidth > width + 1) wrong.sideways.push(document.documentElement.scrollWidth);
   const name = e => (e.textContent || "").trim().replace(/\s+/g, " ").slice(0, 50) + " <" + (e.parentElement || e).tagName + ">";
   const scrolls = e => { for (; e; e = e.parentElement) if (["auto", "scroll"].includes(getComputedStyle(e).overflowX)) return true; };
@@ -153,8 +154,8 @@ MEASURE = r"""
       turned = Math.min(Math.abs(m.a), Math.abs(m.b)) > .02 * Math.hypot(m.a, m.b);
       const whole = drawn.getBoundingClientRect();
       for (const r of rects) if (r.right > whole.right + 2 || r.left < whole.left - 2 || r.bottom > whole.bottom + 2 || r.top < whole.top - 2) { wrong.clipped.push(name(node) + " of " + (drawn.closest("figure") || {}).id); break; }
-      if (!paper && size < 9.95 && e.tagName === "text") wrong.small.push(size.toFixed(1) + " " + name(node) + " of " + (drawn.closest("figure") || {}).id);
-    } else if (!paper && size < 10) wrong.small.push(size.toFixed(1) + " " + name(node));
+      if (!paper && size < least && e.tagName === "text") wrong.small.push(size.toFixed(1) + " " + name(node) + " of " + (drawn.closest("figure") || {}).id);
+    } else if (!paper && size < least) wrong.small.push(size.toFixed(1) + " " + name(node));
     const ink = rgba(drawn ? style.fill : style.color), ground = drawn ? [255, 255, 255, 1] : behind(e);
     if (ink && !(drawn && light(ink) > .8)) {
       const [a, b] = [light(ink), light(ground)].sort((x, y) => y - x), ratio = (a + .05) / (b + .05);

@@ -9,9 +9,12 @@ import pytest
 from browser import MEASURE, PAPER, Browser, found
 from test_loop_command import commanded, few_effects, mmrjax, starts_churning
 from test_settle import made as made_log
+from test_time_overlay import overlay
 
 from sweeps import pages
 from sweeps.pages import loop_page
+from sweeps.report import page_renderer
+from sweeps.report.document import Document, Figure, Section
 
 pytestmark = [
     pytest.mark.slow,
@@ -158,3 +161,34 @@ def test_a_table_is_sorted_by_its_headings_and_a_figure_says_its_values(browser,
       return document.getElementById("reading").textContent;
     })()""")
     assert "slope" in said and any(c.isdigit() for c in said)
+
+
+def drag(browser, element, begin, end):
+    """Press the mouse in an element and release it elsewhere; both are shares of its width."""
+    x, y, width, height = browser.value(f"""(() => {{
+      const e = document.querySelector("{element}");
+      e.scrollIntoView({{block: "center"}});
+      const box = e.getBoundingClientRect();
+      return [box.x, box.y, box.width, box.height];
+    }})()""")
+    steps = [("mouseMoved", 0), ("mousePressed", 0), ("mouseMoved", 0.5), ("mouseMoved", 1), ("mouseReleased", 1)]
+    for kind, part in steps:
+        share = begin + part * (end - begin)
+        browser(
+            "Input.dispatchMouseEvent", type=kind, x=x + share * width, y=y + height / 2, button="left", clickCount=1
+        )
+
+
+def test_a_time_overlay_zooms_and_its_residual_follows(browser, tmp_path):
+    figure = Figure("histories", "The simulated speed is off by 5.", "**Over time.**", overlay)
+    made = Document("Overlay", "The simulated speed is off by 5 rpm.", (), (Section("Over time", (figure,)),))
+    page = page_renderer.write(tmp_path, made)
+    assert wrong(browser, page) == {}
+    browser.open(page, 1280)
+    ranges = "document.querySelector('.overlay').ranges()"
+    before = browser.value(ranges)
+    drag(browser, ".overlay .u-over", 0.25, 0.75)
+    after = browser.value(f"new Promise(done => setTimeout(() => done({ranges}), 100))")
+    assert len(before) == len(after) == 2  # readings and their residual
+    assert before[0] == before[1] == pytest.approx([0, 10], abs=0.2)
+    assert after[0] == after[1] == pytest.approx([2.5, 7.5], abs=0.3)

@@ -412,7 +412,7 @@ def test_a_table_with_missing_readings_calibrates_and_says_so(found_with_gaps):
     assert made.converged and (made.status == "converged").all()
     assert made.notes[:2] == (
         "total_current_A: 2 of 20 readings are missing (rows 3, 8)",
-        "motor_speed_rpm: no readings; what they would show is not fitted",
+        "motor_speed_rpm: no readings; parameters that only they show are not fitted",
     )
     assert {c: e.rows for c, e in made.errors_after.items()} == {"total_current": 18, "motor_speed": 0, "speed": 20}
     assert made.noise["motor_speed"].source == "no readings"

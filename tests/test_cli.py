@@ -89,6 +89,7 @@ def test_simulate_runs_from_a_file_of_conditions(mmrjax, tmp_path):
     assert table(tmp_path / "p" / "runs.csv")[0]["run_id"] == "a"
 
 
+@pytest.mark.slow
 def test_battery_sags_and_ends_clearly(mmrjax, tmp_path):
     code, _, _ = mmrjax("simulate", "--battery", "--no-report", "--out", "full")
     (full,) = table(tmp_path / "full" / "runs.csv")

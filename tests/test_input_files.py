@@ -53,7 +53,7 @@ TOML = {
     "empty": ("# nothing\n", "states nothing; expected tables of parameters"),
     "a channel twice": (
         RIG.format(more="").replace('"motor_current"', '"output_speed"'),
-        "output_speed stands twice",
+        "output_speed is repeated",
     ),
 }
 

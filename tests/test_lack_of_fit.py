@@ -205,6 +205,7 @@ def test_command_opens_with_it(tmp_path):
         tmp_path, "calibrate", "runs.csv", "--out", "x", "--starts", "4", "--no-profiles", "--no-hold-out",
         *(a for c in ("6T2A", "4W2T") for a in ("--prior", f"{c}.ground.friction.static=0.6±0.09")),
     )  # fmt: skip
-    assert answer.code == 0 and answer.out.startswith("Not adequate: ")
+    assert answer.code == 0 and answer.out.startswith("The fit is not adequate; rms error before → after on ")
     page = (tmp_path / "x" / "report.html").read_text(encoding="utf-8")
-    assert page.index("Not adequate: ") < page.index("maximum a posteriori")
+    assert page.index("The fit is not adequate; ") < page.index("Not adequate: ") < page.index("maximum a posteriori")
+    assert '<div class="card " id="search">' in page  # converged, yet not green

@@ -212,6 +212,7 @@ def test_a_robot_held_on_a_slope_for_an_hour_stays(robot, configuration, mode, s
         assert float(found.total.of["path"]) == 0.0
 
 
+@pytest.mark.slow
 def test_what_friction_cannot_hold_rolls_back(robot):
     found = run(robot, asked(1, adhesion=2.0), rows([0, 20], "coast", slope_deg=20.0))
     assert float(found.total.of["distance"]) < -20.0

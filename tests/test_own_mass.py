@@ -213,7 +213,7 @@ def test_a_total_without_its_payload_is_suspected(robot):
 def test_a_surface_other_than_the_robots_is_said(robot):
     said = own_mass.remarks(robot, table({"6T2A": 13.1, "4W2T": 11.5}, surface="asphalt"))
     assert said == [
-        "the table has runs on asphalt: the friction that is written is that of lacquered_wood; simulate with "
+        "the table has runs on asphalt: the written friction is for lacquered_wood; simulate with "
         "--surface asphalt to meet what was fitted"
     ]
     assert own_mass.remarks(robot, table({"6T2A": 13.1, "4W2T": 11.5}, surface="lacquered_wood")) == []

@@ -157,7 +157,7 @@ def test_what_gets_worse_stands_before_effects_on_page_and_terminal(traced, tmp_
     found = finished(traced)
     rise = Worse("slope", "motor_speed", found.errors_held_out["slope"][1]["motor_speed"]["rows"], 4.3, 4.7)
     found = dataclasses.replace(found, held_out_worse=(rise,))
-    said = "Held out, what was found predicts worse: by slope motor speed 4.3 → 4.7 %."
+    said = f"Predicts worse on held-out rows: by slope motor speed 4.3 → 4.7 % (same {rise.rows} rows)."
     schema = json.loads((Path(__file__).parents[1] / "docs" / "schemas" / "loop.schema.json").read_text("utf-8"))
     document = finite(found.to_json())
     jsonschema.validate(document, schema)
@@ -169,13 +169,13 @@ def test_what_gets_worse_stands_before_effects_on_page_and_terminal(traced, tmp_
 
     room.print_discovery(found)
     printed = capsys.readouterr().out
-    assert said in " ".join(printed.split()) and printed.index("Held out, what") < printed.index("effect ")
+    assert said in " ".join(printed.split()) and printed.index("Predicts worse") < printed.index("effect ")
     assert printed.index("as stated, nothing fitted") < printed.index("before, fitted")
 
     text = loop_page.write(tmp_path, found, robot_name="nominal").read_text("utf-8")
     page = Tables(text)
     assert said in page.text
-    assert text.index('id="errors"') < text.index('id="worse"') < text.index('id="effects"')
+    assert text.index('id="summary"') < text.index('id="worse"') < text.index('id="use"')
     assert [row[0] for row in page.tables["summary"][1:3]] == ["as stated", "fitted again"]
     assert len(page.tables["alternatives_held_out"]) == 1 + len(traced.held_out)
 

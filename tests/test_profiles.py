@@ -143,7 +143,7 @@ def test_supply_voltage_beside_the_battery_is_refused(read):
     table = read("time_s,supply_voltage_V\n0,24\n1,24\n")
     table.check_source(battery=False)
     with pytest.raises(
-        BadConfiguration, match=r"--battery: got it beside mission.csv, which states supply_voltage_V"
+        BadConfiguration, match=r"--battery: got it together with mission.csv, which states supply_voltage_V"
     ):
         table.check_source(battery=True)
 
@@ -162,9 +162,9 @@ WRONG = {
     "gap in the time": ("time_s,duty\n0,1\n,1\n9,1\n", r"row 2, time_s: got an empty cell; expected a number, 0 to 1e\+06"),
     "gap at a ramp's end": (_LINEAR + "time_s,duty,slope_deg\n0,1,0\n5,1,\n", r"row 2, slope_deg: got an empty cell"),
     "gap in the surface": ("time_s,duty,surface\n0,1,asphalt\n5,1,\n9,1,\n", r"row 2, surface: got an empty cell; expected one of"),
-    "two demands": ("time_s,motor_speed_rpm,speed_mm_s\n0,3000,\n5,3000,400\n6,3000,\n", r"row 2, speed_mm_s: got 400 beside motor_speed_rpm; expected one demand in a row"),
-    "duty beside a speed": ("time_s,duty,speed_mm_s\n0,0.5,400\n5,,400\n", r"row 1, speed_mm_s: got 400 beside duty; expected one demand in a row"),
-    "demand beside another mode": ("time_s,speed_mm_s,mode\n0,400,brake\n5,,brake\n", r"row 1, speed_mm_s: got 400 beside mode brake"),
+    "two demands": ("time_s,motor_speed_rpm,speed_mm_s\n0,3000,\n5,3000,400\n6,3000,\n", r"row 2, speed_mm_s: got 400 in addition to motor_speed_rpm; expected one demand in a row"),
+    "duty beside a speed": ("time_s,duty,speed_mm_s\n0,0.5,400\n5,,400\n", r"row 1, speed_mm_s: got 400 in addition to duty; expected one demand in a row"),
+    "demand beside another mode": ("time_s,speed_mm_s,mode\n0,400,brake\n5,,brake\n", r"row 1, speed_mm_s: got 400 in addition to mode brake"),
     "no demand": ("time_s,duty,speed_mm_s\n0,1,\n5,,\n9,,400\n", r"row 2: got no demand; expected a value in one of duty, speed_mm_s, or brake or coast"),
     "mode without its column": ("time_s,mode\n0,speed\n5,speed\n", r"row 1, mode: got speed; expected a column with that demand, such as speed_mm_s"),
     "mode without its demand": ("time_s,speed_mm_s,mode\n0,400,\n5,,speed\n9,,\n", r"row 2, speed_mm_s: got an empty cell; expected the demand of mode speed"),
@@ -188,7 +188,7 @@ WRONG = {
     "empty file": ("", r"mission.csv: the file is empty; expected a header with time_s"),
     "comments only": ("# cycles = 3\n", r"mission.csv: the file is empty"),
     "header only": ("time_s,duty\n", r"got a header and no rows; expected two rows or more"),
-    "one row only": ("time_s,duty\n0,1\n", r"got one row; expected two rows or more, of which the last ends the mission"),
+    "one row only": ("time_s,duty\n0,1\n", r"got one row; expected two rows or more; the last one ends the mission"),
     "a short row": ("time_s,duty\n0,1\n5\n", r"row 2: got 1 cell; the header has 2 columns"),
     "commas and points": ("time_s;duty\n0;0,5\n5;0.5\n", r"duty: got 0,5 and 0\.5; expected decimal commas or points"),
     "unknown surface": ("time_s,duty,surface\n0,1,ice\n5,1,ice\n", r"row 1, surface: got ice; expected one of these; .*asphalt"),
@@ -203,9 +203,9 @@ WRONG = {
     "duties and voltages": ("time_s,duty_left,duty_right,voltage_left_V,voltage_right_V\n0,1,1,,\n5,1,1,,\n", r"got duty_left together with voltage_left_V; expected one of the two"),
     "duty beside duties": ("time_s,duty,duty_left,duty_right\n0,,1,1\n5,,1,1\n", r"got duty together with duty_left; expected one"),
     "gap in a side": ("time_s,duty_left,duty_right\n0,1,\n5,1,1\n", r"row 1, duty_right: got an empty cell; expected a value for either side"),
-    "duties beside a speed": ("time_s,duty_left,duty_right,speed_mm_s\n0,1,1,300\n5,1,1,\n", r"row 1, speed_mm_s: got 300 beside duty_left; expected one demand in a row"),
+    "duties beside a speed": ("time_s,duty_left,duty_right,speed_mm_s\n0,1,1,300\n5,1,1,\n", r"row 1, speed_mm_s: got 300 in addition to duty_left; expected one demand in a row"),
     "yaw rate without a speed": ("time_s,yaw_rate_rad_s,duty\n0,1,1\n5,1,1\n", r"got yaw_rate_rad_s without speed_mm_s; expected a demanded ground speed"),
-    "gap in the yaw rate": ("time_s,speed_mm_s,yaw_rate_deg_s\n0,300,\n5,300,10\n", r"row 1, yaw_rate_deg_s: got an empty cell; expected the yaw rate demanded beside the speed, 0 for straight travel"),
+    "gap in the yaw rate": ("time_s,speed_mm_s,yaw_rate_deg_s\n0,300,\n5,300,10\n", r"row 1, yaw_rate_deg_s: got an empty cell; expected the demanded yaw rate, 0 for straight travel"),
     "yaw rate of a braked robot": ("time_s,speed_mm_s,yaw_rate_rad_s,mode\n0,,1,brake\n5,,,\n", r"row 1, yaw_rate_rad_s: got 1; expected an empty cell: a yaw rate goes with a demanded speed, and this row has mode brake"),
     "setting twice": ("# cycles = 4\n# cycles = 4\ntime_s,duty\n0,1\n5,1\n", r"cycles is set twice"),
 }  # fmt: skip

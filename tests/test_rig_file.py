@@ -369,7 +369,7 @@ REFUSED = {
     "shaft on wheels": (BENCH + 'movers = "wheels"', r"bench: states both load = 'shaft' and movers"),
     "not said what": (
         BENCH + "[other]\ninertia = 1.0\n",
-        r"other: what it is is missing; state load = one of shaft, linear, vehicle",
+        r"other: its kind is missing; state load = one of shaft, linear, vehicle",
     ),
     "not among": ('configurations = ["bench"]' + BENCH + '[slow]\nload = "shaft"', r"slow: not among the configurations"),
     "vehicle with a parameter of a shaft": (

@@ -130,7 +130,7 @@ REFUSED = {
     ),
     "a configuration twice": (
         "configurations = ['6T2A', '6T2A']",
-        r"configurations: 6T2A stands 2 times; name each once",
+        r"configurations: 6T2A is listed 2 times; name each once",
     ),
     "a configuration with a dot": (
         "configurations = ['a.b']",

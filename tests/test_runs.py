@@ -71,7 +71,7 @@ def test_missing_readings_are_nan_and_counted(tmp_path):
     np.testing.assert_array_equal(np.isnan(runs.measured()), [[False, True, False], [True, True, False]])
     assert runs.missing() == [
         "total_current_A: 1 of 2 readings are missing (row 2)",
-        "motor_speed_rpm: no readings; what they would show is not fitted",
+        "motor_speed_rpm: no readings; parameters that only they show are not fitted",
     ]
     assert np.isnan(runs.deviations()).all()
 
@@ -84,7 +84,7 @@ def test_a_table_without_any_known_channel_is_refused(tmp_path):
 
 def test_a_reading_without_its_stated_sd_is_refused(tmp_path):
     text = f"{HEADER},speed_sd_mm_s\n{ROW},4\n{ROW},\n"
-    with pytest.raises(BadData, match=r"row 2, speed_sd_mm_s: got an empty cell beside a reading; expected its sd"):
+    with pytest.raises(BadData, match=r"row 2, speed_sd_mm_s: got an empty cell next to a reading; expected its sd"):
         records.read(write(tmp_path, text))
 
 
@@ -199,7 +199,7 @@ REFUSED = {
         r"slope_deg is missing; is slope_degr meant",
     ),
     "misspelt optional column": (f"{HEADER},total_current_sd_AA\n{ROW},1", r"did you mean total_current_sd_A"),
-    "repeated column": (f"{HEADER},slope_deg\n{ROW},5", r"column slope_deg stands 2 times"),
+    "repeated column": (f"{HEADER},slope_deg\n{ROW},5", r"column slope_deg is present 2 times"),
     "extra cell": (f"{HEADER}\n{ROW},7", r"row 1: got 9 cells; the header has 8"),
     "missing cell": (f"{HEADER}\n{ROW}\n6T2A,15", r"row 2: got 2 cells"),
     "slope of 95": (
@@ -304,11 +304,14 @@ def test_bytes_that_are_no_text_are_refused(tmp_path):
 @pytest.mark.parametrize(
     ("rows", "says"),
     [
-        ("15;13,1;0;0;2,75;4.800;422", r"motor_speed_rpm: got 4\.800 beside 13,1 in total_mass_kg; expected decimal"),
-        ("15;13.1;0;0;2.75;4,800;422", "motor_speed_rpm: got 4,800 beside 13.1 in total_mass_kg; expected decimal"),
+        (
+            "15;13,1;0;0;2,75;4.800;422",
+            r"motor_speed_rpm: got 4\.800 next to 13,1 in total_mass_kg; expected decimal",
+        ),
+        ("15;13.1;0;0;2.75;4,800;422", "motor_speed_rpm: got 4,800 next to 13.1 in total_mass_kg; expected decimal"),
         (
             "15;13;0;0;3;4.800;422\n6T2A;5;13;0;0;3;950;92",
-            r"motor_speed_rpm: got 4\.800 beside whole numbers below a thousand; .* nothing between thousands",
+            r"motor_speed_rpm: got 4\.800 next to whole numbers below a thousand; .* nothing between thousands",
         ),
     ],
 )
@@ -346,9 +349,9 @@ def test_commas_and_points_in_one_column_are_refused(tmp_path):
         (
             "supply_voltage_V",
             "24V",
-            "got 24V; write 24, the unit stands in the column's name; expected a number, -100",
+            "got 24V; write 24, as the column's name has the unit; expected a number, -100",
         ),
-        ("supply_voltage_V", "24 volts", "got 24 volts; write 24, the unit stands in"),
+        ("supply_voltage_V", "24 volts", "got 24 volts; write 24, as the column's name has"),
         (
             "supply_voltage_V",
             "24000",
@@ -409,7 +412,7 @@ def test_what_a_table_lacks_is_said_before_it_is_used(tmp_path):
     assert found.notes == (
         "runs.csv: 1 of 4 cells of total_current_A are empty, the first in row 2; they weigh nothing",
         "runs.csv: no column motor_speed_rpm; nothing is known of its channel",
-        "runs.csv: run_id a stands in rows 1, 3; without time_s every row is a run of its own",
+        "runs.csv: run_id a is in rows 1, 3; without time_s every row is a separate run",
     )
 
 

@@ -186,7 +186,7 @@ BAD = {
     ),
     "time twice": (
         lambda c: c | {"time_s": np.r_[c["time_s"][0], c["time_s"][0], c["time_s"][2:]]},
-        r"row 2, time_s: 0 s stands twice; give each sample its own time",
+        r"row 2, time_s: 0 s is repeated; give each sample its own time",
     ),
     "no time": (
         lambda c: {k: v for k, v in c.items() if k != "time_s"},
@@ -207,7 +207,7 @@ BAD = {
             | {"supply_voltage_V": np.full(1200, 12.0), "duty": np.repeat([0.5, 0.6] * 3, 200)}
             | {"motor_speed_rpm": np.repeat([1, 1.2, -1, -1.2, 1, 1.2], 200) * (1000 + np.arange(1200) % 3)}
         ),
-        r"motor_speed_rpm: shows -1001 rpm at 6 V; expected the sign of what is imposed; give duty the sign",
+        r"motor_speed_rpm: shows -1001 rpm at 6 V; expected the sign of the imposed quantity; give duty the sign",
     ),
     "nothing imposed": (lambda c: c | {"supply_voltage_V": np.zeros(600)}, r"rows 1 to 600, no settled stretch: supply_voltage_V: nothing drives the motors; log rows"),
     "never settles": (
@@ -247,31 +247,31 @@ WRONG = {
     ),
     "a speed turned round": (
         dict(motor_speed_rpm=lambda x: -x),
-        r"rows \d+ to 200, motor_speed_rpm: shows -1080 rpm at 6 V; expected the sign of what is imposed; state "
+        r"rows \d+ to 200, motor_speed_rpm: shows -1080 rpm at 6 V; expected the sign of the imposed quantity; state "
         r"\[columns\] motor_speed_rpm = \{column = \.\.\., factor = -1\}",
     ),
     "a current turned round": (
         dict(total_current_A=lambda x: -x),
-        r"rows \d+ to 200, total_current_A: shows -0\.6 A at 6 V; expected the sign of what is imposed; state "
+        r"rows \d+ to 200, total_current_A: shows -0\.6 A at 6 V; expected the sign of the imposed quantity; state "
         r"\[columns\] total_current_A = \{column = \.\.\., factor = -1\}",
     ),
     "a voltage without sign": (
         dict(supply_voltage_V=np.abs),
-        r"rows \d+ to 600, motor_speed_rpm: shows -1080 rpm at 6 V; expected the sign of what is imposed; give "
+        r"rows \d+ to 600, motor_speed_rpm: shows -1080 rpm at 6 V; expected the sign of the imposed quantity; give "
         "supply_voltage_V the sign of its direction",
     ),
     "an angle in radians": (
         dict(output_angle_deg=np.radians),
-        r"rows \d+ to 200, output_angle_deg: 0\.01745 times as fast as motor_speed_rpm says with the ratio of the rig's "
+        r"rows \d+ to 200, output_angle_deg: 0\.01745 times as fast as motor_speed_rpm with the ratio of the rig's "
         r"file; is it radians for degrees\? write all rows in its unit, or state .* factor = 57\.3\}",
     ),
     "recordings in two units": (
         dict(output_angle_deg=lambda x: np.where(np.arange(800) < 400, x - x[399], np.radians(x - x[399]))),
-        r"rows \d+ to 600, output_angle_deg: 0\.01745 times as fast as motor_speed_rpm says",
+        r"rows \d+ to 600, output_angle_deg: 0\.01745 times as fast as motor_speed_rpm with",
     ),
     "an angle that changes its unit": (
         dict(output_angle_deg=lambda x: np.where(np.arange(800) < 350, x, np.radians(x))),
-        r"row 351, output_angle_deg: goes from 3133 to 5\d\.?\d* between two samples, as degrees beside radians",
+        r"row 351, output_angle_deg: goes from 3133 to 5\d\.?\d* between two samples, as if degrees and radians are mixed",
     ),
     "an angle that wraps": (
         dict(output_angle_deg=lambda x: np.mod(x, 360.0)),

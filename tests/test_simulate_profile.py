@@ -231,7 +231,7 @@ def test_what_does_not_go_with_a_profile_is_refused(mmrjax, capsys, monkeypatch,
 _VOLTS = "time_s,voltage_left_V,voltage_right_V\n0,20,10\n2,20,10\n"
 SIDES = {
     "more than the supply has": (_VOLTS, ["--voltage", "15"], r"voltage_left_V and voltage_right_V: got 20 V; the supply has 15 V"),
-    "voltages of a battery": (_VOLTS, ["--battery"], r"--battery: got it beside sides.csv, which states voltage_left_V; .* duty_left and duty_right"),
+    "voltages of a battery": (_VOLTS, ["--battery"], r"--battery: got it together with sides.csv, which states voltage_left_V; .* duty_left and duty_right"),
     "a robot of one side": (_VOLTS, ["--set", "sides=1"], r"sides.csv drives the sides apart: got a robot of 1 side; expected sides = 2"),
     "options beside": (_VOLTS, ["--left", "10", "--right", "5"], r"--left acts without --profile only"),
 }  # fmt: skip
@@ -249,7 +249,7 @@ def test_sides_that_cannot_be_are_refused(mmrjax, capsys, monkeypatch, case):
 def test_voltage_of_the_profile_beside_the_battery_is_refused(mmrjax, capsys, monkeypatch):
     (mmrjax.folder / "volts.csv").write_text("time_s,supply_voltage_V\n0,24\n1,24\n")
     code, _, err = mmrjax(capsys, monkeypatch, "simulate", "--profile", "volts.csv", "--battery")
-    assert code == 2 and "--battery: got it beside volts.csv, which states supply_voltage_V" in err
+    assert code == 2 and "--battery: got it together with volts.csv, which states supply_voltage_V" in err
 
 
 def test_help_names_the_packaged_profiles_and_units(mmrjax, capsys, monkeypatch):

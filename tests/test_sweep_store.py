@@ -908,7 +908,7 @@ REFUSED = {
     "zero shares": (CONFIG, ["--shard", "1/0"], "--shard: got 1/0; expected i/n with i from 1 to n"),
     "share zero": (CONFIG, ["--shard", "0/3"], "--shard: got 0/3; expected i/n"),
     "share in words": (CONFIG, ["--shard", "first"], "--shard: got first; expected i/n"),
-    "shares of a cluster": (CONFIG, ["--shard", "1/2", "--scheduler", "tcp://x:1"], "--shard: got it beside --scheduler"),
+    "shares of a cluster": (CONFIG, ["--shard", "1/2", "--scheduler", "tcp://x:1"], "--shard: not allowed with --scheduler"),
     "unknown export": (CONFIG, ["--export", "xls"], "--export: got xls; allowed: csv, parquet"),
     "option of a grid": (CONFIG, ["--slopes", "3"], "--slopes: acts with a grid of options only"),
     "two configurations": (CONFIG, ["--config", "plan.toml"], "--config: got plan.toml beside plan.toml"),

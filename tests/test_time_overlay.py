@@ -70,7 +70,7 @@ def test_panels_are_stacked_for_phones(tmp_path, monkeypatch, stated):
 
     def draw():
         fig, grid = figure_style.figure(1, 2, 3.0, sharey="row")
-        grid[0, 0].set_ylabel("current")
+        grid[0, 0].set(ylabel="current", xlabel="runs by slope, then payload, then voltage; band: ±2σ")
         drawn.append((fig, grid))
         return fig
 
@@ -81,7 +81,7 @@ def test_panels_are_stacked_for_phones(tmp_path, monkeypatch, stated):
         fig, grid = drawn[1]
         assert fig.get_size_inches()[0] == figure_style.NARROW
         assert grid[0, 0].get_position().y0 > grid[0, 1].get_position().y1
-        assert grid[0, 1].get_ylabel() == "current"
+        assert grid[0, 1].get_ylabel() == "current" and "\n" in grid[0, 0].get_xlabel()
 
 
 def test_a_colour_scale_is_not_inverted_in_the_dark(tmp_path):

@@ -177,7 +177,9 @@ def test_a_voltage_beside_the_battery_is_refused(mmrjax, tmp_path):
     (tmp_path / "runs.csv").write_text("configuration,supply_voltage_V,payload_kg,slope_deg\n6T2A,24,0,0\n")
     code, _, err = mmrjax("simulate", "--battery", "--runs", "runs.csv")
     assert code == 4
-    assert err.startswith("mmrjax: runs.csv row 1, supply_voltage_V: got 24 beside --battery, whose charge sets")
+    assert err.startswith(
+        "mmrjax: runs.csv row 1, supply_voltage_V: got 24 together with --battery, whose charge sets"
+    )
 
 
 @pytest.mark.slow

@@ -200,10 +200,10 @@ def test_tables_take_the_duty_of_either_side(tmp_path):
     assert runs.turns
     assert runs.axes[-2:] == ("duty_left", "duty_right")
     path.write_text(f"{HEADER}duty_left\n6T2A,33,0,0,1\n")
-    with pytest.raises(BadData, match="column duty_right is missing beside duty_left"):
+    with pytest.raises(BadData, match="column duty_right is missing, duty_left is stated"):
         records.read(path, measured=False)
     path.write_text(f"{HEADER}duty_left,duty_right,duty\n6T2A,33,0,0,1,1,1\n")
-    with pytest.raises(BadData, match="column duty beside duty_left"):
+    with pytest.raises(BadData, match="column duty in addition to duty_left"):
         records.read(path, measured=False)
 
 
@@ -251,7 +251,7 @@ def test_options_of_one_run_are_refused_beside_a_table(tmp_path, mmrjax):
     path.write_text(f"{HEADER}{SIDED}\n6T2A,33,0,0,1,0.5\n")
     for more in ((), ("--profile", "patrol", "--battery")):
         code, _, err = mmrjax("simulate", "--runs", path, "--voltage", "4", "--mass", "12", *more)
-        assert code == 2 and "--voltage, --mass: got it beside --runs" in err
+        assert code == 2 and "--voltage, --mass: not allowed with --runs" in err
 
 
 @pytest.mark.parametrize(

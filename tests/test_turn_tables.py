@@ -193,16 +193,16 @@ def test_the_packaged_robot_turns_by_voltages_of_its_sides_without_a_supply(tmp_
     conditions = runs.conditions(mm.nominal())
     np.testing.assert_allclose(conditions.voltage, [24.0, 12.0])
     np.testing.assert_allclose(conditions.duty_left, [0.25, -1.0])
-    with pytest.raises(BadData, match=r"voltage_left_V beside --battery, .* state duty_left and duty_right"):
+    with pytest.raises(BadData, match=r"voltage_left_V together with --battery, .* state duty_left and duty_right"):
         records.read(path, measured=False, battery=True)
 
 
 @pytest.mark.parametrize(
     ("header", "row", "says"),
     [
-        ("voltage_left_V", (3,), "column voltage_right_V is missing beside voltage_left_V; state what drives both"),
-        ("voltage_left_V,voltage_right_V,duty_left,duty_right", (3, 6, 0.5, 1), "column duty_left beside voltage_left"),
-        ("voltage_left_V,voltage_right_V,duty", (3, 6, 1), "column duty beside voltage_left_V, .* keep one"),
+        ("voltage_left_V", (3,), "column voltage_right_V is missing, voltage_left_V is stated; state the drive of both"),
+        ("voltage_left_V,voltage_right_V,duty_left,duty_right", (3, 6, 0.5, 1), "column duty_left in addition to voltage_left"),
+        ("voltage_left_V,voltage_right_V,duty", (3, 6, 1), "column duty in addition to voltage_left_V, .* keep one"),
         ("voltage_left_V,voltage_right_V,supply_voltage_V", (3, 13, 12), "row 2, voltage_right_V: got 13 of a supply "
          "of 12 V; expected no more than supply_voltage_V, or no such column"),
         ("voltage_left_V,voltage_right_V", ("", 3), "row 2, voltage_left_V: got an empty cell; expected a number, -100"),
@@ -280,11 +280,11 @@ def row_of(*changes):
 KEEP = tuple((k, 1) for k in range(5))
 REFUSED = {
     "one side": (KINEMATIC, f"motor_speed_left_rpm,{READ}", row_of(KEEP[0], *KEEP[2:]),
-                 "column motor_speed_right_rpm is missing beside motor_speed_left_rpm"),
+                 "column motor_speed_right_rpm is missing, motor_speed_left_rpm is stated"),
     "one duty": (DRIVEN, f"supply_voltage_V,duty_left,{READ}", [(24, 1, *row[2:]) for row in SOUND],
-                 "column duty_right is missing beside duty_left"),
+                 "column duty_right is missing, duty_left is stated"),
     "both ways": (KINEMATIC, f"motor_speed_rpm,{SPEEDS},{READ}", [(1, *row) for row in SOUND],
-                  "column motor_speed_rpm beside motor_speed_left_rpm, motor_speed_right_rpm; keep one"),
+                  "column motor_speed_rpm in addition to motor_speed_left_rpm, motor_speed_right_rpm; keep one"),
     "letters": (KINEMATIC, f"{SPEEDS},motor_current_l_A,motor_current_r_A,yaw_rate_rad_s", SOUND,
                 "column motor_current_l_A: the sides are called left and right; name it motor_current_left_A"),
     "in front": (KINEMATIC, f"{SPEEDS},left_motor_current_A,right_motor_current_A,yaw_rate_rad_s", SOUND,

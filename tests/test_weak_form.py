@@ -190,7 +190,7 @@ def test_a_current_or_a_speed_may_be_imposed(tmp_path, imposed, channel):
     assert imposed == "motor_speed" or "churning" in [e.name for e in ranked.effects[:2]]
 
 
-@pytest.mark.parametrize("kind, made", [("servo", servo), ("carriage", carriage)])
+@pytest.mark.parametrize("kind, made", [("servo", servo), pytest.param("carriage", carriage, marks=pytest.mark.slow)])
 def test_logs_of_an_angle_alone_are_twice_integrated(tmp_path, kind, made):
     made = made(np.random.default_rng(1), levels=(0.8, 1.0, -0.9) if kind == "servo" else (1.2, 2.0, -1.6))
     robot = written(tmp_path, kind, made)

@@ -254,14 +254,14 @@ OVER = CurveOver("slip", ("slope",))
                     NameTest("c", 5.0, 3.41, (), 9.0, again=0.75, larger=("d", "e"), remains=True),
                 ),
             ),
-            "a explains 1.2 σ next to smooth curves (slip balance over slope), and chance reaches 3.4; b is a worse "
+            "a explains 1.2 σ next to smooth curves (slip balance over slope); chance alone reaches 3.4; b is a worse "
             "explanation than a smooth curve in its place and rests on row 10; c is chosen again in 75 % of the data "
             "with a block left out, has a rival of an implausible size (d and e) and leaves something in its own "
             "equation",
         ),
         (
             NameSupport(False, "none by itself", tests=(NameTest("a", 1.2, 3.41, (), 0.0),)),
-            "a explains 1.2 σ, and chance reaches 3.4",
+            "a explains 1.2 σ; chance alone reaches 3.4",
         ),
         (
             NameSupport(
@@ -346,7 +346,7 @@ def test_a_mechanism_is_stated_with_its_window_and_why_no_name_stands():
         == f"No: missing is a slip that changes with {within}. Its exact law is not established."
     )
     said = (
-        "one constant in the slip balance in runs 30 to 44 leaves nothing; a explains 1.2 σ, and chance reaches 3.4"
+        "one constant in the slip balance in runs 30 to 44 leaves nothing; a explains 1.2 σ; chance alone reaches 3.4"
     )
     assert loop_words.why(found) == said
     found.after.adequate = False
@@ -441,9 +441,9 @@ def test_names_say_what_would_explain_more_than_they():
 @pytest.mark.parametrize(
     ("found", "predicted", "said"),
     [
-        ((10, 4.3, 4.72), (10, 10), "motor speed 4.3 → 4.7 %"),
-        ((10, 0.141, 0.149), (10, 10), "motor speed 0.14 → 0.15 %"),
-        ((8, 4.0, 5.0), (8, 10), "motor speed 4.0 → 5.0 % (of the 8 rows that both predict)"),
+        ((10, 4.3, 4.72), (10, 10), "motor speed 4.3 → 4.7 % (same 10 rows)"),
+        ((10, 0.141, 0.149), (10, 10), "motor speed 0.14 → 0.15 % (same 10 rows)"),
+        ((8, 4.0, 5.0), (8, 10), "motor speed 4.0 → 5.0 % (same 8 rows)"),
         (None, (10, 8), "2 rows fewer predicted"),
         (None, (10, 9), "1 row fewer predicted"),
         (None, (10, 10), ""),
@@ -451,7 +451,7 @@ def test_names_say_what_would_explain_more_than_they():
 )
 def test_what_is_predicted_worse_is_said_with_its_rows(found, predicted, said):
     worse = () if found is None else (Worse("voltage", "motor_speed", *found),)
-    whole = f"Held out, what was found predicts worse: by voltage {said}."
+    whole = f"Predicts worse on held-out rows: by voltage {said}."
     assert loop_words.worse(worse, {"voltage": predicted}) == (whole if said else "")
 
 

@@ -89,7 +89,7 @@ def refusal(where: str, meaning: Column, cell: str, layout: Layout, *, hints: bo
 
 
 def _hint(meaning: Column, cell: str, units: bool, readings: tuple[str, ...]) -> str:
-    """Guess at the meaning of a refused cell, with a semicolon at its end; empty where there is none."""
+    """Guess at the meaning of a refused cell, with a semicolon at its end; empty without a guess."""
     if cell.lower() in NOTHING:
         return "leave the cell empty where there is no reading; " if meaning.column in readings else ""
     quantity, mine = meaning.quantity, meaning.unit
@@ -115,7 +115,7 @@ def _unit_hint(value: str, written: str, mine: str, named: Mapping[str, str]) ->
     """Advice on a unit next to a number; `mine`: the column's own unit, `named`: columns by their units."""
     unit = quantities.unit_in_column(written)
     if unit == mine:
-        return f"write {value}, the unit stands in the column's name; "
+        return f"write {value}, as the column's name has the unit; "
     if unit in named:
         return f"write numbers alone, in {mine or 'shares of 1'}, or name the column {named[unit]}; "
     return f"write the number alone{f', in {mine}' if mine else ''}; "

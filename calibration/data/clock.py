@@ -14,7 +14,7 @@ from calibration.data.columns import Column
 from calibration.data.input_errors import number
 from calibration.data.named_arrays import Raw, numbers
 
-#: Day of a cell that holds a time alone, and length of a day [s].
+#: Day of a cell with a time alone, and length of a day [s].
 _SOME_DAY, _DAY = "1970-01-01T", 86400.0
 #: Seconds since 1970 between which a clock may count from there, 1990 and 2100; and seconds of one of other units.
 EPOCH, PARTS = (6.3e8, 4.2e9), {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}
@@ -23,7 +23,7 @@ _WITH_POINTS = re.compile(r"(\d\d)\.(\d\d)\.(\d{4})(?=[ T])")
 
 
 def from_the_first(name: str, meaning: Column, raw: Raw, runs: Sequence[str] | None) -> tuple[Raw, tuple[str, ...]]:
-    """Returns a column of time as the time since the first row of each run, and notes on what that changes.
+    """Returns a column of time as the time since the first row of each run, and notes on the changes.
 
     A run begins at its first row, whatever its clock shows there: the time since a controller started, or a time of
     day. Times of day follow ISO 8601, or have a date as 25.11.2026, or are numbers beyond the largest time. These

@@ -22,16 +22,17 @@ _SIDE = {"l": "left", "lh": "left", "lft": "left", "port": "left", "r": "right",
 def understood(
     name: str, header: Sequence[str], layout: Layout, *, inferred: bool, of_turns: bool
 ) -> tuple[list[str], Layout, tuple[str, ...]]:
-    """Returns the names of columns as this program spells them, the layout with the channels that they show, and a
-    note on each name that differs in case.
+    """Returns the names of columns in this program's spelling, the layout with their channels, and notes.
+
+    A note reports each name that differs in case.
 
     Raises:
-        BadData: a name that stands twice.
+        BadData: a repeated name.
     """
     named, notes = _in_case(name, header, layout, inferred)
     repeated = sorted({c for c in named if named.count(c) > 1})
     if repeated:
-        raise BadData(f"{name}: column {repeated[0]} stands {named.count(repeated[0])} times; expected once")
+        raise BadData(f"{name}: column {repeated[0]} is present {named.count(repeated[0])} times; expected once")
     if inferred:
         layout = _with_channels(name, named, layout, channels.EVERY)
     if of_turns and {*layout.sides, *VOLTS, *HEADING} & {m.column for m in layout.meanings(name, named) if m}:
@@ -40,7 +41,7 @@ def understood(
 
 
 def _in_case(name: str, header: Sequence[str], layout: Layout, inferred: bool) -> tuple[list[str], tuple[str, ...]]:
-    """A header with the capitals of the columns' names, and sentences on what was read so."""
+    """A header with the capitals of the columns' names, and notes on changed names."""
     known = dataclasses.replace(layout, channels=channels.EVERY) if inferred else layout
     spelled: dict[str, set[str]] = {}
     for column in known.spellings():
@@ -73,20 +74,20 @@ def check_header(
         strange = [c for c in strange if c not in {x for k in channels.EVERY for x in (k.column, k.sd_column)}]
     _check_names_of_sides(name, strange, stated, layout)
     required = layout.required(measured=measured, battery=battery)
-    if layout.imposed_column == SPEED and stated & set(layout.sides):  # theirs is imposed
+    if layout.imposed_column == SPEED and stated & set(layout.sides):  # the sides' speeds are imposed
         required = tuple(c for c in required if c != SPEED)
         if SPEED in stated:
-            raise BadData(f"{name}: column {SPEED} beside {', '.join(layout.sides)}; keep one of them")
-    if stated & set(VOLTS):  # of which the supply's is the larger
+            raise BadData(f"{name}: column {SPEED} in addition to {', '.join(layout.sides)}; keep one of them")
+    if stated & set(VOLTS):  # the supply's voltage is the larger one
         required = tuple(c for c in required if c != SUPPLY)
-    if not layout.complete and "surface" in stated:  # which says the configuration too, where it has those of one
+    if not layout.complete and "surface" in stated:  # it gives the configuration too, if all surfaces are of one
         required = tuple(c for c in required if c != "configuration")
     for column in (c for c in (*required, *layout.measured_columns) if c not in stated):
         close = difflib.get_close_matches(column, strange, 1, 0.6)
         if column in required or (close and layout.complete):
             got = f"; is {close[0]} meant?" if close else ""
-            if column == SUPPLY and {f"motor_{volts}" for volts in VOLTS} <= {*header}:  # which may be readings too
-                got = "; what drives the sides may be stated, in the robot's file: [columns] " + ", ".join(
+            if column == SUPPLY and {f"motor_{volts}" for volts in VOLTS} <= {*header}:  # they may be readings too
+                got = "; the drive of the sides may be stated, in the robot's file: [columns] " + ", ".join(
                     f'{volts} = "motor_{volts}"' for volts in VOLTS
                 )
             raise BadData(
@@ -120,15 +121,15 @@ def check_time(name: str, header: list[str], meanings: list[Column | None], layo
 
 
 def _other_names(strange: list[str], column: str) -> str:
-    """Advice on columns with unknown names, for a message; empty if there are none."""
+    """Advice on columns with unknown names, for a message; empty without such columns."""
     if not strange:
         return ""
     unit = column.rpartition("_")[2]
     guess = next((c for c in strange if re.search(rf"\b{unit}\b", c)), "...")
     shown = ", ".join(strange[:NAMED]) + (", ..." if len(strange) > NAMED else "")
     return (
-        f"; other columns: {shown}; if one of them is it, say so in the robot's file, with the factor from its unit: "
-        f'[columns] {column} = {{column = "{guess}", factor = 1.0}} (mmrjax inspect proposes such lines)'
+        f"; other columns: {shown}; if one of them is it, state it in the robot's file, with the factor from its "
+        f'unit: [columns] {column} = {{column = "{guess}", factor = 1.0}} (mmrjax inspect proposes such lines)'
     )
 
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from mmrjax.model.rig import Instrument
     from mmrjax.model.robot import Robot
 
-#: Column of what is imposed (`rig.IMPOSED`), and the SI value of its unit.
+#: Column of each imposed quantity (`rig.IMPOSED`), and the SI value of its unit.
 SUPPLY, SPEED, CURRENT = "supply_voltage_V", "motor_speed_rpm", "motor_current_A"
 IMPOSED = {"voltage": (SUPPLY, 1.0), "motor_speed": (SPEED, RPM), "motor_current": (CURRENT, 1.0)}
 #: Rows of all runs of a log from which on readings of fewer are used (`thinning`).
@@ -30,7 +30,7 @@ def _conditions(*loads: str) -> dict[str, Condition]:
 
 #: Conditions that act on a vehicle alone, and on a load on a shaft alone.
 ON_GROUND, ON_SHAFT = tuple(_conditions(GROUND)), tuple(_conditions(SHAFT))
-#: Conditions that the packaged robot's tables state, and values of those that a table may leave out.
+#: Conditions that the packaged robot's tables state, and default values of optional ones.
 CONDITIONS = {SUPPLY: BY_COLUMN[SUPPLY], **_conditions(GROUND)}
 DEFAULTS = {c.column: c.usual for c in CONDITIONS.values() if c.usual is not None}
 TIME = {"time_s": BY_COLUMN["time_s"]}
@@ -43,7 +43,7 @@ CIRCUITS = dict(zip(DRIVEN, (0.0, -1.0, 1.0), strict=True))
 DRIVING = ("duty", "mode")
 #: Shares of the supply's voltage that the motors of either side get, of a robot whose sides are driven apart.
 SIDES = {c: BY_COLUMN[c] for c in ("duty_left", "duty_right")}
-#: The same in volts, which are read as those shares (`sides.of_volts`).
+#: The same in volts, converted to shares (`sides.of_volts`).
 VOLTS = {c: BY_COLUMN[c] for c in ("voltage_left_V", "voltage_right_V")}
 #: The same where speeds are imposed.
 SPEEDS = tuple(channels.find_channel(f"motor_speed_{side}").column for side in channels.SIDES)
@@ -52,11 +52,11 @@ HEADING = {"heading_deg": BY_COLUMN["heading_deg"]}
 LEVERS = {c: BY_COLUMN[c] for c in ("levers_front_deg", "levers_rear_deg")}
 #: Torque of a brake on the output of each drive, positive against forward rotation.
 LOAD = "load_torque_Nm"
-#: Columns that say when a row was measured; a table without either was measured in the order of its rows.
+#: Columns with the time or order of measurement; a table without either was measured in the order of its rows.
 WHEN = ("time_s", "order")
 WORDS = tuple(label.column for label in quantities.LABELS)
 
-#: Least similarity of two names of columns for one to be meant by the other.
+#: Least similarity of two names of columns for one to be a misspelling of the other.
 ALIKE = 0.6
 
 
@@ -102,14 +102,14 @@ class Layout:
     """Facts of a robot that decide about the columns of its tables.
 
     Attributes:
-        imposed: on its motors, one of `rig.IMPOSED`.
+        imposed: quantity imposed on its motors, one of `rig.IMPOSED`.
         has_ground: True if a ground carries it, see `Robot.has_ground`.
         weight: True if a weight or a constant torque acts on it, which may drive its motors either way.
-        inherits: True if values that its file does not state are those of a packaged robot.
+        inherits: True if a packaged robot gives the values that its file does not state.
         configurations: their names.
         instruments: properties of instruments that are known.
         mapped: (column as this program calls it, column of the file, factor from its unit).
-        channels: that its readings are of, in the order of arrays.
+        channels: of its readings, in the order of arrays.
     """
 
     imposed: str = "voltage"
@@ -123,7 +123,7 @@ class Layout:
 
     @classmethod
     def of(cls, robot: Robot | None) -> Layout:
-        """Returns that of a robot; of None the packaged robot's."""
+        """Returns the layout of a robot; None: of the packaged robot."""
         if robot is None:
             return cls()
         rig = robot.rig
@@ -136,7 +136,7 @@ class Layout:
 
     @property
     def table8(self) -> bool:
-        """True if it is driven as the paper's robot is, so that the conditions of Table 8 are conditions of it."""
+        """True if it is driven as the paper's robot, so that the conditions of Table 8 apply to it."""
         return self.inherits and self.has_ground and self.imposed == "voltage"
 
     @property
@@ -156,7 +156,7 @@ class Layout:
 
     @property
     def imposed_column(self) -> str:
-        """Column of what is imposed."""
+        """Column of the imposed quantity."""
         return IMPOSED[self.imposed][0]
 
     @property
@@ -167,7 +167,7 @@ class Layout:
 
     @property
     def axes(self) -> tuple[str, ...]:
-        """Columns of the conditions that a run of it has, what is imposed first."""
+        """Columns of the conditions of its runs, the imposed quantity first."""
         return (self.imposed_column, *(c for c in ON_GROUND if c not in self.idle))
 
     @property
@@ -189,7 +189,7 @@ class Layout:
         return sum(i.variance for i in self.instruments if i.channel == channel)
 
     def known(self) -> tuple[str, ...]:
-        """Every column that means something."""
+        """Every column with a meaning."""
         read = (SUPPLY, *self.measured_columns, *self.deviation_columns)
         labels = [word for word in WORDS if word != "mode" or self.imposed == "voltage"]
         set_ = [c.column for c in quantities.SET if c.in_tables and self.imposed in (c.imposed or IMPOSED)]
@@ -225,7 +225,7 @@ class Layout:
             if column in theirs:
                 mine, factor = theirs[column]
                 meant = by_name.get(mine)
-                if meant is None and mine in _of_every_channel():  # one that is not read
+                if meant is None and mine in _of_every_channel():  # a channel that is not read
                     found.append(None)
                     continue
                 if meant is None:
@@ -249,12 +249,13 @@ class Layout:
         return {name: Column(quantity, name, unit) for quantity in held for name, unit in quantity.columns().items()}
 
     def spellings(self) -> tuple[str, ...]:
-        """Every name that a column of a file may have and that means something, in any unit."""
+        """Every name of a column with a meaning, in any unit."""
         return (*self._by_name(), *(column for _, column, _ in self.mapped))
 
     def nearest(self, name: str, stated: Collection[str]) -> str:
-        """Returns the column, in the unit of `name`, that a column without a role is most like: by its name, else as
-        the only condition in its unit; empty where it is like none.
+        """Returns the column, in the unit of `name`, that a column without a role is most similar to.
+
+        It is the column with a similar name, else the only condition in its unit; empty if there is neither.
 
         Args:
             stated: columns that the table has, which are left out.
@@ -271,7 +272,7 @@ class Layout:
         return alone[0] if len(alone) == 1 else ""
 
     def expected(self, column: str) -> str:
-        """Returns the column, and where the robot's file says that it is read from."""
+        """Returns the column, with its source column if the robot's file states one."""
         theirs = next((their for mine, their, _ in self.mapped if _standard(self._by_name(), mine) == column), None)
         return column if theirs is None else f"{column} (in the robot's file: {theirs})"
 

@@ -1,4 +1,4 @@
-"""Configurations of a robot from the tables of its file: which there are, and what each starts from."""
+"""Configurations of a robot from the tables of its file: their names, and the values that each starts from."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ class Loads:
     """The loads of a robot file, before the parameters that it states.
 
     Attributes:
-        by_name: in order; travels: whether they travel, as vehicles and linear units do.
-        linear: names of those that are linear units.
+        by_name: in order; travels: true if they travel, as vehicles and linear units do.
+        linear: names of linear units.
         missing: parameters without default that the file does not state.
     """
 
@@ -47,20 +47,20 @@ class Loads:
 
 
 def loads(base: Robot | None, content: dict[str, Any], sds: dict[str, float], where: str) -> Loads:
-    """The loads that the file's content states, in its order.
+    """Returns the loads that the file's content states, in its order.
 
-    Takes `configurations` and every configuration's `load`, `like` and `movers` out of `content`, and puts shafts in
-    the place of linear units; what is left are parameters. Without `configurations` a robot keeps those of its base,
-    or has those whose tables say what they are.
+    Takes `configurations` and every configuration's `load`, `like` and `movers` out of `content`, and replaces linear
+    units by shafts; the remaining keys are parameters. Without `configurations` a robot keeps the configurations of
+    its base; without a base, each table is a configuration.
 
     Args:
         base: None starts from nothing; else `like` names one of its configurations.
         sds: stated ±, by dotted name; where: opens the message of an error.
 
     Raises:
-        BadConfiguration: no list of names, a name twice or one that cannot be, a table that is no configuration's, an
-            unknown `load`, `like` or `movers`, those that contradict each other, none of them, shafts beside
-            vehicles, or with a base a parameter without default that is not stated.
+        BadConfiguration: `configurations` is no list of names, or has a repeated or reserved name; a table belongs to
+            no configuration; `load`, `like` or `movers` is unknown, contradicts another one, or all are missing;
+            a file has both shafts and vehicles; a robot with a base lacks a parameter without default.
     """
     found = [n for n, table in content.items() if n not in TAKEN and isinstance(table, dict)]
     usual = found if base is None else list(base.configurations)
@@ -106,10 +106,10 @@ def loads(base: Robot | None, content: dict[str, Any], sds: dict[str, float], wh
 
 
 def resolved_likes(content: dict[str, Any], where: str) -> None:
-    """Put what each `like` of a file that starts from nothing stands for in its place: the other table of the file.
+    """Replace each `like` of a file that starts from nothing by the other table of the file that it names.
 
     Raises:
-        BadConfiguration: a `like` that names no other table, or one with a `like` of its own.
+        BadConfiguration: a `like` that names no other table, or a table with a `like` of its own.
     """
     tables = {n: dict(table) for n, table in content.items() if n not in TAKEN and isinstance(table, dict)}
     own = [name for name, table in tables.items() if "like" not in table]
@@ -130,7 +130,7 @@ def _over(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _kind(table: dict[str, Any], where: str) -> str:
-    """The load that a table states; a vehicle where it says nothing."""
+    """Load that a table states; by default a vehicle."""
     if "load" not in table:
         return "vehicle"
     load = table.pop("load")
@@ -145,13 +145,13 @@ def _kind(table: dict[str, Any], where: str) -> str:
 
 
 def _sides(content: Mapping[str, Any], base: Robot | None) -> float:
-    """Drives of a file; what is no count is refused later."""
+    """Drives of a file; a value that is no count is refused later."""
     sides = content.get("sides", 1.0 if base is None else float(base.sides))
     return float(sides) if isinstance(sides, int | float) and sides >= 1 else 1.0
 
 
 def _shaft(table: Mapping[str, Any]) -> tuple[Shaft, list[str]]:
-    """A shaft before the parameters that its table states, and those that it does not state but should."""
+    """A shaft before the parameters of its table apply, and the required parameters that the table lacks."""
     missing = [
         field.name
         for field in dataclasses.fields(Shaft)
@@ -161,10 +161,10 @@ def _shaft(table: Mapping[str, Any]) -> tuple[Shaft, list[str]]:
 
 
 def _vehicle(table: dict[str, Any], where: str, sides: float) -> tuple[Chassis, list[str]]:
-    """A vehicle that starts from nothing, before the parameters that its table states, and those that it should."""
+    """A vehicle before the parameters of its table apply, and the required parameters that the table lacks."""
     if "movers" not in table:
         raise BadConfiguration(
-            f"{where}: what it is is missing; state load = one of {', '.join(rig_file.LOADS)}, or movers = one of "
+            f"{where}: its kind is missing; state load = one of {', '.join(rig_file.LOADS)}, or movers = one of "
             f"{', '.join(MOVERS)}"
         )
     on_tracks = _movers(table.pop("movers"), where)
@@ -197,7 +197,7 @@ def _names(stated: Any, where: str) -> list[str]:
         raise BadConfiguration(f"{where}: got {stated!r}; expected a list of names, at least one, as {_EXAMPLE}")
     for name in stated:
         if stated.count(name) > 1:
-            raise BadConfiguration(f"{where}: {name} stands {stated.count(name)} times; name each once")
+            raise BadConfiguration(f"{where}: {name} is listed {stated.count(name)} times; name each once")
         if name in TAKEN:
             raise BadConfiguration(f"{where}: {name} is the name of something else in a robot file; choose another")
         if not re.fullmatch(r"[A-Za-z0-9_-]+", name):

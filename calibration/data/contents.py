@@ -1,4 +1,4 @@
-"""Contents of a file of data: its signals with unit, rate, range and gaps, and which columns they may be."""
+"""Contents of a file of data: its signals with unit, rate, range and gaps, and their possible columns."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from calibration.data.sources import in_memory, one_clock, opening
 from calibration.data.sources.recorded_signals import Clock, Signal, Source, known, unit_of_clock
 from mmrjax.model import channels, quantities
 
-#: Usual steps beyond which samples are missing.
+#: Least gap between samples, in usual steps.
 GAP = 5.0
-#: Words in the name of a signal, and the columns that it may be then, without their unit. The first that fits wins.
+#: Words in the name of a signal, and its possible columns, without their unit. The first match wins.
 MEANINGS = (
     (r"duty|pwm", ("duty",)),
     (r"(supply|bus|bat|input|vin|vbus|pack).*(volt|_v\b)|vbat|vbus|volt|\bu\b|^v$", ("supply_voltage",)),
@@ -81,12 +81,12 @@ class Contents:
     proposed: tuple[str, ...]
 
     def to_json(self) -> dict[str, Any]:
-        """The whole, for machines."""
+        """The contents as JSON-able data."""
         return {"schema": "mmrjax.inspect/1", **dataclasses.asdict(self)}
 
 
 def inspect(source: str | Path | Any) -> Contents:
-    """Returns what a file or a table in memory holds.
+    """Returns the contents of a file or of a table in memory.
 
     Raises:
         BadData: no such file, an unreadable one, or one without columns.
@@ -108,7 +108,7 @@ def inspect(source: str | Path | Any) -> Contents:
     if len(clocks) > 1:
         notes.append(f"{found.name}: signals have {len(clocks)} clocks; rows become those of the densest channel")
     still = {fact.path for fact in facts if fact.least == fact.greatest}
-    moving = sorted(found.signals, key=lambda signal: signal.path in still)  # of several the first that changes
+    moving = sorted(found.signals, key=lambda signal: signal.path in still)  # of several, the first that changes
     lines = dict(_proposed(moving))
     proposed = tuple(lines[s.path] for s in found.signals if s.path in lines)
     return Contents(found.name, found.kind, facts, tuple(notes), preset, () if preset else proposed)
@@ -156,7 +156,7 @@ def _clock(signal: Signal | None) -> Clock | None:
 
 
 def _unit_of_time(name: str) -> str | None:
-    """Unit of a clock by its name, also as loggers name them; None if it is none."""
+    """Unit of a clock by its name, also by names of loggers; None if it is not a clock."""
     bare = name.casefold().replace("time (", "time_").rstrip(")")
     return "ms" if bare == "ms_today" else unit_of_clock(bare)
 
@@ -202,7 +202,7 @@ def _seconds(clock: Clock) -> tuple[np.ndarray, str] | str:
 
 
 def _proposed(signals: Sequence[Signal]) -> Iterator[tuple[str, str]]:
-    """Paths of signals whose names say what they may be, each with its line of a table `[columns]`."""
+    """Paths of signals with a recognised name, each with its line of a table `[columns]`."""
     layout = Layout(channels=channels.EVERY)
     every = layout.quantities()
     spelled, taken = set(layout.spellings()), set[str]()
@@ -217,7 +217,7 @@ def _proposed(signals: Sequence[Signal]) -> Iterator[tuple[str, str]]:
             taken.add("time")
             continue
         stems = next((stems for pattern, stems in MEANINGS if re.search(pattern, signal.name.casefold())), None)
-        if stems is None:  # of a field named data, the topic says it
+        if stems is None:  # for a field named data, the topic has the name
             stems = next((stems for pattern, stems in MEANINGS if re.search(pattern, signal.path.casefold())), ())
         for stem in stems:
             column = next((c for c, q in every.items() if (q.stem or q.name) == stem or c == stem), stem)

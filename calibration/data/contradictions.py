@@ -17,7 +17,7 @@ from mmrjax.model.robot import Robot, turn_error
 #: Share of the motors' back-EMF below which no voltage turns them at an imposed speed [-], and least back-EMF that
 #: tells [V].
 TOO_SMALL, LEAST = 0.5, 0.2
-#: Share of the rows that may brake, where no current says which.
+#: Share of the rows that may brake, where no current shows them.
 MOST_BRAKING = 0.5
 #: Channel of a column whose instrument may show magnitude alone; of columns of currents, the motors' first.
 MAGNITUDES = {"motor_voltage_V": "motor_voltage"}
@@ -36,9 +36,8 @@ def check(runs: Runs, robot: Robot) -> None:
     """Refuse a table that contradicts itself or its robot.
 
     Raises:
-        BadData: a vehicle without mass, a turn of a robot that cannot turn or whose sides are exchanged, an imposed
-            speed that the stated voltage cannot turn the motors at, or an angle that wraps or whose unit changes, or
-            time that goes back now and then.
+        BadData: a vehicle has no mass; a robot turns that cannot turn, or its sides are exchanged; the stated voltage
+            cannot turn the motors at the imposed speed; an angle wraps or changes its unit; time sometimes goes back.
     """
     _mass(runs, robot)
     if runs.turns and (why := turn_error(robot, sorted({str(n) for n in runs.configurations_named(robot)}))):
@@ -58,7 +57,7 @@ def check(runs: Runs, robot: Robot) -> None:
 
 
 def cannot_stand(robot: Robot) -> str | None:
-    """Why it is not known how a robot stands; None where it is."""
+    """Reason why the stance of a robot is unknown; None if it is known."""
     if not robot.has_ground:
         return "the robot's load is a shaft, which stands on no ground"
     if not any(robot.knows([f"running_gear.{p.name}"]) for p in params.walk_parameters(robot.running_gear)):
@@ -67,15 +66,17 @@ def cannot_stand(robot: Robot) -> str | None:
 
 
 def without_levers(robot: Robot, configuration: str) -> str:
-    """Why a configuration has no levers; empty where it has."""
+    """Reason why a configuration has no levers; empty if it has levers."""
     have = [name for name, c in robot.configurations.items() if float(c.on_tracks) > 0.5]
     others = f"those that have: {', '.join(have)}" if have else "no configuration of the robot has"
     return "" if configuration in have else f"{configuration} has no levers; {others}"
 
 
 def misplaced(runs: Runs, robot: Robot) -> tuple[int, str, str] | None:
-    """Row and column in which levers cannot stand as a table states it, and why: a configuration without them, an
-    angle beyond their range; None where they can."""
+    """Row and column of an impossible lever angle, and the reason; None if there is no such row.
+
+    The reason is a configuration without levers, or an angle beyond their range.
+    """
     stated = [name for name in LEVERS if runs.has(name)]
     if not stated:
         return None
@@ -114,8 +115,11 @@ def _mass(runs: Runs, robot: Robot) -> None:
 
 
 def _voltage(runs: Runs, robot: Robot, column: str) -> None:
-    """The motors' back-EMF follows from the imposed speed; a supply may be turned round by its bridge. What a load
-    drives brakes, with less voltage by as much as its current takes: where no current is read, some rows may."""
+    """Refuse a voltage that contradicts the motors' back-EMF, which follows from the imposed speed.
+
+    A bridge may reverse the supply. Motors that a load drives brake: their voltage is smaller by the voltage drop of
+    their current. Without readings of current, a share of the rows may be such rows.
+    """
     if not runs.has(column) or not np.nan_to_num(runs[column]).any() or not robot.knows(CURRENT):
         return
     voltage = runs[column]
@@ -141,7 +145,7 @@ def _voltage(runs: Runs, robot: Robot, column: str) -> None:
 
 
 def _time(runs: Runs) -> None:
-    """Rows may come in any order; time that goes back now and then is of several recordings, or its clock was set."""
+    """Refuse time that sometimes goes back: several recordings, or a clock that was set. Any order is allowed."""
     time, run = runs["time_s"], runs.run_names
     for name in np.unique(run):
         mine = np.flatnonzero(run == name)
@@ -155,7 +159,7 @@ def _time(runs: Runs) -> None:
 
 
 def _beside(step: np.ndarray) -> np.ndarray:
-    """Median of the four steps beside each one: a drive that mostly stands is quick for a while."""
+    """Median of the four steps next to each step, as a drive that mostly stands may be fast for a while."""
     wide = np.pad(step, 2, constant_values=np.nan)
     return np.nanmedian([wide[k : k + len(step)] for k in (0, 1, 3, 4)], axis=0)
 
@@ -175,7 +179,7 @@ def _angle(runs: Runs) -> None:
         if jumps.size:
             row, passed = int(mine[jumps[0] + 1]), np.diff(runs["time_s"][mine])
             gap = passed[jumps[0]]
-            why = "as an angle that wraps; expected one that counts on beyond a turn"
+            why = "as an angle that wraps; expected an angle that continues beyond a turn"
             if gap > GAP * np.median(passed):
                 why = f"{number(float(f'{gap:.3g}'))} s earlier; give each recording its own run_id"
             raise BadData(
@@ -191,5 +195,5 @@ def _angle(runs: Runs) -> None:
             was, now = (number(float(f"{x:.4g}")) for x in angle[mine][k : k + 2])
             raise BadData(
                 f"{runs.source} row {row + 1}, output_angle_deg: goes from {was} to {now} between two samples, as "
-                "degrees beside radians; write all rows in one unit"
+                "if degrees and radians are mixed; write all rows in one unit"
             )

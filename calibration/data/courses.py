@@ -10,7 +10,7 @@ import numpy as np
 from calibration.data.columns import LOAD, SUPPLY
 from calibration.data.runs import Runs
 
-#: Columns of which every sample of a run may have a value of its own. A stated mass may change as the payload does.
+#: Columns whose values may change from sample to sample of a run. A stated mass may change as the payload does.
 CHANGING = ("supply_voltage_V", "slope_deg", "payload_kg", "total_mass_kg", LOAD, "surface", "duty", "mode")
 
 
@@ -21,8 +21,8 @@ class Stretch:
     Attributes:
         rows: indices of the samples in the order of time, shape (samples,).
         begin, end: when these conditions began, and when others follow or the run ends, since its start [s].
-        driven: whether the motors are driven forwards.
-        whole: whether the run has no other stretch.
+        driven: true if the motors are driven forwards.
+        whole: true if the run has no other stretch.
     """
 
     rows: np.ndarray
@@ -47,8 +47,10 @@ def changing(runs: Runs) -> tuple[str, ...]:
 
 
 def applied(runs: Runs) -> np.ndarray:
-    """Voltage that the driver gives the motors in every row, in turns the size of the larger one, 0 where they brake
-    or coast [V], or the speed [rpm] or current [A] imposed on them; shape (rows,)."""
+    """Voltage of the motors in every row, or the imposed speed or current; shape (rows,) [V], [rpm] or [A].
+
+    The voltage is 0 where the driver brakes or coasts. In turns it is the magnitude of the larger of both sides'.
+    """
     if runs.turns:
         return np.abs(runs.of_sides).max(0)
     if runs.layout.imposed_column != SUPPLY:

@@ -1,4 +1,4 @@
-"""Cells of a table as text: how they are encoded, what separates them, and the decimal mark of their numbers."""
+"""Cells of a table as text: their encoding, their separators, and the decimal mark of their numbers."""
 
 from __future__ import annotations
 
@@ -66,8 +66,10 @@ def arrays(path: Path, name: str) -> NamedArrays:
 
 
 def _plain(name: str, content: bytes) -> NamedArrays | None:
-    """Columns of a plain table, numbers as arrays: UTF-8 with commas, without comments, quotes and units. None: it is
-    none, and `cells` reads it with all its checks."""
+    """Columns of a plain table, numbers as arrays; None for any other table, which `cells` reads with all checks.
+
+    A plain table is in UTF-8 with commas, without comments, quotes and units.
+    """
     end = content.find(b"\n")
     if content.startswith((b"#", codecs.BOM_UTF8, b"\xff\xfe", b"\xfe\xff")) or b'"' in content or end < 0:
         return None
@@ -198,7 +200,7 @@ def cells(name: str, lines: Sequence[str]) -> tuple[list[list[str]], tuple[str, 
             if (other or j in whole) and all(map(_THOUSANDS.fullmatch, written)):
                 beside = ", ".join(f"{cells[0]} in {_column(rows, k)}" for k, cells in list(other.items())[:1])
                 raise BadData(
-                    f"{name}, {_column(rows, j)}: got {written[0]} beside "
+                    f"{name}, {_column(rows, j)}: got {written[0]} next to "
                     f"{beside or 'whole numbers below a thousand'}; {wanted}"
                 )
     return rows, (f"{said}, and numbers have decimal commas; read so" if comma else f"{said}; read so",)

@@ -1,4 +1,4 @@
-"""Effects of the user's own: classes in a Python file, checked against the contract and added to the library."""
+"""Effects of users: classes in a Python file, checked against the contract and added to the library."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from mmrjax.model.balances import BALANCES, ROUND, effects_sum, moving_signals
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.signals import Signals, State
 
-#: Effects by name, as robot files and the command line know them.
+#: Effects by their name in robot files and on the command line.
 Library = Mapping[str, type[Effect]]
 
 #: First part of the name of a module of the user's own effects; the rest is a hash of its path.
@@ -64,10 +64,10 @@ TURN: dict[str, Any] = {
 
 
 def library(paths: Sequence[Path | str] = ()) -> Library:
-    """The packaged effects and those of the files, by name.
+    """Returns the packaged effects and the effects of the files, by name.
 
     Raises:
-        BadConfiguration: as `read`, a name that stands twice, or one that settles to an effect that is not there.
+        BadConfiguration: as `read`; a repeated name; an effect that settles to an unknown effect.
     """
     known = dict(effects.BY_NAME)
     own = [(path, effect) for path in map(Path, paths) for effect in read(path)]
@@ -93,15 +93,15 @@ class _FromSource(importlib.machinery.SourceFileLoader):
 
 
 def read(path: Path) -> tuple[type[Effect], ...]:
-    """The effect classes that a Python file defines, in its order. The file's code is run.
+    """Returns the effect classes that a Python file defines, in its order. The file's code is run.
 
     Raises:
-        BadConfiguration: no such file, code that fails, no effect in it, or one that breaks the contract of
-            `effects.Effect`; one sentence with file, class, attribute, what came and what is expected.
+        BadConfiguration: no such file, code that fails, no effect in it, or an effect that breaks the contract of
+            `effects.Effect`. The sentence has file, class, attribute, the value and the expected value.
     """
     if not path.is_file():
         raise BadConfiguration(f"--effects: got {path}, no such file; expected a Python file with Effect classes")
-    # A name of its own: two files may be called alike, and none may hide a module of the package.
+    # A unique name: two files may have the same name, and no file may hide a module of the package.
     name = OWN_MODULE + hashlib.sha256(os.fsencode(path.resolve())).hexdigest()[:16]
     spec = importlib.util.spec_from_file_location(name, path, loader=_FromSource(name, str(path)))
     if path.suffix != ".py" or spec is None or spec.loader is None:
@@ -178,14 +178,18 @@ def _check(path: Path, effect: type[Effect]) -> None:
 
 @functools.cache
 def _instants(balance: str, channel: str, configuration: int) -> tuple[Signals, Signals, Signals]:
-    """Of the nominal robot on its battery: what a term of the left side may read while it climbs and turns to the
-    left, all signals of that instant, and what a term may read at rest."""
+    """Signals of the nominal robot on its battery.
+
+    Returns:
+        Three sets of signals. While the robot climbs and turns to the left: the signals that a term of the left side
+        may read, and all signals. At rest: the signals that a term may read.
+    """
     robot = paper_robots.nominal()
     run = Conditions(configuration, slope_deg=6.0, payload=2.0, battery=1.0, discharge=100.0)
     zero = jnp.zeros(())
     climbing = State(jnp.asarray(1.5), jnp.asarray(800.0), jnp.asarray(0.6), jnp.asarray(100.0))
     rest = State(zero, zero, zero, zero)
-    # What is summed for the turn is summed when both sides' slip and resistance are known.
+    # Sums for the turn are computed after both sides' slip and resistance.
     before = "slip" if balance in ROUND else balance
     climbs, every = readable_signals(robot, run, climbing, before, channel), moving_signals(robot, run, climbing)
     still = readable_signals(robot, run, rest, before, channel)
@@ -197,7 +201,7 @@ def _check_term(refuse: Callable[[str], BadConfiguration], effect: type[Effect],
     memory = {} if effect.memory_size is None else {effect.name: jnp.asarray(0.3 * effect.memory_size)}
 
     def term(amplitude: jax.Array, signals: Signals) -> jax.Array:
-        # A configuration that the nominal robot does not have is the business of the robot file.
+        # The robot file checks configurations that the nominal robot does not have.
         made = dataclasses.replace(params.replace(effect(), {"amplitude": amplitude}), configurations=())
         with_it = dataclasses.replace(robot, effects=(made,))
         return jnp.asarray(effects_sum(with_it, signals, effect.balance, effect.channel), float)
@@ -238,7 +242,7 @@ def _check_term(refuse: Callable[[str], BadConfiguration], effect: type[Effect],
         if not alike and effect.driver != THE_SIDE:
             raise refuse(
                 f", driver: got {effect.driver!r} of a term that is not the same on both sides; expected "
-                f'"{THE_SIDE}", so that it is known that a robot that has it does not travel straight by itself'
+                f'"{THE_SIDE}", as a robot with this effect does not travel straight without steering'
             )
         if effect.needs_battery and float(fed) != 0.0:
             raise refuse(f", needs_battery: its term is {float(fed):g} on an external supply; expected 0")

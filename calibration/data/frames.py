@@ -1,4 +1,4 @@
-"""Tables of results as pandas, polars, Arrow and xarray have them."""
+"""Tables of results as objects of pandas, polars, Arrow and xarray."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Errors of what comes in from outside, files and arguments; each carries its exit code."""
+"""Errors of input from outside, files and arguments; each has its exit code."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from mmrjax.errors import shorten
 
 
 class InputError(Exception):
-    """Something from outside is not as it should be; the message is one sentence for a person."""
+    """Error of input from outside; the message is one sentence for a person."""
 
     def __init__(self, message: str) -> None:
         """Keeps the message `shortened`."""
@@ -63,10 +63,10 @@ def stated_number(
     """A number of a TOML file.
 
     Args:
-        low, high: bounds; unit: of it, empty or `-` for none; None: not known here, and not said.
+        low, high: bounds; unit: of the number, empty or `-` for none; None: unknown, the message leaves it out.
 
     Raises:
-        BadConfiguration: no number, or one that is not finite or out of bounds.
+        BadConfiguration: no number, or a number that is not finite or out of bounds.
     """
     if not is_number(value) or (math.isinf(high - low) and not math.isfinite(value)):
         kind = "a number" if unit is None else f"a number [{unit or '-'}]"

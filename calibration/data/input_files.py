@@ -1,4 +1,4 @@
-"""Opening of input files: every table, profile and TOML file comes in here."""
+"""Opening of input files: every table, profile and TOML file is opened here."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import Any, BinaryIO
 from calibration.data.input_errors import BadConfiguration, BadData, InputError
 from mmrjax.errors import count_noun
 
-#: First bytes of formats that are not read, and what they are (`sources.opening` has those that are).
+#: First bytes of unsupported formats, and their names (`sources.opening` has the supported formats).
 BINARY = {
     b"PK\x03\x04": "an Excel workbook or a zip file", b"\xd0\xcf\x11\xe0": "an Excel workbook",
     b"\x1f\x8b": "a gzip file", b"SQLite format 3\0": "an SQLite file", b"%PDF": "a PDF",
@@ -28,7 +28,7 @@ TEXTS = {
 LARGEST, LARGEST_TOML, KEYS, DEEPEST = 2**31, 2**22, 2_000, 16
 #: Whole numbers that a TOML file may hold (TOML 1.0: 64 bits).
 WHOLE = 2**63
-#: Kinds of files that are not read: what they are called.
+#: Names of kinds of files that are not read.
 _KINDS = {stat.S_ISDIR: "a folder", stat.S_ISFIFO: "a pipe", stat.S_ISSOCK: "a socket"}
 
 

@@ -1,4 +1,4 @@
-"""Instruments whose sign or step a rig's file leaves free: as the readings of a table show them."""
+"""Sign and step of instruments, inferred from the readings of a table where a rig's file leaves them free."""
 
 from __future__ import annotations
 
@@ -14,18 +14,20 @@ from mmrjax.model.channels import Channel
 from mmrjax.model.rig import Instrument
 from mmrjax.model.robot import Robot
 
-#: Smallest step that counts as one, and what of a difference is rounding, as shares of the largest difference.
+#: Smallest step, and largest rounding of a difference, as shares of the largest difference.
 SMALLEST, ROUNDING = 1e-5, 1e-9
-#: Fewest different readings that tell a step: of so many random multiples the common divisor is the step itself in
-#: 99 % of tables, of four in 83 %.
+#: Fewest different readings that show a step: the common divisor of so many random multiples is the step itself in
+#: 99 % of tables, of four multiples in 83 %.
 FEWEST = 8
-#: Coarsest step of a display, as a share of the largest reading: coarser multiples are levels that somebody set.
+#: Coarsest step of a display, as a share of the largest reading: coarser multiples are levels set by a person.
 COARSEST = 0.25
 
 
 def step_of(readings: np.ndarray) -> float:
-    """The largest step of which all differences between readings are multiples, by Euclid's algorithm; 0: there is
-    none that is larger than rounding, or too few different readings tell."""
+    """Returns the largest common divisor of all differences between readings, by Euclid's algorithm.
+
+    It is 0 if the divisor is no larger than rounding, or if there are too few different readings.
+    """
     levels = np.unique(readings[np.isfinite(readings)])
     if levels.size < FEWEST:
         return 0.0
@@ -42,10 +44,10 @@ def step_of(readings: np.ndarray) -> float:
 
 
 def display_step(readings: np.ndarray, channel: Channel) -> float:
-    """Step of the display that shows a channel [SI], 0 if none shows.
+    """Step of the display of a channel [SI], 0 if the readings show no step.
 
-    It is that of `step_of`. Too few different readings do not tell it. Then it is the largest power of ten that
-    divides all of them, in the unit of their column and up to `COARSEST` of the largest.
+    It is the result of `step_of`. With too few different readings, it is the largest power of ten that divides all of
+    them in the unit of their column. It is at most `COARSEST` of the largest reading.
 
     Args:
         readings: [SI].
@@ -63,8 +65,9 @@ def display_step(readings: np.ndarray, channel: Channel) -> float:
 def infer_instruments(
     instruments: tuple[Instrument, ...], columns: Mapping[str, np.ndarray]
 ) -> tuple[Instrument, ...]:
-    """Instruments with nothing free: one shows magnitude alone where none of its readings is negative and some runs
-    go backward, and its step is that of its readings.
+    """Instruments with sign and step inferred from the readings where they are free.
+
+    An instrument shows magnitude alone if no reading is negative although some runs go backward.
 
     Args:
         columns: of the table, in their units.
@@ -84,7 +87,7 @@ def infer_instruments(
 
 
 def with_inferred_instruments(robot: Robot, runs: Runs) -> Robot:
-    """`robot` with the instruments that its table shows."""
+    """Returns `robot` with the instruments that its table shows."""
     mine = robot.rig.instruments
     found = runs.layout.instruments if any(i.free for i in mine) else mine
     named = {i.channel for i in found}

@@ -9,7 +9,7 @@ import numpy as np
 
 from calibration.data.input_errors import parsed
 
-#: Raw values of a column: a list of texts as written, or an array of numbers with NaN where there is no reading.
+#: Raw values of a column: a list of texts as written, or an array of numbers with NaN for a missing reading.
 Raw = list[str] | np.ndarray
 #: Entries of programs for a missing reading.
 MISSING = frozenset({"", "nan", "na", "n/a", "#n/a", "<na>", "none", "null"})
@@ -25,7 +25,7 @@ class NamedArrays:
         name: of the source, which opens every message.
         header: names of the columns, as the source states them.
         values: one for each column, all of one length.
-        units: one for each column, spelled by `quantities.unit_in_column`; empty if the source states none; or none.
+        units: one for each column, spelled by `quantities.unit_in_column`, empty if unknown; or no units at all.
         units_from: place where the source states them, for messages.
         notes: sentences on reading.
         digest: SHA-256 of the source's bytes; empty if it has none.

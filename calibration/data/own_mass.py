@@ -1,8 +1,8 @@
-"""The mass of a robot without payload: what its file states, and what a table of runs states in its place.
+"""Mass of a robot without payload: the mass of its file, or the mass that a table of runs states instead.
 
-A table that states `total_mass_kg` is simulated with that mass, whatever the robot's own. A robot that is fitted to
-it has to have the same mass, or an effect that adds to the mass would be found against the table's and written beside
-the file's.
+A table that states `total_mass_kg` is simulated with that mass, whatever the robot's own mass. A robot that is fitted
+to the table needs the same mass. Otherwise the fit would identify an effect on the mass relative to the table's mass,
+and write it to a file with another mass.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class StatedMass:
 
     Attributes:
         median, low, high: over the rows of the configuration [kg].
-        unladen: whether it varies although `total_mass_kg` does not, as where that leaves the payload out.
+        unladen: true if it varies although `total_mass_kg` is constant, as if that column leaves the payload out.
     """
 
     median: float
@@ -112,7 +112,7 @@ def remarks(robot: Robot, runs: Runs) -> list[str]:
     others = [s for s in np.unique(runs["surface"][of_table5]) if s != BENCH] if of_table5.any() else []
     if others:
         said.append(
-            f"the table has runs on {', '.join(others)}: the friction that is written is that of {BENCH}; simulate "
+            f"the table has runs on {', '.join(others)}: the written friction is for {BENCH}; simulate "
             f"with --surface {others[0]} to meet what was fitted"
         )
     return said

@@ -1,7 +1,7 @@
 """Packaged sheets of parts for sizing: motors, gearboxes and cells, each value from a sheet that its row names.
 
-The tables are in `parts/*.csv` in the units of the sheets; the reader gives SI. What a sheet does not state is NaN.
-`docs/reference/parts.md` says where the sheets come from and how consistent they are.
+The tables are in `parts/*.csv` in the units of the sheets; the reader gives SI. Values missing in a sheet are NaN.
+`docs/reference/parts.md` has the origin of the sheets, and checks of their consistency.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ COULOMB_PER_MAH = 3.6
 
 
 def _column(name: str, factor: float = 1.0) -> Any:
-    """A number of the table; its unit in the column's name, times `factor` gives SI; NaN where the cell is empty."""
+    """A number of the table in the unit of the column's name; times `factor` it is in SI; NaN for an empty cell."""
     return dataclasses.field(metadata={"column": name, "factor": factor})
 
 
@@ -34,7 +34,7 @@ def _text(name: str) -> Any:
 
 
 def _texts(name: str) -> Any:
-    """Several names in one cell, apart by semicolons."""
+    """Several names in one cell, separated by semicolons."""
     return dataclasses.field(metadata={"column": name, "list": True})
 
 
@@ -60,7 +60,7 @@ class MotorSheet:
         price: of one piece without tax [EUR of 2020].
         gearboxes: families of `gearboxes()` that the source combines it with, among those packaged.
         source: sheet and where it was read.
-        note: what else to know.
+        note: further facts.
     """
 
     name: str = _text("name")

@@ -1,4 +1,4 @@
-"""The posterior of a calibrated robot: what a fit leaves open, and the file `posterior.nc` that holds it."""
+"""The posterior of a calibrated robot: uncertainty of the fitted parameters, and its file `posterior.nc`."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ SCHEMA = "mmrjax.posterior/1"
 FILE = "posterior.nc"
 #: Maps from a coordinate u to a parameter: the identity, the exponential, or an angle within half a turn.
 NORMAL, LOG, ANGLE = "normal", "log-normal", "angle"
-#: Largest difference, in posterior sds, between the centre of a posterior and the robot beside it.
+#: Largest difference, in posterior sds, between the centre of a posterior and its robot.
 APART = 0.05
 
 
 @dataclasses.dataclass(frozen=True)
 class Posterior:
-    """A normal distribution of coordinates z, and what parameters they are.
+    """A normal distribution of coordinates z, and their parameters.
 
     u = location + spread · z, held within low and high (softly over `softness` of the spread, as in
     `calibration.inference.priors.Coordinates`; 0 cuts), and θ = u, exp u, or u within half a turn.
@@ -55,7 +55,7 @@ class Posterior:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Every parameter that it sets: those of its coordinates, then those tied to one."""
+        """Every parameter that it sets: the parameters of its coordinates, then parameters tied to a coordinate."""
         return (*self.coordinates, *(follower for follower, _, _ in self.tied))
 
     @property
@@ -65,8 +65,10 @@ class Posterior:
         return vectors * np.sqrt(np.maximum(values, 0.0))
 
     def at(self, z: Any) -> Any:
-        """Parameters [SI] in the order of `names` at coordinates z, shape (..., coordinates): in NumPy of an array of
-        NumPy, which compiles nothing, else traceable."""
+        """Parameters [SI] in the order of `names` at coordinates z, shape (..., coordinates).
+
+        For a NumPy array it computes in NumPy, without compilation; otherwise it is traceable.
+        """
         import jax.numpy as jnp
 
         from calibration.inference.priors import clip_softly
@@ -92,7 +94,7 @@ class Posterior:
         return self.at(np.asarray(self.mean) + normal_scores @ self.root.T)
 
     def draw(self, draws: int, seed: int) -> np.ndarray:
-        """Parameters [SI] of so many random draws, shape (draws, names)."""
+        """Parameters [SI] of random draws, shape (draws, names)."""
         return self.values(np.random.default_rng(seed).standard_normal((draws, len(self))))
 
     def check(self, robot: Robot, where: str) -> None:
@@ -102,7 +104,7 @@ class Posterior:
             where: opens the message.
 
         Raises:
-            BadData: a parameter that the robot does not have, or whose value is not where the posterior is.
+            BadData: a parameter that the robot does not have, or a value far from the centre of the posterior.
         """
         from mmrjax.model import params
 
@@ -121,7 +123,7 @@ class Posterior:
             if not abs(known[name] - value) <= APART * width + 1e-6 * abs(value):  # also where one is NaN
                 raise BadData(
                     f"{where}: {name} is {known[name]:.6g} in the robot; expected {value:.6g}, the centre of its "
-                    "posterior: take the robot.toml beside it, without changes to what was fitted"
+                    "posterior: take the robot.toml from the same folder, without changes to fitted parameters"
                 )
 
     @property
@@ -144,7 +146,7 @@ def write(posterior: Posterior, path: Path | str) -> None:
         "spread": (p.spread, "du/dz"),
         "low": (p.low, "least u"),
         "high": (p.high, "greatest u"),
-        "softness": (p.softness, "width over which bounds are rounded off, as a share of the spread"),
+        "softness": (p.softness, "width of the soft transition at the bounds, as a share of the spread"),
         "value": (p.at(p.mean)[: len(p)], "parameter at the mean [SI]"),
         "sd": (p.sd[: len(p)], "standard deviation of the parameter, to first order [SI]"),
         "covariance": (p.covariance, "covariance of z"),
@@ -182,13 +184,13 @@ def read(path: Path | str) -> Posterior:
     """Read `posterior.nc`.
 
     Raises:
-        BadData: no such file, not a posterior, or one that is damaged.
+        BadData: no such file, or a file that is damaged or no posterior.
     """
     import xarray as xr
 
     path = Path(path)
     if not path.is_file():
-        raise BadData(f"{path}: no such file; expected the {FILE} that calibrate and loop leave beside robot.toml")
+        raise BadData(f"{path}: no such file; expected the {FILE} that calibrate and loop write next to robot.toml")
     try:
         with xr.open_dataset(path, engine="scipy") as data:
             data.load()
@@ -237,7 +239,7 @@ def _of(data: Any) -> Posterior:
 
 
 def joined(parts: Sequence[Posterior], covariance: np.ndarray) -> Posterior:
-    """Several sets of coordinates as one, of which `covariance` is that of all."""
+    """Joins sets of coordinates into one; `covariance` is the covariance of all of them."""
     fields = {
         f: np.concatenate([getattr(p, f) for p in parts])
         for f in ("mean", "location", "spread", "low", "high", "softness")

@@ -1,4 +1,4 @@
-"""Presets: TOML files that say which columns of a logger's files mean what, with unit and sign."""
+"""Presets: TOML files with the meanings of the columns of a logger's files, with unit and sign."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ SEPARATOR = ","
 
 @dataclasses.dataclass(frozen=True)
 class PresetColumn:
-    """A column of this program, and where a logger's file has it.
+    """A column of this program, and its source in a logger's file.
 
     Attributes:
         mine: name of the column; theirs: names that it may have in the file; the first that it has is read.
-        factor: from its unit to that of `mine`; note: what it is, for a note.
+        factor: from its unit to the unit of `mine`; note: its meaning, for a note.
     """
 
     mine: str
@@ -60,7 +60,7 @@ class Preset:
     def mapped(
         self, found: Callable[[str], str | None], has_readings: Callable[[str], bool] | None = None
     ) -> tuple[tuple[tuple[str, str, float], ...], tuple[str, ...]]:
-        """Returns columns of a source as `Layout.mapped` has them, and notes on what they are.
+        """Returns columns of a source in the form of `Layout.mapped`, and notes on their meaning.
 
         Args:
             found: name of the source's column that a name means; None: it has none.
@@ -75,7 +75,7 @@ class Preset:
                 mapped.append((column.mine, present[0], column.factor))
                 if column.note:
                     notes.append(f"{self.name}: {present[0]}, read as {column.mine}, {column.note}")
-            elif self.name not in PACKAGED:  # which has columns of several loggers
+            elif self.name not in PACKAGED:  # a packaged preset has columns of several loggers
                 mapped.append((column.mine, column.theirs[0], column.factor))
         return tuple(mapped), tuple(notes)
 
@@ -90,7 +90,7 @@ def of_columns(columns: Mapping[str, Any], where: str = "the stated table") -> P
 
 
 def find(stated: str | Path) -> Preset:
-    """Returns a packaged preset by its name, or one of a file; numbers that it asks for may follow.
+    """Returns a packaged preset by its name, or the preset of a file; numbers that it asks for may follow.
 
     Args:
         stated: `vesc,pole_pairs=7`, `mine.toml`.
@@ -136,7 +136,7 @@ def recognised(names: Sequence[str]) -> str:
 
 
 def asked(name: str) -> tuple[str, ...]:
-    """Returns names of the numbers that a packaged preset asks for, and has no usual value of."""
+    """Returns names of the numbers that a packaged preset asks for and has no usual value for."""
     numbers = input_files.toml_content(_packaged(name), name).get("ask", {})
     return tuple(key for key, stated in numbers.items() if isinstance(stated, str) or "usual" not in stated)
 
@@ -235,7 +235,7 @@ def _column(mine: str, theirs: Any, where: str, numbers: Mapping[str, float]) ->
 
 
 def _filled(name: str, where: str, numbers: Mapping[str, float]) -> str:
-    """A column's name with the whole numbers that it names in braces."""
+    """A column's name with whole numbers in place of the names in braces."""
     try:
         named = [field for _, field, _, _ in string.Formatter().parse(name) if field is not None]
     except ValueError:
@@ -255,7 +255,7 @@ def _texts(stated: Any, where: str, form: str = "expected a list of names") -> t
 def merged(
     first: Iterable[tuple[str, str, float]], others: Iterable[tuple[str, str, float]]
 ) -> tuple[tuple[str, str, float], ...]:
-    """Columns of two tables; those of `first` win where both have a column, or read the same one."""
+    """Columns of two tables; `first` wins where both have a column, or read the same source column."""
     first = tuple(first)
     taken = {_bare(mine) for mine, _, _ in first} | {theirs for _, theirs, _ in first}
     return (*first, *(c for c in others if _bare(c[0]) not in taken and c[1] not in taken))

@@ -55,7 +55,7 @@ QUANTITIES: dict[str, Quantity] = {
     for quantity in (quantities.condition_named("time"), *quantities.SET, *channels.EVERY)
     if quantity.in_profiles
 }
-#: Columns of which a row has at most one, and the mode that each means.
+#: Columns of demands, at most one in a row, and the mode of each.
 DEMANDS = {
     **dict.fromkeys(("duty", *PAIRS[0], *PAIRS[1]), MODES[VOLTAGE]),
     **{mode: mode for mode in CONTROLLED},
@@ -63,8 +63,8 @@ DEMANDS = {
 #: Columns of a file that no row may leave empty.
 HELD = ("voltage", "slope_deg", "payload", "load_torque", "current_other")
 MODE, SURFACE = "mode", "surface"
-#: What a comment line may set of the state that a mission begins in: field of `Start`, least, greatest, and the SI
-#: value of one.
+#: Initial state of a mission that comment lines may set: field of `Start`, least, greatest, and the SI value of one
+#: unit.
 STARTS = {
     "start_speed_mm_s": ("speed", -50_000.0, 50_000.0, 1e-3),
     "start_winding_C": ("temperature_winding", -50.0, 400.0, 1.0),
@@ -132,7 +132,7 @@ class ProfileTable:
         )
 
     def demanded(self, segment: np.ndarray, elapsed: np.ndarray, per_speed: float) -> np.ndarray:
-        """Ground speed that is demanded [m/s], of a motor speed the one it rolls at; NaN where none is.
+        """Demanded ground speed [m/s], also from a demanded motor speed; NaN without a demand.
 
         Args:
             segment: of one cycle, from 0; elapsed: since it began [s]; both of one shape.
@@ -145,26 +145,27 @@ class ProfileTable:
         return np.where(np.isin(mode, CONTROLLED), value, np.nan)
 
     def check_source(self, battery: bool) -> None:
-        """Refuse what does not go with the source of the run.
+        """Refuse a profile that contradicts the supply of the run.
 
         Raises:
-            BadConfiguration: it states a supply voltage, and the battery is to feed the motors.
+            BadConfiguration: it states a voltage, and the battery feeds the motors.
         """
         if battery and PAIRS[1][0] in self.values:
             raise BadConfiguration(
-                f"--battery: got it beside {self.source}, which states voltage_left_V; a battery's voltage falls, so "
-                "state duty_left and duty_right"
+                f"--battery: got it together with {self.source}, which states voltage_left_V; a battery's voltage "
+                "falls, so state duty_left and duty_right"
             )
         if battery and "voltage" in self.values:
             raise BadConfiguration(
-                f"--battery: got it beside {self.source}, which states supply_voltage_V; expected one of the two"
+                f"--battery: got it together with {self.source}, which states supply_voltage_V; expected one of "
+                "the two"
             )
 
     def profile(self, robot: Robot, conditions: Conditions) -> Profile:
         """The profile that a simulation takes, for a batch of runs.
 
         Args:
-            robot: that is to follow it; conditions: of shape (runs,), configurations as indices.
+            robot: that follows it; conditions: of shape (runs,), configurations as indices.
 
         Returns:
             Fields of shape (rows,); where surfaces are stated, `adhesion` of shape (runs, rows).
@@ -198,13 +199,13 @@ def known_columns() -> dict[str, tuple[str, str]]:
 
 
 def read(source: str | Path) -> ProfileTable:
-    """Returns a packaged profile, by its name, or that of a file in any format of a table.
+    """Returns a packaged profile, by its name, or the profile of a file in any format of a table.
 
     Raises:
-        BadData: no such file, fewer than two rows, an unknown, misspelt or repeated column or unit, a time that does
-            not increase, a cell that is no number, not finite or out of range, an empty cell of a column that every
-            row needs, two demands in a row or none, an unknown mode, surface or setting; said with file, row (counted
-            from 1 below the header), column, value and what is allowed.
+        BadData: no such file; fewer than two rows; an unknown, misspelt or repeated column or unit; a time that does
+            not increase; a cell that is no number, not finite or out of range; an empty cell of a required column;
+            two demands in a row or none; an unknown mode, surface or setting. The message has file, row (counted
+            from 1 below the header), column, value and the allowed values.
     """
     if str(source) in PACKAGED:
         file = resources.files("calibration") / "data" / "profiles" / f"{source}.csv"
@@ -237,7 +238,7 @@ def _parsed(
     columns = _columns(name, header)
     if len(body) < 2:
         got = "one row" if body else "a header and no rows"
-        raise BadData(f"{name}: got {got}; expected two rows or more, of which the last ends the mission")
+        raise BadData(f"{name}: got {got}; expected two rows or more; the last one ends the mission")
     for k, row in enumerate(body, 1):
         if len(row) != len(header):
             raise BadData(
@@ -423,7 +424,7 @@ def _driven(cells: _Cells) -> tuple[tuple[str, ...], dict[str, np.ndarray]]:
         own = [field for field in filled if DEMANDS[field] == mode]
         _check_demands(cells, row, before, mode, own, [f for f in filled if f not in own and f not in ends])
         modes.append(mode)
-        if row and cells.linear:  # what the ramp that leads here ends at, where this row does not say
+        if row and cells.linear:  # default end of the ramp that leads here
             for name in wholes:
                 found[name][row] = 0.0 if mode in CONTROLLED else found[name][row - 1]
             for name in shares:
@@ -443,7 +444,7 @@ def _demands_yaw(cells: _Cells, row: int, before: str, mode: str) -> bool:
             YAW_RATE, row, f"an empty cell: a yaw rate goes with a demanded speed, and this row has mode {mode}"
         )
     if cells.has(YAW_RATE) and not stated and mode == speed and (cells.linear or row < len(cells) - 1):
-        cells.refuse(YAW_RATE, row, "the yaw rate demanded beside the speed, 0 for straight travel")
+        cells.refuse(YAW_RATE, row, "the demanded yaw rate, 0 for straight travel")
     return stated
 
 
@@ -465,13 +466,13 @@ def _mode(cells: _Cells, row: int, before: str, filled: list[str]) -> str:
 
 
 def _check_demands(cells: _Cells, row: int, before: str, mode: str, own: list[str], others: list[str]) -> None:
-    """Refuse a row with two demands, one whose demand is missing, and a ramp from one kind of demand to another."""
+    """Refuse a row with two demands or a missing one, and a ramp from one kind of demand to another."""
     if others:
         where = cells.columns[others[0]][0]
         beside = cells.columns[own[0]][0] if own and not cells.text(MODE, row) else f"mode {mode}"
         raise BadData(
-            f"{cells.source} row {row + 1}, {where}: got {cells.text(others[0], row)} beside {beside}; expected one "
-            "demand in a row"
+            f"{cells.source} row {row + 1}, {where}: got {cells.text(others[0], row)} in addition to {beside}; "
+            "expected one demand in a row"
         )
     pair = next((pair for pair in PAIRS if cells.has(pair[0])), ())
     ends = row == len(cells) - 1 and not cells.linear

@@ -8,9 +8,9 @@ import numpy as np
 APART, FEWEST = 2, 12
 #: Share of changes that may come sooner than a period, and least share that comes after a whole number of periods.
 SOONER, REGULAR = 0.02, 0.8
-#: Least share of rows that repeat the one before, and how alike the periods of recordings are at least.
+#: Least share of rows that repeat the row before, and least ratio of the periods of recordings.
 LEAST, ALIKE = 0.3, 0.8
-#: Share of changes by one smallest step from which on a channel's repeats are those of its display.
+#: Least share of changes by one smallest step for which a channel's repeats are attributed to its display.
 STEPS = 0.5
 
 

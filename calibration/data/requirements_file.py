@@ -1,4 +1,4 @@
-"""Requirements as TOML files: what a robot has to do, over which envelope of use, units in the names."""
+"""Requirements as TOML files: limits on a robot's performance over an envelope of use, units in the names."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ DUTIES = ("standing", "driving")
 STATED = (0.0, 1e6)
 #: Stairs have a rise and a tread, whose least and greatest are stated [mm].
 STAIRS, TREAD, TREADS = "stairs_rise_mm", "tread_mm", (10.0, 5000.0)
-#: In place of a number: what the part in question permits; and the quantities of which parts state that.
+#: Word that stands for the limit that the part permits, and the quantities for which parts state one.
 RATED = "rated"
 RATINGS = ("winding_C", "motor_speed_rpm", "gearbox_speed_rpm", "gearbox_Nm")
 
@@ -69,7 +69,7 @@ class Envelope:
 
     @property
     def charge_end(self) -> float:
-        """State of charge at which the battery's use ends: the least of its range, 0 where that is one number."""
+        """State of charge at the end of the battery's use: the least of its range, 0 if the range is one number."""
         low, high = self.state_of_charge
         return low if low < high else 0.0
 
@@ -86,9 +86,9 @@ class Requirement:
     """One requirement.
 
     Attributes:
-        name: of `QUANTITIES`; limit: in the unit of the name, None: as the part is rated; least: that it has to be at
-            least; else at most.
-        envelope: over which.
+        name: of `QUANTITIES`; limit: in the unit of the name, None: as the part is rated; least: true if the quantity
+            has to be at least the limit, false if at most.
+        envelope: conditions under which it has to be met.
         share: of the time that the robot drives, for the endurance; 0: it stands.
         tread_mm: of stairs, for their rise.
         source: where the requirement comes from.
@@ -146,12 +146,13 @@ def load(path: Path | None) -> Requirements:
 def read(text: str, where: str) -> Requirements:
     """Requirements from the text of a file.
 
-    The file states quantities by name, each a number (the least or the most that it may be, by its usual sense), of
-    some "rated" (what the part permits), a
-    table with `least` and `most`, keys of the envelope that hold for it alone and `source`, or a list of such tables;
-    of the endurance a table also states `duty` (standing, or driving at full voltage for a `share` of the time).
-    `[envelope]` states for all of them payload_kg, slope_deg, state_of_charge or supply_voltage_V, ambient_C (a
-    number or [least, greatest]), surface, configuration, and battery.
+    The file states quantities by name. The value of each is a number (the least or the most allowed, by its usual
+    sense), a table, or a list of tables. For some quantities it may be "rated" (the limit that the part permits). A
+    table has `least`, `most`, `source`, and keys of the envelope for this requirement only. A table of the endurance
+    also states `duty` (standing, or driving at full voltage for a `share` of the time).
+
+    `[envelope]` applies to all requirements: payload_kg, slope_deg, state_of_charge or supply_voltage_V, ambient_C
+    (a number or [least, greatest]), surface, configuration, and battery.
 
     Raises:
         BadConfiguration: not TOML; no requirement; an unknown key, or one without its unit; no finite number; an
@@ -212,7 +213,7 @@ def _range(value: Any, where: str, low: float, high: float, unit: str) -> Range:
 
 
 def _envelope(base: Envelope, stated: Mapping[str, Any], where: str) -> Envelope:
-    """`base` with what is stated in its place."""
+    """`base` with the stated values in place of its own."""
     found: dict[str, Any] = {}
     for key, value in stated.items():
         place = f"{where}.{key}"
@@ -296,7 +297,7 @@ def _limit(value: Any, where: str, quantity: Quantity) -> float | None:
 
 
 def quantity_key(quantity: Quantity) -> str:
-    """`least` or `most`: what a number alone is."""
+    """`least` or `most`: the meaning of a number alone."""
     return "least" if quantity.least else "most"
 
 
@@ -311,7 +312,7 @@ def _share(duty: Any, share: Any, where: str) -> float:
     return found
 
 
-#: Quantities that are the same one elsewhere in the envelope.
+#: Quantities that equal another quantity at some point of the envelope.
 _SAME = {"speed_end_of_charge_m_s": "speed_m_s", "gearbox_speed_rpm": "motor_speed_rpm"}
 
 

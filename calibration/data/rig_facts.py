@@ -23,9 +23,9 @@ from mmrjax.model.shaft import Shaft
 from mmrjax.model.signals import GRAVITY
 
 BATTERY = "battery"
-#: From this ratio a gearbox has three stages or more; and the efficiency that makers state for those at most.
+#: Least ratio of a gearbox with three stages or more, and the largest efficiency that makers state for these.
 STAGES, EFFICIENCY = 100.0, 0.85
-#: How many times its time constant a speed takes that is not that of its motors alone; fewest samples that show it.
+#: Least duration of a change of speed, in time constants, that the motors and load do not explain; fewest samples.
 FAR, RISING = 100.0, 3
 
 
@@ -34,7 +34,7 @@ class Fact:
     """Returns facts that follow from a rig's numbers.
 
     Attributes:
-        what: in words; value: with its unit; odd: why its numbers should be looked at again, else empty.
+        what: in words; value: with its unit; odd: reason to check its numbers again, else empty.
     """
 
     what: str
@@ -51,7 +51,7 @@ def facts(robot: Robot) -> list[Fact]:
 
 
 def _within(value: float, low: float, high: float, why: str) -> str:
-    """`why` where a value is out of what is usual."""
+    """`why` if a value is outside the usual range, else empty."""
     return "" if low <= value <= high else f"{why} (usual: {rounded(low)} to {rounded(high)})"
 
 
@@ -77,7 +77,7 @@ def _motor(robot: Robot) -> Iterator[Fact]:
     if with_constant and with_resistance:
         size = constant**2 / resistance
         odd = _within(
-            size, 1e-7, 1.0, "torque_constant and resistance hardly belong to one motor; look at their units"
+            size, 1e-7, 1.0, "torque_constant and resistance are unlikely to be of one motor; look at their units"
         )
         yield Fact("torque over speed k²/R", f"{rounded(size * 1e3)} mN·m·s", odd)
         if inertia > 0:
@@ -114,7 +114,7 @@ def _current(robot: Robot, torque: float) -> float:
 
 
 def _drawn(robot: Robot, what: str, torque: float, places: str) -> Iterator[Fact]:
-    """The current that a torque takes, held against the stall current where the voltage's limit is stated."""
+    """Current that a torque takes, compared with the stall current if the voltage's limit is stated."""
     if not robot.knows(["motor.torque_constant"]):
         return
     current, limit = _current(robot, torque), robot.motor.voltage_limit
@@ -135,7 +135,7 @@ def _shaft(robot: Robot, name: str, load: Shaft) -> Iterator[Fact]:
             robot, f"{name}: current to hold and lift the arm", friction + gravity, f"{name}.torque_gravity"
         )
         length = float(load.inertia) * GRAVITY / gravity
-        why = f"{name}.inertia and {name}.torque_gravity hardly belong to one arm: m l² and m g l"
+        why = f"{name}.inertia and {name}.torque_gravity are unlikely to be of one arm: m l² and m g l"
         yield Fact(f"{name}: swings as a pendulum of", f"{rounded(length * 1e3)} mm", _within(length, 0.01, 3.0, why))
     if float(load.inertia) > 0 and float(robot.motor.inertia) > 0:
         share = float(load.inertia) / (float(robot.motor.inertia) * float(robot.gearbox.ratio) ** 2)
@@ -177,8 +177,10 @@ def _vehicle(robot: Robot, name: str) -> Iterator[Fact]:
 
 
 def doubtful_time(runs: Runs, robot: Robot) -> str:
-    """Why a log's time is in milliseconds: speeds rise over samples, at a constant voltage, in far longer than the
-    motors take with their load; empty where nothing shows that."""
+    """Reason to read a log's time as milliseconds; empty without evidence.
+
+    At a constant voltage, the speed then changes over far longer than the motors take with their load.
+    """
     if not runs.sampled or robot.rig.imposed != "voltage":
         return ""
     longest = FAR * time_constant(robot)
@@ -204,13 +206,15 @@ def doubtful_time(runs: Runs, robot: Robot) -> str:
     return ""
 
 
-#: Multiples of the current that turns a load slowly which a log's largest imposed current is between.
+#: Usual range of a log's largest imposed current, in multiples of the current that turns a load slowly.
 LEAST, MOST = 0.1, 100.0
 
 
 def doubtful_current(runs: Runs, robot: Robot) -> str:
-    """Why an imposed current, or torque, is in another unit: far from what turns the loads of its table slowly; empty
-    where nothing shows that."""
+    """Reason to doubt the unit of an imposed current or torque; empty without evidence.
+
+    Such a current is far from the current that turns the loads of the table slowly.
+    """
     column, present = runs.layout.imposed_column, set(runs["configuration"])
     loads = [x for name, x in robot.configurations.items() if name in present and isinstance(x, Shaft)]
     if column != CURRENT or not loads:
@@ -251,13 +255,13 @@ def gap(runs: Runs) -> str:
         more = f" (and {count_noun(int(long.sum()) - 1, 'other row')} after a gap)" if long.sum() > 1 else ""
         told = (
             f"{runs.source} row {rows[k + 1] + 1}, time_s: {rounded(worst)} s after the row before it, where "
-            f"{rounded(usual)} s is usual{more}; a fit holds what is imposed for that time; if rows are missing, "
-            'give the rows from there on another run_id, with start = "measured" in the rig\'s file'
+            f"{rounded(usual)} s is usual{more}; a fit holds the imposed quantity for that time; if rows are "
+            'missing, give the rows from there on another run_id, with start = "measured" in the rig\'s file'
         )
     return told
 
 
-#: Of the times between rows: spread over the usual one, and correlation of one with the next, from which on a clock
+#: Least relative spread of the times between rows, and largest correlation of one with the next, of a clock that
 #: jitters; fewest rows.
 UNEVEN, TURNS_BACK, ROWS_OF_CLOCK = 0.1, -0.3, 50
 
@@ -294,23 +298,23 @@ def one_level(runs: Runs) -> str:
         return ""
     return (
         f"{runs.source} rows 1 to {len(runs)}, {runs.headings.get(column, column)}: {rounded(runs[column][0])} "
-        f"{column.rpartition('_')[2]} in every row; after the start one level shows one current and one speed, by "
-        "which losses that rise with either are not told apart; log three levels or more, both ways if it turns back"
+        f"{column.rpartition('_')[2]} in every row; after the start one level shows one current and one speed, "
+        "which do not separate losses that rise with either; log three levels or more, both ways if it turns back"
     )
 
 
-#: Share of the largest voltage up to which rows show resistance and back-EMF, and fewest of them; the misfit up to
-#: which they do, over their voltage; the share of a larger voltage that its rows have to show.
+#: Rows up to this share of the largest voltage show resistance and back-EMF; fewest such rows; largest misfit over
+#: their voltage; the least share of a larger voltage that its rows have to show.
 INNER, ROWS_INNER, FITS, REACHES = 0.25, 30, 0.2, 0.8
 
 
 def saturated(runs: Runs) -> str:
-    """Sentence on a voltage in a log that the driver does not reach; empty where nothing shows that.
+    """Sentence on a voltage in a log that the driver does not reach; empty without evidence.
 
     Rows of small voltage give U = R I + k ω by least squares. In rows of a larger voltage, current and speed show one
     voltage all the time if the driver limits it.
     """
-    # Of a duty, the supply's current is its share of the motors' alone.
+    # With a duty, the supply's current is only a share of the motors' current.
     known = [CURRENT, *(() if runs.has("duty") else ("total_current_A",))]
     current, speed = next((c for c in known if runs.has(c)), CURRENT), SPEED
     if runs.layout.imposed != "voltage" or not (runs.sampled and runs.has(current) and runs.has(speed)) or runs.turns:
@@ -328,7 +332,7 @@ def saturated(runs: Runs) -> str:
     top = read & (np.abs(given) >= np.quantile(np.abs(given[read]), 0.9))
     limit = float(np.median(np.abs(seen[top])))
     beyond = read & (np.abs(given) > limit / REACHES)
-    # Where what they show rises on, something else is wrong.
+    # If the voltage that they show still rises, the reason is another one.
     if beyond.sum() < ROWS_INNER or np.std(np.abs(seen[beyond])) > FITS * limit:
         return ""
     row = int(np.flatnonzero(beyond)[0])
@@ -340,13 +344,15 @@ def saturated(runs: Runs) -> str:
     )
 
 
-#: Multiple of the torque at stall beyond which a brake's is in another unit.
+#: Multiple of the torque at stall beyond which a brake's torque is taken to be in another unit.
 BEYOND = 3.0
 
 
 def doubtful_torque(runs: Runs, robot: Robot) -> str:
-    """Why a brake's torque is in another unit: most of its rows are far above what stalls the motors; empty where
-    nothing shows that, or where the speed is imposed."""
+    """Reason to doubt the unit of a brake's torque; empty without evidence, or if the speed is imposed.
+
+    Most rows of such a torque are far above the torque that stalls the motors.
+    """
     of_current = robot.rig.imposed == "motor_current"
     if not runs.has(LOAD) or not (of_current or (robot.rig.imposed == "voltage" and robot.knows(VOLTAGE))):
         return ""
@@ -379,7 +385,7 @@ def doubts(runs: Runs, robot: Robot) -> tuple[str, ...]:
 
 
 def time_constant(robot: Robot) -> float:
-    """Time constant J R/k² of the motors' speed with the slowest load [s]; infinite where it is not known."""
+    """Time constant J R/k² of the motors' speed with the slowest load [s]; infinite if it is unknown."""
     motor, sides, found = robot.motor, float(robot.sides), 0.0
     if not robot.knows(VOLTAGE):
         return math.inf
@@ -397,7 +403,7 @@ class Origin:
     """Origin of a number of a robot.
 
     Attributes:
-        name: of the parameter; value [unit]; sd: stated, None where the file states none.
+        name: of the parameter; value [unit]; sd: as stated, None if the file states none.
         why: in words.
     """
 
@@ -429,7 +435,7 @@ def origins(file: RobotFile) -> list[Origin]:
         elif robot.rig.inherits:
             why = "its base"
         elif head == BATTERY and not robot.knows([p.name]):
-            why = "not stated: an example's; what is run on the battery rests on it"
+            why = "not stated: an example's; results on the battery depend on it"
         else:
             why = _default(p.name, rest if mine else "")
         found.append(Origin(p.name, float(p.value), p.spec.unit, priors.get(p.name), why))

@@ -34,14 +34,14 @@ LINEAR = {
     "force_coulomb_N": "dry friction of guide and screw",
     "force_viscous_N_s_m": "viscous friction of guide and screw",
     "force_constant_N": "force that acts against forward travel whatever the speed",
-    "incline_deg": "angle at which forward travel climbs",
-    "inertia": "inertia of what turns with the output, beside the mass [kg·m^2]",
+    "incline_deg": "slope that forward travel climbs, positive uphill",
+    "inertia": "inertia of parts that turn with the output, without the mass [kg·m^2]",
 }
 _TRAVEL = ("lead_mm", "drum_radius_mm")
 _LEAST = {"mass_kg", *_TRAVEL}  # these must be more than 0
 
-#: What a robot that starts from nothing has where its file says nothing: value, and why. Limits and all other losses
-#: are none (`robots.blank`).
+#: Default values of a robot that starts from nothing, each with its reason. It has no limits and no other losses
+#: (`robots.blank`).
 DEFAULTS: dict[str, tuple[float, str]] = {
     "motor.inertia": (0.0, "not stated: the load's inertia alone; histories from rest need it"),
     "battery.current_other": (0.0, "not stated: nothing else is on the battery"),
@@ -51,7 +51,7 @@ WINDING = 2e-4
 WINDING_WHY = f"not stated: assumed, {1e3 * WINDING:g} ms of the resistance"
 #: The same of a vehicle, below its configuration.
 VEHICLE: dict[str, tuple[float, str]] = {
-    "track.loss_coulomb": (0.0, "not stated: wheels lose nothing beside rolling"),
+    "track.loss_coulomb": (0.0, "not stated: wheels have no loss except rolling resistance"),
     "track.loss_viscous": (0.0, "not stated: no loss that rises with speed"),
     "track.guide_friction": (0.0, "not stated: nothing rubs on a guide"),
     "track.guide_share": (0.0, "not stated: pulleys or wheels carry all of the weight"),
@@ -62,17 +62,17 @@ VEHICLE: dict[str, tuple[float, str]] = {
     "turning.rule": (1.0, "not stated: assumed, friction against the sliding"),
     "turning.inertia": (0.0, "not stated: only a robot that turns needs it"),
 }
-#: What a vehicle that states how wide it is, and so may turn, has to state beside that.
+#: Further required parameters of a vehicle that states its width, and so may turn.
 WIDTH, WHEELBASE = "turning.width", "running_gear.wheelbase"
-#: The same of what an example has where nothing is stated.
+#: Parameter whose default value is taken from an example, and the reason.
 CENTRE, CENTRE_WHY = "running_gear.centre_height", "not stated: an example's; in turns it moves load"
 #: Parameters of VEHICLE that tracks have to state.
 _OF_TRACKS = ("track.loss_coulomb",)
 DYNAMIC = "ground.friction.dynamic"
-#: Share of a vehicle's mass that turns with its wheels, as disks, where none is stated: over time a shaft has to have
-#: an inertia, and beside the mass this is small.
+#: Default share of a vehicle's mass that turns with its wheels, as disks. A simulation over time needs an inertia of
+#: the shaft; compared with the mass this one is small.
 WHEELS = 0.05
-#: Why those of a vehicle that follow from what it states are what they are.
+#: Reasons for default values of a vehicle that follow from other stated values.
 FOLLOWS = {
     DYNAMIC: f"not stated: assumed, {DYNAMIC_SHARE:g} of static",
     "inertia": f"not stated: assumed, wheels that are disks of {100 * WHEELS:g} % of the mass",
@@ -80,18 +80,21 @@ FOLLOWS = {
 
 
 def linear(table: dict[str, Any], name: str, where: str, sds: dict[str, float], sides: float) -> None:
-    """Turn the table of a linear unit into that of the shaft of one of its drives, and its sds with it.
+    """Converts the table of a linear unit, and its sds, into the table of the shaft of one of its drives.
 
-    Travel r a radian is lead / 2π or the drum's radius; of n drives each has J = J_0 + m r² / n, M_0 = F_0 r / n,
-    K = b r² / n, M_c = (F_c + m g sin α) r / n. Their sds are those of first order, of independent inputs; of exact
-    ones they are exact.
+    Travel r per radian is lead / 2π or the drum's radius. With n drives, each drive has
+
+        J = J_0 + m r² / n,  M_0 = F_0 r / n;  K = b r² / n,  M_c = (F_c + m g sin α) r / n.
+
+    The sds are first order for independent inputs; exact inputs give exact values.
 
     Args:
         table: of the configuration `name`, without `load`; where: opens the message of an error.
         sds: stated, by dotted name; sides: drives that move it together.
 
     Raises:
-        BadConfiguration: an unknown key, no number, no mass, no travel or two, or one that is not positive.
+        BadConfiguration: an unknown key, a value that is no number, no mass, not exactly one travel, or a mass or
+            travel that is not positive.
     """
     at = {key: _linear_value(table, key, where) for key in list(table) if _known_key(key, where)}
     travels = [key for key in _TRAVEL if key in at]
@@ -154,7 +157,7 @@ def vehicle_defaults(on_tracks: bool, table: Mapping[str, Any], sides: float) ->
         at: Any = table
         for key in keys:
             at = at.get(key) if isinstance(at, Mapping) else None
-        return float(at) if is_number(at) else 0.0  # what is no number is refused later
+        return float(at) if is_number(at) else 0.0  # a value that is no number is refused later
 
     found = {name: value for name, (value, _) in VEHICLE.items() if not (on_tracks and name in _OF_TRACKS)}
     wheels = 0.5 * WHEELS * stated("mass") * stated("radius") ** 2 / sides
@@ -165,8 +168,8 @@ def rig(content: dict[str, Any], where: str, loads: Sequence[str], *, travels: b
     """The rig that a file's content states; takes the `KEYS` out of it.
 
     Args:
-        loads: names of the configurations; travels: whether their travel can be measured.
-        inherits: whether the robot has a base.
+        loads: names of the configurations; travels: true if their travel can be measured.
+        inherits: true if the robot has a base.
 
     Raises:
         BadConfiguration: an unknown word, channel or column, a channel that is imposed, or an instrument of a channel
@@ -211,7 +214,7 @@ def _channels(stated: Any, where: str) -> tuple[str, ...]:
         if name not in every:
             raise BadConfiguration(f"{where}: got {name}; {allowed_words(name, every)}")
         if stated.count(name) > 1:
-            raise BadConfiguration(f"{where}: {name} stands twice; expected each channel once")
+            raise BadConfiguration(f"{where}: {name} is repeated; expected each channel once")
     return tuple(name for name in every if name in stated)
 
 
@@ -284,7 +287,7 @@ def _columns(stated: Any, where: str) -> tuple[tuple[str, str, float], ...]:
 
 
 def needed(rig: Rig, values: Iterable[tuple[str, Any]] = ()) -> tuple[str, ...]:
-    """Parameters that a robot which starts from nothing has to state: of the drive, and of one that turns.
+    """Required parameters of a robot that starts from nothing: of its drive, and of its turns if it turns.
 
     Args:
         values: of its parameters, by dotted name.
@@ -308,11 +311,11 @@ def needed(rig: Rig, values: Iterable[tuple[str, Any]] = ()) -> tuple[str, ...]:
 def refuse_missing(
     missing: Sequence[str], known: Mapping[str, params.Parameter], where: str, given: Iterable[str] = ()
 ) -> None:
-    """Refuse a robot that starts from nothing and does not state what it must.
+    """Refuse a robot that starts from nothing and does not state all required parameters.
 
     Args:
         missing: names of parameters; known: every parameter of the robot.
-        given: names that the file states, of which one may be misspelt.
+        given: names that the file states; one of them may be misspelt.
 
     Raises:
         BadConfiguration: one sentence that lists all of them.
@@ -336,12 +339,12 @@ def with_priors(robot: Robot, sds: Mapping[str, float], where: str) -> Robot:
         sds: by dotted name [SI].
 
     Raises:
-        BadConfiguration: an sd of what is no parameter.
+        BadConfiguration: an sd of a name that is no parameter.
     """
     known = {p.name: p for p in params.walk_parameters(robot)}
     for name in sds:
         if name not in known:
-            raise BadConfiguration(f"{where}, {name}: a ± stands with parameters alone; state the number")
+            raise BadConfiguration(f"{where}, {name}: only parameters may have a ±; state the number")
     priors = tuple((name, float(p.value), sds[name]) for name, p in known.items() if name in sds)
     return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, priors=priors))
 

@@ -1,4 +1,4 @@
-"""Robots as TOML files: a base robot by name, and what this one has besides or in its place."""
+"""Robots as TOML files: a base robot by name, with added or replaced parameters and effects."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ COUNTS = {
     "battery.cells": (1, 100, "(cells of the battery in series)"),
 }
 
-#: Key of an effect's table by which a file brings the library's priors and limits to the rig's size.
+#: Key of an effect's table that scales the library's priors and limits to the rig's size.
 FACTORS = "scaled"
 
 #: Ratings by makers, which no fit can free: least, greatest, unit and meaning. Experiments stay within them.
@@ -52,7 +52,7 @@ RATINGS = {
     "battery.current_charge": (0.0, 1e4, "A", "largest current that a cell may take; not stated: none"),
     "battery.capacity_curve": (1.0, 1e6, "C", "capacity of the cell whose curvature and slope are stated"),
 }
-#: The parabola of a cell's no-load voltage; stated beside a capacity it is that of a cell of this capacity.
+#: The parabola of a cell's no-load voltage; together with a capacity, it applies to a cell of this capacity.
 CURVE = {"battery.curvature", "battery.slope"}
 #: Switches of a robot, which no fit can free: meaning.
 SWITCHES = {
@@ -65,14 +65,14 @@ CHOICES = {"driver.decay": (DECAYS, "between pulses the driver shorts the motors
 
 @dataclasses.dataclass(frozen=True)
 class RobotFile:
-    """A robot and what is known of where it comes from.
+    """A robot and the origin of its numbers.
 
     Attributes:
-        robot: with all that is said of it elsewhere too, as on the command line.
-        source: path of its file, or name of a packaged robot, whose file states nothing.
-        stated: names of the parameters that the file states, in place of a linear unit's those of its shaft.
+        robot: including changes from elsewhere, such as the command line.
+        source: path of its file, or name of a packaged robot; a packaged robot states no parameters.
+        stated: names of the parameters that the file states; a linear unit's keys become parameters of its shaft.
         linear: configurations that it states as linear units; text: of the file.
-        remarks: sentences on what the robot is, for whoever reads numbers of it.
+        remarks: sentences on the robot, for readers of its numbers.
     """
 
     robot: Robot
@@ -94,10 +94,10 @@ def load(name_or_path: str, library: Library = effects.BY_NAME, notes: list[str]
 
     Args:
         name_or_path: `nominal`, `sm1`, `sm2`, or a TOML file that `calibrate`, `loop` or `rig new` wrote.
-        library: effects by name that the file may hold; notes: takes what is worth saying of the file.
+        library: effects by name that the file may use; notes: receives remarks on the file.
 
     Raises:
-        BadConfiguration: no such name or file, or a value in it that is none.
+        BadConfiguration: no such name or file, or an invalid value in the file.
     """
     return find(name_or_path, library, notes).robot
 
@@ -134,14 +134,16 @@ def parse(path: Path, library: Library = effects.BY_NAME, notes: list[str] | Non
         schema: version of this form.
         base: name of the robot that it starts from, `nominal` if left out; `none` starts from nothing.
         imposed, channels, start, columns, instruments: how it is driven and measured, see `rig_file`.
-        sides: motors driven alike; `battery.cells`: cells in series.
-        configurations: names of those that the robot has, in order; else those of the base, or those that have
-            tables. One that the base does not have states `like`, the base's configuration that it starts from, or
-            `movers` (`tracks` or `wheels`) or `load` (see `rig_file.LOADS`) and every parameter that has no default.
+        sides: number of motors; `battery.cells`: cells in series.
+        configurations: names of the robot's configurations, in order; default: those of the base, or all tables.
+            A configuration that is not in the base states `like`, the base's configuration that it starts from.
+            Otherwise it states `movers` (`tracks` or `wheels`) or `load` (see `rig_file.LOADS`), and every parameter
+            without default.
         parameters: in tables by dotted name in SI units, e.g. `[motor] resistance = 0.9`, or with the sd of their
             prior as `"0.9 ± 5 %"`; RATINGS; SWITCHES, true or false; and CHOICES.
-        effects: one is present when its table `[effects.NAME]` is, which may name the `configurations` that it acts
-            on, and by `scaled` how its priors and limits compare to the library's (see `effects.scaled`).
+        effects: an effect is present if the file has its table `[effects.NAME]`. The table may name the
+            `configurations` that the effect acts on, and scale its priors and limits by `scaled` (see
+            `effects.scaled`).
 
     Args:
         notes: as for `find`.
@@ -191,7 +193,7 @@ def _without_parameters(
     """The robot of a file's content before the parameters that it states, the sds stated of those, its linear units.
 
     Args:
-        base: None starts from nothing; content: what is left of it are parameters.
+        base: None starts from nothing; content: the function removes keys other than parameters.
     """
     if base is None:
         resolved_likes(content, where)
@@ -222,7 +224,7 @@ def _of_size(library: Library, name: str, factors: Any, where: str) -> type[effe
     """The effect of a name with its priors and limits brought to the rig's size, as its file states.
 
     Raises:
-        BadConfiguration: no three positive numbers, or an effect that has no size of its own.
+        BadConfiguration: not three positive numbers, or an effect without a prior size.
     """
     here = f"{where}, effects.{name}.{FACTORS}"
     if name not in library:
@@ -246,11 +248,11 @@ def with_effects(
     """The robot with these effects of `library`, or curves, present, each with amplitude 0.
 
     Args:
-        configurations: by an effect's name, a list of those that it acts on; others keep their class's default.
+        configurations: by an effect's name, the list of its configurations; default: as in its class.
         where: opens the message of an error.
 
     Raises:
-        BadConfiguration: configurations of an effect that are no list of names, or that the robot does not have.
+        BadConfiguration: an effect's configurations are no list of names, or are not in the robot.
     """
     known = {**effects.BESIDE, **library}
     present = []
@@ -279,7 +281,7 @@ def change(robot: Robot, values: Mapping[str, Any], where: str, notes: list[str]
     stated = dict(values)
     counts = {name: _count(where, name, stated.pop(name)) for name in COUNTS if name in stated}
     ratings: dict[str, Any] = {name: _rating(where, name, stated.pop(name)) for name in RATINGS if name in stated}
-    if CURVE & stated.keys() and "battery.capacity" in stated:  # all of one cell, unless it is said otherwise
+    if CURVE & stated.keys() and "battery.capacity" in stated:  # all of one cell, unless stated otherwise
         ratings.setdefault("battery.capacity_curve", stated["battery.capacity"])
     ratings |= {name: _switch(where, name, stated.pop(name)) for name in SWITCHES if name in stated}
     ratings |= {name: _choice(where, name, stated.pop(name)) for name in CHOICES if name in stated}
@@ -311,7 +313,7 @@ def change(robot: Robot, values: Mapping[str, Any], where: str, notes: list[str]
 
 
 def _refused(name: str, value: Any, known: Mapping[str, params.Parameter]) -> str:
-    """Why a parameter cannot be stated so; empty: it can."""
+    """Reason why a value of a parameter is refused; empty if it is allowed."""
     if name not in known:
         return f"no such parameter; {_parameters(name, known)}"
     spec = known[name].spec
@@ -412,9 +414,9 @@ def _check_pairs(robot: Robot, where: str) -> None:
 
 
 def write(robot: Robot, path: Path, *, note: str = "") -> None:
-    """Write a robot with everything that it states, unit, meaning and source beside each; `read` gives it back.
+    """Write a robot with everything that it states, with unit, meaning and source; `read` returns the same robot.
 
-    Of a robot that starts from nothing, what it leaves open is left out.
+    Parameters that a robot which starts from nothing does not state are left out.
     """
     whole, nothing = robot.rig.inherits, _start(robot)
     pack = not whole and robot.battery.cells == nothing.battery.cells

@@ -1,4 +1,4 @@
-"""Checks of rows: values of columns that contradict each other, and what a table leaves out."""
+"""Checks of rows: values of columns that contradict each other, and missing columns with a default."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from mmrjax.model.rig import Instrument
 
 #: Excess of a reading beyond zero by its noise, in stated sds, and as a share of the channel's rms.
 SIGN_SDS, SIGN_SHARE = 4.0, 0.05
-#: Share of the largest reading of a speed below which a motor that nothing drives stands.
+#: Share of the largest reading of a speed below which an undriven motor counts as at rest.
 STILL = 0.02
 
 
@@ -81,7 +81,7 @@ def _fill(name: str, columns: dict[str, np.ndarray], rows: int, layout: Layout) 
 
 
 def _only(name: str, columns: dict[str, np.ndarray], layout: Layout) -> str:
-    """Returns the configuration of a table without that column: the only one, or the one that has its surfaces."""
+    """Returns the configuration of a table without that column: the only one, or the only one with its surfaces."""
     labels = np.unique(columns.get("surface", np.zeros(0, str)))
     found = surfaces.common(layout.configurations, labels)
     if found is None:
@@ -113,10 +113,12 @@ def _check_sides(name: str, columns: dict[str, np.ndarray], layout: Layout) -> N
     stated = [c for c in layout.sides if c in columns]
     if len(stated) == 1:
         (other,) = set(layout.sides) - set(stated)
-        raise BadData(f"{name}: column {other} is missing beside {stated[0]}; state what drives both sides")
+        raise BadData(f"{name}: column {other} is missing, {stated[0]} is stated; state the drive of both sides")
     if stated and set(columns) & {"duty", "mode"}:
         beside = min(set(columns) & {"duty", "mode"})
-        raise BadData(f"{name}: column {beside} beside {stated[0]}, which says how either side is driven; keep one")
+        raise BadData(
+            f"{name}: column {beside} in addition to {stated[0]}, which states the drive of both sides; keep one"
+        )
 
 
 def _check_mass(name: str, columns: dict[str, np.ndarray]) -> None:
@@ -138,8 +140,8 @@ def _check_deviations(name: str, columns: dict[str, np.ndarray], shown: tuple[Ch
             lost = np.isfinite(columns[channel.column]) & ~np.isfinite(columns[channel.sd_column])
             if lost.any():
                 raise BadData(
-                    f"{name} row {int(np.flatnonzero(lost)[0]) + 1}, {channel.sd_column}: got an empty cell beside a "
-                    f"reading; expected its sd, more than 0 {channel.unit}"
+                    f"{name} row {int(np.flatnonzero(lost)[0]) + 1}, {channel.sd_column}: got an empty cell next "
+                    f"to a reading; expected its sd, more than 0 {channel.unit}"
                 )
 
 
@@ -224,7 +226,7 @@ def _check_signs(name: str, columns: dict[str, np.ndarray], layout: Layout) -> N
             if wrong.size:
                 raise BadData(
                     f"{name} row {wrong[0] + 1}, {channel.column}: got {number(readings[wrong[0]])}; expected no "
-                    "negative reading, as the robot's file says that the instrument shows magnitude alone"
+                    "negative reading, as the robot's file states that the instrument shows magnitude alone"
                 )
             continue
         # Gravity may drive a motor: only up the slope, or on the flat, its current has the sign of its voltage.
@@ -234,14 +236,14 @@ def _check_signs(name: str, columns: dict[str, np.ndarray], layout: Layout) -> N
         doubt = _doubt(columns, channel)
         wrong = np.flatnonzero(backward & (readings > (doubt if layout.crosses_zero else 0.0)))
         forward = (imposed > 0) & (columns["slope_deg"] >= 0) & (not channel.zero_at_rest)
-        forward &= channel.name != "motor_voltage"  # which is held against the back-EMF
+        forward &= channel.name != "motor_voltage"  # it is compared with the back-EMF
         against = np.flatnonzero(forward & (readings < -doubt))
         if against.size:
             at = int(against[0])
             alike = "" if channel not in channels.OF_TURNS else f"; a turn has {' and '.join(layout.sides)} too"
             raise BadData(
                 f"{name} row {at + 1}, {channel.column}: got {number(readings[at])} at {number(imposed[at])} {unit}; "
-                "nothing else drives the motors there, so expected a reading with the sign of what is imposed, the "
+                "nothing else drives the motors there, so expected a reading with the sign of the drive, the "
                 f"same in every row{alike}"
             )
         if wrong.size:
@@ -295,8 +297,8 @@ def lacks(name: str, columns: dict[str, np.ndarray], layout: Layout) -> Iterator
             which = f"{', '.join(map(str, rows[:5]))}{' and more' if len(rows) > 5 else ''}"
             others = f", and so {several.sum() - 1} more" if several.sum() > 1 else ""
             yield (
-                f"{name}: run_id {run} stands in rows {which}{others}; without {', '.join(TIME)} every row is a run "
-                "of its own"
+                f"{name}: run_id {run} is in rows {which}{others}; without {', '.join(TIME)} every row is a "
+                "separate run"
             )
 
 

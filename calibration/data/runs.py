@@ -63,7 +63,7 @@ def read(
             Tables in memory are a pandas or polars DataFrame, an Arrow table, an xarray Dataset, a dict of arrays,
             or a list of records.
         columns: of the source, where its names are not this program's: a packaged preset (`vesc,pole_pairs=7`), a
-            preset's file, or a dict such as `{"motor_speed_rpm": "speed"}`. They win over those of the robot's file.
+            preset's file, or a dict such as `{"motor_speed_rpm": "speed"}`. They win over the robot's file.
         measured, battery, robot, of_turns: as for `of_arrays`.
 
     Raises:
@@ -89,13 +89,13 @@ def read(
 
 
 def _refuse_a_loggers_names(arrays: NamedArrays, layout: Layout) -> None:
-    """Refuses a source without any column of a known name whose columns are those of a preset."""
+    """Refuses a source without any column of a known name whose columns match a preset."""
     if any(m is not None for m in layout.meanings(arrays.name, list(dict.fromkeys(arrays.header)))):
         return
     if name := presets_file.recognised(arrays.header):
         numbers_asked = "".join(f",{key}=..." for key in presets_file.asked(name))
         raise BadData(
-            f"{arrays.name}: has no column with a name that is known, but those of {name}; add --columns "
+            f"{arrays.name}: has no column with a known name, but columns of {name}; add --columns "
             f'{name}{numbers_asked}, in Python columns="{name}{numbers_asked}"'
         )
 
@@ -109,7 +109,7 @@ def of_arrays(
     of_turns: bool = False,
     mapped: Mapped | None = None,
 ) -> Runs:
-    """Returns the runs that named columns of raw values state.
+    """Returns the runs in named columns of raw values.
 
     Args:
         arrays: columns of the source.
@@ -118,7 +118,7 @@ def of_arrays(
         robot: defines the columns that are needed, and the channels. None: the packaged robot, with a channel for
             each further column of one.
         of_turns: True to give a table of turns a channel for each of its columns of one side or of the yaw.
-        mapped: columns that have other names in the source, as `Layout.mapped`; None: those of the robot's file.
+        mapped: columns that have other names in the source, as `Layout.mapped`; None: from the robot's file.
 
     Raises:
         BadData: no columns or rows, no channel, a missing, misspelt or repeated column, or a wrong unit; values that
@@ -172,7 +172,7 @@ def of_arrays(
 def _columns(
     arrays: NamedArrays, meanings: Sequence[Column | None], layout: Layout, battery: bool
 ) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
-    """Values of the columns that mean something, and notes on cells that are read as something else."""
+    """Values of the columns with a meaning, and notes on cells that are read as another value."""
     columns: dict[str, np.ndarray] = {}
     bad: list[tuple[int, int, str]] = []
     notes: list[str] = []
@@ -205,10 +205,10 @@ def _columns(
 
 
 def _listed(name: str, said: Sequence[str], count: int) -> str:
-    """One message on all refused cells, the first row first; each advice stands once.
+    """One message on all refused cells, the first row first, without repeated advice.
 
     Args:
-        said: sentences, among them the first `LISTED`; count: number of cells.
+        said: sentences, at least the first `LISTED`; count: number of cells.
     """
     first, *others = said
     if not others:
@@ -240,7 +240,7 @@ def _without_repeats(name: str, columns: dict[str, np.ndarray], layout: Layout) 
 def _with_instruments(
     columns: Mapping[str, np.ndarray], layout: Layout, measured: bool
 ) -> tuple[Layout, tuple[Instrument, ...]]:
-    """The layout with the instruments that the readings tell, and those of them that show magnitude alone."""
+    """The layout with the instruments inferred from the readings, and instruments without sign."""
     inferred = instruments.infer_instruments(layout.instruments, columns)
     stated = {i.channel for i in inferred}
     unsigned = tuple(i for i in sides.magnitudes(columns, layout) if measured and i.channel not in stated)
@@ -248,9 +248,9 @@ def _with_instruments(
 
 
 def _configurations_in_case(name: str, cells: list[str], layout: Layout) -> tuple[list[str], list[str]]:
-    """Names of configurations with the capitals of the robot's, and sentences on what was read so."""
+    """Names of configurations with the capitals of the robot's names, and notes on changed names."""
     meant = {c.casefold(): c for c in layout.configurations}
-    if len(meant) < len(layout.configurations):  # told apart by their capitals alone
+    if len(meant) < len(layout.configurations):  # they differ only in their capitals
         return cells, []
     others = [c for c in dict.fromkeys(cells) if c not in layout.configurations]
     odd = {c: meant[c.casefold()] for c in others if c.casefold() in meant}
@@ -272,7 +272,7 @@ def _refuse_idle(arrays: NamedArrays, meaning: Column, raw: Raw, layout: Layout)
     why = (
         f"{NO_BRAKE}; state slope_deg or payload_kg, or describe the load as a shaft"
         if layout.has_ground
-        else "the robot's load is a shaft, on which no slope, payload or mass acts; remove the column, or describe "
+        else "the robot's load is a shaft; no slope, payload or mass acts on it; remove the column, or describe "
         "the load as a vehicle"
     )
     if isinstance(raw, np.ndarray):
@@ -291,8 +291,8 @@ def _refuse_stated(arrays: NamedArrays, voltages: Raw) -> None:
         stated = [row for row, cell in enumerate(voltages) if cell][:1]
     for row in stated:
         raise BadData(
-            f"{arrays.row(row)}, supply_voltage_V: got {texts(voltages[row : row + 1])[0]} beside --battery, whose "
-            "charge sets the voltage; expected an empty cell, or no such column"
+            f"{arrays.row(row)}, supply_voltage_V: got {texts(voltages[row : row + 1])[0]} together with --battery, "
+            "whose charge sets the voltage; expected an empty cell, or no such column"
         )
 
 

@@ -1,4 +1,4 @@
-"""From a log over time to settled runs: stretches in which what is imposed holds and every channel has settled."""
+"""Settled runs from a log over time: stretches with a constant drive in which every channel has settled."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from mmrjax.model import channels
 from mmrjax.model.channels import Channel
 from mmrjax.model.robot import Robot
 
-#: Share of a signal's largest size below which it counts as none: the motors are not driven, the output stands.
+#: Share of a signal's largest size below which it counts as zero: the motors are not driven, the output is at rest.
 STILL = 0.02
-#: Share of a signal's largest size to which it is known at least, beside the share of its own mean.
+#: Least uncertainty of a signal as a share of its largest size, in addition to the share of its own mean.
 FINE = 0.005
-#: Largest change of a mean within a stretch, as a share of it, where none is stated.
+#: Default of the largest change of a mean within a stretch, as a share of the mean.
 DRIFT = 0.02
-#: Shortest stretch where none is stated [s].
+#: Default of the shortest stretch [s].
 LEAST = 0.3
 #: Fewest samples of a stretch, and of its parts between which means are compared.
 FEWEST, PART = 8, 3
@@ -37,20 +37,20 @@ SDS = 3.0
 OF_CHANGE = 12**0.5
 #: Beginnings of a stretch that are tried, and share of the largest change from which on a change is slight.
 TRIES, SLIGHT = 5, 0.05
-#: Share of readings up to which there are different ones where an instrument has coarse steps.
+#: Largest number of different readings, as a share of all, of an instrument with coarse steps.
 COARSE = 0.2
 #: Equal readings one after the other that an instrument with noise does not show, and up to what share of all steps
 #: readings that are equal to the one before are noise's chance.
 STUCK, CHANCE = 20, 0.2
 #: Robust sds, and steps of the instrument, by which a glitch is off the readings next to it.
 FAR = 6.0
-#: Share of glitches in a stretch up to which the other readings have a mean; samples beside which a reading is held.
+#: Largest share of glitches in a stretch whose other readings still have a mean; samples around a tested reading.
 MOST_GLITCHES, BESIDE = 0.25, (21, 101)
 #: Channels that a robot that travels straight reads as zero.
 OF_YAW = tuple(c.name for c in channels.OF_TURNS if c.directed and c.side is None)
-#: Conditions whose every change ends a stretch.
+#: Conditions that end a stretch whenever they change.
 EXACT = ("configuration", "surface", "mode", "slope_deg", "payload_kg", "total_mass_kg")
-#: Why samples are left out.
+#: Reasons to leave samples out.
 REASONS = (
     "changes", "short", "settling", "accelerates", "idle", "rest", "stuck", "glitches", "unread", "undriven",
 )  # fmt: skip
@@ -61,9 +61,8 @@ class Signal:
     """Readings of a channel in settled travel, sample by sample.
 
     Attributes:
-        channel: that the table of settled runs has; shown: its readings [unit of the column], NaN where missing and
-            at glitches.
-        angle: the angle that it is the rate of [unit of its column], empty where it is read itself.
+        channel: of the table of settled runs; shown: its readings [unit of the column], NaN if missing or a glitch.
+        angle: the angle whose rate it is [unit of its column], empty if the channel is read directly.
         step: of its instrument [unit], 0 without; largest: size of its readings but for the last two in a hundred.
         glitches: True for readings far from the readings next to them, see `glitches`, shape (rows,).
     """
@@ -86,7 +85,7 @@ class Inertia:
     """Current that the acceleration of a configuration's motors takes.
 
     Attributes:
-        speed, current: names of channels, `current` empty where it is what is imposed.
+        speed, current: names of channels; `current` is empty if the current is imposed.
         per_rate: current [A] of one unit of the speed's column a second.
         least: current below which shares are of this [A].
     """
@@ -103,9 +102,9 @@ class Stretch:
 
     Attributes:
         run: name of; rows: indices in the table, in the order of time; begin, end: of time [s].
-        why: empty where it is a settled run, else one of `REASONS`; channel: whose, where one is to blame; size: how
-            much, as a share.
-        mean, sd: of each channel, by name [unit of the column]; of a settled run alone.
+        why: empty for a settled run, else one of `REASONS`; channel: the channel to blame, if there is one;
+            size: of its change, as a share.
+        mean, sd: of each channel, by name [unit of the column]; only for a settled run.
         drift: change of each channel over it, by name [unit]; imposed: mean of what drives the motors.
         glitches: readings of each channel that its mean leaves out, by name; only channels that have some.
     """
@@ -135,8 +134,8 @@ class Settled:
 
     Attributes:
         runs: of the log; stretches: all of them, in the order of the log; signals: of its channels.
-        shortest, drift: that were asked for; gaps: rows after which samples are missing.
-        scatter: of each channel by which stretches alike differ beyond their own sds, by name [unit].
+        shortest, drift: as requested; gaps: rows after which samples are missing.
+        scatter: sd of each channel between stretches under the same conditions beyond their own sds, by name [unit].
     """
 
     runs: Runs
@@ -153,7 +152,7 @@ class Settled:
         return tuple(s for s in self.stretches if not s.why)
 
     def settled_runs(self) -> Runs:
-        """The settled runs, as a table of runs that is read."""
+        """The settled runs, as a table of runs from a file would be."""
         columns = {**self.runs.columns, **self.table()}
         count = len(self.kept)
         columns = {name: x for name, x in columns.items() if len(x) == count and name not in (*TIME, "mode")}
@@ -197,24 +196,28 @@ def settle(
     rolling: Mapping[str, Mapping[str, float]] | None = None,
     loop: str = "mmrjax loop LOG --robot RIG",
 ) -> Settled:
-    """The settled runs of a log.
+    """Returns the settled runs of a log.
 
-    What is imposed is divided where it changes; of each level the end is taken, and what stands before it as long as
-    every channel's mean stays there. Their means are the settled run. Its sds are those of means of readings with
-    their own autocorrelation (Geyer's initial positive sequence, 1992), with what steps of the instrument leave of
-    their mean (Widrow and Kollár, Quantization noise, 2008, of normal noise: the first term), the drift that is left,
-    and what stretches alike differ by. Means leave out glitches; see `glitches`.
+    The log is divided into levels where the imposed quantity changes. Of each level the end is taken, extended
+    backward while every channel's mean stays the same. The means over this stretch are the settled run. Means leave
+    out glitches; see `glitches`. The sd of a mean has four parts:
+
+    * noise with its autocorrelation (Geyer's initial positive sequence, 1992),
+    * the error from the steps of the instrument (Widrow and Kollár, Quantization noise, 2008, first term for normal
+      noise),
+    * the remaining drift, and
+    * the scatter of stretches under the same conditions.
 
     Args:
         shortest: stretch [s]; None: 0.3 s, and at least 20 samples.
         drift: largest change of a mean within a stretch, as a share of it.
         inertia: by configuration; a stretch whose acceleration takes more than `drift` of its current is left out.
         loop: command that fits the log as it is, for messages.
-        rolling: by configuration, what channels show while the motors turn by 1 rad/s, by name [unit of the column].
+        rolling: by configuration, readings of channels by name, with motors at 1 rad/s [unit of the column].
 
     Raises:
-        BadData: time that does not increase, a channel that shows one number only, no stretch at all, speeds or
-            currents without a sign, or speeds and rates of angles in other units than their columns say.
+        BadData: time that does not increase; a channel with a single number; no stretch at all; speeds or currents
+            without a sign; speeds or rates of angles in other units than their columns state.
     """
     result = _divided(runs, shortest, drift, inertia)
     if not result.kept:
@@ -225,10 +228,10 @@ def settle(
 
 
 def doubtful_sign(runs: Runs) -> str:
-    """Why the sign of a channel of a log is wrong, by what settles in it; empty where nothing shows that it is."""
+    """Reason to doubt the sign of a channel of a log, from its settled stretches; empty without evidence."""
     try:
         result = _divided(runs, None, DRIFT, None)
-    except BadData:  # what no stretch can be found in
+    except BadData:  # a log without a stretch
         return ""
     try:
         _check_signs(result)
@@ -238,7 +241,7 @@ def doubtful_sign(runs: Runs) -> str:
 
 
 def _divided(runs: Runs, shortest: float | None, drift: float, inertia: Mapping[str, Inertia] | None) -> Settled:
-    """Stretches of a log with their means, before they are held against each other."""
+    """Stretches of a log with their means, before they are compared with each other."""
     if not runs.sampled:
         raise BadData(f"{runs.source}: column time_s is missing, and a row is a settled run already; give it to loop")
     each = _in_order(runs)
@@ -286,7 +289,7 @@ def _in_order(runs: Runs) -> list[np.ndarray]:
             row, was, now = int(rows[k + 1]) + 1, time[rows[k]], time[rows[k + 1]]
             if now == was:
                 raise BadData(
-                    f"{runs.source} row {row}, time_s: {number(now)} s stands twice; give each sample its own time, "
+                    f"{runs.source} row {row}, time_s: {number(now)} s is repeated; give each sample its own time, "
                     "with more digits if the clock has them, or remove one"
                 )
             raise BadData(
@@ -374,8 +377,10 @@ RATES = (("output_angle_deg", "output_speed", 1 / 6), ("position_mm", "speed", 1
 
 
 def _step(runs: Runs, channel: Channel, shown: np.ndarray) -> float:
-    """Step of a channel's instrument [unit of the column]: that which its readings show, else the file's, else of
-    readings that mostly come again the smallest difference."""
+    """Step of a channel's instrument [unit of the column]: from its readings, else from the file.
+
+    If neither has one, it is the smallest difference of readings that mostly repeat.
+    """
     stated = (i.quantum or 0.0 for i in runs.layout.instruments if i.channel == channel.name)
     if found := step_of(shown) or next(stated, 0.0) / channel.factor:
         return found
@@ -385,7 +390,7 @@ def _step(runs: Runs, channel: Channel, shown: np.ndarray) -> float:
 
 
 def _rate(time: np.ndarray, x: np.ndarray, half: int) -> np.ndarray:
-    """Difference from twice so many samples before, by time: what comes after a level does not show at its end."""
+    """Rate over the last `2 * half` samples, so that samples after a level do not affect its end."""
     k = np.arange(len(x))
     before, now = np.maximum(k - 2 * half, 0), np.maximum(k, 1)
     return (x[now] - x[before]) / (time[now] - time[before])
@@ -405,7 +410,7 @@ def _check_alive(runs: Runs, signal: Signal) -> None:
 
 
 def _stuck(signal: Signal, each: list[np.ndarray]) -> np.ndarray:
-    """Rows in which a channel shows one number for longer than its noise lets it: saturated, or frozen."""
+    """Rows in which a channel repeats one number for longer than its noise allows: saturated, or frozen."""
     held = np.zeros(len(signal.shown), bool)
     if len(signal.angle):
         return held
@@ -428,7 +433,7 @@ def _stuck(signal: Signal, each: list[np.ndarray]) -> np.ndarray:
 
 
 def _noise(x: np.ndarray) -> float:
-    """Sd of what changes from sample to sample, robust to steps; 0 where most samples are as the one before."""
+    """Sd of changes from sample to sample, robust to steps; 0 if most samples equal the sample before."""
     steps = np.diff(x[np.isfinite(x)])
     return 1.4826 * float(np.median(np.abs(steps - np.median(steps)))) / math.sqrt(2) if len(steps) else 0.0
 
@@ -436,8 +441,10 @@ def _noise(x: np.ndarray) -> float:
 def _levels(
     runs: Runs, drives: np.ndarray, rows: np.ndarray, shortest: float, drift: float, step: float
 ) -> Iterator[np.ndarray]:
-    """Rows of a part without gaps, divided where a condition changes, or `drives` by more than its noise: what is
-    imposed, or the torque of a brake."""
+    """Rows of a part without gaps, divided where a condition changes, or `drives` changes by more than its noise.
+
+    `drives` is the imposed quantity, or the torque of a brake.
+    """
     if not len(rows):
         return
     cuts = differs(rows, (runs[name] for name in EXACT if runs.has(name)))
@@ -465,11 +472,11 @@ def _levels(
 
 @dataclasses.dataclass(frozen=True)
 class _End:
-    """The end of a level, before it is known whether it is settled.
+    """The end of a level, before the test that it is settled.
 
     Attributes:
         rows: of it; seen: mean, sd and change of each channel over it, by name [unit of the column].
-        left_over: largest share of a channel that changes for certain within it.
+        left_over: largest significant change of a channel within it, as a share.
         glitches: readings of each channel that its mean leaves out.
     """
 
@@ -479,7 +486,7 @@ class _End:
     glitches: dict[str, int]
 
 
-#: Why a level has no settled end: a reason of `REASONS`, the channel to blame, and how much, as a share.
+#: Reason why a level has no settled end: one of `REASONS`, the channel to blame, and the size as a share.
 _Why = tuple[str, str, float]
 
 
@@ -494,7 +501,7 @@ def _settled(
     stuck: Mapping[str, np.ndarray],
     inertia: Mapping[str, Inertia],
 ) -> Stretch:
-    """The settled end of a level, or why it has none."""
+    """The settled end of a level, or the reason why it has none."""
     time = runs["time_s"]
     begin, end, imposed = float(time[rows[0]]), float(time[rows[-1]]), float(np.mean(drives[rows]))
     left = Stretch(str(runs.run_names[rows[0]]), rows, begin, end, imposed)
@@ -525,7 +532,7 @@ def _settled(
     if acting is not None and (accelerates := _accelerates(acting, seen, lasts, imposed, drift)) is not None:
         return out(*accelerates)
     every = {s.channel.name: seen.get(s.channel.name, (math.nan,) * 3) for s in signals}
-    # What changes goes on after the end, of a lag's tail about as much again, and all channels with it.
+    # A change continues after the end, a lag's tail by about as much again, and all channels with it.
     further = {s.channel.name: left_over * _scale(s, every[s.channel.name][0]) for s in signals}
     return dataclasses.replace(
         left,
@@ -539,7 +546,7 @@ def _settled(
 
 
 def _end(signals: tuple[Signal, ...], time: np.ndarray, rows: np.ndarray, shortest: float, drift: float) -> _End:
-    """The end of a level from where on nothing changes for certain, if there is such a place, else its last parts."""
+    """The part of a level after its last significant change, if there is one, else its last parts."""
     parts = _parts(time[rows], shortest)
     first = _first_steady(signals, rows, parts, drift)
     last = max(len(parts) - 3, first)
@@ -553,8 +560,10 @@ def _end(signals: tuple[Signal, ...], time: np.ndarray, rows: np.ndarray, shorte
 
 
 def _unsettled(signals: tuple[Signal, ...], rows: np.ndarray, end: _End, drift: float) -> tuple[_Why | None, float]:
-    """Why the end of a level is not settled, None where it is; and the largest share by which a channel changes
-    within it or after it."""
+    """Reason why the end of a level is not settled, None if it is, and the largest change of a channel.
+
+    The change is within the end or after it, as a share.
+    """
     left_over = end.left_over
     for signal in signals:
         name = signal.channel.name
@@ -585,7 +594,7 @@ def _rests(signals: tuple[Signal, ...], seen: Mapping[str, tuple[float, float, f
 def _accelerates(
     acting: Inertia, seen: Mapping[str, tuple[float, float, float]], lasts: float, imposed: float, drift: float
 ) -> _Why | None:
-    """Why acceleration takes too large a share of the current, over so many seconds; None where it does not."""
+    """Reason if acceleration takes too large a share of the current over so many seconds; else None."""
     if acting.speed not in seen or (acting.current and acting.current not in seen):
         return None
     a_second = acting.per_rate / lasts
@@ -650,7 +659,7 @@ def _parts(time: np.ndarray, shortest: float) -> list[tuple[int, int]]:
 
 
 def _first_steady(signals: tuple[Signal, ...], rows: np.ndarray, parts: list[tuple[int, int]], drift: float) -> int:
-    """The first part from which on every channel's mean stays where it ends."""
+    """First part after which every channel's mean stays at its final value."""
     ends = parts[-3:]
     first = len(parts) - len(ends)
     means = np.array([[_plain(s.shown[rows[low:high]]) for low, high in parts] for s in signals])
@@ -716,7 +725,7 @@ def _mean(signal: Signal, time: np.ndarray, rows: np.ndarray) -> tuple[float, fl
     spread = float(np.std(rest))
     sd = spread * math.sqrt(_correlation_time(rest) / len(x))
     if signal.step > 0:  # without noise readings round alike; with it their mean is off by less
-        # Of two readings alone nobody knows how often noise carries one to the other.
+        # Two readings alone do not show how often noise carries one to the other.
         within = max(spread**2 / signal.step**2 - 1 / 12, 0.0) if len(np.unique(shown[finite])) > 2 else 0.0
         rounding = min(1 / math.sqrt(12), math.exp(-2 * math.pi**2 * within) / (math.pi * math.sqrt(2)))
         sd = math.hypot(sd, rounding * signal.step)
@@ -753,7 +762,7 @@ def _scatter(runs: Runs, found: list[Stretch], signals: tuple[Signal, ...], larg
 
 
 def _held(runs: Runs, stretch: Stretch) -> tuple[int, ...]:
-    """Levels in a stretch of the brake's torque, and in a turn of what drives each side, in steps of `DRIFT` of the
+    """Levels of the brake's torque in a stretch, and in a turn of the drive of each side, in steps of `DRIFT` of the
     largest."""
     signals = (*(runs.of_sides if runs.turns else ()), *([runs[LOAD]] if runs.has(LOAD) else []))
     return tuple(
@@ -767,7 +776,7 @@ def _wider(stretch: Stretch, scatter: Mapping[str, float]) -> Stretch:
 
 #: Sds beyond zero from which on a mean has a sign.
 SIGNED = 5.0
-#: What a speed may be off by where a unit is another one, and how near it has to come.
+#: Factors of a speed in a wrong unit, and the relative tolerance of a match.
 UNITS = {
     "degrees for radians": 180 / math.pi, "radians for degrees": math.pi / 180, "deg/s for rpm": 6.0,
     "rpm for deg/s": 1 / 6, "rad/s for rpm": math.pi / 30, "rpm for rad/s": 30 / math.pi,
@@ -807,14 +816,14 @@ def _check_signs(found: Settled) -> None:
                 if turned
                 else f"give {'duty' if runs.has('duty') else layout.imposed_column} the sign of its direction"
             )
-            raise BadData(f"{_shows(found, wrong[0], channel)}; expected the sign of what is imposed; {cure}")
+            raise BadData(f"{_shows(found, wrong[0], channel)}; expected the sign of the imposed quantity; {cure}")
 
 
 def _check_units(found: Settled, rolling: Mapping[str, Mapping[str, float]]) -> None:
     """Refuse speeds, and rates of angles, that differ from another channel's by the factor between two units."""
     runs = found.runs
     angles = {rate: angle for angle, rate, _ in RATES}
-    # What an angle shows is doubted first: nobody reads its rate.
+    # The angle is doubted first, as its rate is not read directly.
     order = sorted(found.signals, key=lambda s: not len(s.angle))
     for s in found.kept:
         shown = rolling.get(str(runs["configuration"][s.rows[0]]), {})
@@ -834,7 +843,7 @@ def _check_units(found: Settled, rolling: Mapping[str, Mapping[str, float]]) -> 
                 column = angles[one] if one in angles and not _read(runs, one) else channels.find_channel(one).column
                 raise BadData(
                     f"{runs.source} rows {s.rows[0] + 1} to {s.rows[-1] + 1}, {column}: {off:.4g} times as fast as "
-                    f"{channels.find_channel(other).column} says with the ratio of the rig's file; is it {unit}? "
+                    f"{channels.find_channel(other).column} with the ratio of the rig's file; is it {unit}? "
                     f"write all rows in its unit, "
                     f"or state [columns] {column} = {{column = ..., factor = {1 / off:.3g}}} in "
                     "the rig's file"
@@ -842,12 +851,12 @@ def _check_units(found: Settled, rolling: Mapping[str, Mapping[str, float]]) -> 
 
 
 def _read(runs: Runs, channel: str) -> bool:
-    """True if a channel is read itself, and is not the rate of an angle."""
+    """True if a channel is read directly, and is not the rate of an angle."""
     return runs.has(channels.find_channel(channel).column)
 
 
 def _nothing(found: Settled, loop: str) -> str:
-    """Says that a log has no settled stretch, why mostly, and what to do; `loop` is the command that takes it."""
+    """Message on a log without settled stretch: main reason and advice; `loop` is the command that takes it."""
     direct = "" if found.runs.turns else f"use the log itself ({loop}), or "
     source, longest = found.runs.source, max(found.stretches, key=lambda s: s.lasts)
     whys = [s.why for s in found.stretches]
@@ -857,7 +866,7 @@ def _nothing(found: Settled, loop: str) -> str:
         step = longest.lasts / max(len(longest.rows) - 1, 1)
         held, asked = f"{longest.lasts:.3g} s", f"{found.shortest:.3g} s"
         cure = "hold each level longer or state --shortest"
-        if len(longest.rows) < FEWEST or found.shortest > longest.lasts >= LEAST:  # it is the samples that are few
+        if len(longest.rows) < FEWEST or found.shortest > longest.lasts >= LEAST:  # too few samples
             needed = max(FEWEST, round(found.shortest / step) if step > 0 else FEWEST)
             held, asked = count_noun(len(longest.rows), "sample"), f"{needed}"
             cure = (

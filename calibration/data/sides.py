@@ -13,11 +13,12 @@ from mmrjax.model import channels
 from mmrjax.model.quantities import TURN
 from mmrjax.model.rig import Instrument
 
-#: Of rows that tell: what drives the sides apart, or one backward, as a share of the most that does so [-].
+#: Least difference of the sides' drives, or backward drive of a side, of rows that count: as a share of the largest
+#: [-].
 CLEAR = 0.25
-#: Fewest rows that tell, and the share of them that has to be against what is possible [-].
+#: Fewest rows that count, and the least share of them that has to contradict the drive [-].
 FEWEST, MOSTLY = 3, 0.75
-#: By how much a side's voltage may be above the supply's, as both are written with few digits [-].
+#: Largest relative excess of a side's voltage over the supply's, as both are written with few digits [-].
 ROUNDED = 0.01
 
 
@@ -38,21 +39,24 @@ def of_volts(name: str, columns: dict[str, np.ndarray], battery: bool) -> tuple[
         A note on the replacement; none if the table has no such column.
 
     Raises:
-        BadData: a battery feeds the motors, one side's is missing, shares beside, or more than the supply has.
+        BadData: a battery feeds the motors, one side's voltage is missing, the table also states shares, or a voltage
+            is higher than the supply's.
     """
     stated = [c for c in VOLTS if c in columns]
     if not stated:
         return ()
     if battery:
         raise BadData(
-            f"{name}: column {stated[0]} beside --battery, whose voltage falls; state {' and '.join(SIDES)}, the "
-            "shares of it"
+            f"{name}: column {stated[0]} together with --battery, whose voltage falls; state {' and '.join(SIDES)}, "
+            "the shares of it"
         )
     if twin := next((c for c in (*SIDES, *DUTY) if c in columns), None):
-        raise BadData(f"{name}: column {twin} beside {stated[0]}, which says how either side is driven; keep one")
+        raise BadData(
+            f"{name}: column {twin} in addition to {stated[0]}, which states the drive of both sides; keep one"
+        )
     if len(stated) == 1:
         (other,) = {*VOLTS} - {*stated}
-        raise BadData(f"{name}: column {other} is missing beside {stated[0]}; state what drives both sides")
+        raise BadData(f"{name}: column {other} is missing, {stated[0]} is stated; state the drive of both sides")
     volts = np.stack([columns.pop(c) for c in VOLTS])
     supply, parts = shares(volts, columns.get(SUPPLY))
     beyond = np.abs(volts) > np.abs(supply) * (1 + ROUNDED)
@@ -72,7 +76,7 @@ def check(runs: Runs) -> None:
     """Refuses a table of turns with exchanged sides or a yaw rate of the other sign.
 
     Raises:
-        BadData: readings of a side that go with what drives the other one, or a yaw rate against both.
+        BadData: readings of a side that follow the drive of the other side, or a yaw rate that contradicts both.
     """
     left, right = runs.of_sides
     for what in ("motor_speed", "motor_current"):
@@ -102,7 +106,7 @@ def _refuse_against(
     """Refuses readings that mostly have the other sign than their drive; the message names the clearest row.
 
     Args:
-        shown: what the columns hold in every row.
+        shown: values of the columns in every row.
     """
     told = np.isfinite(readings) & (np.abs(drive) > CLEAR * np.max(np.abs(drive), initial=0.0))
     against = told & (readings * drive < 0)
@@ -118,8 +122,8 @@ def _refuse_against(
 
 
 def magnitudes(columns: Mapping[str, np.ndarray], layout: Layout) -> tuple[Instrument, ...]:
-    """Instruments of the sides' currents that show no sign: positive in every row in which their side is driven
-    backward.
+    """Instruments of the sides' currents that show no sign: their readings are positive in every row that drives
+    their side backward.
 
     Args:
         columns: of the table.

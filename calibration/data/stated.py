@@ -1,4 +1,4 @@
-"""Numbers with what is known of them: `5.95 ± 5 %`, `0.82 ± 0.02`; `12 ± 0` is known exactly."""
+"""Numbers with their uncertainty: `5.95 ± 5 %`, `0.82 ± 0.02`; `12 ± 0` is exact."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def stated_number(text: str, where: str) -> tuple[float, float]:
 
 
 def taken_apart(table: dict[str, Any], where: str, prefix: str = "") -> dict[str, float]:
-    """Put the value in the place of each `value ± sd` of a table and those below it; their sds by dotted name.
+    """Replaces each `value ± sd` of a table and its subtables by the value; returns the sds by dotted name.
 
     Raises:
         BadConfiguration: as `stated_number`.

@@ -1,4 +1,4 @@
-"""Labels of surfaces: the names of their configurations, and which of them scale a robot's adhesion."""
+"""Labels of surfaces: the names of their configurations, and the labels that scale a robot's adhesion."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Surfaces of runs: labels of Table 5 scale the paper's robots' adhesion, any other has a friction of its own.
+"""Surfaces of runs: labels of Table 5 scale the paper's robots' adhesion, any other surface has its own friction.
 
-A surface whose friction nobody has stated is a configuration of its own, named after configuration and label: its
-`ground.*` is free, and all else of it follows the first one's (`rig.surfaces`).
+A surface without stated friction becomes a separate configuration, named after configuration and label: its
+`ground.*` is free, and all its other parameters follow the first configuration (`rig.surfaces`).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from mmrjax.errors import allowed_words
 from mmrjax.model.paper_tables import SURFACES
 from mmrjax.model.robot import Configurations, Robot
 
-#: Beginning of the parameters of a configuration that are its surface's.
+#: Beginning of the names of a configuration's parameters that belong to its surface.
 GROUND = "ground."
 #: Likeness of a label to one of Table 5 from which it is taken for misspelt [-].
 MISSPELT = 0.75
@@ -27,7 +27,7 @@ V = TypeVar("V")
 
 
 def common(configurations: Sequence[str], labels: Iterable[str]) -> str | None:
-    """Returns the only configuration, or the one that has all of these labels as its surfaces; otherwise None."""
+    """Returns the only configuration, or the configuration with all of these surfaces; otherwise None."""
     if len(configurations) == 1:
         return configurations[0]
     stems = [
@@ -52,8 +52,8 @@ def refused(label: str, layout: Layout) -> str:
 def with_surface_configurations(robot: Robot, runs: Runs) -> Robot:
     """`robot` with a configuration for each surface of the table that does not scale its adhesion.
 
-    A configuration without rows elsewhere gives way to those of its surfaces, unless it has but one. Priors that the
-    robot's file states become those of the new ones.
+    If all surfaces of a configuration's rows have such configurations, these replace it, unless there is only one
+    surface. Priors that the robot's file states apply to the new configurations.
     """
     if not runs.has("surface") or not robot.has_ground:
         return robot
@@ -89,7 +89,7 @@ def with_surface_configurations(robot: Robot, runs: Runs) -> Robot:
 
 
 def of_surfaces(stated: Mapping[str, V], robot: Robot, runs: Runs) -> dict[str, V]:
-    """What is stated of configurations by parameter, those that gave way to their surfaces' replaced by them.
+    """Values stated by parameter, with replaced configurations renamed to the configurations of their surfaces.
 
     Args:
         robot: as from `with_surface_configurations`.
@@ -102,8 +102,10 @@ def of_surfaces(stated: Mapping[str, V], robot: Robot, runs: Runs) -> dict[str, 
 
 
 def names_of_surfaces(names: Iterable[str], robot: Robot, runs: Runs) -> list[str]:
-    """Names of parameters, those of configurations that gave way to their surfaces' replaced by theirs: what is of
-    the ground by each one's, all else by the first's."""
+    """Names of parameters, with replaced configurations renamed to the configurations of their surfaces.
+
+    A parameter of the ground becomes one for each surface; any other becomes the first surface's.
+    """
     found: list[str] = []
     for name in names:
         configuration, _, rest = name.partition(".")

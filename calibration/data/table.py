@@ -31,7 +31,7 @@ from mmrjax.model.robot import Robot
 
 
 def driven_on(columns: Mapping[str, np.ndarray], layout: Layout) -> np.ndarray:
-    """True for rows whose stated load torque turns the shafts the way in which they are driven, shape (rows,)."""
+    """True for rows whose stated load torque acts in the direction of the drive, shape (rows,)."""
     imposed = columns[layout.imposed_column] * (columns.get("duty", 1.0) if layout.imposed == "voltage" else 1.0)
     return columns[LOAD] * imposed < 0 if LOAD in columns else np.zeros(len(imposed), bool)
 
@@ -59,12 +59,12 @@ class Runs:
             that is missing.
         unknown: columns of the file that this program does not know.
         digest: SHA-256 of the file, empty for a table that came from none.
-        extras: cells of `unknown` columns, shape (rows,): numbers, NaN where empty, or words; not in `columns`, as
-            they have no role, and looked at only for what residuals go with.
-        layout: what its columns mean for the robot that it is of, and its channels.
-        notes: sentences on how the file was read, and what it lacks.
-        headings: what the file calls the columns that it has, by their names here.
-        log: that these rows were chosen from, with all that drives its runs, see `thinning`; None: all are here.
+        extras: cells of `unknown` columns, shape (rows,): numbers, NaN if empty, or words. They are not in `columns`,
+            as they have no role; only the search for correlations with residuals reads them.
+        layout: meaning of its columns for its robot, and its channels.
+        notes: sentences on the reading of the file, and on missing data.
+        headings: names of the columns in the file, by their names in this program.
+        log: the whole log, if these rows are a selection of it (see `thinning`); None: all rows are here.
     """
 
     source: str
@@ -103,7 +103,7 @@ class Runs:
         return self.layout.channels
 
     def of(self, robot: Robot) -> Runs:
-        """The table with the channels of a robot; columns of others have no role then, and are among the unknown.
+        """The table with the channels of a robot; columns of other channels become unknown columns without a role.
 
         Raises:
             BadData: the table was read for a robot without a channel of this one, so its column was left out.
@@ -129,7 +129,7 @@ class Runs:
 
     @property
     def axes(self) -> tuple[str, ...]:
-        """Columns of the conditions that its runs have, what is imposed first."""
+        """Columns of the conditions that its runs have, the imposed quantity first."""
         duty = () if self.sampled else DUTY
         usual = (*CONDITIONS, *DUTY, *WHEN)
         others = (c.column for c in quantities.SET if c.in_tables and c.field and c.column not in usual)
@@ -203,7 +203,7 @@ class Runs:
         for k, channel in enumerate(self.channels):
             lost = np.flatnonzero(np.isnan(self.measured()[:, k]))
             if not self.has(channel.column) or lost.size == len(self):
-                said.append(f"{channel.column}: no readings; what they would show is not fitted")
+                said.append(f"{channel.column}: no readings; parameters that only they show are not fitted")
             elif lost.size:
                 rows = ", ".join(str(r + 1) for r in lost[:8]) + (", ..." if lost.size > 8 else "")
                 rows = f"row{'s' * (lost.size > 1)} {rows}"
@@ -211,11 +211,13 @@ class Runs:
         return said
 
     def configurations(self, robot: Robot) -> np.ndarray:
-        """Index of each row's configuration in `robot`, shape (rows,): that of its configuration on its surface
-        (`surface_labels.named`) where the robot has one, else that of its configuration.
+        """Index of each row's configuration in `robot`, shape (rows,).
+
+        It is the configuration on the row's surface (`surface_labels.named`) if the robot has it, else the row's
+        configuration.
 
         Raises:
-            InputError: a configuration that the robot does not have; those that it has are listed.
+            InputError: a configuration that the robot does not have; the message lists its configurations.
         """
         which = np.empty(len(self), int)
         names = self.configurations_named(robot)
@@ -269,7 +271,7 @@ class Runs:
         column, factor = IMPOSED[robot.rig.imposed]
         imposed = robot.rig.imposed != "voltage"
         if imposed and not self.has(column):
-            raise BadData(f"{self.source}: no {column}, which the robot's file says is imposed; give it in a table")
+            raise BadData(f"{self.source}: no {column}, which the robot's file states as imposed; give it in a table")
         stated = {c.field: self[c.column] for c in quantities.SET if c.in_tables and c.field and self.has(c.column)}
         stated["duty"] = np.where(held, 0.0, stated.get("duty", 1.0))
         stated["voltage"] = np.zeros(len(self)) if battery or imposed else self[SUPPLY]

@@ -20,7 +20,7 @@ from mmrjax.model.robot import Robot
 #: A polyline longer or higher than the first, smaller than the second, or with a wall higher than the third is taken
 #: for one in other units [m].
 LARGEST, SMALLEST, WALL = 50.0, 1e-3, 5.0
-#: Voltage of a motor that nothing here has [V].
+#: Voltage beyond which a motor's voltage is refused [V].
 HIGHEST = 1000.0
 #: Metres of one.
 _LENGTHS = {"m": 1.0, "mm": 1e-3}
@@ -84,8 +84,8 @@ def read_terrain(path: Path) -> Terrain:
 
     Raises:
         BadConfiguration: no such file.
-        BadData: columns without units, cells without numbers, ground that folds back, metres that are millimetres or
-            the other way round.
+        BadData: columns without units, cells without numbers, ground that folds back, or metres mistaken for
+            millimetres or the reverse.
     """
     columns, names = _read(path, "--terrain", [("x_m", "z_m"), ("x_mm", "z_mm")])
     unit = names[0].rpartition("_")[2]
@@ -112,7 +112,7 @@ def read_sequence(path: Path, robot: Robot, begins: tuple[float, float]) -> Sequ
     """Lever angles over distance or time from a file, or voltages of their motors.
 
     Args:
-        begins: angles of front and rear levers at which those that have voltages begin [rad].
+        begins: initial angles of front and rear levers [rad], used if the file states voltages.
 
     Raises:
         BadConfiguration: no such file.
@@ -147,7 +147,7 @@ def read_sequence(path: Path, robot: Robot, begins: tuple[float, float]) -> Sequ
 
 
 def below(robot: Robot, angle: float) -> str:
-    """Why levers cannot begin at an angle [deg] on level ground; empty where they can."""
+    """Reason why levers cannot begin at an angle [deg] on level ground; empty if they can."""
     gear = robot.running_gear
     axle = robot.radius_pulley + gear.grouser_height
     above = float(roller_clearance(axle, gear, jnp.radians(angle)))
@@ -161,7 +161,7 @@ def below(robot: Robot, angle: float) -> str:
 
 
 def beyond(robot: Robot, angle: float) -> str:
-    """Why levers cannot stand at an angle [deg]; empty where they can."""
+    """Reason why levers cannot reach an angle [deg]; empty if they can."""
     levers = robot.running_gear.levers
     least, most = (float(np.degrees(np.asarray(x))) for x in (levers.angle_least, levers.angle_most))
     within = least - 1e-6 <= angle <= most + 1e-6

@@ -1,4 +1,4 @@
-"""Logs with more rows than a fit has time for: of which rows the readings are read."""
+"""Selection of rows whose readings a fit uses, for logs with too many rows."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from calibration.data.columns import ROWS
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.table import Runs
 
-#: Rows at the start of a run that are read whatever follows: the beginning of a run is measured by them.
+#: Rows at the start of a run whose readings are always used: they show its initial state.
 FIRST = 5
 
 
 def thinned(runs: Runs, most: int = ROWS) -> Runs:
-    """A log with about `most` of its rows, if it has more; what drives its runs stays as it is, in `Runs.log`.
+    """Returns a log with about `most` of its rows, if it has more; `Runs.log` keeps the drive in all rows.
 
-    Of each run are kept its first rows, its last, and one of every few between: of rows side by side the one with
-    readings of the channels of which fewest were kept so far, else the first. A table without `time_s` is left as it
-    is.
+    Each run keeps its first rows, its last row, and one row of every few in between. Of neighbouring rows, it keeps
+    the one with readings of the channels with the fewest readings so far, else the first. A table without `time_s`
+    is returned unchanged.
 
     Raises:
-        BadConfiguration: none at all is asked for.
+        BadConfiguration: `most` is less than 1.
     """
     if most < 1:
         raise BadConfiguration(f"rows: got {most}; expected 1 or more")
@@ -40,7 +40,7 @@ def _evenly(read: np.ndarray, apart: int) -> np.ndarray:
     """First rows, last row, and one of every `apart`.
 
     Args:
-        read: whether a row has a reading, shape (rows, channels).
+        read: true if a row has a reading, shape (rows, channels).
     """
     kept = list(range(min(FIRST, len(read))))
     count = read[kept].sum(0)

@@ -1,4 +1,4 @@
-"""Tables and documents as files: CSV with empty cells, JSON with null, where a number is not finite."""
+"""Tables and documents as files: numbers that are not finite are empty cells in CSV and null in JSON."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from calibration.data import frames
 
 @contextlib.contextmanager
 def naming(path: Path | str) -> Iterator[None]:
-    """Adds the file's name to an error of the system while it is written, since a full disk does not name it."""
+    """Adds the file's name to an error of the system while the file is written, as a full disk does not name it."""
     try:
         yield
     except OSError as error:
@@ -34,12 +34,12 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Write a JSON file; what is not finite becomes null."""
+    """Write a JSON file; numbers that are not finite become null."""
     write_text(path, json.dumps(finite(content), indent=2, ensure_ascii=False) + "\n")
 
 
 def write_table(path: Path, columns: Mapping[str, np.ndarray], tables: str = "csv") -> None:
-    """Write a table as CSV; what is not finite becomes an empty cell.
+    """Write a table as CSV; numbers that are not finite become empty cells.
 
     Args:
         tables: `parquet` to write the same columns into a file of that format too, with all their digits.
@@ -74,7 +74,7 @@ def cell(value: Any) -> str:
 
 
 def finite(value: Any) -> Any:
-    """JSON-able data with null in the place of what is not finite."""
+    """JSON-able data with null in place of numbers that are not finite."""
     if isinstance(value, Mapping):
         return {key: finite(v) for key, v in value.items()}
     if isinstance(value, list | tuple):

@@ -1,1 +1,1 @@
-"""What each command of the command line does, a file a command."""
+"""The commands of the command line, one file each."""

@@ -16,6 +16,7 @@ from sweeps import config as configuration
 from sweeps.console import pulse, say, tell
 from sweeps.inputs import load_robot, read_runs
 from sweeps.pages import words
+from sweeps.report.words import fit_words
 from sweeps.skeleton import leave, page
 from sweeps.store import open_folder
 
@@ -46,8 +47,9 @@ def calibrate(
 
 
 def print_calibration(found: CalibrationResult) -> None:
-    """Whether the fit is adequate; parameters, errors and remarks, for a person."""
-    say(found.adequacy.statement)
+    """Print the answer (adequate or not), parameters, errors and remarks."""
+    say(fit_words.calibration(found))
+    say(f"{found.adequacy.statement}.")
     shown = Table(
         title=f"{count_noun(len(found), 'row')}, {found.model}", title_justify="left", box=None, pad_edge=False
     )

@@ -131,10 +131,10 @@ def _climbed(
 
 
 def _along(config: configuration.Climb, robot: Robot, conditions: Conditions, sequence: Sequence) -> Along | None:
-    """What derivatives are asked by; None: no derivatives.
+    """Variables of the derivatives; None: no derivatives.
 
     Raises:
-        BadConfiguration: a name that is none, or that does not act here.
+        BadConfiguration: an unknown name, or one without effect on this climb.
     """
     names = config.derivatives
     if not names:
@@ -231,11 +231,11 @@ def _terrain(config: configuration.Climb, size: Scalar) -> tuple[Terrain, str]:
 
 
 def _sequence(config: configuration.Climb, robot: Robot, name: str) -> Sequence:
-    """What the levers do.
+    """Returns the motion of the levers.
 
     Raises:
-        BadConfiguration: levers are asked of a configuration without, an angle beyond their range, a lever that
-            begins below the ground.
+        BadConfiguration: a configuration without levers, an angle beyond their range, a lever that begins below the
+            ground.
     """
     stated = config.sequence, config.levers_front_deg, config.levers_rear_deg
     gear = robot.running_gear
@@ -255,8 +255,8 @@ def _sequence(config: configuration.Climb, robot: Robot, name: str) -> Sequence:
         found = terrains.read_sequence(config.sequence, robot, (angles[0], angles[1]))
         if found.begins is None and stated[1:] != (None, None):
             raise BadConfiguration(
-                f"--levers-front, --levers-rear: {config.sequence.name} states all angles; expected them beside a "
-                "sequence of voltages alone (front_V, rear_V)"
+                f"--levers-front, --levers-rear: {config.sequence.name} states all angles; expected them only with "
+                "a sequence of voltages (front_V, rear_V)"
             )
     if config.levers_voltage_V is not None:
         found = dataclasses.replace(found, supply=jnp.asarray(config.levers_voltage_V))

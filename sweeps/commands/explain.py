@@ -33,10 +33,10 @@ EVERY_OUTPUT: tuple[Any, ...] = (*outputs.FURTHER, *derived.TABLE, *mission_batc
 
 
 def explain(name: str | None, files: tuple[str, ...] = ()) -> int:
-    """Say what a name means: of an effect, status, flag, output, channel or parameter; without one, which there are.
+    """Explain an effect, status, flag, output, channel or parameter by its name; without a name, list all.
 
     Raises:
-        BadConfiguration: nothing has that name; what is near is said.
+        BadConfiguration: unknown name; the message lists the nearest.
     """
     library = {**effect_file.library(files), **effects.BESIDE}
     known = names(library)
@@ -114,13 +114,15 @@ def _effect(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
 
 def _histories(effect: type[Effect]) -> str:
     if effect.transient:
-        return "; settled runs show nothing of it, histories do"
+        return "; only histories show it, settled runs do not"
     return f"; settled runs cannot tell it from {effect.settles_to}" if effect.settles_to else ""
 
 
 def _changes(effect: Effect) -> Iterator[str]:
-    """What one typical size of it changes in settled travel, in percent of the readings; nothing where that shows
-    nothing of it, or the runs have no operating point."""
+    """Sentences on the change of settled travel by a typical size of an effect, in percent of the readings.
+
+    Empty if settled travel does not show the effect or the runs have no operating point.
+    """
     if effect.transient or effect.needs_reverse:
         return
     import dataclasses
@@ -218,7 +220,7 @@ def _output(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
 
 
 def _attribute(kind: type, name: str) -> str:
-    """What a class's docstring says of one of its attributes."""
+    """Description of an attribute, from the docstring of its class."""
     text = " ".join((inspect.getdoc(kind) or "").partition("Attributes:")[2].split())
     found = re.search(rf"(?:^|[.\]] |, |; )(?:\w+, )*{name}(?:, \w+)*: (.*?)(?=\.? [a-z_]+(?:, [a-z_]+)*: |$)", text)
     return "" if found is None else found[1].rstrip(".")

@@ -117,7 +117,7 @@ def _check_robot(robot: Robot) -> None:
     for name, load in robot.configurations.items():
         if float(load.torque_gravity) > 0:
             raise BadConfiguration(
-                f"--profile: {name} is an arm on which gravity acts with its angle, which a profile does not follow; "
+                f"--profile: {name} is an arm whose gravity load varies with its angle, unlike a profile; "
                 "simulate it over time with --model drive"
             )
 
@@ -131,7 +131,7 @@ def _check_acting(robot: Robot, source: ProfileTable) -> None:
     imposed.check_acting(robot, ground, shaft)
     if "speed" in source.modes and not robot.shows_travel:
         raise BadConfiguration(
-            f"{source.source}, speed_mm_s: the robot's load is a shaft, of which no channel shows a travel; demand "
+            f"{source.source}, speed_mm_s: the robot's load is a shaft, so no channel shows a distance; state "
             "motor_speed_rpm or duty"
         )
 
@@ -284,7 +284,7 @@ def _segment_of(found: Mission, k: int) -> np.ndarray:
 
 
 def thinned(segment: np.ndarray, current: np.ndarray, most: int, marked: np.ndarray | None = None) -> np.ndarray:
-    """Which rows of a course to keep, in order: the peak of current of each segment, marked rows, evenly spread ones.
+    """Rows of a course to keep, in order: the peak of current of each segment, marked rows, evenly spread ones.
 
     Args:
         segment: of each row, not decreasing; current: of each row; most: rows to keep at most; marked: rows to keep,
@@ -378,7 +378,7 @@ def _charge_left(table: dict[str, np.ndarray], status: str) -> str:
 
 
 def print_missions(found: Missions, idle: Collection[str] = ()) -> None:
-    """What missions come to, one a column, without `idle` columns; statuses and flags in words."""
+    """Print a table of missions, one a column, without `idle` columns; statuses and flags in words."""
     about = {output.column: output for output in (*mission_batch.OUTPUTS, *mission_batch.OF_TURNS)}
     table, source = found.table, found.source
     count = len(table["status"])

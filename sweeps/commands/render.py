@@ -65,7 +65,7 @@ def render_climb(
 ) -> int:
     """Draw a climb that is in a folder; returns the exit code. `stated`: whether conditions of a run are, too."""
     if stated:
-        raise BadConfiguration("--climb: got it beside options of a run of the track model; expected one of the two")
+        raise BadConfiguration("--climb: not allowed with options of a run of the track model; give one of them")
     _check_free(file, force)
     found = Seen.read(folder)
     from sweeps.pages import climb_figures

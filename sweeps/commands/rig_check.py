@@ -39,7 +39,7 @@ from sweeps.report.words import fit_words
 
 @dataclasses.dataclass(frozen=True)
 class RigCheck:
-    """What the command found.
+    """Result of `rig check`.
 
     Attributes:
         file: that was read; robot: of it; examples: its lines that still hold an example's number.
@@ -58,7 +58,7 @@ class RigCheck:
     doubts: tuple[str, ...] = ()
 
     def understood(self) -> list[str]:
-        """What it is, how it is driven and measured, in sentences."""
+        """Sentences on the rig, its drive and its sensors."""
         robot, rig = self.robot, self.robot.rig
         count = int(robot.sides)
         motors = "One motor drives" if count == 1 else f"{count} motors alike drive"
@@ -83,7 +83,7 @@ class RigCheck:
         ]
 
     def remarks(self) -> list[str]:
-        """What should be looked at, a sentence each."""
+        """Sentences on points to check, one each."""
         said = []
         if self.robot.rig.inherits:
             said.append(
@@ -96,8 +96,8 @@ class RigCheck:
         said += self.doubts
         if self.runs is not None and self.runs.has("duty") and self.runs.has("total_current_A"):
             said.append(
-                "total_current beside a duty is what the supply gives, the duty's share of the motors' current; what "
-                "a sensor in a motor's leads shows is motor_current"
+                "with a duty, total_current is the supply current: the duty's share of the motors' current; a sensor "
+                "in a motor's leads measures motor_current"
             )
         said += [f"{fact.what} {fact.value}: {fact.odd}" for fact in self.facts if fact.odd]
         loose = [
@@ -159,7 +159,7 @@ class RigCheck:
         return found
 
     def _means_nothing(self, column: str) -> bool:
-        """Whether a column that the table lacks says nothing of this rig: of a ground, or what is not imposed."""
+        """True if a column missing from the table does not apply to this rig: ground, or another kind of drive."""
         idle = Layout.of(self.robot).idle
         return column in idle or (column == SUPPLY and self.robot.rig.imposed != "voltage")
 
@@ -181,7 +181,7 @@ class RigCheck:
         return [*said, *([without] if others else [])]
 
     def statement(self) -> str:
-        """What the table can determine, in a sentence."""
+        """Sentence on the parameters that the table can determine."""
         if self.foresight is None:
             return "Without data: give a table to see what it can determine."
         pairs = self.foresight.together
@@ -233,7 +233,7 @@ class RigCheck:
 
 
 def _source(word: str, channel: Channel) -> str:
-    """Where the sd of a channel comes from, in words."""
+    """Origin of the sd of a channel, in words."""
     every = {
         "columns": "of the table", "series": "estimated by how readings scatter along series of rows",
         "assumed": f"assumed, {100 * channel.sd_share:g} %, as {channel.sd_column} is no column",
@@ -361,8 +361,8 @@ def _print_data(found: RigCheck, runs: Runs, seen: Foresight) -> None:
     ]
     if others:
         say(
-            f"- with the file's numbers not every row settles ({', '.join(others)}); one that the "
-            "robot does not reach counts for nothing"
+            f"- with the file's numbers not every row settles ({', '.join(others)}); rows without a "
+            "steady state are not counted"
         )
     title = "\nwhat these data can determine (posterior sd over prior sd, at the numbers of the file)"
     shown = _table(title, "parameter", "value>r", "prior ±>r", "unit", "posterior/prior>r", "")
@@ -372,7 +372,7 @@ def _print_data(found: RigCheck, runs: Runs, seen: Foresight) -> None:
     say(shown)
     say(f"not determined: above {identifiability.HELD:g}")
     for one, other, size in seen.alike:
-        say(f"- {one} and {other} act alike in these data (correlation {size:+.2f})")
+        say(f"- {one} and {other} are nearly indistinguishable in these data (correlation {size:+.2f})")
 
 
 def _words(words: list[str]) -> str:

@@ -77,7 +77,7 @@ READERS: dict[str, Callable[[Path, str | None], str]] = {".xml": of_mujoco}
 class _Drive:
     """Numbers of a driven joint [SI].
 
-    Attributes: as of the rig's file; effects: name → fields of effects that the actuator's terms stand for.
+    Attributes: as of the rig's file; effects: name → fields of the effects given by the actuator's terms.
     """
 
     def __init__(self, library: Any, model: Any, joint: int, actuator: int) -> None:

@@ -154,7 +154,7 @@ def _operating_points(
 
 
 def words_of(name: str) -> str:
-    """What is imposed, in words."""
+    """Words for the imposed quantity."""
     return name.replace("_", " ")
 
 
@@ -192,9 +192,9 @@ def _candidates(config: configuration.Sensitivity, robot: Robot, points: Runs, t
 
 
 def print_sensitivity(found: SensitivityResult) -> None:
-    """What decides which output, what does not matter, what to measure next; for a person."""
+    """Print decisive inputs of each output, inputs without effect, and the next measurements."""
     say(found.statement())
-    title = f"{sensitivity_words.METHODS[found.method]}, {len(found.points)} operating points"
+    title = sensitivity_words.METHODS[found.method]
     if found.evaluations:
         title += f", {found.evaluations:,} model evaluations"
     shown = Table(title=title, title_justify="left", box=None, pad_edge=False)

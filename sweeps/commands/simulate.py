@@ -162,7 +162,7 @@ def over_time(robot: Robot, batch: Run) -> dict[str, np.ndarray]:
 
 
 def permissible(robot: Robot, table: dict[str, np.ndarray]) -> np.ndarray:
-    """How long the current of each run may flow from ambient temperature [s]; inf for ever, NaN without a current."""
+    """Permissible duration of each run's current from ambient temperature [s]; inf: continuous, NaN: no current."""
     current = amperes(robot, table)
     known = np.isfinite(current)
     filled = np.zeros(len(current) + -len(current) % PAD)
@@ -192,7 +192,7 @@ def amperes(robot: Robot, table: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def remarks(robot: Robot, table: dict[str, np.ndarray]) -> list[str]:
-    """What the numbers of the runs do not say by themselves, a sentence each, of a few runs at most."""
+    """Remarks that the numbers alone do not show, one sentence each, on a few runs at most."""
     said: list[str] = []
     several = len(table["status"]) > 1
     times = table[PERMISSIBLE] if PERMISSIBLE in table else permissible(robot, table)

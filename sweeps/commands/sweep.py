@@ -277,7 +277,7 @@ def finish(store: SweepStore, config: Campaign, file: RobotFile, job: scale.Job,
 
 
 def leave(store: SweepStore, config: Campaign, file: RobotFile, job: scale.Job, same: Identity) -> None:
-    """Everything of a run folder beside the store, which is moved into place."""
+    """Write all files of a run folder except the store, then move the store into place."""
     robot_file.write(job.robot, store.partial / "robot.toml", note=f"the robot of this sweep, from {config.robot}")
     found = summary(store.layout, job, store.done().values())
     store.write_json("result.json", found)
@@ -312,13 +312,13 @@ def summary(layout: Layout, job: scale.Job, done: Iterable[Done]) -> dict[str, A
 
 
 def statuses(done: Iterable[Done]) -> dict[str, int]:
-    """How many points ended in each status; every status is named."""
+    """Number of points by status; every status is included."""
     total = np.sum([d.statuses for d in done], axis=0, dtype=int)
     return dict(zip(STATUSES, np.broadcast_to(total, len(STATUSES)).tolist(), strict=True))
 
 
 def print_counts(counts: Mapping[str, int], things: str, model: str = "") -> None:
-    """How the runs or points of a model ended, in words."""
+    """Print the number of runs or points by status, in words."""
     total = count_noun(sum(counts.values()), things.removesuffix("s"))
     shown = Table(title=total, title_justify="left")
     for heading in ("status", things, "meaning"):

@@ -202,13 +202,13 @@ def cells(config: configuration.TurnPart, given: dict[str, Any]) -> dict[str, An
 
 
 def _channels(robot: Robot, settled: bool) -> tuple[Channel, ...]:
-    """What is shown of a turn."""
+    """Channels shown for a turn."""
     every = channels.channels_named((*robot.rig.channels, *SHOWN))
     return tuple(c for c in every if c.settled or not settled)
 
 
 def _with_others(robot: Robot, asked: Conditions) -> tuple[Run, Conditions]:
-    """The settled turn that is asked for, and those of other duties of the slower side; in one batch."""
+    """The requested settled turn and turns at other duties of the slower side, in one batch."""
     left, right = (float(np.asarray(getattr(asked, name))[0]) for name in SIDES)
     outer, shares = max(left, right, key=abs), len(SHARES)
     others = outer * SHARES
@@ -245,7 +245,7 @@ def _number(value: Any) -> float | None:
 
 
 def print_sides(sides: list[tuple[str, str, str]]) -> None:
-    """What either side does, for a person."""
+    """Print the table of the left and right side."""
     shown = Table(box=None, pad_edge=False)
     for heading in ("", "left", "right"):
         shown.add_column(heading, justify="left" if not heading else "right")

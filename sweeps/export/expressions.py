@@ -304,13 +304,13 @@ ZERO = const(0.0)
 
 
 class Dialect:
-    """How functions are written: `jnp.sqrt(x)`. Subclasses change single functions."""
+    """Notation of functions: `jnp.sqrt(x)`. Subclasses change single functions."""
 
     def __init__(self, prefix: str) -> None:
         self.prefix = prefix
 
     def call(self, op: str, args: Sequence[str], constants: Sequence[bool]) -> str:
-        """Text of a function of arguments in text; `constants`: whether each is a number."""
+        """Text of a function of arguments in text; `constants`: true for each number."""
         name = {"max": "maximum", "min": "minimum", "asin": "arcsin", "acos": "arccos", "atan": "arctan",
                 "atan2": "arctan2", "not": "logical_not"}.get(op, op)  # fmt: skip
         return f"{self.prefix}.{name}({', '.join(args)})"

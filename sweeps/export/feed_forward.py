@@ -43,7 +43,7 @@ class Map(eqx.Module):
 
     @property
     def efficiency(self) -> np.ndarray:
-        """Power given over power taken [-], of a joint that drives; of one that is driven the other way round."""
+        """Power given over power taken [-], of a joint that drives; its inverse for a driven joint."""
         out, taken = np.outer(self.speed, self.torque), self.values["power"]
         share = np.where(out > 0, out / np.where(taken > 0, taken, np.inf), taken / np.where(out < 0, out, -np.inf))
         return np.clip(share, 0.0, 1.0)

@@ -21,7 +21,7 @@ from sweeps.export.joint import Joint, joint
 from sweeps.export.law_source import Constant
 from sweeps.export.situation import AtJoint, Situation, situation
 
-#: Names of formats and what they are for.
+#: Names of formats and their uses.
 FORMATS = {
     "mujoco": "MJCF with <dcmotor>, and a scene that runs",
     "jax": "an actuator function in JAX, as source and as a serialised program",
@@ -70,7 +70,7 @@ def exported(
         to: one of `FORMATS`; configuration: name, None: the robot's first.
         data: runs, or the file of a table or log; None: a grid of operating points.
         at: name of the joint in the simulator's model; draws, seed: of `randomization`.
-        posterior: of the robot; None: what lies beside its file.
+        posterior: of the robot; None: from the folder of its file.
 
     Raises:
         BadConfiguration, BadData: a format, a drive or a table that is refused.

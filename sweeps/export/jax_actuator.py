@@ -26,7 +26,7 @@ PLATFORMS = ("cpu", "cuda")
 
 
 class ActuatorLaw(eqx.Module):
-    """The generated actuator in steady travel; nothing of it is refitted. Attributes: as of `comparison.FormatLaw`.
+    """The generated actuator in steady travel, without a refit. Attributes: as of `comparison.FormatLaw`.
 
     params: of the actuator, of shape (runs,) where they differ; guess: speed of the joint near the solution [rad/s].
     """

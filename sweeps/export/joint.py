@@ -150,7 +150,7 @@ def joint(file: RobotFile, configuration: str | None = None) -> Joint:
     if robot.unlike:
         raise BadConfiguration(
             f"{file.name}: {', '.join(robot.unlike)} makes its sides differ, and one joint has one drive; expected a "
-            "robot whose sides are alike: export a robot file of each side, without this effect"
+            "robot with identical sides: export a robot file of each side, without this effect"
         )
     if robot.rig.imposed != "voltage":
         what = robot.rig.imposed.replace("_", " ")
@@ -326,7 +326,7 @@ def values(joint: Joint) -> dict[str, float]:
 
 
 def typical(signals: Signals, names: Sequence[str]) -> dict[str, float]:
-    """Mean of signals of the surroundings over runs [SI], by name; 0 of one that is not known."""
+    """Mean of signals of the surroundings over runs [SI], by name; 0 if unknown."""
     found: dict[str, float] = {}
     for name in names:
         value = np.asarray(getattr(signals, name.removeprefix("surroundings.")), float)

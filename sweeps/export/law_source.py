@@ -37,7 +37,7 @@ class Constant:
 
     @property
     def interval(self) -> str:
-        """Its interval in words; empty where none is known."""
+        """Its interval in words; empty if unknown."""
         return "" if self.low is None else f"{self.low:.4g} to {self.high:.4g} ({self.kind})"
 
 

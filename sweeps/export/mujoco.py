@@ -33,7 +33,7 @@ TERMS = {
     "cogging": "cogging, which does not fade at speed",
     "presliding": "lugre",
 }
-#: Friction that falls with speed: amplitude at the motor's shaft, whether its speed is the motor's.
+#: Friction that falls with speed: amplitude at the motor's shaft; true if its speed is the motor's.
 STRIBECK = {
     "stribeck_motor": (True, True),
     "stribeck_gear": (False, True),

@@ -42,9 +42,9 @@ class Situation:
 
     Attributes:
         joint: the drive; source: of the runs, in words; runs: the table, its rows chosen.
-        conditions: of all rows of the table; kept: mask of those that are compared.
+        conditions: of all rows of the table; kept: True for compared rows.
         signals: of the joint's own model, with the effects inside alone, of shape (runs,).
-        native: readings of the whole model [SI], shape (runs, channels); measured: likewise, NaN where there is none.
+        native: readings of the whole model [SI], shape (runs, channels); measured: likewise, NaN if missing.
         command: mean voltage at the driver's output [V]; load: torque that the joint has to give at the wheel [N·m].
     """
 

@@ -17,7 +17,7 @@ PAIRED, RADII = 6, (1.515, 2.448)
 
 
 def parameters(found: CalibrationResult) -> Figure:
-    """Where each parameter lies in prior sds, with its 95 % interval, over the prior's own."""
+    """Estimate of each parameter in prior sds, with its 95 % interval and the prior's."""
     fig, grid = figure(1, 1, 1.1 + 0.32 * len(found.parameters))
     axes = grid[0, 0]
     axes.axvspan(-Z95, Z95, color="#eeeeee", lw=0, zorder=0)

@@ -12,6 +12,7 @@ from sweeps.pages.page import Album, columns, curves, first_rows, render
 from sweeps.pages.time_overlay import time_overlay
 from sweeps.pages.words import words_shown
 from sweeps.report.condition_columns import conditions
+from sweeps.report.words import fit_words
 
 
 def write(folder: Path, found: CalibrationResult, *, robot_name: str) -> Path:
@@ -49,6 +50,7 @@ def write(folder: Path, found: CalibrationResult, *, robot_name: str) -> Path:
         album,
         of_channels=found.channels,
         title=f"Calibration of {words_shown(Path(robot_name).name)} to {Path(found.source).name}",
+        answer=fit_words.calibration(found),
         curves=curves(found.robot),
         document=found.to_json(),
         rows=first_rows(table),

@@ -51,7 +51,7 @@ def spread(output: np.ndarray, label: str, varied: Mapping[str, Varied]) -> Figu
 
 
 def endings(codes: np.ndarray, names: Sequence[str], across: Varied, up: Varied) -> Figure:
-    """How points of a grid ended, over two of its axes.
+    """Status of the points of a grid over two of its axes.
 
     Args:
         codes: of the points; names: of the codes.

@@ -84,7 +84,7 @@ def _outputs(
 
 
 def _verdicts(album: Album, values: np.ndarray, found: dict[str, np.ndarray], layout: Layout) -> list[dict[str, Any]]:
-    """How climbs ended, a row each; drawn over the size of the obstacle and the first axis beside it."""
+    """Number of climbs by outcome, a row each; drawn over the obstacle's size and the first other axis."""
     if VERDICT not in found:
         return []
     codes, known, design = found[VERDICT].astype(int), layout.coordinates, layout.design
@@ -110,7 +110,7 @@ def _verdicts(album: Album, values: np.ndarray, found: dict[str, np.ndarray], la
 
 
 def _largest(values: np.ndarray, found: dict[str, np.ndarray], layout: Layout) -> str:
-    """The largest obstacle that is got over and the first point at which it is, in words; empty of other sweeps."""
+    """Largest obstacle climbed and its first point, in words; empty for other sweeps."""
     if VERDICT not in found:
         return ""
     names = layout.design.names
@@ -154,7 +154,7 @@ def thinned(store: Path, layout: Layout) -> tuple[np.ndarray, dict[str, np.ndarr
 
 
 def _varied(layout: Layout, values: np.ndarray) -> list[dict[str, Any]]:
-    """What varies, in words, a row a name."""
+    """Varied names, in words, a row each."""
     rows = []
     for k, name in enumerate(layout.design.names):
         about = layout.coordinates[name]

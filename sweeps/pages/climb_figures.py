@@ -74,7 +74,7 @@ def _draw(axes: Any, found: Drawable, q: np.ndarray, colour: str = BLUE) -> None
 
 
 def instants(found: Drawable) -> list[tuple[str, int]]:
-    """Samples of the run that decide it, in the order of time: what is there, and which."""
+    """Decisive samples of the run in order of time: label and index."""
     t = found.table
     picked = {
         "start": 0,
@@ -137,7 +137,7 @@ def course(found: ClimbResult) -> Figure:
 
 
 def search(found: ClimbResult) -> Figure:
-    """How each size that was tried ended."""
+    """Outcome of each size tried."""
     sizes, verdicts = np.array([s for s, _ in found.tried]), [v for _, v in found.tried]
     kinds = list(dict.fromkeys(verdicts))
     fig, axes = figure(1, 1, 1.0 + 0.4 * len(kinds))

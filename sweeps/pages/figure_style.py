@@ -6,6 +6,7 @@ import html
 import io
 import json
 import re
+import textwrap
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -70,6 +71,8 @@ _RC: dict[Any, Any] = {
 
 #: Width of a figure with stacked panels, for phones [inches].
 NARROW = 4.3
+#: Letters of a line across it, and of a line of the names at its left.
+LETTERS, NAMES = 42, 20
 
 
 @contextmanager
@@ -82,11 +85,11 @@ def style(width: float = WIDTH) -> Iterator[None]:
 def figure(rows: int, columns: int, height: float, **keywords: Any) -> tuple[Figure, np.ndarray]:
     """A figure of the width of `style` and its axes, shape (rows, columns)."""
     stacked = matplotlib.rcParams["figure.figsize"][0] == NARROW
-    size = (
-        (NARROW, (max(height / rows, 2.2) * columns if columns > 1 else height / rows) * rows)
-        if stacked
-        else (WIDTH, height)
-    )
+    size = WIDTH, height
+    if stacked and columns > 1:
+        size = NARROW, max(height / rows, 2.2) * columns * rows
+    elif stacked:
+        size = NARROW, max(height, 2.8) if rows == 1 else height
     fig = Figure(figsize=size, layout=ConstrainedLayoutEngine(w_pad=0.08, h_pad=0.06))
     FigureCanvasAgg(fig)
     if not stacked or columns == 1:
@@ -103,32 +106,47 @@ def figure(rows: int, columns: int, height: float, **keywords: Any) -> tuple[Fig
     return fig, grid
 
 
+def legend_columns(labels: Iterable[str]) -> int:
+    """Columns of a legend: all labels in one line; in a narrow figure as many as fit into its width."""
+    lengths = [len(label) for label in labels]
+    if matplotlib.rcParams["figure.figsize"][0] != NARROW:
+        return max(len(lengths), 1)
+    return max(1, min(len(lengths), int(72 * NARROW // (0.62 * LEAST_NARROW * max(lengths, default=1) + 40))))
+
+
 def can_stack(fig: Figure) -> bool:
     """True for a figure that `figure` made, which can be drawn for a phone."""
     return pages.FOR_PHONES and hasattr(fig, "panels")
 
 
-def with_labels(fig: Figure) -> Figure:
-    """A stacked figure in which each panel has the labels that its row or column shared."""
+def fit_for_phones(fig: Figure) -> Figure:
+    """A narrow figure with wrapped labels and titles; stacked panels have the labels that they shared."""
     grid: Any = vars(fig)["panels"]
     for i, j in np.ndindex(grid.shape):
         axes = grid[i, j]
         if not axes.axison:
             continue
-        if not axes.get_ylabel():
-            axes.set_ylabel(grid[i, 0].get_ylabel())
-        if not axes.get_xlabel():
-            axes.set_xlabel(grid[-1, j].get_xlabel())
+        if grid.shape[1] > 1:
+            axes.set_ylabel(axes.get_ylabel() or grid[i, 0].get_ylabel())
+            axes.set_xlabel(axes.get_xlabel() or grid[-1, j].get_xlabel())
+        axes.set_xlabel("\n".join(textwrap.wrap(axes.get_xlabel(), LETTERS)))
+        axes.set_title("\n".join(textwrap.wrap(axes.get_title(loc="left"), LETTERS - 12)))
+        names = [tick.get_text() for tick in axes.get_yticklabels()]
+        if max(map(len, names), default=0) > NAMES:
+            axes.set_yticks(axes.get_yticks(), [textwrap.fill(name, NAMES) for name in names])
+    for legend in fig.legends:
+        legend.set_ncols(1)
     return fig
 
 
 def has_colour_scale(fig: Figure) -> bool:
-    """True for a figure whose colours stand for numbers, which a dark page must not invert."""
+    """True if colours of the figure encode numbers; a dark page must not invert them."""
     return bool(fig.findobj(lambda artist: isinstance(artist, AxesImage | QuadMesh)))
 
 
-#: Least size of text in a figure [pt], and least contrast of a text's colour to white paper (WCAG 2, AA).
-LEAST, CONTRAST = 8.5, 4.6
+#: Least size of text in a figure [pt], the same in a narrow figure, which is 11 px on a phone of 390 px, and least
+#: contrast of a text's colour to white paper (WCAG 2, AA).
+LEAST, LEAST_NARROW, CONTRAST = 8.5, 10.0, 4.6
 
 
 def svg(fig: Figure) -> str:
@@ -136,13 +154,16 @@ def svg(fig: Figure) -> str:
 
     `data-axes` of the document says where its axes are and what they run over, so that a page can show values.
     """
+    least = LEAST_NARROW if fig.get_figwidth() == NARROW else LEAST
     for written in fig.findobj(lambda artist: isinstance(artist, Text)):
         assert isinstance(written, Text)
-        written.set_fontsize(max(written.get_fontsize(), LEAST))
+        written.set_fontsize(max(written.get_fontsize(), least))
         written.set_color(readable(written.get_color()))
     if (engine := fig.get_layout_engine()) is not None:
         fig.set_dpi(72)  # that of SVG
         engine.execute(fig)
+        if least == LEAST_NARROW and _wrap(fig):
+            engine.execute(fig)
         fig.set_layout_engine(None)  # or savefig draws everything once more to lay it out
     buffer = io.StringIO()
     fig.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
@@ -153,6 +174,21 @@ def svg(fig: Figure) -> str:
     )
     axes = html.escape(json.dumps([_place(fig, a) for a in fig.axes if a.axison and a.get_visible()]))
     return text.replace("<svg ", f'<svg data-axes="{axes}" ', 1)
+
+
+def _wrap(fig: Figure) -> bool:
+    """Break horizontal texts that reach beyond the figure; True if there is any."""
+    width, wrapped = 72 * fig.get_figwidth(), False
+    for written in fig.findobj(lambda artist: isinstance(artist, Text) and artist.get_visible()):
+        assert isinstance(written, Text)
+        text, box = written.get_text(), written.get_window_extent()
+        beyond = max(box.x1 - width, -box.x0, 0.0)
+        if beyond > 0 and " " in text and written.get_rotation() == 0:
+            longest = max(map(len, text.split("\n")))
+            room = 1 - (2 if written.get_horizontalalignment() == "center" else 1) * beyond / box.width
+            written.set_text("\n".join(textwrap.wrap(text, max(12, int(longest * room) - 2))))
+            wrapped = True
+    return wrapped
 
 
 def readable(colour: Any) -> Any:
@@ -171,7 +207,7 @@ def _luminance(channels: np.ndarray) -> float:
 
 
 def _place(fig: Figure, axes: Axes) -> dict[str, Any]:
-    """Where axes are in the drawing [pt from its upper left corner], and what they run over."""
+    """Position of axes in the drawing [pt from its upper left corner], and their ranges."""
     width, height = 72 * fig.get_size_inches()
     box = axes.get_position(original=False)
     place = [box.x0 * width, (1 - box.y1) * height, box.width * width, box.height * height]

@@ -42,12 +42,12 @@ class Gear:
         return slice(int(np.searchsorted(self.time, self.time[-1] - seconds)), None)
 
     def settled_since(self, instant: float) -> bool:
-        """Whether from that instant [s] on there is enough of the run to look for ripple."""
+        """True if the run after that instant [s] is long enough to look for ripple."""
         return bool(instant <= self.time[-1] - TAIL)
 
     @property
     def rolls(self) -> bool:
-        """Whether it moved forward on its contacts to the end, so that there is a ripple to show."""
+        """True if it moved forward on its contacts to the end, so that it has a ripple to show."""
         return self.status in ("converged", "not_settled", "slides")
 
     @property

@@ -74,7 +74,7 @@ class Start:
 
     @property
     def gets_under_way(self) -> bool:
-        """Whether there are stages to tell apart."""
+        """True if the start has distinct stages."""
         return self.status in words.UNDER_WAY
 
     @property
@@ -119,7 +119,7 @@ def starts(robot: Robot, history: Any, status: np.ndarray, which: Sequence[int],
 def from_standstill(shown: list[Start], current_title: str = "total current", speed_title: str = "speeds") -> Figure:
     """A row for each run: the inrush enlarged, the total current, V and the speed of the shafts, stages shaded.
 
-    Where a run ends backward, backward is drawn positive.
+    For a run that ends backward, backward is drawn positive.
     """
     fig, grid = figure(len(shown), 3, 3.1 * len(shown), width_ratios=[0.85, 1.2, 1.35])
     look = looks(start.configuration for start in shown)
@@ -201,8 +201,10 @@ def _speeds(axes: Axes, start: Start, colour: str) -> None:
 
 
 def slip_over_start(shown: list[Start]) -> Figure:
-    """A row for each run: V_x and V_x_teor until after the start, and beside them the slip (33), its mean over each
-    stage and over t'. Where a run ends backward, backward is drawn positive."""
+    """A row for each run: V_x and V_x_teor until after the start, and the slip (33).
+
+    The slip's mean is drawn over each stage and over t'. For a run that ends backward, backward is drawn positive.
+    """
     fig, grid = figure(len(shown), 2, 3.1 * len(shown), width_ratios=[1.2, 1.0])
     look = looks(start.configuration for start in shown)
     for (speeds, slip), start in zip(grid, shown, strict=True):

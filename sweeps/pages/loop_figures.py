@@ -16,17 +16,7 @@ from calibration.inference.bases import place_in_words
 from calibration.inference.details import TimeStatistics
 from mmrjax.effects.curve import EVERY_VARIABLE, Variable
 from mmrjax.model.channels import EVERY, SIDES, Channel
-from sweeps.pages.figure_style import (
-    BLUE,
-    FAINT,
-    GREEN,
-    INK,
-    ORANGE,
-    SKY,
-    figure,
-    looks,
-    note,
-)
+from sweeps.pages.figure_style import BLUE, FAINT, GREEN, INK, ORANGE, SKY, figure, legend_columns, looks, note
 from sweeps.pages.sweep_figures import UNITS, imposed
 from sweeps.pages.words import short_name
 
@@ -142,7 +132,7 @@ def over_time(runs: Runs, table: dict[str, np.ndarray], channels: Sequence[Chann
 
 
 def time_statistics(detail: TimeStatistics, channels: Sequence[Channel], verdict: str) -> Figure:
-    """What only histories tell: memory of the residual, waves in shaft angle, drift in time."""
+    """Statistics that need histories: autocorrelation of the residual, waves in shaft angle, drift in time."""
     sides = [("before", detail.before, ORANGE), ("after", detail.after, BLUE)]
     sides = sides if verdict != "none" else sides[1:]
     count = len(channels)
@@ -187,8 +177,8 @@ def ladder(found: DiscoveryResult) -> Figure:
     axes.set_yticks(range(len(rungs)), [f"{r.name}  ({r.balance})" for r in rungs])
     axes.set_ylim(len(rungs) - 0.4, -1.8)
     axes.grid(axis="y", visible=False)
-    axes.set(xlabel="score: what the effect alone, at a plausible size, would explain beside the base [σ], linearly")
-    axes.set_title("blue: found; light blue: these data cannot tell it from one that was found")
+    axes.set(xlabel="score: linear estimate of the misfit that the effect alone explains, at a plausible size [σ]")
+    axes.set_title("blue: found; light blue: indistinguishable from a found effect in these data")
     return fig
 
 
@@ -241,7 +231,7 @@ NEAR = 1 / 12
 
 
 def given(table: dict[str, np.ndarray]) -> tuple[np.ndarray, str]:
-    """What is imposed in runs, of a supply the share that a driver passes on, and its label."""
+    """Imposed quantity of runs and its label; for a supply with a driver, the voltage after the duty."""
     own = imposed(table)
     if own == "supply_voltage_V" and "duty" in table and np.isfinite(table["duty"]).all():
         return table[own] * table["duty"], "voltage given to the motors [V]"
@@ -257,8 +247,10 @@ def roughness(x: np.ndarray, y: np.ndarray) -> float:
 
 
 def conditions_and_readings(table: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """What rows differ by, by its label: what is imposed, payload, slope, readings, and of what each side has its own
-    the mean and the difference too."""
+    """Variables in which rows differ, by label: imposed quantity, payload, slope and readings.
+
+    A variable of each side also appears as mean and difference.
+    """
     known = {c.column: (c.label, c.unit) for c in EVERY} | CONDITION_WORDS
     if "duty_left" in table and "supply_voltage_V" in table:
         sides = {f"voltage_{s}_V": table["supply_voltage_V"] * table[f"duty_{s}"] for s in SIDES}
@@ -274,8 +266,7 @@ def conditions_and_readings(table: dict[str, np.ndarray]) -> dict[str, np.ndarra
 
 
 def depends_on(table: dict[str, np.ndarray], change: np.ndarray) -> tuple[np.ndarray, str]:
-    """Over what an effect is drawn, and its label: that condition or reading over which what it changes of a reading
-    runs smoothest.
+    """Abscissa of an effect and its label: the condition or reading that makes the change of a reading smoothest.
 
     Args:
         change: of the reading, shape (rows,), NaN where a row does not count.
@@ -292,8 +283,8 @@ class Change:
     """Change of the readings of the runs by an effect of the robot that is written.
 
     Attributes:
-        channel: the one that it changes most; rms: by how much [% of its measured rms].
-        without, with_it: simulated without and with it, all else alike [SI], shape (rows,).
+        channel: with the largest change; rms: of the change [% of the channel's measured rms].
+        without, with_it: simulated without and with the effect, otherwise the same [SI], shape (rows,).
     """
 
     channel: Channel
@@ -303,8 +294,7 @@ class Change:
 
 
 def laws(found: DiscoveryResult, table: dict[str, np.ndarray], changes: Mapping[str, Change]) -> Figure:
-    """What each effect that was found explains: readings less the same robot without it, and what it adds, over what
-    that depends on."""
+    """Contribution of each effect found: readings minus the robot without it, and the effect's change."""
     fig, grid = figure(1, len(changes), 3.4)
     for axes, (name, change) in zip(grid[0], changes.items(), strict=True):
         c = change.channel
@@ -323,7 +313,7 @@ def laws(found: DiscoveryResult, table: dict[str, np.ndarray], changes: Mapping[
 
 
 def defects_of(table: dict[str, np.ndarray], when: str, balance: str) -> dict[str, np.ndarray]:
-    """Defects of a balance by side, whose name is empty where sides are alike."""
+    """Defects of a balance by side; the side's name is empty if both sides are the same."""
     sides = {side: f"defect_{when}_{balance}{'_' * bool(side)}{side}" for side in ("", *SIDES)}
     return {side: table[column] for side, column in sides.items() if column in table}
 
@@ -335,8 +325,10 @@ def closed(table: dict[str, np.ndarray]) -> list[str]:
 
 
 def _over(table: dict[str, np.ndarray], column: str, label: str, side: str = "") -> tuple[np.ndarray, str]:
-    """The variable over which a defect is drawn, of its side where it has one, or what is imposed where a table lacks
-    it or it does not vary."""
+    """Variable over which a defect is drawn, with its label, for one side if each side has its own.
+
+    The imposed quantity replaces a variable that the table lacks or that does not vary.
+    """
     own = imposed(table)
     if side:
         column = f"motor_current_{side}_A" if column == "current_A" else f"motor_speed_{side}_rpm"
@@ -348,7 +340,7 @@ def _over(table: dict[str, np.ndarray], column: str, label: str, side: str = "")
 
 
 def defects(table: dict[str, np.ndarray], verdict: str, crosses_zero: bool = False) -> Figure:
-    """What each equation lacks, run by run, over the variable that shows it, before and after.
+    """Defect of each equation by run, over the variable that shows it, before and after.
 
     Args:
         crosses_zero: whether readings may (`Layout.crosses_zero`): drawn are the equations that they close.
@@ -372,7 +364,11 @@ def defects(table: dict[str, np.ndarray], verdict: str, crosses_zero: bool = Fal
             if row == len(whens) - 1:
                 axes.set_xlabel(label)
                 axes.locator_params(axis="x", nbins=5)
-    fig.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside upper right", ncols=4)
+    fig.legend(
+        *grid[0, 0].get_legend_handles_labels(),
+        loc="outside upper right",
+        ncols=legend_columns(grid[0, 0].get_legend_handles_labels()[1]),
+    )
     return fig
 
 
@@ -396,7 +392,7 @@ def look_alikes(found: DiscoveryResult) -> Figure:
 
 
 def base_shift(found: DiscoveryResult) -> Figure:
-    """Where each base parameter lies in prior sds, before and after the effects were added."""
+    """Each base parameter in prior sds, before and after the effects were added."""
     shift = found.base_shift
     fig, grid = figure(1, 1, 1.0 + 0.27 * len(shift))
     axes = grid[0, 0]

@@ -89,7 +89,7 @@ def findings(found: DiscoveryResult, changed: Mapping[str, loop_figures.Change])
 
 
 def changes(found: DiscoveryResult) -> dict[str, loop_figures.Change]:
-    """What each effect changes in settled runs; nothing of histories, and of effects that the written robot lacks."""
+    """Change of settled runs by each effect; empty for histories and for effects that the written robot lacks."""
     added = [e.name for e in found.effects if e.name in {x.name for x in found.robot.effects}]
     if not isinstance(found.detail, EquationDefects) or not added:
         return {}
@@ -152,29 +152,32 @@ def unseen(found: DiscoveryResult) -> list[dict[str, Any]]:
 
 
 def summary(found: DiscoveryResult) -> list[dict[str, Any]]:
-    """Errors as stated, fitted again, and with what was found: seen, and unseen by the first kind of block, marked
-    where those seen are better or worse than in the line before."""
-    unseen = next(iter(found.errors_held_out.values()), ({}, {}))
+    """Errors as stated, fitted again, and with what was found: seen, and unseen by the first kind of block.
+
+    A change is marked if both lines are over the same number of rows.
+    """
+    unseen, total = next(iter(found.errors_held_out.values()), ({}, {})), len(found.runs)
     lines = [("as stated", found.errors_as_stated, {}), ("fitted again", found.errors[0], unseen[0])]
     if not found.refit_alone:
         lines.append(("with what was found", found.errors[1], unseen[1]))
-    shown, before = [], dict[str, float]()
+    shown, before = [], dict[str, tuple[float, int]]()
     for what, seen, held in lines:
         cells = []
         for c, e in seen.items():
             other = f" ({held[c]['rms_percent']:.1f} %)" if c in held and held[c]["rows"] else ""
-            change = e["rms_percent"] - before.get(c, e["rms_percent"])
+            last, rows = before.get(c, (e["rms_percent"], e["rows"]))
+            change = e["rms_percent"] - last if rows == e["rows"] else 0.0
             arrow, mark = ("", "") if not abs(change) >= NOTABLE else (" ↓", "good") if change < 0 else (" ↑", "bad")
             cells.append({"text": f"{e['rms_percent']:.1f} %{other}{arrow}" if e["rows"] else "-", "mark": mark})
-        before = {c: float(e["rms_percent"]) for c, e in seen.items()}
-        reached = max((int(e["rows"]) for e in seen.values()), default=0)
-        shown.append({"what": what, "cells": cells, "reached": f"{reached}/{len(found.runs)}"})
+        before = {c: (float(e["rms_percent"]), int(e["rows"])) for c, e in seen.items()}
+        reached, also = (max((int(e["rows"]) for e in by.values()), default=0) for by in (seen, held))
+        n = f"{reached}/{total}" + (f" ({also}/{total})" if also else "")
+        shown.append({"what": what, "cells": cells, "reached": n})
     return shown
 
 
 def check_first(found: DiscoveryResult) -> list[str]:
-    """What to look at before the robot is used: the reading that weighs most, parameters that moved too far, and what
-    the table contradicts."""
+    """Points to check before use: the reading with the largest weight, parameters that moved far, contradictions."""
     far = [describe(note) for note in found.remarks if isinstance(note, FarFromPrior | Repeats | Copied)]
     against = [note for note in found.remarks if isinstance(note, str)]
     said = [loop_words.largest_share(found), *far, *against[:1]]

@@ -11,7 +11,19 @@ from matplotlib.figure import Figure
 
 from mmrjax.model.channels import SIDES
 from mmrjax.model.energy import SINKS
-from sweeps.pages.figure_style import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, SKY, VERMILION, figure, note
+from sweeps.pages.figure_style import (
+    BLUE,
+    FAINT,
+    GREEN,
+    INK,
+    ORANGE,
+    PURPLE,
+    SKY,
+    VERMILION,
+    figure,
+    legend_columns,
+    note,
+)
 from sweeps.points.imposed import UNLIMITED
 
 #: Units of a time axis: how long a mission is for it [s], its size [s], its name.
@@ -32,12 +44,12 @@ def label_of_sink(name: str) -> str:
 
 
 def course(rows: Mapping[str, np.ndarray], cycle: float | None, limit: float, linear: bool, sides: float) -> Figure:
-    """A run over its profile, a row a subject; beside it its first cycle, where it has several.
+    """A run over its profile, a row a subject; with several cycles, the first one is also drawn.
 
     Args:
         rows: of history.csv, of one run; cycle: end of its first cycle [s], None where it has one only.
         limit: of the winding's temperature [°C]; linear: whether the profile's values are, between rows.
-        sides: how many motors there are.
+        sides: number of motors.
     """
     spans = [float(rows["time_s"][-1]), *([cycle] if cycle is not None else [])]
     titles = ["the mission", "its first cycle"]
@@ -97,7 +109,8 @@ def _beside(axes: Axes, label: str, colour: str) -> Axes:
 
 def _legend(axes: Axes, *others: Axes) -> None:
     handles = [h for a in (axes, *others) for h in a.get_legend_handles_labels()[0]]
-    axes.legend(handles, [str(h.get_label()) for h in handles], loc="upper center", ncols=len(handles), fontsize=8)
+    labels = [str(h.get_label()) for h in handles]
+    axes.legend(handles, labels, loc="upper center", ncols=legend_columns(labels), fontsize=8)
     low, high = axes.get_ylim()
     axes.set_ylim(low, high + 0.22 * (high - low))  # room for it
 
@@ -147,7 +160,7 @@ def of_motors(rows: Mapping[str, np.ndarray], name: str, unit: str) -> np.ndarra
 
 
 def _near(rows: Mapping[str, np.ndarray], limit: float) -> bool:
-    """Whether the limit is near enough to be drawn; far above it would flatten what is to be seen."""
+    """True if the limit is near enough to be drawn; a far limit would flatten the curve."""
     return "housing_temperature_C" in rows and bool(np.max(rows["winding_temperature_C"]) > 0.6 * limit)
 
 
@@ -191,7 +204,7 @@ def _source(axes: Axes, time: np.ndarray, rows: Mapping[str, np.ndarray]) -> Non
 
 
 def energy(run: Mapping[str, Any], on_battery: bool) -> Figure:
-    """Where the energy of one run goes, in the order of the chain [Wh], and its share of what was drawn [%].
+    """Energy of one run by use, in the order of the chain [Wh], and its share of the energy drawn [%].
 
     Args:
         run: its row of runs.csv.

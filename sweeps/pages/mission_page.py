@@ -108,7 +108,7 @@ def answer(run: dict[str, Any]) -> str:
 
 
 def _cards(run: dict[str, Any]) -> list[dict[str, str]]:
-    """What a mission comes to, in large figures."""
+    """Key figures of a mission, in large print."""
     about = {output.column: output for output in mission_batch.OUTPUTS}
     shown = ("energy_Wh", "energy_per_metre_Wh", "distance_m", "peak_current_A", "winding_peak_C", "state_of_charge")
     cards = []
@@ -129,7 +129,7 @@ OF_HEAT = ("hottest winding", "rms current, one motor")
 
 
 def _limits(robot: Robot, run: dict[str, Any]) -> list[dict[str, Any]]:
-    """How much of each limit the mission uses: words, its value, the limit, and the share of it [%]."""
+    """Use of each limit by the mission: words, its value, the limit, and the share of it [%]."""
     rpm, motor, gearbox, battery = np.pi / 30, robot.motor, robot.gearbox, robot.battery
     heat = robot.knows(WARMING)
     asked = [
@@ -168,7 +168,7 @@ def _flags(run: dict[str, Any], found: Missions, name: str) -> list[dict[str, An
 
 
 def _segments(found: Missions, name: str) -> list[dict[str, Any]]:
-    """Of one run each segment: its first cycle, and what it comes to over all cycles."""
+    """Segments of one run: the first cycle and totals over all cycles."""
     source = found.source
     rows = {key: value[found.segments["run_id"] == name] for key, value in found.segments.items()}
     whole = float(np.sum(rows["energy_Wh"]))
@@ -202,7 +202,7 @@ def _segments(found: Missions, name: str) -> list[dict[str, Any]]:
 
 
 def _demand(found: Missions, k: int) -> str:
-    """What the profile asks for in a segment, in words."""
+    """Demand of the profile in a segment, in words."""
     source = found.source
     last = k + 1 if source.linear else k
 

@@ -21,7 +21,7 @@ from mmrjax.model.channels import Channel
 from mmrjax.model.robot import Robot
 from sweeps import capabilities
 from sweeps.pages import words
-from sweeps.pages.figure_style import NARROW, can_stack, has_colour_scale, style, svg, with_labels
+from sweeps.pages.figure_style import NARROW, can_stack, fit_for_phones, has_colour_scale, style, svg
 from sweeps.pages.time_overlay import TimeOverlay
 from sweeps.report.document import PAGE_ROWS as ROWS
 from sweeps.report.document import Column, Note, Section, Table, tone
@@ -52,7 +52,7 @@ class Album:
         if can_stack(figure):
             with style(NARROW):
                 drawn = draw()
-                narrow = svg(with_labels(drawn[0] if isinstance(drawn, tuple) else drawn))
+                narrow = svg(fit_for_phones(drawn[0] if isinstance(drawn, tuple) else drawn))
         write_text(self.folder / f"{name}.svg", text)
         looks = "scale " * has_colour_scale(figure)
         picture = _inline(text, name, looks + ("wide" if narrow else "only"))

@@ -1,4 +1,4 @@
-"""What is said of a posture, on the console and on the page."""
+"""Sentences on a posture, on the console and on the page."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def table(found: Postures) -> dict[str, Any]:
 
 
 def stands(found: Postures) -> str:
-    """How the first run stands and what geometry allows it, in a sentence or two."""
+    """One or two sentences on the posture of the first run and its geometric limits."""
     one, most = {c: values[0] for c, values in found.table.items()}, found.over.step_mm.max()
     return (
         f"posture: pitch {one['pitch_deg']:z.1f}°, on {one['contact_mm']:.0f} mm, which bear {one['bears']}; tips on "
@@ -45,7 +45,7 @@ def stands(found: Postures) -> str:
 
 
 def remarks(found: Postures) -> list[str]:
-    """What the numbers of straight travel do not say: which runs would tip over."""
+    """Remarks on runs that would tip over, which the numbers of straight travel do not show."""
     over = np.flatnonzero(found.table["margin_mm"] < 0)
     if not over.size:
         return []

@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 from matplotlib.figure import Figure
 
-from sweeps.pages.figure_style import BLUE, GREEN, INK, ORANGE, PURPLE, SKY, figure
+from sweeps.pages.figure_style import BLUE, GREEN, INK, ORANGE, PURPLE, SKY, figure, legend_columns
 
 #: Where power goes, with its colour: losses in the order of the chain, then what is left.
 ITEMS = {
@@ -38,7 +38,7 @@ def sources(runs: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def drawable(runs: dict[str, np.ndarray]) -> np.ndarray:
-    """Which runs have numbers, and losses that are none of them negative."""
+    """Mask of runs with numbers and without negative losses."""
     parts, given = np.stack(list(split(runs).values())), sum(sources(runs))
     return np.isfinite(parts).all(0) & (parts >= -1e-6 * np.maximum(given, 1.0)).all(0) & (given > 0)
 
@@ -75,5 +75,9 @@ def chain(runs: dict[str, np.ndarray], names: list[str], has_ground: bool = True
     axes.grid(False)
     beyond = 1.35 if (slope > 1e-6).any() else 1.1
     axes.set(xlabel="power [W]", xlim=(0, beyond * float(total.max())))
-    fig.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=len(ITEMS))
+    fig.legend(
+        *axes.get_legend_handles_labels(),
+        loc="outside upper center",
+        ncols=legend_columns(axes.get_legend_handles_labels()[1]),
+    )
     return fig

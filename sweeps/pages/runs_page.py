@@ -167,8 +167,9 @@ def _histories(
 
 
 def limits(robot: Robot, run: dict[str, Any], starts: Sequence[Start] = ()) -> list[dict[str, Any]]:
-    """How much of each limit a run uses: words, its value, the limit, and the share of it [%]; of a winding the share
-    of what it may warm up by. An inrush of which the robot states no limit has neither.
+    """Use of each limit by a run: words, its value, the limit, and the share of it [%].
+
+    A winding has the share of its permissible temperature rise. An inrush without a stated limit has no share.
 
     Args:
         starts: the same run from standstill, of a fidelity that has histories.
@@ -220,7 +221,7 @@ def warmed(value: float, limit: float, ambient: float) -> float:
 
 
 def inrush_limit(robot: Robot, on_battery: bool) -> float | None:
-    """What the driver, or the battery beside other consumers, gives to all motors at most [A]; None: not stated."""
+    """Largest current of the driver, or of the battery less other consumers, for all motors [A]; None: not stated."""
     most, battery = float(robot.driver.current_limit), robot.battery
     stated = [float(robot.sides) * most] if most < float(type(robot.driver)().current_limit) else []
     if on_battery and battery.current_limit is not None:

@@ -209,7 +209,7 @@ def convergence(found: SensitivityResult) -> Figure:
 
 
 def next_runs(runs: NextRuns, found: SensitivityResult) -> Figure:
-    """What is left of each input's sd after each of the proposed runs."""
+    """Remaining share of each input's sd after each proposed run."""
     left = runs.sd[-1]
     moving = [k for k in np.argsort(left, kind="stable") if left[k] < 0.99][:10]
     fig, axes = figure(1, 1, 0.8 + 0.28 * max(len(moving), 2))
@@ -225,5 +225,5 @@ def next_runs(runs: NextRuns, found: SensitivityResult) -> Figure:
     )
     ax.grid(axis="y", visible=False)
     if not moving:
-        note(ax, "these runs tell nothing of these inputs")
+        note(ax, "these runs give no information on these inputs")
     return fig

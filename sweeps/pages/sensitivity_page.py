@@ -66,17 +66,17 @@ def write(folder: Path, found: SensitivityResult, file: RobotFile) -> Path:
 
 
 def _decided(study: OutputStudy) -> bool:
-    """Whether any input changes an output at all."""
+    """True if any input changes an output."""
     return bool(study.overall_share.max(initial=0.0) > 0)
 
 
 def _sentence(study: OutputStudy, found: SensitivityResult) -> str:
-    """What decides an output, with its own spread."""
+    """Sentence on the inputs that decide an output, with its spread."""
     share, row = study.overall_share, study.row
     if not _decided(study):
         return "No number at any of these operating points, or nothing changes it."
     top = sensitivity_figures.ranked(share, 3)
-    who = ", ".join(f"{found.names[k]} {100 * share[k]:.0f} %" for k in top)
+    who = ", ".join(f"{sensitivity_words.meaning(found, found.names[k])} {100 * share[k]:.0f} %" for k in top)
     value, sd = study.value / row.factor, study.sd / row.factor
     finite = np.isfinite(value) & np.isfinite(sd)
     unit = "" if row.unit == "-" else f" {row.unit}"
@@ -84,7 +84,7 @@ def _sentence(study: OutputStudy, found: SensitivityResult) -> str:
     low, high = value[finite].min(), value[finite].max()
     spans = f"from {low:.{digits}f} to {high:.{digits}f}{unit} over the operating points"
     spread = f"uncertain by ±{np.median(sd[finite]):.{digits}f}{unit} (one sd, median of the points)"
-    return f"{who}. It goes {spans}, and is {spread}."
+    return f"{who[0].upper()}{who[1:]}. It goes {spans}, and is {spread}."
 
 
 def _pairs(study: OutputStudy, found: SensitivityResult) -> list[dict[str, str]]:
@@ -160,7 +160,8 @@ def _two(sd: float) -> str:
 
 
 def _ranges(found: SensitivityResult) -> str:
-    p = found.points
+    """Values of the operating points at which any output was studied."""
+    p = found.points.at(np.any([o.studied for o in found.outputs.values()], axis=0))
     parts = [", ".join(dict.fromkeys(map(str, p.configuration)))]
     _, own, symbol = p.imposed
     for _, x, unit in (("", own, f" {symbol}"), *p.ground):
@@ -170,7 +171,7 @@ def _ranges(found: SensitivityResult) -> str:
 
 
 def _bounds(found: SensitivityResult) -> list[dict[str, str]]:
-    """How bounds of derivatives compare with sampled indices, by output."""
+    """Bounds from derivatives compared with sampled indices, by output."""
     return [
         {
             "label": found.outputs[name].row.label,

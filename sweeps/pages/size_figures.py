@@ -9,7 +9,7 @@ from matplotlib.patches import Patch, Rectangle
 
 from calibration.sizing.chart import LIMITS, Chart
 from calibration.sizing.design import OBJECTIVES
-from sweeps.pages.figure_style import BLUE, GREEN, INK, ORANGE, PURPLE, SKY, VERMILION, figure
+from sweeps.pages.figure_style import BLUE, GREEN, INK, ORANGE, PURPLE, SKY, VERMILION, figure, legend_columns
 from sweeps.results.size_results import SizeResult
 
 _COLOURS = dict(zip(LIMITS, (BLUE, "#555555", VERMILION, PURPLE, ORANGE, "#8c564b", SKY, GREEN), strict=True))
@@ -40,7 +40,12 @@ def limits(found: SizeResult, charts: dict[str, Chart]) -> Figure:
         ax.grid(visible=False)
     axes[0, 0].set_ylabel("slope [deg]")
     handles = [Patch(color=_COLOURS[LIMITS[k]], alpha=0.55, label=LIMITS[k]) for k in sorted(seen)]
-    fig.legend(handles=handles, loc="outside lower center", ncols=len(handles), title="nearest limit")
+    fig.legend(
+        handles=handles,
+        loc="outside lower center",
+        ncols=legend_columns(str(h.get_label()) for h in handles),
+        title="nearest limit",
+    )
     return fig
 
 

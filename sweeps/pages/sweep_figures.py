@@ -33,15 +33,15 @@ def imposed(runs: dict[str, np.ndarray]) -> str:
 
 
 def on_ground(runs: dict[str, np.ndarray]) -> bool:
-    """Whether runs are of a vehicle, with slope and payload."""
+    """True for runs of a vehicle, with slope and payload."""
     return "slope_deg" in runs and "payload_kg" in runs
 
 
 def panels(voltages: np.ndarray, column: str = "supply_voltage_V") -> list[tuple[str, np.ndarray]]:
-    """How a figure splits runs by what is imposed: a title and a mask for each of at most three panels.
+    """Panels of a figure by imposed quantity: a title and a mask for each of at most three panels.
 
-    Every voltage up to three; of a grid of more, the least, a middle and the greatest; where nearly every
-    run has a voltage of its own, thirds of the range.
+    Up to three voltages each have a panel. A grid with more has the least, a middle and the greatest. If nearly every
+    run has its own voltage, the panels are thirds of the range.
     """
     if np.isnan(voltages).all():
         return [("battery", np.ones(len(voltages), bool))]
@@ -56,12 +56,12 @@ def panels(voltages: np.ndarray, column: str = "supply_voltage_V") -> list[tuple
 
 
 def is_map(runs: dict[str, np.ndarray]) -> bool:
-    """Whether the runs have at least two slopes and two payloads, and so fill a map."""
+    """True if the runs have at least two slopes and two payloads and so fill a map."""
     return on_ground(runs) and np.unique(runs["slope_deg"]).size > 1 and np.unique(runs["payload_kg"]).size > 1
 
 
 def settled(runs: dict[str, np.ndarray], channel: Channel) -> np.ndarray:
-    """Which runs have a number to draw: `drive` leaves numbers of a moment with other statuses too."""
+    """Mask of runs with a settled number; `drive` also leaves instantaneous numbers with other statuses."""
     return np.isin(runs["status"], words.SETTLED) & np.isfinite(runs[channel.column])
 
 
@@ -69,7 +69,7 @@ def sweep(runs: dict[str, np.ndarray], channel: Channel) -> Figure:
     """One channel over slope and payload, a panel for each voltage and configuration.
 
     With a single slope or payload the panels are lines over the other. A cell that did not settle is hatched
-    and says why. Where several runs share a cell their median is shown.
+    and names the reason. Several runs in one cell are shown by their median.
     """
     kinds = list(dict.fromkeys(map(str, runs["configuration"])))
     volts = panels(runs[imposed(runs)], imposed(runs))
@@ -126,7 +126,7 @@ def _map(axes: Axes, runs: dict[str, np.ndarray], index: np.ndarray, channel: Ch
 
 
 def _medians(cell: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Which cells there are, and the median of each one's values."""
+    """The cells and the median of the values in each."""
     order = np.lexsort((values, cell))
     cells, begin, count = np.unique(cell[order], return_index=True, return_counts=True)
     ranked = values[order]

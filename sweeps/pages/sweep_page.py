@@ -116,7 +116,7 @@ def _levels(values: np.ndarray, unit: str) -> str:
 
 
 def _where(runs: Table, pick: np.ndarray) -> str:
-    """Where in the sweep the picked runs lie, by configuration: the ranges of slope and voltage."""
+    """Ranges of slope and voltage of the picked runs, by configuration, in words."""
     parts = []
     for kind in dict.fromkeys(map(str, runs["configuration"])):
         mine = pick & (runs["configuration"] == kind)

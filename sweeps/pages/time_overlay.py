@@ -119,7 +119,7 @@ class TimeOverlay:
 
 
 def _numbers(values: np.ndarray) -> list[float | None]:
-    """Numbers with six digits; None for one that is missing."""
+    """Numbers with six digits; None for a missing one."""
     return [float(f"{v:.6g}") if np.isfinite(v) else None for v in values]
 
 

@@ -40,7 +40,7 @@ def write(
     """Write `report.html` and `figures/` for one turn.
 
     Args:
-        run: its row of `runs.csv`; facts: what is said of it.
+        run: its row of `runs.csv`; facts: sentences and table rows on it.
         history: over time, of a fidelity that keeps it; turns: settled ones of other duties of the slower side.
 
     Returns:

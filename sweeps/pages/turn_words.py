@@ -1,4 +1,4 @@
-"""How a turn is told, in the terminal and on its page."""
+"""Sentences on a turn, for the terminal and its page."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ STANDS, SPOT = 1.0, 1.0
 
 @dataclasses.dataclass(frozen=True)
 class Turn:
-    """How a turn is told: the answer in a sentence, rows of what left and right side do, and remarks."""
+    """Description of a turn: the answer in a sentence, rows for the left and right side, and remarks."""
 
     answer: str
     sides: list[tuple[str, str, str]]
@@ -42,15 +42,15 @@ class Turn:
 
 
 def unlike(name: str, effects: Sequence[str], turns: str) -> str:
-    """Of a robot whose sides differ by some effects, which runs that say nothing of either side do not show."""
+    """Remark on effects that differ between the sides and that runs without a turn do not show."""
     return f"{name}: {STRAIGHT} ({', '.join(effects)}); {turns}"
 
 
 def by_itself(robot: Robot, found: Result, value: float) -> str:
-    """How a robot turns whose sides are driven alike, by its configurations; empty where none does.
+    """Turn of a robot with both sides driven the same, by configuration, in words; empty if it travels straight.
 
     Args:
-        value: what is imposed [V, rpm].
+        value: imposed voltage or motor speed [V, rpm].
     """
     imposed, states = ("rpm", "motor_speed_left_rpm and motor_speed_right_rpm") if (
         robot.rig.imposed == "motor_speed"
@@ -68,11 +68,11 @@ def by_itself(robot: Robot, found: Result, value: float) -> str:
 
 
 def reach(speed: float, rate: float, speeds: np.ndarray, rates: np.ndarray) -> str:
-    """Why a turn is not found: what is reached at full voltage, or that friction has none there.
+    """Reason for a missing turn: the limit at full voltage, or no steady turn under friction.
 
     Args:
         speed: demanded [m/s]; rate: demanded yaw rate [rad/s].
-        speeds, rates: of settled turns at full voltage, from straight travel to the spot, NaN where there is none.
+        speeds, rates: of settled turns at full voltage, from straight travel to the spot; NaN: no steady turn.
     """
     known = np.isfinite(speeds) & np.isfinite(rates)
     if not known.any():
@@ -159,8 +159,8 @@ def _notes(robot: Robot, row: Mapping[str, Any]) -> list[str]:
         )
     if robot.rig.inherits and not BETWEEN <= own * MM <= OVER:
         notes.append(
-            f"{own:.0f} mm between the sides is none that the packaged robot's parts allow, {BETWEEN / MM:.0f} to "
-            f"{OVER / MM:.0f} mm"
+            f"{own:.0f} mm between the sides is outside the range of the packaged robot's parts, "
+            f"{BETWEEN / MM:.0f} to {OVER / MM:.0f} mm"
         )
     for side in SIDES:
         power, current = float(row[f"power_{side}_W"]), float(row[f"motor_current_{side}_A"])

@@ -9,7 +9,7 @@ from mmrjax.model import channels
 
 
 class Status(NamedTuple):
-    """How a run ended: `short` in figures, `why` in one line, `meaning` for the reader of a report."""
+    """Words for the end of a run: `short` in figures, `why` in one line, `meaning` for the reader of a report."""
 
     short: str
     why: str
@@ -116,7 +116,7 @@ LOOP_VERDICTS = {
     "none": "nothing is missing as far as these runs can show: what the fitted model leaves is noise",
     "undescribed": "the refitted model misses a channel by more than a quarter of its measured rms, or noise is "
     "estimated as that large: the statement says what to check first, and no effect is named",
-    "place": "something is missing in one equation, or in those that act alike, and no more is established",
+    "place": "something is missing in one equation, or in several that these data cannot separate; no more is known",
     "unnamed": "former word for place; a mechanism was called so too until schema mmrjax.loop/3",
     "mechanism": "what drives the missing term is established, and its equation; its exact law is not",
     "class": "laws are established, and of at least one these data cannot tell which it is",
@@ -134,7 +134,7 @@ GLOSSARY = {
     "class": "effects that these data cannot tell apart",
     "mechanism": "the equation that lacks something and what drives it, without the exact law: it explains half of "
     "the excess misfit or more, predicts runs that the fit has not seen, and is found again without blocks of runs",
-    "place": "the equation that lacks something, with those that act alike; no mechanism is established",
+    "place": "the incomplete equation, or several that these data cannot separate; no mechanism is established",
     "excess misfit": "χ² beyond what noise alone leaves, about one a reading",
     "refit": "the same model with its parameters fitted to the runs, and nothing added",
     "seen, held out": "errors of runs that the fit was made with, and of runs that it has not seen: a whole "
@@ -146,7 +146,7 @@ GLOSSARY = {
     "run is looked at",
     "p": "how often noise alone would look like this",
     "nat": "unit of how probable held-out readings are: +0.1 a reading is a clear gain over 60 readings",
-    "reached": "runs of which the robot has a steady state; on others it slides or stands",
+    "reached": "runs with a steady state of the robot; in the others it slides or does not move",
 }
 
 FLAGS = {
@@ -179,7 +179,7 @@ UNDER_WAY = (*SETTLED, "rolls_back", "not_settled")
 
 
 def solved(counted: Mapping[str, int]) -> bool:
-    """Whether the solver gave an answer to every run, of counts by status."""
+    """True if the solver gave an answer for every run, from counts by status."""
     return not counted.get("failed")
 
 

@@ -189,7 +189,7 @@ def motor_friction(robot: Robot, speed_rpm: np.ndarray) -> np.ndarray:
 def idle_current(robot: Robot, configuration: str, speed_wheel: np.ndarray) -> np.ndarray:
     """Current of one motor [A] that keeps a lifted side turning at pulley speed [rad/s].
 
-    No ground, no weight on the guides: the balances are asked with zero normal load and traction. Their
+    No ground, no weight on the guides: the balances have zero normal load and traction. Their
     net torque is linear in the current while the motor drives, so two currents give the root.
     """
     from mmrjax.model import balances

@@ -30,6 +30,21 @@ def errors(variants: dict[str, np.ndarray], rows: data.Rows) -> list[dict[str, A
     return answer
 
 
+def answer(every: list[dict[str, Any]]) -> str:
+    """Sentence on the rms errors (35) over all rows, from `errors`: the robot's, and the paper's own simulation's."""
+    own, _, raised, *_, paper = (e for e in every if e["group"] == "all")
+    labels = [c.label for c in data.channels_of_paper()]
+    mine, theirs = (
+        ", ".join(f"{c['rms_percent']:.1f} % {label}" for c, label in zip(e["cells"], labels, strict=True))
+        for e in (raised, paper)
+    )
+    few = f", with adhesion raised ({own['rows']} rows settle on its own)" if own["rows"] < own["of"] else ""
+    return (
+        f"rms error against {raised['rows']} of {raised['of']} measured rows: {mine}{few}. "
+        f"The paper's own simulation: {theirs}."
+    )
+
+
 def implied_resistance(robot: Robot, table: runs.Runs) -> np.ndarray:
     """Resistance [Ω] in series with each motor that current and speed of each row imply by (15)."""
     current = table["total_current_A"]

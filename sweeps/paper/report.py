@@ -1,4 +1,4 @@
-"""The page of `reproduce`: the paper's figures and tables remade for a robot, beside the bench and the paper."""
+"""Page of `reproduce`: the paper's figures and tables for a robot, compared with the bench and the paper."""
 
 from __future__ import annotations
 
@@ -22,12 +22,11 @@ def write(folder: Path, file: RobotFile, *, model: str, gear: bool) -> tuple[Pat
 
     Args:
         folder: an existing run folder.
-        file: of any robot; one that has none of the paper's configurations is not set against the bench.
+        file: of any robot; without one of the paper's configurations it is not compared with the bench.
         model: fidelity; gear: whether it resolves the running gear, so that there are Figs. 23-27 from it too.
 
     Returns:
-        The path of the page, and what the robot says of the paper's rows, None where it has none of their
-        configurations.
+        The path of the page, and the robot's results for the paper's rows; None without one of their configurations.
     """
     nominal = ROBOTS["nominal"]()
     robot, shown = file.robot, page.named(file)
@@ -72,9 +71,11 @@ def _against_the_bench(
     certainty = album.add("fig28_current_over_slope", lambda: run_figures.current_over_slope(robot, mine))
     if TRACKED in mine.ratio:
         album.add("fig29_model_errors", lambda: run_figures.model_errors(robots, rows))
+    errors = error_tables.errors(_variants(name, rows), mine)
     return {
+        "answer": error_tables.answer(errors),
         "certainty": certainty,
-        "errors": error_tables.errors(_variants(name, rows), mine),
+        "errors": errors,
         "raised": data.raised_words(robot, mine.ratio),
         "sliding": list(zip(*_sliding_rows(mine), strict=True)),
         "measured": len(mine.conditions),

@@ -22,6 +22,7 @@ from sweeps.pages.figure_style import (
     axis_label,
     figure,
     label_end,
+    legend_columns,
     note,
 )
 from sweeps.pages.words import words_shown
@@ -126,7 +127,8 @@ def model_errors(robots: dict[str, Robot], rows: dict[str, data.Rows]) -> tuple[
     note(grid[0, 0], "shaded: ±7 %, the paper's claim", x=0.02, y=0.04, va="bottom", fontsize=8, color="#447744")
     for axes in grid[1]:
         axes.set_xlabel("slope [°]")
-    fig.legend(handles=handles, loc="outside lower center", ncols=len(handles))
+    labels = [str(h.get_label()) for h in handles]
+    fig.legend(handles=handles, loc="outside lower center", ncols=legend_columns(labels))
     return fig, errors
 
 
@@ -143,7 +145,7 @@ _SPLIT_COLOURS = {
 
 
 def energy(robot: Robot, ratio: dict[str, float]) -> tuple[Figure, list[dict[str, Any]]]:
-    """Where the supply's power goes at twelve operating points, in percent, with watts at the end."""
+    """Use of the supply's power at twelve operating points, in percent, with watts at the end."""
     asked = [(c, u, p, s) for c in ratio for u, p in ((15.0, 0.0), (33.0, 8.0)) for s in (0.0, 10.0, 20.0)]
     kind, voltage, payload, slope = (np.array(v) for v in zip(*asked, strict=True))
 
@@ -196,7 +198,11 @@ def energy(robot: Robot, ratio: dict[str, float]) -> tuple[Figure, list[dict[str
     axes.grid(False)
     remark = "\n* slides on its own adhesion; shown with adhesion raised" if slides.any() else ""
     axes.set(xlabel=f"share of the power taken from the supply [%]{remark}", xlim=(0, 108), xticks=range(0, 101, 20))
-    fig.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=8)
+    fig.legend(
+        *axes.get_legend_handles_labels(),
+        loc="outside upper center",
+        ncols=legend_columns(axes.get_legend_handles_labels()[1]),
+    )
     return fig, table
 
 
@@ -243,5 +249,9 @@ def row_parity(rows: data.Rows, name: str) -> Figure:
         axes.set_ylim(*span)
         axes.locator_params(nbins=5)
     note(grid[0, 0], f"{words_shown(name)}; band ±5 %", fontsize=8.5)
-    fig.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=5)
+    fig.legend(
+        *grid[0, 0].get_legend_handles_labels(),
+        loc="outside lower center",
+        ncols=legend_columns(grid[0, 0].get_legend_handles_labels()[1]),
+    )
     return fig

@@ -36,9 +36,9 @@ def draw(album: Album, robot: Robot) -> dict[str, Any]:
     """Draw the figures.
 
     Returns:
-        `left_out` None, `rows` of the ripple table, and of the tracked configuration the guide `friction`, the
-        robot's own `share` and both `currents` [A], by `steady` at that share and with the share resolved (None
-        where the robot has none); or `left_out`, the statuses of all, and no figures drawn.
+        `left_out` None, `rows` of the ripple table, and for the tracked configuration the guide `friction` and the
+        robot's `share`. `currents` [A] are by `steady` at that share and with the share resolved; None without a
+        tracked configuration. If runs did not settle: `left_out`, the statuses of all, and no figures.
     """
     run, names = runs(robot), data.kinds(robot)
     which = [robot.configurations.index(c) for c in names]

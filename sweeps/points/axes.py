@@ -41,13 +41,13 @@ Quantile = Callable[[np.ndarray], np.ndarray]
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """What a sweep simulates.
+    """Points of a sweep and their constant conditions.
 
     Attributes:
-        design: the points; axes: what is known of each name.
-        conditions: those that do not vary, by name, `configuration` as an index.
+        design: the points; axes: unit and limits of each name.
+        conditions: constant conditions by name, `configuration` as an index.
         surface: of Table 5, which scales the adhesion by configuration; None where adhesion is stated or varies.
-        data: files that the design came from, beside the configuration.
+        data: files of the design, in addition to the configuration.
         rows: conditions of the runs of a table, among which the axis `ROW` counts.
     """
 

@@ -58,7 +58,7 @@ OUTPUTS: dict[str, tuple[str, str]] = {
 
 
 def axis(obstacle: Obstacle) -> Axis:
-    """What is known of the obstacle's size."""
+    """Axis of the obstacle's size."""
     meaning = {"step": "height of the step", "stairs": "rise of each stair", "gap": "width of the trench"}
     return Axis(SIZE, "mm", meaning[obstacle.kind], (1.0, 5000.0), None)
 
@@ -86,14 +86,14 @@ def terrains_of(obstacle: Obstacle, sizes: np.ndarray) -> Terrain:
 
 
 def further(obstacle: Obstacle, varied: Mapping[str, np.ndarray], robot: Robot, where: str) -> dict[str, float]:
-    """A low voltage, where a sweep of climbs states none.
+    """Further conditions: a low voltage, if a sweep of climbs states none.
 
     Args:
         varied: what varies or is stated, with its values.
 
     Raises:
-        BadConfiguration: a robot that cannot climb, no size or one beside a search, angles beside a sequence of them,
-            beyond the levers' range or below the ground in the beginning.
+        BadConfiguration: a robot that cannot climb; no size, or a size and a search; angles and a sequence of angles;
+            angles beyond the levers' range or that begin below the ground.
     """
     if (why := refused(robot)) is not None:
         raise BadConfiguration(f"{where}, obstacle: {why}")

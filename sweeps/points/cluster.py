@@ -77,7 +77,7 @@ class Pool:
             return future
 
         def fill() -> None:
-            """Give the workers that there are now, some of which may have come later, enough to do."""
+            """Submit enough work for the present workers; some may have joined later."""
             room = max(self._workers(), 1) * (1 + AHEAD) - len(numbers)
             for chunk in itertools.islice(left, max(room, 0)):
                 under_way.add(submit(chunk))
@@ -108,14 +108,14 @@ class Pool:
             fill()
 
     def _workers(self) -> int:
-        """How many there are."""
+        """Number of workers."""
         try:
             return len(self.client.scheduler_info(n_workers=-1)["workers"])
         except Exception as error:  # whatever comes of asking one that is no more
             raise LostWorkers(GONE) from error
 
     def _next(self, under_way: Any) -> Any:
-        """The next finished future, however long it takes while some worker is there.
+        """Next finished future; waits as long as at least one worker is connected.
 
         Raises:
             TimeoutError: no worker for `WORKER` seconds.
@@ -141,7 +141,7 @@ class Pool:
         return found[0]
 
     def _result(self, future: Any) -> Any:
-        """What a finished future holds; where its worker is lost before it is fetched, what another one finds.
+        """Result of a finished future; if its worker is lost before the fetch, another worker recomputes it.
 
         Raises:
             TimeoutError, LostWorkers: as `_next`.
@@ -205,7 +205,7 @@ def connect(address: str) -> Pool:
 def _client(address: str) -> Any:
     """A client of the scheduler at an address, in `ANSWER` seconds or not at all.
 
-    dask limits how long it waits for a connection, not for what is said over it; so it waits in a thread here.
+    dask limits the wait for a connection but not for messages over it, so this waits in a thread.
     """
     import distributed
 
@@ -267,7 +267,7 @@ def _start() -> None:
 
 
 def introduce() -> tuple[dict[str, dict[str, str]], str]:
-    """What a worker runs, and on what."""
+    """Software of a worker and its device."""
     _start()
     from sweeps.points.scale import device_kind
 

@@ -32,18 +32,18 @@ AXIS = {"voltage": "voltages_V", "motor_speed": "motor_speeds_rpm", "motor_curre
 
 
 def resolved(config: G, robot: Robot, battery: bool = False, notes: list[str] | None = None) -> G:
-    """The grid with every axis stated that the robot has.
+    """The grid with every axis of the robot stated.
 
-    What is imposed is that of Table 8 for the packaged robot; of a rig thirds of its limit (`sweeps.points.imposed`).
-    Payloads and slopes are those of Table 8 too, of a rig none and 0.
+    The packaged robot takes imposed quantities, payloads and slopes of Table 8. A rig takes thirds of its limit
+    (`sweeps.points.imposed`), no payload and level ground.
 
     Args:
-        battery: whether the runs are on the battery, where the axis of voltages drops out.
-        notes: is given a sentence for what is taken of a rig's limits.
+        battery: whether the runs are on the battery, which removes the axis of voltages.
+        notes: receives a sentence on values taken from a rig's limits.
 
     Raises:
-        BadConfiguration: an axis that the robot does not have, one that is neither stated nor follows from a limit,
-            or a surface or a configuration that there is not.
+        BadConfiguration: an axis that the robot does not have, an axis neither stated nor given by a limit, or an
+            unknown surface or configuration.
     """
     layout = Layout.of(robot)
     check(config, robot)
@@ -67,7 +67,7 @@ def check(config: GridPart, robot: Robot) -> None:
     """Refuse axes that a robot does not have.
 
     Raises:
-        BadConfiguration: one of them, or a surface that is none of Table 5 where those are meant.
+        BadConfiguration: such an axis, or a surface not in Table 5 for a robot that takes its surfaces.
     """
     layout = Layout.of(robot)
     for key in AXIS.values():
@@ -119,10 +119,10 @@ def grid(config: GridPart, robot: Robot, battery: bool = False) -> Runs:
 
 
 def configurations(config: GridPart, robot: Robot) -> tuple[str, ...]:
-    """The configurations of a grid: those stated, each of which the robot has, or all of the robot's.
+    """Configurations of a grid: the stated ones, or all of the robot's.
 
     Raises:
-        BadConfiguration: one that the robot does not have.
+        BadConfiguration: a configuration that the robot does not have.
     """
     if config.configurations is None:
         return robot.configurations.names

@@ -1,4 +1,4 @@
-"""What makes a sweep what it is: two with the same identity give the same numbers, bit by bit, on one machine."""
+"""Identity of a sweep: two with the same identity give the same numbers, bit by bit, on one machine."""
 
 from __future__ import annotations
 

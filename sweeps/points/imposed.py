@@ -1,4 +1,4 @@
-"""What is imposed on a rig's motors where no option states it: shares of what its file says they may take."""
+"""Default of the quantity imposed on a rig's motors: shares of the limit in its file."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ SHARES = (1 / 3, 2 / 3, 1.0)
 
 @dataclasses.dataclass(frozen=True)
 class Said:
-    """What is said of what is imposed: in words, its unit, the parameter that limits it, and examples of options for
-    one run and for a grid."""
+    """Description of an imposed quantity: words, unit, the parameter that limits it, and example options for one run
+    and for a grid."""
 
     words: str
     unit: str
@@ -44,8 +44,7 @@ SAID = {
 
 
 def limit(robot: Robot) -> float | None:
-    """What may be imposed at most: supply voltage [V] or motor speed [rpm]; None where the file says nothing, as it
-    does of a current."""
+    """Largest value to impose: supply voltage [V] or motor speed [rpm]; None: not stated, as for a current."""
     if robot.rig.imposed == "motor_current":
         return None
     if robot.rig.imposed == "voltage":
@@ -61,7 +60,7 @@ def _digits(value: float) -> float:
 
 
 def default(robot: Robot, option: str) -> float:
-    """What a single run has imposed where nothing is stated: the limit, of the paper's robot `VOLTAGE`.
+    """Default of the imposed quantity of a single run: the limit; for the paper's robot `VOLTAGE`.
 
     Raises:
         BadConfiguration: the file states none.
@@ -75,7 +74,7 @@ def default(robot: Robot, option: str) -> float:
 
 
 def usual(robot: Robot) -> float:
-    """What an example has imposed, `default` where the file states a limit [V, rpm]."""
+    """Imposed value of an example; `default` if the file states a limit [V, rpm]."""
     try:
         return default(robot, "")
     except BadConfiguration:
@@ -83,10 +82,10 @@ def usual(robot: Robot) -> float:
 
 
 def levels(robot: Robot, option: str, notes: list[str] | None = None) -> tuple[float, ...]:
-    """What a grid has imposed where nothing is stated: a third, two thirds and all of the limit, or Table 8's.
+    """Default of the imposed quantity of a grid: a third, two thirds and all of the limit, or Table 8's.
 
     Args:
-        notes: is given a sentence that says so.
+        notes: receives a sentence that states these values.
 
     Raises:
         BadConfiguration: the file states none.
@@ -135,7 +134,7 @@ def check_acting(robot: Robot, ground: Iterable[str] = (), shaft: Iterable[str] 
         BadConfiguration: the first of them.
     """
     for option in shaft if robot.has_ground else ground:
-        why = "the robot's load is a shaft, on which no slope, payload, mass or surface acts; leave it out"
+        why = "the robot's load is a shaft, and slope, payload, mass and surface do not act on it; leave it out"
         raise BadConfiguration(f"{option}: {f'{NO_BRAKE}; leave it out' if robot.has_ground else why}")
 
 
@@ -143,7 +142,7 @@ def check_battery(robot: Robot) -> None:
     """Refuse to run a rig on a battery that its file does not state.
 
     Raises:
-        BadConfiguration: its speed is imposed, or its battery is none of its own.
+        BadConfiguration: its speed is imposed, or its file states no battery.
     """
     if robot.rig.imposed != "voltage":
         what = SAID[robot.rig.imposed].words

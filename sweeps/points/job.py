@@ -1,4 +1,4 @@
-"""The job of a plan: what is asked of each point, checked before the first is simulated, and how a store holds it."""
+"""Job of a plan: the computation at each point, checked before the first is simulated, and its layout in a store."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def _bearable(variation: Variation, task: Task, plan: axes.Plan) -> None:
     """Ask the fidelity about points spread over the design, its corners among them.
 
     Raises:
-        BadConfiguration: one that it cannot bear.
+        BadConfiguration: a point that the fidelity refuses.
     """
     fidelity = fidelities.get_fidelity(task.model)
     shape = plan.design.shape
@@ -131,5 +131,5 @@ def laid_out(config: Campaign, job: scale.Job) -> Layout:
 
 
 def _in_store(about: dict[str, Any]) -> dict[str, Any]:
-    """Attributes as a store has them, where the unit of what has none is 1."""
+    """Attributes in the form of a store, with the unit 1 for a quantity without unit."""
     return {**about, "units": "1"} if about.get("units") in ("-", "") else about

@@ -43,7 +43,7 @@ Table = dict[str, np.ndarray]
 
 @dataclasses.dataclass(frozen=True)
 class SimulationResult:
-    """What a simulating command found: typed, by name; what is written is read off it.
+    """Result of a simulating command; all its files are written from it.
 
     Attributes:
         command: that simulated; model: fidelity; robot: that was simulated.
@@ -60,12 +60,12 @@ class SimulationResult:
 
     @property
     def statuses(self) -> dict[str, int]:
-        """How many runs ended in each status; every status is named."""
+        """Number of runs by status; every status is included."""
         return counts(self.table)
 
     @property
     def flags(self) -> dict[str, int]:
-        """How many runs exceed each limit."""
+        """Number of runs that exceed each limit."""
         return {name: int(np.sum(np.char.find(self.table["flags"], name) >= 0)) for name in FLAGS}
 
     def to_json(self) -> dict[str, Any]:
@@ -112,11 +112,11 @@ def computed(
     advance: Callable[[float], None],
     kept: Callable[[Table], Table] = dict,
 ) -> Table:
-    """What is kept of every chunk of a job, one after the other.
+    """Kept outputs of all chunks of a job, in order.
 
     Args:
-        folder: holds chunks under this name; those that an interrupted command left there are not computed again.
-        kept: what is kept of the outputs of a chunk, by default all: in the units of tables, shape (points,).
+        folder: holds chunks under this name; chunks left by an interrupted command are not computed again.
+        kept: selects from the outputs of a chunk, by default all: in the units of tables, shape (points,).
     """
     chunks = range(len(job.blocks))
     files = [f"{name}-{k:06d}" for k in chunks]
@@ -176,10 +176,10 @@ def evaluate(
 
 
 def followed(robot: Robot, runs: Runs, model: str | None) -> Table:
-    """Conditions and what the robot shows in every row of a table of time histories.
+    """Conditions and simulated outputs at every row of a table of time histories.
 
     Args:
-        robot: prepared for the table; model: fidelity that is asked for, None: the one that follows histories.
+        robot: prepared for the table; model: requested fidelity; None: the fidelity for histories.
 
     Raises:
         BadConfiguration: a fidelity that cannot follow them.
@@ -197,7 +197,7 @@ def _observed(observe: observers.Observer, robot: Robot) -> Observation:
 
 
 def conditions(robot: Robot, runs: Runs) -> dict[str, np.ndarray]:
-    """The condition columns of a table, the total mass taken from the robot where none is stated."""
+    """The condition columns of a table, with the robot's total mass if the table has none."""
     columns = dict(runs.columns)
     if "total_mass_kg" in runs.layout.axes and "total_mass_kg" not in columns:
         own = np.array([float(chassis.mass) for chassis in robot.configurations.members])
@@ -207,7 +207,7 @@ def conditions(robot: Robot, runs: Runs) -> dict[str, np.ndarray]:
 
 
 def counts(table: dict[str, np.ndarray]) -> dict[str, int]:
-    """How many runs ended in each status; every status is named."""
+    """Number of runs by status; every status is included."""
     return {status: int(np.sum(table["status"] == status)) for status in STATUSES}
 
 

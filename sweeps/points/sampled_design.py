@@ -28,7 +28,7 @@ class Joint(Protocol):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What it gives values to."""
+        """Names of its columns."""
         ...
 
     def __len__(self) -> int:
@@ -65,7 +65,7 @@ class Samples:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What is sampled, in order."""
+        """Sampled names, in order."""
         return (*self.marginals, *(self.joint.names if self.joint is not None else ()))
 
     def values(self, first: int, count: int) -> Float[np.ndarray, "names points"]:
@@ -103,7 +103,7 @@ class Drawn:
 
     @property
     def number(self) -> int:
-        """How many points there are."""
+        """Number of points."""
         return self.table.shape[1]
 
     def values(self, first: int, count: int) -> Float[np.ndarray, "names points"]:
@@ -115,7 +115,7 @@ def in_blocks(
     values: Callable[[Any], Any],
     normal_scores: Float[np.ndarray, "points coordinates"],
 ) -> Float[np.ndarray, "points names"]:
-    """What a function that computes with jax gives at many points, on the processor whatever the sweep runs on."""
+    """Values of a jax function at many points, computed on the CPU whatever device the sweep uses."""
     import jax
 
     points = len(normal_scores)
@@ -140,7 +140,7 @@ class Design:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What varies: axes, then samples."""
+        """Varied names: axes, then samples."""
         return (*self.axes, *(self.samples.names if self.samples is not None else ()))
 
     @property
@@ -155,7 +155,7 @@ class Design:
 
     @property
     def points(self) -> int:
-        """How many there are."""
+        """Number of points."""
         return math.prod(self.shape)
 
     def block(self, box: tuple[slice, ...]) -> Float[np.ndarray, "points names"]:
@@ -190,7 +190,7 @@ class Blocks:
 
     @staticmethod
     def of(shape: tuple[int, ...], most: int) -> Blocks:
-        """Boxes of at most `most` points, as alike as they can be."""
+        """Boxes of at most `most` points, of nearly equal size."""
         size, inner = [1] * len(shape), 1
         for k in reversed(range(len(shape))):
             if inner * shape[k] > most:
@@ -256,7 +256,7 @@ def random(seed: int, number: int, dimensions: int, first: int, count: int) -> U
 
 
 def latin_hypercube(seed: int, number: int, dimensions: int, first: int, count: int) -> Unit:
-    """Points of which each of `number` equal slices of every dimension holds one (McKay et al. 1979).
+    """Latin hypercube: one point in each of `number` equal slices of every dimension (McKay et al. 1979).
 
     The slice of point k is a keyed permutation of k, so that no point needs the others.
     """

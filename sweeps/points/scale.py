@@ -77,13 +77,13 @@ class Times:
 
 
 def device_kind() -> str:
-    """What the local devices are, in words."""
+    """Kind of the local devices, in words."""
     device = jax.local_devices()[0]
     return f"{device.platform}: {device.device_kind}"
 
 
 def default_chunk(task: Task, device: str | None = None) -> int:
-    """Points of a chunk where none is stated, over all local devices, or on one of a kind elsewhere."""
+    """Default number of points of a chunk, over all local devices or, with `device`, on one remote device."""
     count = len(jax.local_devices()) if device is None else 1
     accelerator = not (device or device_kind()).startswith("cpu")
     return task.at_once[accelerator] * count
@@ -153,7 +153,7 @@ class Compiled:
 
 
 class _Asked(NamedTuple):
-    """What is computed of each point, by a fidelity with its options, and how it is stored.
+    """Outputs of each point by a fidelity with its options, and their form in the store.
 
     Attributes:
         factors: of each output, the SI value of its unit in tables.
@@ -307,7 +307,7 @@ def fetched(arrays: Mapping[str, Any], count: int) -> dict[str, np.ndarray]:
 
 
 def drawn(job: Job, piece: Piece) -> Float[np.ndarray, "names points"] | None:
-    """Values of the samples along a chunk, a row a name, where this chunk is the one that writes them."""
+    """Sample values along a chunk, a row a name; None if another chunk writes them."""
     design, samples = job.plan.design, job.plan.design.samples
     if samples is None or any(job.blocks.place(piece.chunk)[:-1]):
         return None

@@ -1,4 +1,4 @@
-"""What every point of a sweep does: a run of a fidelity, over a profile where there is one, or a climb."""
+"""Task of every point of a sweep: a run of a fidelity, a run over a profile, or a climb."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ def nothing_further(stated: Mapping[str, np.ndarray], robot: Robot, where: str) 
 
 @dataclasses.dataclass(frozen=True)
 class Task:
-    """What every point of a sweep does.
+    """Task of every point of a sweep.
 
     Attributes:
         model: its name; options: of a fidelity.
         attributes: of its outputs in a store, by name; usual: those of a store where none are stated.
-        slow: whether a call takes long and says how far it is; at_once: points in one, on processors or accelerators.
-        axes: what may vary that is neither a condition nor a parameter of the robot.
-        further: conditions besides those that vary or are stated; refuses what cannot be done.
+        slow: whether a call takes long and reports progress; at_once: points in one, on processors or accelerators.
+        axes: names that may vary and are neither a condition nor a parameter of the robot.
+        further: returns conditions in addition to the varied and stated ones; refuses impossible points.
         run: computes points, see `climbs.computed`; None: a program of the fidelity does.
     """
 
@@ -66,7 +66,7 @@ def task_of(config: Campaign, robot: Robot, turns: bool = False) -> Task:
 def of_fidelity(
     model: str, options: Mapping[str, float], robot: Robot, profiled: bool = False, turns: bool = False
 ) -> Task:
-    """A run of a fidelity; `profiled`: over a profile, of which what it comes to is asked, `turns`: of both sides."""
+    """Task of a run; `profiled`: over a profile, with its totals as outputs; `turns`: with both sides."""
     facts, own, usual = (
         fidelities.fidelity_facts(model),
         fidelities.get_fidelity(model).columns,

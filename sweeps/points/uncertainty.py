@@ -31,11 +31,11 @@ SEED = 0
 
 @dataclasses.dataclass(frozen=True)
 class Intervals:
-    """What draws of a posterior say of every run.
+    """Intervals of every run from draws of a posterior.
 
     Attributes:
         columns: as `intervals` names them; arrays of shape (runs,).
-        draws: how many; channels: of the robot.
+        draws: their number; channels: of the robot.
     """
 
     columns: dict[str, np.ndarray]
@@ -114,7 +114,7 @@ def say_lost(found: Intervals) -> None:
         share = 100 * (1 - found.columns[SHARE].min())
         say(
             f"at {int(lost.sum())} of {len(lost)} runs up to {share:.0f} % of the draws do not converge; intervals "
-            "there are of those that do"
+            "are from the others"
         )
 
 

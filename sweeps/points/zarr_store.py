@@ -1,8 +1,8 @@
-"""The store of a sweep: a Zarr group whose chunks are whole or absent, and the record of those that are done.
+"""The store of a sweep: a Zarr group whose chunks are whole or absent, and the record of finished chunks.
 
-Arrays are laid out in the Zarr format 3; each chunk is a file, written aside and moved into place, so that none is
-ever half there. A chunk of the sweep counts as done when its line in a journal is whole, and that is written last;
-the line has a checksum of each of its files, so that a file that was damaged later is seen.
+Arrays are laid out in the Zarr format 3; each chunk is a file, written under another name and moved into place, so
+that no file is ever partial. A chunk of the sweep counts as done when its line in a journal is complete. That line
+is written last and has a checksum of each file, which detects later damage.
 """
 
 from __future__ import annotations
@@ -55,11 +55,11 @@ class Variable:
 
 @dataclasses.dataclass(frozen=True)
 class Layout:
-    """What a store holds.
+    """Layout of a store.
 
     Attributes:
         design: the points; blocks: its chunks; variables: outputs, of all dimensions of the design.
-        coordinates: units and names of what varies, by name; labels: words of an axis in place of its numbers.
+        coordinates: units and long names of the varied names; labels: words of an axis in place of its numbers.
         attributes: of the group; compression: `none` or `zstd`.
     """
 
@@ -82,11 +82,11 @@ class Layout:
 
 @dataclasses.dataclass(frozen=True)
 class Done:
-    """What the journal knows of a finished chunk.
+    """Journal entry of a finished chunk.
 
     Attributes:
-        chunk: its number; statuses: how many points ended in each; ranges: least and greatest finite value of each
-            output, none where there is none.
+        chunk: its number; statuses: number of points by status; ranges: least and greatest finite value of
+            each output that has one.
         checks: checksum of the chunk's file of each array, CRC-32.
     """
 
@@ -156,7 +156,7 @@ class SweepStore(Folder):
         return contents(self.path) is not None and (self.path / "identity.json").is_file()
 
     def _present(self) -> bool:
-        """Whether the folder is the one that this process has opened, and not removed or moved meanwhile."""
+        """True if the folder is still the one that this process opened, neither removed nor moved."""
         assert self._lock is not None
         try:
             return os.path.samestat(os.fstat(self._lock.fileno()), (self.partial / LOCK).stat())
@@ -254,7 +254,7 @@ class SweepStore(Folder):
             write_file(file, content, self._aside)
 
     def _refuse_damaged(self) -> None:
-        """Refuse a finished sweep of which anything is damaged.
+        """Refuse a finished sweep with a damaged file.
 
         Raises:
             BadData: names the first file.
@@ -295,7 +295,7 @@ class SweepStore(Folder):
             self._journal.flush()
 
     def _at_work(self) -> str | None:
-        """A share that another process works on, of those that have one; to be called within `_locked`."""
+        """Share that another process is computing; None: no such share. Call within `_locked`."""
         return share_at_work(self.partial, self._share)
 
     def _busy(self, name: str) -> BadConfiguration:
@@ -391,7 +391,7 @@ class SweepStore(Folder):
 
     @contextlib.contextmanager
     def last(self) -> Iterator[bool]:
-        """Whether this process is the one that finishes the sweep: every chunk is done, and nobody has finished."""
+        """Yields True if this process finishes the sweep: every chunk is done and no process has finished it."""
         with self._locked():
             if not self._present():
                 self.finished = True
@@ -437,10 +437,10 @@ class SweepStore(Folder):
 
 
 def write_file(path: Path, content: Any, aside: Path) -> None:
-    """Write a file that is there whole or not at all, and outlives a loss of power.
+    """Write a file atomically, so that it also survives a loss of power.
 
     Args:
-        aside: where it is written, on the same disk, before it is moved into place.
+        aside: temporary path on the same disk, moved into place at the end.
     """
     try:
         with aside.open("wb") as stream:

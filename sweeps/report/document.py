@@ -18,7 +18,7 @@ import numpy as np
 
 #: Most rows of a table on a page, and on a terminal.
 PAGE_ROWS, TERMINAL_ROWS = 200, 60
-#: What a table shows for a missing number.
+#: Entry of a table for a missing number.
 DASH = "–"
 
 

@@ -1,1 +1,1 @@
-"""What a command found, typed: commands, pages and figures import it, and it none of them."""
+"""Typed results of commands; commands, pages and figures import them, never the reverse."""

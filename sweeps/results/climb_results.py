@@ -1,4 +1,4 @@
-"""What the command `climb` found: how a robot gets over an obstacle, or how large one may be, in words."""
+"""Result of the command `climb`: the run over an obstacle, or the largest obstacle, in words."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def coordinates(table: Mapping[str, np.ndarray]) -> np.ndarray:
 
 @dataclasses.dataclass(frozen=True)
 class Along:
-    """What derivatives are by.
+    """Variables of derivatives.
 
     Attributes:
         names, units: of the values; values, widths: in these units; given: the run that such values make.
@@ -68,7 +68,7 @@ class Along:
 
 @dataclasses.dataclass(frozen=True)
 class Seen:
-    """What is drawn of a climb: as a `ClimbResult` has it, read from the folder that it left."""
+    """Drawn part of a `ClimbResult`, read from its run folder."""
 
     robot: Robot
     configuration: str
@@ -100,15 +100,15 @@ class Seen:
 
 @dataclasses.dataclass(frozen=True)
 class ClimbResult:
-    """What the command found.
+    """Result of `climb`.
 
     Attributes:
         robot, configuration, obstacle: of the run; the last in words.
         terrain: of the run that is shown; climb: that run, alone.
         radius: of the pulleys [m].
         tried: sizes [mm] and verdicts of a search; largest: that it got over [mm], None: no search or none.
-        sought: what was searched for, empty: nothing.
-        along, derivatives: where they were asked for.
+        sought: name of the searched size; empty: no search.
+        along, derivatives: if requested, else None.
     """
 
     robot: Robot
@@ -124,12 +124,12 @@ class ClimbResult:
 
     @property
     def verdict(self) -> str:
-        """How the run that is shown ended."""
+        """Outcome of the run shown."""
         return NAMES[int(self.climb.verdict[0])]
 
     @property
     def over(self) -> bool:
-        """Whether it got over."""
+        """True if it got over."""
         return int(self.climb.verdict[0]) == OVER
 
     @functools.cached_property

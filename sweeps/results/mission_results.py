@@ -1,4 +1,4 @@
-"""What `simulate` over a profile found: numbers, segments and course of every run."""
+"""Result of `simulate` over a profile: numbers, segments and course of every run."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Missions:
     whole: bool
 
     def to_json(self) -> dict[str, Any]:
-        """What `result.json` says: of one run its numbers by name, of several a list of them."""
+        """Content of `result.json`: for one run its numbers by name, for several a list of them."""
         each = [self._one(k) for k in range(len(self.table["status"]))]
         about = {
             "name": self.source.source, "sha256": self.source.digest, "duration_s": self.source.duration,

@@ -1,4 +1,4 @@
-"""How the runs of a table stand on what their levers leave them, and what geometry allows them."""
+"""Postures of the runs of a table, from their lever angles, and the limits set by geometry."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class Postures:
 
 
 def postures(robot: Robot, runs: Runs, conditions: Conditions) -> Postures | None:
-    """How the runs of a table stand; None where it states no levers."""
+    """Postures of the runs of a table; None if it states no levers."""
     if not conditions.states_levers:
         return None
     rests, limits, lies, steps = jax.device_get(static_limits.postures_of_runs(robot, conditions))

@@ -1,4 +1,4 @@
-"""What the command `resonance` found: peaks of ripple, and which speeds to avoid."""
+"""Result of the command `resonance`: peaks of ripple and speeds to avoid."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ SLOW = "too_slow"
 
 @dataclasses.dataclass(frozen=True)
 class ResonanceResult:
-    """What the command found.
+    """Result of `resonance`.
 
     Attributes:
-        configuration, slope_deg, surface: of the map; passing: what shakes it; robot: that was simulated.
-        table: a row a run, as in `points.csv`; the grid's first, then what Table 8 adds.
+        configuration, slope_deg, surface: of the map; passing: source of the excitation; robot: that was simulated.
+        table: a row a run, as in `points.csv`; the grid's first, then further points of Table 8.
         modes: by payload [kg].
         peaks, crossings: at every payload.
     """
@@ -62,13 +62,13 @@ class ResonanceResult:
 
     @property
     def speeds(self) -> tuple[float, float]:
-        """Least and greatest speed read [m/s]; NaN where none is."""
+        """Least and greatest speed read [m/s]; NaN without a reading."""
         speed = self.table["speed_mean_mm_s"][self.read] * MM
         return (float(speed.min()), float(speed.max())) if len(speed) else (float("nan"), float("nan"))
 
     @property
     def statuses(self) -> dict[str, int]:
-        """How many runs ended in each status; every status is named."""
+        """Number of runs by status; every status is included."""
         return {s: int(np.sum(self.table["status"] == s)) for s in (*STATUSES, SLOW)}
 
     @property
@@ -118,12 +118,12 @@ class ResonanceResult:
         return [*gaps, (low, high)] if low < high else gaps
 
     def statement(self) -> str:
-        """Which speeds to avoid."""
+        """Speeds to avoid, in one sentence."""
         return " ".join(self.sentences)
 
     @property
     def sentences(self) -> list[str]:
-        """Which speeds to avoid, the most important first."""
+        """Sentences on speeds to avoid, the most important first."""
         low, high = self.speeds
         if not np.isfinite(low):
             return [f"No run of {self.configuration} travels: there is no ripple to read (status says why)."]
@@ -172,7 +172,7 @@ class ResonanceResult:
         ]
 
     def _table8(self) -> str:
-        """Which points of Table 8 are in a range to avoid, by payload."""
+        """Sentence on the points of Table 8 in a range to avoid, by payload."""
         rows = np.flatnonzero(self.table["table8"] & self.read)
         inside = []
         for voltage in np.unique(self.table["supply_voltage_V"][rows]):
@@ -188,7 +188,7 @@ class ResonanceResult:
         )
 
     def shaken(self, row: int | np.integer[Any]) -> bool:
-        """Whether a run is within one of the strongest peaks of its own payload."""
+        """True if a run is within one of the strongest peaks of its own payload."""
         speed, payload = self.table["speed_mean_mm_s"][row] * MM, self.table["payload_kg"][row]
         strong = {(r.mode, r.order, r.signal) for r in strongest_resonances(self.resonances)}
         return any(
@@ -198,7 +198,7 @@ class ResonanceResult:
         )
 
     def to_avoid(self, row: int | np.integer[Any]) -> str:
-        """Whether the speed of a run is one to avoid: `yes`, `at other payloads` than its own, or `no`."""
+        """Verdict on the speed of a run: avoid (`yes`), avoid `at other payloads` than its own, or `no`."""
         speed = self.table["speed_mean_mm_s"][row] * MM
         within = any(low <= speed <= high for low, high, _ in self.avoid)
         return "yes" if self.shaken(row) else "at other payloads" if within else "no"
@@ -261,7 +261,7 @@ def percent(value: float) -> str:
 
 
 def _listed(ranges: list[tuple[float, float, list[Resonance]]], what: str) -> str:
-    """Ranges to avoid, the lowest speed first; of many those that rise most."""
+    """Ranges to avoid, the lowest speed first; only the strongest if there are many."""
     most = sorted(ranges, key=lambda r: -max(x.rise for x in r[2]))[:SAID]
     texts = []
     for low, high, members in sorted(most, key=lambda r: r[0]):
@@ -275,6 +275,6 @@ def _listed(ranges: list[tuple[float, float, list[Resonance]]], what: str) -> st
 
 
 def span(low: float, high: float, unit: float = MM) -> str:
-    """`low-high` in a unit, or one number where they print alike."""
+    """`low-high` in a unit, or one number if both print the same."""
     ends = f"{low / unit:.0f}", f"{high / unit:.0f}"
     return ends[0] if ends[0] == ends[1] else f"{ends[0]}-{ends[1]}"

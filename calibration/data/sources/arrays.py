@@ -13,7 +13,7 @@ import numpy as np
 from calibration.data.input_errors import BadData
 from calibration.data.sources.recorded_signals import Signal, known, of_arrays
 
-#: What an array of objects is called.
+#: Name of the type of an array of objects.
 _OBJECTS = np.dtype(object)
 
 

@@ -12,11 +12,11 @@ import numpy as np
 from calibration.data.input_errors import BadData
 from calibration.data.sources.recorded_signals import Clock, Signal
 
-#: Most elements of an array in a message that are signals of their own; larger ones are pictures and clouds.
+#: Most elements of an array in a message that become separate signals; larger arrays are pictures and clouds.
 ELEMENTS = 64
 #: Most messages of the topics that are read.
 MESSAGES = 20_000_000
-#: Field that is the time of a message, and how far it may be from that of recording for it to count [ns].
+#: Field with the time of a message, and its largest difference from the time of recording [ns].
 _STAMP, _APART = "header.stamp", 60_000_000_000
 #: Units of fields by the type of message, as its definition states them.
 UNITS = {
@@ -75,7 +75,7 @@ def of_bag(path: Path, name: str) -> tuple[Signal, ...]:
 
 
 def _unit(kind: str, field: str) -> str:
-    """Unit of a field that its type of message states, empty where it states none."""
+    """Unit of a field by its type of message; empty if the type states none."""
     known = UNITS.get(kind, {})
     return next((unit for start, unit in known.items() if field.startswith(start)), "")
 
@@ -133,7 +133,7 @@ def _topic(path: Path, topic: str) -> dict[str, np.ndarray]:
 
 
 def _fields(message: Any, at: str) -> Iterator[tuple[str, bool, str]]:
-    """Path of each field, True for words, and why it cannot be read."""
+    """Path of each field, True for words, and the reason if it cannot be read."""
     for field, value in _values(message, at):
         yield field, isinstance(value, str), ""
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from calibration.data.sources.recorded_signals import Signal
 
-#: Elements of a list that are signals of their own, at most.
+#: Most elements of a list that become separate signals.
 MOST = 64
 #: Keys of a column's metadata that hold its unit.
 _UNITS = (b"unit", b"units", b"Unit")
@@ -52,7 +52,7 @@ def of_table(table: Any) -> tuple[Signal, ...]:
 
 
 def _signals(field: Any, rows: int, load: Callable[[], np.ndarray], read: Callable[[list[str]], Any]) -> list[Signal]:
-    """Signals of a column: of one of lists, each element has its own, `name[0]`."""
+    """Signals of a column; of a column of lists, one signal for each element, `name[0]`."""
     import pyarrow.types as kinds
 
     kind = field.type

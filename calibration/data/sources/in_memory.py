@@ -73,7 +73,7 @@ def _column_name(column: Any) -> str:
 def _of_series(name: str, series: Any, rows: int) -> Signal:
     dtype = series.dtype
     kind = getattr(dtype, "kind", "O")
-    if kind in "mM":  # with a time zone too, which makes no difference to times that pass
+    if kind in "mM":  # also with a time zone, which does not change elapsed times
         return Signal(name, rows, lambda: np.asarray(series.to_numpy(dtype=f"{kind}8[ns]")))
     words = str(dtype) in ("str", "string", "category") or str(dtype).startswith("string")
     if kind == "O" and not words:
@@ -94,7 +94,7 @@ def _words(series: Any) -> Callable[[], np.ndarray]:
 
 
 def _of_xarray(dataset: Any) -> tuple[Signal, ...]:
-    """Signals of a Dataset; where its variables have several dimensions of time, each has the clock of its own."""
+    """Signals of a Dataset; if its variables have several dimensions of time, each variable has its own clock."""
     dimensions = {d for v in dataset.data_vars.values() for d in v.dims}
     several = len({dataset.sizes[d] for d in dimensions if dataset.sizes[d] > 1}) > 1 and len(dimensions) > 1
     found: list[Signal] = []

@@ -15,7 +15,7 @@ from calibration.data.sources.recorded_signals import Signal, group, known, of_a
 
 #: Largest JSON file [bytes]: its objects take some ten times as much memory; most levels within one another.
 LARGEST, DEEPEST = 2**28, 16
-#: Column of the test that a row is of, where a file has several tables with the same columns.
+#: Column with the test of each row, if a file has several tables with the same columns.
 RUN = "run_id"
 
 
@@ -91,7 +91,7 @@ def _unfolded(value: Mapping[str, Any]) -> Mapping[str, Any] | list[Any]:
 
 
 def _records(records: Sequence[Mapping[str, Any]], at: str, arrays: dict[str, np.ndarray], name: str) -> None:
-    """Columns of records; what a record lacks is a missing reading."""
+    """Columns of records; a missing entry is a missing reading."""
     columns: dict[str, list[Any]] = {}
     for k, record in enumerate(records):
         for key, value in _leaves(record, "", name, 1):
@@ -112,7 +112,7 @@ def _leaves(record: Mapping[str, Any], at: str, name: str, depth: int) -> Iterab
 
 
 def _array(values: Sequence[Any]) -> np.ndarray:
-    """An array of numbers, NaN for a missing one, or of words; of objects where it is neither."""
+    """An array of numbers, NaN for a missing number, or of words; otherwise of objects."""
     kinds = {type(value) for value in values}
     if kinds <= {int, float, bool, type(None)}:
         return np.array([np.nan if value is None else value for value in values], dtype=float)
@@ -126,9 +126,9 @@ def _array(values: Sequence[Any]) -> np.ndarray:
 
 
 def _stacked(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Tables of one form, side by side under one key each, as one table with the key as `RUN`: the tests of a file.
+    """Joins tables with the same columns, one under each key, into one table with the key as `RUN`.
 
-    A file of WPILib SysId is such: «slow-forward», «fast-backward», ... are lists of rows.
+    A file of WPILib SysId has such tables: «slow-forward», «fast-backward», ... are lists of rows.
     """
     shaped = {at: v for at, v in arrays.items() if v.ndim == 2 and v.dtype.kind in "iuf" and v.shape[1] > 1}
     widths = {v.shape[1] for v in shaped.values()}

@@ -45,8 +45,8 @@ def _in_table(signal: Signal) -> Signal:
 def _opened(path: Path) -> Any:
     from asammdf import MDF
 
-    logging.getLogger("asammdf").setLevel(logging.CRITICAL)  # its messages become this program's
-    with path.open("rb") as stream:  # of a path it may make and remove further files
+    logging.getLogger("asammdf").setLevel(logging.CRITICAL)  # this program reports its errors
+    with path.open("rb") as stream:  # with a path it may create and remove further files
         try:
             file = MDF(stream)
         except Exception as error:
@@ -57,7 +57,7 @@ def _opened(path: Path) -> Any:
 
 
 def _close_half_made(error: BaseException) -> None:
-    """Marks the object of a file that could not be opened as closed; its own closing fails, and says so on stderr."""
+    """Marks the object of a file that could not be opened as closed; closing it would print an error on stderr."""
     frame = error.__traceback__
     while frame is not None:
         for held in frame.tb_frame.f_locals.values():

@@ -1,4 +1,4 @@
-"""Signals with clocks of their own, brought to one grid of time: commands are held, states follow straight lines."""
+"""Signals with separate clocks, resampled to one grid of time: commands are held, states follow straight lines."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from mmrjax.errors import count_noun
 
 #: Seconds since 1970 between which a clock may count from there: 1990 and 2100.
 EPOCH = (6.3e8, 4.2e9)
-#: Usual steps by which a sample may be recorded late.
+#: Largest delay of a recorded sample, in usual steps.
 LATE = 20.0
-#: Share of a step of the grid by which stamps that are the same may differ.
+#: Largest difference of equal stamps, as a share of a step of the grid.
 SAME = 1e-3
 #: Largest step of whole numbers that are ms, µs and ns: rates of 10 Hz to 10 kHz, and below.
 _STEPS = {"ms": 1e2, "us": 1e5, "ns": 1e8}
@@ -80,7 +80,7 @@ def on_one_grid(
     is_measured: Callable[[str], bool],
     grid: str,
 ) -> tuple[np.ndarray, dict[str, np.ndarray], tuple[str, ...]]:
-    """Time [s] from the first row, values of each signal on it, and notes on what was resampled.
+    """Returns time [s] from the first row, values of each signal at these times, and notes on the resampling.
 
     The grid is the time stamps of the densest measured signal, or of the stated clock. Signals on its clock stay as
     they are. A command has the value of its last sample; rows before the first sample of a command are left out. A
@@ -184,8 +184,8 @@ def used_once(rows: np.ndarray, time: np.ndarray, values: np.ndarray) -> np.ndar
 
 
 def _order(time: np.ndarray) -> np.ndarray | None:
-    """Order of samples by their stamps, where some were recorded a little late; None: they are in order, or the clock
-    was set back."""
+    """Order of samples by their stamps if some were recorded slightly late; None if they are in order, or if the
+    clock was set back."""
     step = np.diff(time)
     if not (step < 0).any() or step.min() < -LATE * float(np.median(np.abs(step))):
         return None

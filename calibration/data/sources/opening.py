@@ -18,7 +18,7 @@ from calibration.data import input_files
 from calibration.data.input_errors import BadData, InputError
 from calibration.data.sources.recorded_signals import Signal, Source
 
-#: Between the path of a file and that of signals in it.
+#: Separator between the path of a file and the path of signals in it.
 WITHIN = "::"
 
 
@@ -27,8 +27,8 @@ class Format:
     """A format of files.
 
     Attributes:
-        kind: what a file of it is called; module, reader: the function that lists its signals.
-        library: that it needs; extra: of this package that installs it.
+        kind: name of a file of this format; module, reader: the function that lists its signals.
+        library: the required library; extra: of this package that installs the library.
     """
 
     kind: str
@@ -78,7 +78,7 @@ BEGINNINGS = {
 }  # fmt: skip
 #: Formats whose files begin with anything, by suffix.
 SUFFIXES = {".mat": MATLAB, ".db3": BAG, ".jsonl": JSON, ".ndjson": JSON}
-#: Bytes of a value, and share of the free memory that values may take; copies and checks take the rest.
+#: Bytes of a value, and largest share of the free memory for values; copies and checks use the rest.
 VALUE, SHARE = 8.0, 0.3
 #: File of a ROS 2 bag's folder that lists its contents.
 _METADATA = "metadata.yaml"
@@ -152,7 +152,7 @@ def opened(path: Path, within: str, name: str, form: Format) -> Source:
 
 
 def _guarded(signals: Sequence[Signal], name: str, kind: str) -> tuple[Signal, ...]:
-    """Signals that raise `BadData` where their library cannot read their values; clocks that are shared stay so."""
+    """Signals that raise `BadData` if their library cannot read their values; shared clocks stay shared."""
 
     def guarded(load: Callable[[], np.ndarray], path: str) -> Callable[[], np.ndarray]:
         def read() -> np.ndarray:
@@ -198,7 +198,7 @@ def digest(path: Path) -> str:
 
 
 def available() -> float:
-    """Memory that is free on this machine [bytes]; infinite where the system does not tell."""
+    """Free memory of this machine [bytes]; infinite if the system does not report it."""
     try:
         return float(os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
     except (ValueError, OSError, AttributeError):

@@ -1,4 +1,4 @@
-"""Named columns of any source: which of its signals are read, and how they become rows of one table."""
+"""Named columns of any source: selection of its signals, and conversion to rows of one table."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from calibration.data.sources import in_memory, one_clock, opening
 from calibration.data.sources.recorded_signals import Signal, Source, named, offered, one
 from mmrjax.model import channels, quantities
 
-#: Columns as `Layout.mapped` has them: name here, name in the source, factor from its unit.
+#: Columns in the form of `Layout.mapped`: name in this program, name in the source, factor from its unit.
 Mapped = tuple[tuple[str, str, float], ...]
-#: Values of columns without a role that are read for what residuals go with, at most.
+#: Most values of columns without a role; they are read to find correlations with residuals.
 EXTRA_VALUES = 20_000_000
 
 
 @dataclasses.dataclass(frozen=True)
 class Reading:
-    """Columns of a source, and what they are read as.
+    """Columns of a source, with their names in this program.
 
     Attributes:
         arrays: the columns; mapped: columns that have other names in the source.
@@ -44,7 +44,7 @@ def read(source: Any, layout: Layout, columns: Preset | None = None, between: st
             (`in_memory.EXPECTED`).
         layout: of the table's robot.
         columns: names of the source's columns, in addition to the robot's; they win over these.
-        between: `linear` where what is imposed follows straight lines between samples, as in `Rig.between_rows`.
+        between: `linear` if the imposed quantity follows straight lines between samples, as in `Rig.between_rows`.
 
     Raises:
         BadData: no such file, a format that is not read, a damaged file, a signal that is missing or of another kind,
@@ -65,10 +65,10 @@ def read(source: Any, layout: Layout, columns: Preset | None = None, between: st
 
 
 def table(path: Path, within: str = "") -> NamedArrays | None:
-    """Returns every column of a table in a file, as it is; None for text, whose comments say more.
+    """Returns every column of a table in a file, unchanged; None for text, whose comments have a meaning.
 
     Raises:
-        BadData: as `read`; signals with clocks of their own, which make no one table.
+        BadData: as `read`; signals with separate clocks, which do not form one table.
     """
     name = path.name or str(path)
     form = opening.format_of(path, name)
@@ -124,7 +124,7 @@ def _none_of(name: str, columns: Preset, header: Sequence[str]) -> BadData:
 
 
 def _of_signals(source: Source, layout: Layout, columns: Preset | None, between: str) -> Reading:
-    """Columns of the signals that mean something, and of few others."""
+    """Columns of the signals with a meaning, and of few others."""
     signals = source.signals
 
     def found(name: str) -> str | None:
@@ -165,7 +165,7 @@ def _of_signals(source: Source, layout: Layout, columns: Preset | None, between:
 
 
 def _chosen(source: Source, mapped: Mapped, layout: Layout) -> tuple[dict[str, Signal], str, tuple[str, ...]]:
-    """Signals by the name of their column, the clock that is stated as the grid, and notes on missing signals.
+    """Signals by the name of their column, the clock stated as the grid, and notes on missing signals.
 
     A signal has a column if a table of columns names it, or if the last part of its path is a column's name.
     """
@@ -212,7 +212,7 @@ def _check_memory(name: str, signals: Mapping[str, Signal]) -> None:
 
 
 def _in_rows(source: Source, signals: Mapping[str, Signal], rows: int = 0) -> dict[str, np.ndarray]:
-    """Values of the columns of a table; a single value is that of every row."""
+    """Values of the columns of a table; a single value applies to every row."""
     lengths = {column: s.length for column, s in signals.items()}
     rows = rows or max(lengths.values(), default=0)
     for column, length in lengths.items():
@@ -232,7 +232,7 @@ def _in_rows(source: Source, signals: Mapping[str, Signal], rows: int = 0) -> di
 def _on_a_grid(
     source: Source, chosen: Mapping[str, Signal], layout: Layout, between: str, clock: str, mapped: Mapped
 ) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
-    """Values of signals with clocks of their own, on one grid."""
+    """Values of signals with separate clocks, on one grid."""
     meanings = dataclasses.replace(layout, mapped=mapped).meanings(source.name, list(chosen))
     column_of = {c: "" if m is None else m.column for c, m in zip(chosen, meanings, strict=True)}
     read = {*layout.measured_columns, *layout.deviation_columns}
@@ -255,13 +255,13 @@ def _on_a_grid(
 def _how_to_name(source: Source) -> str:
     paths = [s.path for s in source.signals]
     return (
-        f"{offered('', paths)}; say in the robot's file which is which, [columns] supply_voltage_V = "
+        f"{offered('', paths)}; state their columns in the robot's file, [columns] supply_voltage_V = "
         f'"{paths[0]}" (mmrjax inspect proposes the lines)'
     )
 
 
 def _raw(values: np.ndarray) -> Raw:
-    """Values as the checks of a table take them: numbers as an array, words and dates as a list."""
+    """Values in the form for the checks of a table: numbers as an array, words and dates as a list."""
     if values.dtype.kind in "US":
         return [str(value).strip() for value in values.tolist()]
     if values.dtype.kind == "M":  # dates are read as text; the clock counts from the first

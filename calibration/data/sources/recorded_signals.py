@@ -15,9 +15,9 @@ from mmrjax.errors import similar_words
 CLOCKS = ("time", "t", "timestamp", "timestamps", "stamp", "elapsed", "clock", "timestamp_sample")
 #: Units that the name of a clock may end with, and the seconds of one.
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
-#: Paths that a message lists, at most.
+#: Most paths that a message lists.
 LISTED = 12
-#: What separates the parts of a path.
+#: Separators of the parts of a path.
 _PARTS = re.compile(r"[/.]|::")
 _UNIT_OF_CLOCK = re.compile(r"(?:[_ ]?[\[(]?)(s|ms|us|µs|ns|sec|seconds|millis|micros)[\])]?$", re.IGNORECASE)
 _WORDS_OF_UNITS = {"sec": "s", "seconds": "s", "millis": "ms", "micros": "us"}
@@ -29,7 +29,7 @@ class Clock:
 
     Attributes:
         name: path of the time stamps, for messages; load: returns them, shape (n,), numbers or `datetime64`.
-        unit: of the numbers, a key of `UNITS`; empty where the recording does not state it.
+        unit: of the numbers, a key of `UNITS`; empty if the recording does not state it.
     """
 
     name: str
@@ -44,9 +44,9 @@ class Signal:
     Attributes:
         path: its name in the recording; length: number of its samples.
         load: returns the values, shape (length,): numbers, words or `datetime64`.
-        unit: that the recording states, empty where it states none.
+        unit: as stated by the recording, empty if it states none.
         clock: its own; None: its samples are rows of a table.
-        words: True if the values are text; refused: why it cannot be read, empty where it can.
+        words: True if the values are text; refused: reason why it cannot be read, empty if it can.
     """
 
     path: str
@@ -64,7 +64,7 @@ class Signal:
 
 
 def known(values: np.ndarray) -> Callable[[], np.ndarray]:
-    """Returns a function that returns values which are in memory."""
+    """Returns a function that returns the given values."""
     return lambda: values
 
 
@@ -74,7 +74,7 @@ def parts(path: str) -> list[str]:
 
 
 def named(signals: Iterable[Signal], name: str) -> list[Signal]:
-    """Signals that a name means: the one with this path, else those whose path ends with its parts."""
+    """Signals that match a name: the signal with this path, else signals whose path ends with its parts."""
     pool = list(signals)
     if exact := [s for s in pool if s.path == name]:
         return exact
@@ -83,10 +83,10 @@ def named(signals: Iterable[Signal], name: str) -> list[Signal]:
 
 
 def one(signals: Sequence[Signal], name: str, where: str) -> Signal:
-    """The signal that a name means.
+    """The only signal that matches a name.
 
     Raises:
-        BadData: none, or several.
+        BadData: no signal matches, or several match.
     """
     found = named(signals, name)
     if len(found) == 1:
@@ -108,7 +108,7 @@ def offered(name: str, paths: Sequence[str]) -> str:
 
 
 def unit_of_clock(name: str) -> str | None:
-    """Unit that the name of a clock states, empty where it states none; None if it is not a name of a clock."""
+    """Unit that the name of a clock states, empty if it states none; None if it is not a name of a clock."""
     bare = name.strip().casefold()
     if bare in CLOCKS:
         return ""
@@ -125,7 +125,7 @@ def of_arrays(
     arrays: Mapping[str, tuple[tuple[int, ...], np.dtype, Callable[[], np.ndarray]]],
     units: Mapping[str, str] | None = None,
 ) -> tuple[Signal, ...]:
-    """Signals of named arrays; columns of an array of two dimensions are signals of their own, `name[0]`.
+    """Signals of named arrays; each column of an array of two dimensions is a separate signal, `name[0]`.
 
     Arrays of one group that are equally long share its time stamps: the array there whose name is a clock's. A group
     without one, or a recording in which every array is equally long, is a table.
@@ -159,7 +159,7 @@ def group(path: str) -> str:
 
 
 def longest(shape: tuple[int, ...]) -> int:
-    """Number of samples of an array: its first dimension, of a row the other one."""
+    """Number of samples of an array: its first dimension, or the second one of a single row."""
     if not shape:
         return 1
     return shape[1] if len(shape) == 2 and shape[0] == 1 else shape[0]
@@ -200,12 +200,12 @@ def _field(load: Callable[[], np.ndarray], name: str) -> Callable[[], np.ndarray
 
 @dataclasses.dataclass(frozen=True)
 class Source:
-    """A recording or a table: its signals, and how it was opened.
+    """A recording or a table: its signals, and notes on its reading.
 
     Attributes:
         name: for messages; kind: of file, `a Parquet file` say.
         signals: in the order of the recording; digest: SHA-256 of the file, empty of data in memory.
-        notes: sentences on how it was read.
+        notes: sentences on its reading.
     """
 
     name: str

@@ -26,7 +26,7 @@ def of_ulog(path: Path, name: str) -> tuple[Signal, ...]:
     from pyulog import ULog
 
     _check_end(path, name)
-    with contextlib.redirect_stdout(io.StringIO()):  # on which it reports damage
+    with contextlib.redirect_stdout(io.StringIO()):  # the library reports damage there
         log = ULog(str(path))
     if log.file_corruption or not log.data_list:
         raise BadData(

@@ -15,11 +15,11 @@ document.querySelectorAll("script[data-overlay]").forEach(source => {
     plots.forEach(u => u.destroy());
     plots = [];
     const {time, channels} = data.runs[name], [ink, ...lines] = colours(), width = Math.max(260, root.clientWidth - 4);
-    const axis = label => ({stroke: ink, grid: {stroke: css("--line")}, ticks: {stroke: css("--line")}, label, labelSize: label ? 22 : 0, size: label ? undefined : 55});
+    const axis = options => ({stroke: ink, grid: {stroke: css("--line"), width: 1}, ticks: {stroke: css("--line"), width: 1}, font: "11px sans-serif", labelFont: "bold 11px sans-serif", labelSize: 18, ...options});
     const add = (label, height, values, series, last) => plots.push(new uPlot({
       width, height, series: [{label: "time", value: (u, v) => v == null ? "" : v.toPrecision(5) + " s"}, ...series],
       scales: {x: {time: false}}, cursor: {sync: {key: source.dataset.overlay}}, hooks: {setScale: [follow]},
-      axes: [axis(last ? "time [s]" : ""), {...axis(label), size: 62}],
+      axes: [axis(last ? {label: "time [s]", size: 28} : {size: 28}), axis({label, size: 58})],
     }, [time, ...values], root));
     channels.forEach((values, k) => {
       const {label, unit} = data.channels[k], measured = values[0];
@@ -28,7 +28,7 @@ document.querySelectorAll("script[data-overlay]").forEach(source => {
         : {label: name, stroke: ink, width: 0, points: {show: true, size: 4, fill: ink}, value});
       add(`${label} [${unit}]`, 220, values, each);
       const off = values.slice(1).map(simulated => simulated.map((v, i) => v == null || measured[i] == null ? null : v - measured[i]));
-      add(`residual [${unit}]`, 130, off, off.map((_, n) => ({label: data.labels[n + 1] + " − measured", stroke: lines[n], width: 1, value})), k === channels.length - 1);
+      add(`residual [${unit}]`, 150, off, off.map((_, n) => ({label: data.labels[n + 1] + " − measured", stroke: lines[n], width: 1, value})), k === channels.length - 1);
     });
   };
   const hint = document.createElement("p");

@@ -9,16 +9,16 @@ from mmrjax.effects.base import THE_SIDE
 from mmrjax.model.channels import find_channel
 from sweeps.report.words.experiment_words import ACTS, DOING
 
-#: What isolates a balance: rows of `experiments.DOING`, `weigh`, and of a channel of `sensor` rows of `ACTS`.
+#: Tests that isolate a balance: rows of `experiments.DOING`, `weigh`, and of a channel of `sensor` rows of `ACTS`.
 ISOLATED_BY = {
     "mass": ("weigh",), "supply": ("held", "one held"), "electrical": ("held", "alone"), "motor": ("alone",),
     "gearbox": ("braked", "lifted"), "track": ("lifted",), "ground": ("laden", "about"), "slip": ("laden",),
     "inertia": ("lifted",), "inductance": ("held",),
 }  # fmt: skip
 CHECKED_BY = {"total_current": ("zero current", "shunt"), "motor_speed": ("strobe",), "speed": ("timing",)}
-#: Of any other channel.
+#: Test of any other channel.
 COMPARE = "Read a second instrument next to that of the {}, at several values"
-#: What to change, all else alike, so that a term changes that goes with it.
+#: Condition to vary, all others constant, so that a term that depends on a signal changes.
 VARY = {
     "speed": "the speed (the supply voltage)", "current": "the current (slope or payload at one voltage)",
     "load": "the load (slope or payload at one voltage)", "slope": "the slope", "weight": "the payload",
@@ -57,7 +57,7 @@ def declared(effect: type[Effect]) -> Iterator[str]:
 
 
 def tests(effect: type[Effect]) -> Iterator[str]:
-    """How it is told from others on a bench: what isolates its balance, and what to change."""
+    """Bench tests that distinguish it from other effects: how to isolate its balance, and the change to make."""
     if effect.channel:
         for name in CHECKED_BY.get(effect.channel, ()):
             yield ACTS[name].format("several values")

@@ -1,4 +1,4 @@
-"""What to do next, for an engineer: calibration acts and runs of the menu, what to read and to watch, more runs."""
+"""Instructions for an engineer: calibration acts, runs of the menu, readings to take and limits to watch."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def slopes(angles: Sequence[float]) -> str:
 
 # --- the menu -------------------------------------------------------------------------------------------
 
-#: How each calibration act is done, by its name; what is set fills the gap.
+#: Instructions for each calibration act, by its name; the setting fills the gap.
 ACTS = {
     "zero current": "Switch the motors off; read the ammeter",
     "zero reading": "Switch the motors off, at rest and with no load; read the {}",
@@ -66,7 +66,7 @@ ACTS = {
 }
 #: Units of what they set.
 UNITS = {"shunt": "A", "strobe": "rad/s", "timing": "m/s", "zero current": ""}
-#: What is done in each kind of runs.
+#: Instructions for each kind of runs.
 DOING = {
     "travel": "travel",
     "run": "run",
@@ -84,7 +84,7 @@ DOING = {
 
 
 def experiment(e: menu.Experiment) -> str:
-    """What to do, what to read, and what to watch."""
+    """Instruction of one experiment: the run, the readings, and the limits to watch."""
     return _act(e) if isinstance(e, menu.Act) else _run(e)
 
 
@@ -160,7 +160,7 @@ def _allowed(temperature: float) -> str:
 
 
 def instruction(what: Instruction) -> str:
-    """What to do and what to read."""
+    """Instruction for one calibration act: the steps and the readings."""
     if isinstance(what, NothingPossible):
         return "Every experiment of the menu is forbidden or beyond reach"
     if isinstance(what, NoMenu):
@@ -191,7 +191,7 @@ def more_runs(what: MoreRuns) -> str:
 
 
 def _steady_speeds(what: MoreRuns) -> str:
-    """Speeds at which a wave is followed."""
+    """Speeds for measuring a wave."""
     three = [f"{menu.round_significant(v):g}" for v in (what.low, 0.5 * (what.low + what.high), what.high)]
     return (
         f"Mark the driving shaft, start every run from the mark, and record steady travel at {', '.join(three[:2])} "
@@ -231,7 +231,7 @@ def _up_to(most: float, runs: int, unit: str = "", first: str = "") -> str:
 
 
 def _usual(what: MoreRuns) -> dict[str, str]:
-    """By variable, of a vehicle whose voltage is imposed."""
+    """Advice by variable, for a vehicle with an imposed voltage."""
     low, high, within = what.low, what.high, what.within
     load = [f"a payload up to {what.payload:g} kg"] * bool(what.payload > 0)
     load += [f"a slope up to {what.slope:g} deg"] * bool(what.slope > 0)
@@ -261,7 +261,7 @@ def _usual(what: MoreRuns) -> dict[str, str]:
 
 
 def _of_level(what: MoreRuns) -> dict[str, str]:
-    """By variable, where the motors' speed or current is imposed."""
+    """Advice by variable, for an imposed speed or current of the motors."""
     within = what.within
     level = "Repeat on the level, unladen," if within.has_ground else "Repeat"
     of_speed = within.imposed == "motor_speed"
@@ -290,7 +290,7 @@ def _brake(what: MoreRuns) -> str:
 
 
 def _of_shaft(what: MoreRuns) -> dict[str, str]:
-    """By variable, where the load is a shaft."""
+    """Advice by variable, for a shaft as the load."""
     crawl, top = f"Repeat with {_steps(what, 'crawl')}", menu.round_significant(what.top)
     return {
         "voltage": f"Repeat with {_steps(what)}",

@@ -12,7 +12,7 @@ from sweeps.export.comparison import APPROXIMATED, DROPPED, EXPORTED, HELD, NATI
 from sweeps.export.formats import FORMATS, Export
 from sweeps.export.joint import INSIDE
 
-#: How a file of each format is used, in a paragraph of LAW.md.
+#: Use of a file of each format, as a paragraph of LAW.md.
 USE = {
     "mujoco": (
         'Put `<include file="drive.xml"/>` before `<worldbody>` of your model and `class="{name}_drive"` on the '
@@ -51,7 +51,7 @@ NOT_TESTED = (
     "Voltages, loads and temperatures outside the runs above.",
     "Fast changes: the comparison is of settled runs, so inductance and inertia rest on their stated values.",
 )
-BACKWARD = "Runs in which the load drives the motor: none is among those above."
+BACKWARD = "Runs in which the load drives the motor: the runs above include none."
 
 
 def statement(found: Export) -> str:
@@ -83,7 +83,7 @@ def errors_title(found: Export) -> str:
 
 
 def remarks(found: Export) -> list[str]:
-    """What to know of an export."""
+    """Remarks on an export."""
     compared, drive = found.comparison, found.joint
     said = []
     if not compared.situation.is_measured:
@@ -165,7 +165,7 @@ def equations(found: Export) -> list[str]:
             )
     if found.format == "mujoco":
         lines += [
-            "MuJoCo's form of it: U = R' I' + L' dI'/dt + i_r K ω and M = i_r K I' - f sign ω - d ω, with "
+            "MuJoCo's form of it: U = R' I' + L' dI'/dt + i_r K ω and M = i_r K I' - f sign ω - d ω. Here "
             "R' = R_rot/η_rm (resistance), L' = L_d/η_rm, K = C_m (motorconst), f (frictionloss), d (damping), and "
             "the motor's current I = c I' (current over act). Its numbers are refitted to the law above.",
         ]

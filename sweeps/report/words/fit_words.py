@@ -5,8 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from calibration.inference import blocks, fit_notes
 from calibration.inference.identifiability import HELD
+from calibration.inference.simulation_errors import root_mean_square
 from mmrjax.errors import count_noun
 from mmrjax.model import channels
 
@@ -16,7 +19,7 @@ if TYPE_CHECKING:
     from calibration.inference.result import CalibrationResult
 
 
-#: What a parameter far from its prior means, by what it is told of.
+#: Meaning of a parameter far from its prior, by the kind of result.
 FAR = {
     "loop": "{} is implausible, {:.1f} prior sds from its prior: it probably absorbs a missing effect",
     "calibration": "{} lies {:.1f} prior sds from its prior: the prior or the model is wrong",
@@ -30,9 +33,9 @@ FACTS = {
     "no covariance": "the posterior has no finite covariance: values stand, intervals do not",
     "no grip": "no run grips: static friction, and slip below it, are known by their priors alone",
 }
-#: Where a prior comes from that is neither a field's nor stated.
+#: Origin of a prior that is neither from a field nor stated.
 PRIORS = {"product": "its product with the share of the guides, as in the other fidelities"}
-#: How a member of a population loses a row.
+#: Reasons why a member of a population loses a row.
 LOST_AS = {
     "slides": "slide", "tips": "turn over", "failed": "leave the ground for good or cannot be computed",
     "stalled": "stall",
@@ -40,7 +43,7 @@ LOST_AS = {
 
 
 def noise_off(note: fit_notes.NoiseOff) -> str:
-    """By what sds are off."""
+    """Ratio of residuals to their sds."""
     if not note.channel:
         return (
             f"residuals are {note.factor:.2g} times the {note.source} sds in every channel and under all "
@@ -82,7 +85,7 @@ def only_together(note: fit_notes.OnlyTogether) -> str:
 
 
 def of_rows(note: fit_notes.OfRows) -> str:
-    """Of which rows something is so."""
+    """Rows with a property, and its consequence."""
     rows = f"rows {', '.join(map(str, note.rows))}"
     if note.what == "limited":
         return (
@@ -113,7 +116,7 @@ def same_predictions(note: fit_notes.SamePredictions) -> str:
     """Kinds of blocks that give the same predictions."""
     return (
         f"held out by {' or by '.join(blocks.kind_in_words(k) for k in note.others)}: the same predictions as held "
-        f"out by {blocks.kind_in_words(note.kind)}, which stand for them; these runs do not vary them apart"
+        f"out by {blocks.kind_in_words(note.kind)}, shown in their place; these runs do not vary them separately"
     )
 
 
@@ -140,7 +143,7 @@ def header(found: CalibrationResult, robot_name: str) -> str:
 
 
 def generations(note: fit_notes.Generations) -> str:
-    """How far a search went."""
+    """Progress of a search."""
     end = "the last gained nothing that counts"
     if not note.settled:
         end = "the last still gained: go on with more --generations"
@@ -190,7 +193,7 @@ def shown_by(test: fit_notes.Shown) -> str:
     }[test.what]
 
 
-#: Why no test of residuals decides whether a fit is adequate.
+#: Reasons why no test of residuals decides on the adequacy of a fit.
 OBSTACLES = {
     "undescribed": "This model does not describe these runs: {large}. Check units, signs, sides, and columns that "
     "vary and are not used, before any parameter is read",
@@ -237,6 +240,33 @@ def adequacy(found: Adequacy) -> str:
         f"Adequate as far as can be tested: the residuals show no structure ({p}); the noise was estimated from "
         "them, so χ² tests nothing"
     )
+
+
+#: Verdict of `Adequacy.adequate`, in words.
+_VERDICTS: dict[bool | None, str] = {
+    True: "The fit is adequate",
+    False: "The fit is not adequate",
+    None: "Adequacy undecided",
+}
+
+
+def calibration(found: CalibrationResult) -> str:
+    """Answer of a calibration: adequate or not, and rms errors before and after over the rows that have both."""
+    each, rows = list[tuple[str, str]](), dict[str, int]()
+    for c in found.channels:
+        r = found.readings[c.name]
+        both = np.isfinite(r.measured) & np.isfinite(r.before) & np.isfinite(r.after)
+        if both.any():
+            size = root_mean_square(r.measured[both])
+            before, after = (100 * root_mean_square((x - r.measured)[both]) / size for x in (r.before, r.after))
+            rows[c.label] = int(both.sum())
+            each.append((c.label, f"{c.label} {before:.1f} → {after:.1f} %"))
+    if not each:
+        return f"{_VERDICTS[found.adequacy.adequate]}; no row is reached both before and after."
+    same = len(set(rows.values())) == 1
+    errors = ", ".join(text + ("" if same else f" ({rows[label]} rows)") for label, text in each)
+    where = f"the same {count_noun(max(rows.values()), 'row')}" if same else "the same rows"
+    return f"{_VERDICTS[found.adequacy.adequate]}; rms error before → after on {where}: {errors}."
 
 
 #: Levels of a cluster that are listed, the farthest from nothing.

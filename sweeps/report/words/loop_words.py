@@ -120,7 +120,7 @@ def _claim(sure: Sequence[str], others: Sequence[str]) -> str:
 
 
 def _undescribed(said: loop_notes.Summary) -> str:
-    """That a model does not describe the runs, by how much, and what to check."""
+    """Sentence on a model that does not describe the runs: the misfit and the checks."""
     each = [
         f"{channels.find_channel(m.channel).label} by {100 * m.error:.0f} % of its measured rms"
         + (f" (its noise is estimated as {100 * m.noise:.0f} %)" if m.noise > m.error else "")
@@ -150,7 +150,7 @@ def evidence(found: loop_notes.Mechanism) -> str:
     )
 
 
-#: What speaks against a mechanism.
+#: Evidence against a mechanism.
 NO_MECHANISM = {
     "share": "it explains only {share:.0f} % of the excess misfit",
     "gain": "on runs that its fit has not seen it gains {0.gain:.2g} ± {0.se:.2g} nat a reading",
@@ -283,7 +283,7 @@ def _without_name(where: DiscrepancyLocation, p: float, no_effect: str) -> str:
 
 
 def _shown(where: DiscrepancyLocation) -> str:
-    """Variable over which a discrepancy shows, and equally significant others."""
+    """Variable that shows a discrepancy, and equally significant others."""
     well = [shown_over(v, where.by_duty).removeprefix("best shown ") for v in where.variables_alike]
     return shown_over(where.variable, where.by_duty) + (f" (as well {', '.join(well)})" if well else "")
 
@@ -294,7 +294,7 @@ def _within(where: DiscrepancyLocation) -> str:
 
 
 def shown_over(variable: str, by_duty: bool = False) -> str:
-    """Variable over which a discrepancy shows; `by_duty`: only the duty changed the motors' voltage."""
+    """Variable that shows a discrepancy; `by_duty`: only the duty changed the motors' voltage."""
     variable = "duty" if by_duty and variable == "voltage" else variable
     happens = bases.window_from_name(variable)
     if variable == "side":
@@ -391,7 +391,7 @@ def _rms(errors: Errors, total: int) -> str:
         return "no row is reached"
     rms, worst, rows = (max(float(e[name]) for e in known) for name in ("rms_percent", "max_percent", "rows"))
     few = f" ({rows:.0f}/{total} reached)" if rows < total else ""
-    return f"rms up to {rms:.1f} %, worst reading {worst:.1f} %{few}"
+    return f"rms ≤ {rms:.1f} %, worst {worst:.1f} %{few}"
 
 
 def largest_share(found: DiscoveryResult) -> str:
@@ -473,9 +473,9 @@ def _strength(test: loop_notes.NameTest) -> str:
     return f"{test.effect} {test.root:.1f} σ (chance {test.needed:.1f}{less})"
 
 
-#: What speaks against an effect by itself: short, and in words.
+#: Evidence against a single effect: short, and in words.
 DOUBTS = {
-    "chance": ("chance", "explains {0.root:.1f} σ{beside}, and chance reaches {0.needed:.1f}"),
+    "chance": ("chance", "explains {0.root:.1f} σ{beside}; chance alone reaches {0.needed:.1f}"),
     "curve": ("a curve", "is a worse explanation than a smooth curve in its place"),
     "row": ("{0.what} {0.rests_on}", "rests on {0.what} {0.rests_on}"),
     "blocks": ("blocks", "is chosen again in {again:.0f} % of the data with a block left out"),
@@ -531,7 +531,7 @@ def tentative(found: DiscoveryResult, effect: FoundEffect) -> str:
     return ": ".join(["tentative", *([", ".join(DOUBTS[d][0].format(test) for d in test.fails)] if test else [])])
 
 
-#: Why an effect is not plausible.
+#: Reasons why an effect is not plausible.
 RULED_OUT = {
     "power": "{0.name} would make its balance supply power",
     "size": "{0.name} at {0.size:.2g} times its largest plausible size; check {check}",
@@ -540,7 +540,7 @@ RULED_OUT = {
 
 
 def why_ruled_out(reasons: Sequence[loop_notes.RuledOut]) -> str:
-    """Why effects are not plausible, each."""
+    """Reason why each effect is not plausible."""
     return "; ".join(RULED_OUT[r.why].format(r, check=" and ".join(r.check)) for r in reasons)
 
 
@@ -617,13 +617,13 @@ def worse(found: Sequence[Worse], predicted: Mapping[str, tuple[int, int]]) -> s
     for kind, (before, after) in predicted.items():
         mine = [w for w in found if w.kind == kind]
         changes = [f"{channels.find_channel(w.channel).label} {_change(w.before, w.after)} %" for w in mine]
-        if any(w.rows < max(before, after) for w in mine):
-            changes[-1] += f" (of the {min(w.rows for w in mine)} rows that both predict)"
+        if mine:
+            changes[-1] += f" (same {min(w.rows for w in mine)} rows)"
         if before > after:
             changes.append(f"{count_noun(before - after, 'row')} fewer predicted")
         if changes:
             parts.append(f"by {blocks.kind_in_words(kind)} {', '.join(changes)}")
-    return f"Held out, what was found predicts worse: {'; '.join(parts)}." if parts else ""
+    return f"Predicts worse on held-out rows: {'; '.join(parts)}." if parts else ""
 
 
 def _change(before: float, after: float) -> str:
@@ -711,7 +711,7 @@ def kept_out(note: loop_notes.KeptOut) -> str:
 
 
 def still_lacks(note: loop_notes.StillLacks) -> str:
-    """What the effects found leave."""
+    """Sentence on the discrepancy that remains with the effects found."""
     place, over = bases.place_in_words(note.place), note.variable.replace("_", " ")
     return f"not everything is explained: an error in the {place} that varies with {over} remains"
 
@@ -726,7 +726,7 @@ def late(note: loop_notes.Late) -> str:
 
 
 def led(note: loop_notes.Led) -> str:
-    """By what the leader of a class was chosen, and whether the other way would have chosen another."""
+    """Criterion that chose the leader of a class; a different choice by the other criterion is reported."""
     names, leader = note.names, note.leader
     by = {
         HELD_OUT: "errors held out",
@@ -758,7 +758,7 @@ def rests_on(note: loop_notes.RestsOn) -> str:
 
 
 def unwritten(note: loop_notes.Unwritten) -> str:
-    """Why what was found is not in the robot that is written."""
+    """Reason why identified effects are not in the written robot."""
     what = "the curve" if note.curve else "what was found"
     how = "no better than" if note.curve and note.gain > 0 else "worse than"
     return (

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from calibration.sensitivity import sensitivity_notes
+from mmrjax.errors import count_noun
 
 if TYPE_CHECKING:
-    from calibration.sensitivity.result import SensitivityResult
+    from calibration.sensitivity.result import Points, SensitivityResult
 
-#: What each method says of an input.
+#: Meaning of each method's result for an input.
 METHODS = {
     "local": "exact derivatives at the robot's own values",
     "sobol": "shares of the variance, alone and with others",
@@ -20,24 +24,74 @@ METHODS = {
 }
 
 
+#: Method → verb, measure and qualification of an input's share; others measure shares of the variance.
+_CAUSES = {
+    "local": ("causes", "variance", " (to first order)"),
+    "morris": ("has", "squared effects", ""),
+    "derivative": ("causes at most", "variance", ""),
+}
+
+
+def meaning(found: SensitivityResult, name: str) -> str:
+    """An input in words: its meaning without symbols' sources, and its configuration; the name of an effect's."""
+    if name.startswith("effects.") or not found.inputs[name].meaning:
+        return name
+    words = re.split(r"[,;:] | \(", found.inputs[name].meaning)[0]
+    where = name.partition(".")[0]
+    return f"{words} ({where})" if where in set(map(str, found.points.configuration)) else words
+
+
 def statement(found: SensitivityResult) -> str:
-    """Inputs that matter most for each output."""
-    leaders = {
-        name: [f"{label} ({100 * share:.0f} %)" for label, share in outputs]
-        for name, outputs in found.leaders().items()
-    }
+    """Inputs that matter most for each output, at which operating points."""
+    leaders = found.leaders()
     if not leaders:
         return "None of these inputs changes any of these outputs."
-    ordered = sorted(leaders.items(), key=lambda item: -len(item[1]))
-    said = "; ".join(f"{name} matters most for {', '.join(what)}" for name, what in ordered)
-    idle = len(found.negligible)
-    return f"{said[0].upper() if said[0].islower() and '.' not in said.split(' ')[0] else said[0]}{said[1:]}; " + (
-        f"{idle} of {len(found.inputs)} inputs do not matter." if idle else "every input matters somewhere."
+    verb, measure, note = _CAUSES.get(found.method, ("causes", "variance", ""))
+    said = "; ".join(
+        f"{meaning(found, name)} {verb} {100 * outputs[0][1]:.0f} % of the {measure} of {outputs[0][0]}"
+        + "".join(f", {100 * share:.0f} % of {label}" for label, share in outputs[1:])
+        for name, outputs in sorted(leaders.items(), key=lambda item: -len(item[1]))
+    )
+    where, idle = points_studied(found), len(found.negligible)
+    return f"{where}: {said}{note}. " + (
+        f"{idle} of {len(found.inputs)} inputs do not matter." if idle else "Every input matters somewhere."
     )
 
 
+def points_studied(found: SensitivityResult) -> str:
+    """`At 12 of 18 operating points (20° left out, where the robot does not travel)`."""
+    total = len(found.points)
+    parts = {o.studied.tobytes(): o.studied for o in found.outputs.values() if not o.studied.all()}
+    if not parts:
+        return f"At {count_noun(total, 'operating point')}"
+    why = "the robot does not travel" if found.method == "local" else "too many robots of the sample do not travel"
+    fewest = min(int(x.sum()) for x in parts.values())
+    if len(parts) > 1:
+        return f"At {fewest} to {total} of {total} operating points, by output (left out where {why})"
+    (studied,) = parts.values()
+    whole = [o.row.label for o in found.outputs.values() if o.studied.all()]
+    rest = f"; all {total} for {', '.join(whole)}" if whole else ""
+    return (
+        f"At {fewest} of {total} operating points ({_in_words(found.points, ~studied)} left out, where {why}{rest})"
+    )
+
+
+def _in_words(points: Points, mask: np.ndarray) -> str:
+    """Points of a mask by the values of one axis, such as `20° and 18 more`."""
+    _, imposed, unit = points.imposed
+    axes = [(x, u) for _, x, u in points.ground[::-1]] + [(imposed, f" {unit}"), (points.configuration, "")]
+    most, words = 0, ""
+    for x, symbol in axes:
+        whole = np.setdiff1d(x[mask], x[~mask])
+        covered = int(np.isin(x, whole).sum())
+        if covered > most:
+            most, words = covered, f"{', '.join(f'{v:g}' if symbol else str(v) for v in whole)}{symbol}"
+    others = int(mask.sum()) - most
+    return " and ".join([words] * bool(words) + [f"{others} more" if words else str(others)] * bool(others))
+
+
 def sampling(note: sensitivity_notes.Sampling) -> str:
-    """What a method goes over."""
+    """Distribution of the inputs that a method samples."""
     return f"{METHODS[note.method]}, over {note.points} operating points"
 
 

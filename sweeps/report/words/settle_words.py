@@ -7,9 +7,9 @@ from collections.abc import Iterable
 from calibration.data.settling import RATES, Settled, Stretch
 from mmrjax.errors import count_noun
 
-#: Reasons that are none where the log itself is fitted, and what to do then.
+#: Reasons that do not apply where the log itself is fitted, and the advice then.
 OF_LEVELS = ("changes", "short", "settling", "accelerates")
-#: Of each of `settling.REASONS`: what is so, and what to do where it is much.
+#: Finding and advice for each of `settling.REASONS`.
 WHY = {
     "changes": ("the imposed quantity changes all the time", "hold it at each level for a while"),
     "short": ("the level is held too briefly", "hold it longer, or state --shortest"),
@@ -25,7 +25,7 @@ WHY = {
 
 
 def reason(stretch: Stretch) -> str:
-    """Why a stretch is left out: `total_current still changes at the end of its level (6.1 %)`."""
+    """Reason why a stretch is left out: `total_current still changes at the end of its level (6.1 %)`."""
     what = f"{stretch.channel} {WHY[stretch.why][0]}" if stretch.channel else WHY[stretch.why][0]
     return what + (f" ({100 * stretch.size:.2g} %)" if stretch.size else "")
 

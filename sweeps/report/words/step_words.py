@@ -76,6 +76,6 @@ def expected(text: str, seconds: float) -> float | None:
 
 
 def still(doing: str, seconds: float, compiled: int) -> str:
-    """That a step goes on, how long it has, and how many programs were compiled in it."""
+    """Progress of a running step: its duration and the number of programs compiled."""
     programs = f", {count_noun(compiled, 'program')} compiled" if compiled else ""
     return f"still {doing} ({seconds:.0f} s{programs})"

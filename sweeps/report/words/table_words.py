@@ -9,7 +9,7 @@ from typing import Any
 from calibration.data.input_errors import number
 from calibration.inference import fit_notes
 
-#: What would measure a parameter that the data do not, by the start or end of its name.
+#: Measurements that determine a parameter which the data do not, by the start or end of its name.
 WOULD_MEASURE = {
     "battery.": "runs on the on-board battery (Source Mode 1)",
     "motor.inductance": "a time history of the start-up current, with samples every tenth of a millisecond",
