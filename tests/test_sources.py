@@ -387,7 +387,7 @@ def test_a_recording_larger_than_memory_is_refused_before_it_is_read(tmp_path, r
     assert "more values than the free memory" in contents.inspect(tmp_path / "log.parquet").signals[0].refused
 
 
-@pytest.mark.parametrize("source", [3, None, [1, 2], {}, pd.Series([1.0])])
+@pytest.mark.parametrize("source", [3, None, [1, 2], {}, pd.Series([1.0]), pd.DataFrame()])
 def test_what_is_no_table_in_memory_is_refused(robot, source):
     with pytest.raises(BadData):
         records.read(source, robot)
