@@ -310,8 +310,9 @@ def example(folder: Path) -> str:
     )
     effects = "\n".join(
         f"* **{', or '.join(e['families'])}** (`{e['name']}`, {e['standing']}).\n  Equation: {e['equation'].rstrip('.')}.\n"
-        f"  Size: {e['parameters']['amplitude']['value']:.3g} ± {e['parameters']['amplitude']['sd']:.2g} "
-        f"{e['parameters']['amplitude']['unit']}."
+        + f"  Size: {e['parameters']['amplitude']['value']:.3g} ± {e['parameters']['amplitude']['sd']:.2g} "
+        f"{e['parameters']['amplitude']['unit']}".rstrip(" -")
+        + "."
         for e in d["effects"]
     )
     after = d["next_experiment"]

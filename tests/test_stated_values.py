@@ -107,6 +107,7 @@ def test_resistance_freed_of_its_prior_is_the_right_one(wrong, truth, looks):
     assert 2 * shift.fit.cost < readings + 4 * np.sqrt(2 * readings)
     freed = FreedValue("motor.resistance", said.value, said.unit)
     assert words.freed_value(freed) == f"motor.resistance is {said.value:.3g} ohm"
+    assert words.freed_value(freed._replace(unit="-")) == f"motor.resistance is {said.value:.3g}"
 
 
 def test_nothing_is_shifted_where_the_sheet_is_right(looks):

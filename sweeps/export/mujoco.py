@@ -382,7 +382,9 @@ def attribute_notes(
 
     def made_of(*names: str) -> str:
         found = [known[n] for n in names if n in known]
-        return "; ".join(f"{c.name} {c.value:.5g} {c.unit}{f', {c.interval}' if c.interval else ''}" for c in found)
+        return "; ".join(
+            f"{c.name} {c.value:.5g} {c.unit}".rstrip(" -") + (f", {c.interval}" if c.interval else "") for c in found
+        )
 
     def fitted(key: str) -> str:
         return f" (translated {translated[key]:.5g}, refitted to the native model {values[key]:.5g})"

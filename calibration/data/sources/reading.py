@@ -118,8 +118,8 @@ def _none_of(name: str, columns: Preset, header: Sequence[str]) -> BadData:
     )
     has = ", ".join(header[:8]) + (", ..." if len(header) > 8 else "")
     return BadData(
-        f"{name}: has none of the columns of {columns.name} ({wanted}), but {has}; choose another preset, or copy it "
-        "and change the names"
+        f"{name}: has none of the columns of {columns.name} ({wanted}), but {has}; correct the names, "
+        "or choose another preset"
     )
 
 
@@ -194,7 +194,8 @@ def _chosen(source: Source, mapped: Mapped, layout: Layout) -> tuple[dict[str, S
 def _extras(source: Source, chosen: Mapping[str, Signal], own: Sequence[Signal]) -> dict[str, Signal]:
     """Further columns of a table, as long as the chosen ones, if there are few values."""
     taken = {id(signal) for signal in chosen.values()}
-    lengths = {s.length for s in chosen.values() if s.length > 1} or {max((s.length for s in source.signals), default=0)}
+    longest = max((s.length for s in source.signals), default=0)
+    lengths = {s.length for s in chosen.values() if s.length > 1} or {longest}
     others = [s for s in source.signals if id(s) not in taken and not s.refused and s.length in lengths]
     if own or sum(s.length for s in others) > EXTRA_VALUES:
         return {}

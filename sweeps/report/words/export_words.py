@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 
 from calibration.data.input_errors import rounded
@@ -191,6 +193,8 @@ def law(found: Export) -> str:
         f"* {f.name}: {verdicts[f.verdict]} {f.how}{f' ({kept(f)} of its change is kept)' if kept(f) else ''}"
         for f in compared.fates
     )
+    cited = any(re.search(r"\beqs?\.|\bTables? [A\d]", f"{c.meaning} {c.source}") for c in found.constants)
+    paper = "\nNumbers of equations and tables are those of the paper that describes this robot.\n" if cited else ""
     bullets = lambda lines: "\n".join(f"* {line}" for line in lines)  # noqa: E731
     return f"""# The law of this drive
 A motor with its gearbox on one joint: {drive.file.name}, {drive.configuration}. A program, mmrjax {__version__},
@@ -207,7 +211,7 @@ that program. All units are SI; the joint is the driven wheel or output shaft.
 | name | value | unit | interval | meaning | source |
 |---|---|---|---|---|---|
 {constants}
-{table}
+{paper}{table}
 ## What this format holds
 {fates}
 

@@ -310,7 +310,7 @@ def shown_over(variable: str, by_duty: bool = False) -> str:
 
 def freed_value(v: loop_notes.FreedValue) -> str:
     """`motor.resistance is 1.94 ohm`."""
-    return f"{v.name} is {v.value:.3g} {v.unit}".strip()
+    return f"{v.name} is {v.value:.3g} {v.unit}".rstrip(" -")
 
 
 def p_value(p: float) -> str:
@@ -570,7 +570,7 @@ def hidden(found: DiscoveryResult) -> str:
     if not found.hidden:
         return ""
     each = [
-        f"{h.name} up to {h.amplitude:.2g} {h.unit}".strip()
+        f"{h.name} up to {h.amplitude:.2g} {h.unit}".rstrip(" -")
         + (f" ({h.experiment} would show it)" if h.experiment else "")
         for h in found.hidden
     ]
