@@ -42,7 +42,7 @@ def meaning(found: SensitivityResult, name: str) -> str:
 
 
 def statement(found: SensitivityResult) -> str:
-    """Inputs that matter most for each output, at which operating points."""
+    """Inputs that matter most for each output, with their operating points."""
     leaders = found.leaders()
     if not leaders:
         return "None of these inputs changes any of these outputs."
