@@ -149,8 +149,8 @@ def equations(found: Export) -> list[str]:
     dry, viscous = ("M_t0", "K_ft") if robot.has_ground else ("M_0", "K")
     backward = "2 - 1/η_rm, at least 0.02" if robot.gearbox.mesh_theory else "η_rm"
     lines = [
-        "ω is the speed of the joint [rad/s], ω_m = i_r ω that of the motor. U is the voltage at the driver's output, "
-        "I the current of the motor. sign ω fades to 0 at rest.",
+        "ω is the speed of the joint [rad/s], ω_m = i_r ω that of the motor. U is the voltage at the driver's "
+        "output, I the current of the motor. sign ω fades to 0 at rest.",
         f"Winding: L_d dI/dt = U - C_m ω_m - R_rot I{less['winding']}. [V]",
         f"Motor: M_d = C_m I - (M_df0 sign ω + K_fd ω_m){less['motor']}, at its shaft. [N·m]",
         f"Gearbox: M_r = i_r η_rm (M_d - M_rf0 sign ω - K_fr ω_m){less['gearbox']}, at its output. 1/η_b replaces "
