@@ -30,13 +30,13 @@ def law(file: str | None) -> Any:
     if file is not None:
         return types.SimpleNamespace(**runpy.run_path(file))
     from calibration.data import robot_file
-    from sweeps.export.joint import joint
-    from sweeps.export.law_source import Constant, executed, jax_source
+    from sweeps.export.joint import joint_of_robot
+    from sweeps.export.law_source import Constant, jax_source, module_from_source
 
-    drive = joint(robot_file.find("nominal"))
+    drive = joint_of_robot(robot_file.find_robot_file("nominal"))
     known = [Constant(n, float(p.value), "", "", "") for n, p in drive.parameters().items()]
     known += [Constant(n, 30.0, "N", "", "") for n in drive.surroundings()]
-    return executed(jax_source(drive, known))
+    return module_from_source(jax_source(drive, known))
 
 
 def best(function: Callable[..., Any], *given: Any) -> tuple[float, float]:

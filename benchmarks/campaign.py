@@ -70,7 +70,7 @@ def robot_of(name: str) -> Any:
     ready()
     from calibration.data import robot_file
 
-    return robot_file.load(name)
+    return robot_file.load_robot(name)
 
 
 #: Largest amplitude of a case, in ordinary sizes; larger ones are implausible for any library.
@@ -107,8 +107,8 @@ def begun(case: Any, task: Task, stated: Mapping[str, tuple[float, float]] | Non
 
     with tempfile.TemporaryDirectory() as folder:
         case.write(Path(folder))
-        robot = robot_of(task.robot) if case.toml is None else robot_file.read(Path(folder) / "rig.toml")
-        runs = records.read(Path(folder) / "table.csv", robot=robot)
+        robot = robot_of(task.robot) if case.toml is None else robot_file.read_robot(Path(folder) / "rig.toml")
+        runs = records.read_runs(Path(folder) / "table.csv", robot=robot)
     return prepare_loop(runs, robot, stated=stated, replicates=task.replicates, seed=task.seed)
 
 

@@ -154,7 +154,7 @@ def _number(value: float) -> str:
 
 def _about(effect: type[Effect]) -> tuple[str, ...]:
     """Equation, description and source, as cells of a table."""
-    return tuple(text.replace("|", "∣") for text in words.about(effect))
+    return tuple(text.replace("|", "∣") for text in words.effect_summary(effect))
 
 
 def _section(effect: type[Effect]) -> str:
@@ -166,7 +166,7 @@ def _section(effect: type[Effect]) -> str:
     where = effect.balance + (f": {effect.channel}" if effect.channel else "")
     low, high = spec.bounds
     equation, meaning, source = _about(effect)
-    declared = list(words.declared(effect))
+    declared = list(words.effect_declarations(effect))
     lines = [
         f"### `{effect.name}`", "", equation, "", f"{meaning} {source}".strip(), "",
         f"- Balance `{where}`. Family: {effect.family()}.",

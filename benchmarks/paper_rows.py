@@ -23,7 +23,7 @@ import numpy as np  # noqa: E402
 from measure import machine  # noqa: E402
 from shaking import SET_S  # noqa: E402
 
-from calibration.data.runs import Runs, read  # noqa: E402
+from calibration.data.runs import Runs, read_runs  # noqa: E402
 from calibration.inference.calibration import calibrate  # noqa: E402
 from mmrjax.effects.slip_effects import VibrationSlip  # noqa: E402
 from mmrjax.fidelities.track import STEP, track_batch  # noqa: E402
@@ -81,7 +81,7 @@ CHOSEN = "wheels without rolling resistance"
 
 def rows(printed_mass: bool) -> Runs:
     """The consistent rows, the wheeled robot with its mass as printed or with that of Table 7."""
-    table = read("simulated_by_paper")
+    table = read_runs("simulated_by_paper")
     table = table.where((table["configuration"] == "4W2T") | (table["supply_voltage_V"] > 20))
     wheeled = table["configuration"] == "4W2T"
     mass = table["total_mass_kg"] - np.where(wheeled & (not printed_mass), MASS_PRINTED - MASS, 0.0)

@@ -58,13 +58,13 @@ def write(path: Path, rows: int) -> None:
 def read(path: Path, rig: Path) -> None:
     """Read a file and print rows, seconds and the memory that reading took [GB] beyond the libraries."""
     from calibration.data import runs
-    from calibration.data.robot_file import load
+    from calibration.data.robot_file import load_robot
 
-    robot = load(rig)
-    runs.read({"time_s": [0.0, 1.0], "supply_voltage_V": [1.0, 1.0], "total_current_A": [0.1, 0.1]}, robot)
+    robot = load_robot(rig)
+    runs.read_runs({"time_s": [0.0, 1.0], "supply_voltage_V": [1.0, 1.0], "total_current_A": [0.1, 0.1]}, robot)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     began, used = time.perf_counter(), time.process_time()
-    found = runs.read(path, robot)
+    found = runs.read_runs(path, robot)
     seconds, used = time.perf_counter() - began, time.process_time() - used
     after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     print(

@@ -73,8 +73,8 @@ def work(task: Task) -> dict:
         whole = assemble_result(found, given.runs, given.numbers, given.settings, given.library, lambda note: None)
         line |= held_out(whole, case) | {"seconds_whole": line["seconds"] + time.perf_counter() - began}
         with tempfile.TemporaryDirectory() as folder:
-            robot_file.write(whole.robot, Path(folder) / "robot.toml")
-            again = robot_file.read(Path(folder) / "robot.toml")
+            robot_file.write_robot(whole.robot, Path(folder) / "robot.toml")
+            again = robot_file.read_robot(Path(folder) / "robot.toml")
         line["read_again"] = [e.name for e in again.effects] == [e.name for e in whole.robot.effects]
     return line
 

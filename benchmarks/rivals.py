@@ -106,8 +106,8 @@ def posed(robot: str, table: Any, seed: int, replicates: int, case: Any = None) 
     from calibration.inference import blocks
     from calibration.inference.held_out import search_each
 
-    rig = robot_file.load(robot)
-    runs = records.read(table, robot=rig)
+    rig = robot_file.load_robot(robot)
+    runs = records.read_runs(table, robot=rig)
     if runs.unknown:
         raise Unable(f"column {runs.unknown[0]} of the record is not used")
     given = prepare_loop(runs, rig, replicates=replicates, seed=seed)

@@ -25,7 +25,7 @@ from mmrjax.model import paper_robots  # noqa: E402
 
 def grid(objective: str, points: int, kept: np.ndarray) -> tuple[float, int, float]:
     """The best feasible objective of a grid, its number of designs, and seconds."""
-    robot, asked = paper_robots.nominal(), requirements_file.load(None)
+    robot, asked = paper_robots.nominal(), requirements_file.load_requirements(None)
     chosen = options_for_robot(robot)
     of = sizing_task(robot, asked, chosen)
     choice = design_search.choice_space(robot, of, chosen)
@@ -50,7 +50,7 @@ def main() -> None:
     parser.add_argument("--grid", type=int, default=1_000_000)
     parser.add_argument("--objective", default="mass", choices=list(OBJECTIVES))
     given = parser.parse_args()
-    robot, asked = paper_robots.nominal(), requirements_file.load(None)
+    robot, asked = paper_robots.nominal(), requirements_file.load_requirements(None)
     for words in ("with compilation", "once compiled"):
         begin, busy = time.perf_counter(), time.process_time()
         found = design_search.size_robot(robot, asked, (given.objective,), starts=given.starts)

@@ -60,7 +60,7 @@ def prepared(arguments: argparse.Namespace, points: int, devices: int) -> tuple[
     from mmrjax.model import channels, paper_robots
     from sweeps.config_campaign import Campaign
     from sweeps.points import axes
-    from sweeps.points.job import prepare
+    from sweeps.points.job import prepare_job
 
     chunk = (
         arguments.chunk
@@ -72,8 +72,8 @@ def prepared(arguments: argparse.Namespace, points: int, devices: int) -> tuple[
         **plan_of(points, arguments.sampled),
     )  # fmt: skip
     robot = paper_robots.nominal()
-    plan = axes.plan(config, robot, "benchmark")
-    return config, prepare(config, robot, plan, "benchmark")
+    plan = axes.plan_design(config, robot, "benchmark")
+    return config, prepare_job(config, robot, plan, "benchmark")
 
 
 def against_cpu(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -87,7 +87,7 @@ def against_cpu(arguments: argparse.Namespace) -> dict[str, Any]:
     found = []
     for devices in (jax.local_devices(), jax.local_devices(backend="cpu")[:1]):
         compiled = scale.Compiled(job, devices)
-        found.append(scale.fetched(compiled(compiled.points(0)), count))
+        found.append(scale.fetch_values(compiled(compiled.points(0)), count))
     one, other = found
     differences = {}
     for name in job.outputs:
@@ -119,15 +119,17 @@ def sweep(arguments: argparse.Namespace, points: int, devices: list[Any] | None 
     try:
         compiled = scale.Compiled(job, devices)
         begin = time.perf_counter()
-        scale.fetched(compiled(compiled.points(0)), 1)
+        scale.fetch_values(compiled(compiled.points(0)), 1)
         first = time.perf_counter() - begin
         times, layout = scale.Times(), laid_out(config, job)
         begin = time.perf_counter()
         store = SweepStore(folder / "s", {}, layout)
         store.begin()
-        scale.run(store.write, job, scale.produce(compiled, range(len(job.blocks)), times), lambda _: None, times)
+        scale.write_chunks(
+            store.write, job, scale.produce_chunks(compiled, range(len(job.blocks)), times), lambda _: None, times
+        )
         total = time.perf_counter() - begin
-        statuses = command.statuses(store.done().values())
+        statuses = command.points_by_status(store.done().values())
         store.close()
     finally:
         shutil.rmtree(folder)

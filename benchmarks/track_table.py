@@ -43,7 +43,7 @@ from measure import machine  # noqa: E402
 from scipy.optimize import least_squares  # noqa: E402
 
 from calibration.data import own_mass  # noqa: E402
-from calibration.data.runs import Runs, read  # noqa: E402
+from calibration.data.runs import Runs, read_runs  # noqa: E402
 from calibration.inference import priors  # noqa: E402
 from calibration.inference.held_out import search_each  # noqa: E402
 from calibration.inference.observers.settled import SettledRuns  # noqa: E402
@@ -240,10 +240,10 @@ class Posed:
 
 def pose(what: str) -> tuple[Posed, Robot, Runs]:
     """The problem, the robot with its effects, and the table."""
-    table = read("measured")
+    table = read_runs("measured")
     if what == "slip":
         table = table.where(table["configuration"] == "6T2A")
-    robot = own_mass.with_table_mass(paper_robots.nominal(), read("measured"))
+    robot = own_mass.with_table_mass(paper_robots.nominal(), read_runs("measured"))
     if what == "slip":
         robot = params.replace(robot, {"6T2A.track.guide_friction": 0.06})
         names, stated = FRICTION + GEAR, {}
@@ -268,7 +268,7 @@ def pose(what: str) -> tuple[Posed, Robot, Runs]:
     rest = jax.tree.map(lambda x: x[wheeled], conditions)
     row = np.concatenate([runs, wheeled]).astype(int)
     measured = table.measured()
-    paper = read("simulated_by_paper")
+    paper = read_runs("simulated_by_paper")
     paper = paper.where(paper["configuration"] == "6T2A")
     if not all(np.array_equal(paper[n], table.where(tracked)[n]) for n in ("supply_voltage_V", "slope_deg")):
         raise ValueError("the simulated rows of the paper are not those measured")
@@ -433,7 +433,7 @@ def lumped_slip(arguments: argparse.Namespace) -> None:
 
 def timed(arguments: argparse.Namespace) -> dict[str, Any]:
     """Time of one generation of gears over all twenty rows, with wheeled ones also by the track model."""
-    table = read("measured")
+    table = read_runs("measured")
     robot = own_mass.with_table_mass(
         params.replace(paper_robots.nominal(), {"6T2A.track.guide_friction": 0.06}), table
     )

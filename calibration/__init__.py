@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from calibration.data.frames import to_pandas, to_polars, to_xarray
-    from calibration.data.robot_file import load as read_robot
-    from calibration.data.runs import read as read_runs
-    from calibration.data.runs import read as runs
+    from calibration.data.robot_file import load_robot as read_robot
+    from calibration.data.runs import read_runs as read_runs
+    from calibration.data.runs import read_runs as runs
     from calibration.discovery.discover import discover
     from calibration.inference.calibration import calibrate
 
@@ -21,9 +21,9 @@ __all__ = [
 _HOMES = {
     "calibrate": ("calibration.inference.calibration", "calibrate"),
     "discover": ("calibration.discovery.discover", "discover"),
-    "read_robot": ("calibration.data.robot_file", "load"),
-    "read_runs": ("calibration.data.runs", "read"),
-    "runs": ("calibration.data.runs", "read"),
+    "read_robot": ("calibration.data.robot_file", "load_robot"),
+    "read_runs": ("calibration.data.runs", "read_runs"),
+    "runs": ("calibration.data.runs", "read_runs"),
     "to_pandas": ("calibration.data.frames", "to_pandas"),
     "to_polars": ("calibration.data.frames", "to_polars"),
     "to_xarray": ("calibration.data.frames", "to_xarray"),

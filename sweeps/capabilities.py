@@ -43,12 +43,12 @@ def _nothing(robot: Robot) -> dict[str, float]:
     return {p.name: float(p.value) for p in params.walk_parameters(blank_robot(robot.configurations, rig=robot.rig))}
 
 
-def states(robot: Robot, prefix: str) -> bool:
+def states_parameter(robot: Robot, prefix: str) -> bool:
     """True if the robot's file or its base states any parameter whose name begins so."""
     return any(p.name.startswith(prefix) and robot.knows([p.name]) for p in params.walk_parameters(robot))
 
 
-def battery(robot: Robot) -> bool:
+def has_battery(robot: Robot) -> bool:
     """True if the robot has its own battery."""
     if robot.rig.inherits:
         return True
@@ -61,7 +61,7 @@ def battery(robot: Robot) -> bool:
     )
 
 
-def unknown(robot: Robot) -> list[str]:
+def unknown_numbers_sentence(robot: Robot) -> list[str]:
     """Sentences on results that are unknown because the robot's file does not state their parameters."""
     gone = [output for output in outputs.FURTHER if not robot.knows(output.rests_on)]
     lacking = dict.fromkeys(name for output in gone for name in robot.unknown(output.rests_on))
@@ -78,7 +78,7 @@ def idle_columns(robot: Robot) -> set[str]:
         found |= {*OF_TRAVEL}
     found |= {column for column, names in RESTS_ON.items() if not robot.knows(names)}
     found |= {f"{column.removesuffix('_C')}_{side}_C" for column in found & {*_WARMING} for side in SIDES}
-    if not battery(robot):
+    if not has_battery(robot):
         found |= {"voltage_cell_V"}
     return found
 
@@ -91,7 +91,7 @@ def without_idle(robot: Robot, table: dict[str, np.ndarray]) -> dict[str, np.nda
     return {column: values for column, values in table.items() if column not in gone}
 
 
-def parameters(file: RobotFile) -> list[tuple[str, float, str, str, str]]:
+def rig_parameters(file: RobotFile) -> list[tuple[str, float, str, str, str]]:
     """Parameters that a rig's file states, and others with an effect: name, value, unit, meaning, source."""
     robot = file.robot
     nothing, found = _nothing(robot), []

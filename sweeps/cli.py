@@ -20,7 +20,7 @@ from mmrjax import SOUND_AT_LEVEL_0, __version__, fidelities
 from mmrjax.errors import shorten
 from sweeps import config, config_campaign
 from sweeps import options as made
-from sweeps.flags import flags as flags_of
+from sweeps.flags import options_of_fields as flags_of
 
 INTERRUPTED = 130
 
@@ -82,7 +82,7 @@ def _command(
         kind: of the configuration; failure: what exit code 3 means.
         beside: configuration of options that change no number; a file may state its `[solver]` only.
         arguments: fields that are arguments; a `plan` of the function's own is the file, as --config is.
-        resolve: in place of `config.resolve`.
+        resolve: in place of `config.resolve_configuration`.
     """
 
     def of(function: Callable[..., int]) -> Callable[..., int]:
@@ -90,7 +90,7 @@ def _command(
 
         @functools.wraps(function)
         def run(**given: Any) -> int:
-            from sweeps.console import working
+            from sweeps.console import report_working
 
             no_cache, file, trust = given.pop("no_cache"), given.pop("config_file"), given.pop("trust")
             given.pop("help_all", None)
@@ -98,13 +98,15 @@ def _command(
             if plan is not None and file is not None:
                 raise InputError(f"--config: got {file} beside {plan}; expected one of them")
             file = plan if file is None else file
-            stated = made.taken(kind, given)
+            stated = made.take_options(kind, given)
             further = None
             if beside is not None:
-                further = config.resolve_beside(beside, file, made.taken(beside, given), trust)
-            resolved = functools.partial(config.resolve, kind, beside=beside) if resolve is None else resolve
+                further = config.resolve_beside(beside, file, made.take_options(beside, given), trust)
+            resolved = (
+                functools.partial(config.resolve_configuration, kind, beside=beside) if resolve is None else resolve
+            )
             found = resolved(file, stated, trust=trust)
-            with working(function.__name__.replace("_", " ")):
+            with report_working(function.__name__.replace("_", " ")):
                 return function(Told(_prepared(found, no_cache), further, file), **given)
 
         own = list(inspect.signature(function, eval_str=True).parameters.values())[1:]
@@ -117,7 +119,7 @@ def _command(
             keyword("no_cache", annotation=_NoCache, default=False),
             *made.help_all(kinds),
         ]
-        fields = [p for k in kinds[::-1] for p in made.parameters(k, arguments)]
+        fields = [p for k in kinds[::-1] for p in made.option_parameters(k, arguments)]
         everything = [*first, *fields, *last]
         run.__signature__ = inspect.Signature(everything)  # type: ignore[attr-defined]
         run.__annotations__ = {p.name: p.annotation for p in everything}
@@ -174,14 +176,14 @@ def simulate(
     if told.config.profile is not None:
         from sweeps.commands import missions
 
-        return missions.simulate(told.config, given, stated, out, force)
+        return missions.simulate_missions(told.config, given, stated, out, force)
     if told.config.turns:
         from sweeps.commands import turn
 
-        return turn.simulate(told.config, given, out, force)
+        return turn.simulate_turn(told.config, given, out, force)
     from sweeps.commands import simulate as room
 
-    return room.simulate(told.config, given, out, force)
+    return room.simulate_to_folder(told.config, given, out, force)
 
 
 @_command(
@@ -224,10 +226,10 @@ def sweep(
     varies, as a grid or sampled (docs/reference/plans.md). An interrupted sweep continues with the same command and
     the same --out.
     """
-    how = config_campaign.how(told.beside.shard, told.beside.scheduler, export, dry_run, zarr, outputs)
+    how = config_campaign.sweep_options(told.beside.shard, told.beside.scheduler, export, dry_run, zarr, outputs)
     from sweeps.commands import sweep as room
 
-    return room.sweep(told.config, told.where, out, force, how)
+    return room.sweep_to_folder(told.config, told.where, out, force, how)
 
 
 @_command(config.Compare, example="mmrjax compare measured --robot sm1 --set 6T2A.ground.friction.static=0.6")
@@ -245,7 +247,7 @@ def compare(
     """Simulate the runs of a table and compare: equation (35) per row and channel, rms, worst, R²."""
     from sweeps.commands import compare as room
 
-    return room.compare(told.config, data, own_mass, out, force)
+    return room.compare_with_table(told.config, data, own_mass, out, force)
 
 
 @_command(config.Reproduce, example="mmrjax reproduce --robot found/robot.toml --model track")
@@ -256,7 +258,7 @@ def reproduce(told: Told, out: _Out = None, force: _Force = False) -> int:
     """
     from sweeps.commands import reproduce as room
 
-    return room.reproduce(told.config, out, force)
+    return room.reproduce_paper(told.config, out, force)
 
 
 @_command(
@@ -294,7 +296,7 @@ def render(
     slow = 20.0 if slow is None else slow
     begin = (0.8 if file.suffix == ".png" else 0.0) if begin is None else begin
     end = begin + 0.1 if end is None and file.suffix != ".png" else end
-    return room.render(told.config, told.beside.model_dump(), file, begin, end, slow, force)
+    return room.render_run(told.config, told.beside.model_dump(), file, begin, end, slow, force)
 
 
 @_command(
@@ -319,7 +321,7 @@ def calibrate(
     """
     from sweeps.commands import calibrate as room
 
-    return room.calibrate(told.config, data, out, force, told.beside.members)
+    return room.calibrate_robot(told.config, data, out, force, told.beside.members)
 
 
 @_command(
@@ -342,7 +344,7 @@ def settle(
     """
     from sweeps.commands import settle as room
 
-    return room.settle(told.config, log, out, force)
+    return room.settle_to_folder(told.config, log, out, force)
 
 
 @_command(
@@ -359,7 +361,7 @@ def export(told: Told, out: _Out = None, force: _Force = False) -> int:
     """
     from sweeps.commands import export_drive as room
 
-    return room.export(told.config, out, force)
+    return room.export_to_folder(told.config, out, force)
 
 
 @_command(
@@ -385,7 +387,7 @@ def loop(
     """
     from sweeps.commands import loop as room
 
-    return room.loop(told.config, data, out, force, told.beside.members, told.beside.seconds)
+    return room.run_loop(told.config, data, out, force, told.beside.members, told.beside.seconds)
 
 
 @_command(
@@ -399,7 +401,7 @@ def sensitivity(told: Told, out: _Out = None, force: _Force = False) -> int:
     """
     from sweeps.commands import sensitivity as room
 
-    return room.sensitivity(told.config, out, force)
+    return room.study_sensitivity(told.config, out, force)
 
 
 @_command(
@@ -416,7 +418,7 @@ def resonance(told: Told, out: _Out = None, force: _Force = False) -> int:
     """
     from sweeps.commands import resonance as room
 
-    return room.resonance(told.config, out, force)
+    return room.map_resonance(told.config, out, force)
 
 
 @_command(
@@ -433,7 +435,7 @@ def climb(told: Told, out: _Out = None, force: _Force = False) -> int:
     """
     from sweeps.commands import climb as room
 
-    return room.climb(told.config, out, force)
+    return room.climb_obstacle(told.config, out, force)
 
 
 @_command(
@@ -449,7 +451,7 @@ def check(told: Told, out: _Out = None, force: _Force = False) -> int:
     """
     from sweeps.commands import check as room
 
-    return room.check(told.config, out, force)
+    return room.check_robot(told.config, out, force)
 
 
 @_command(
@@ -465,7 +467,7 @@ def size(told: Told, out: _Out = None, force: _Force = False) -> int:
     """
     from sweeps.commands import size as room
 
-    return room.size(told.config, out, force)
+    return room.size_to_folder(told.config, out, force)
 
 
 rig = typer.Typer(
@@ -531,7 +533,7 @@ def new(
         "stall-torque": stall_torque, "stall-current": stall_current, "resistance": resistance,
     }  # fmt: skip
     sheet = {name: text for name, text in given.items() if text is not None}
-    return rig_new.new(file, kind, force, source, joint, sheet if sheet or from_sheet else None)
+    return rig_new.write_new_rig(file, kind, force, source, joint, sheet if sheet or from_sheet else None)
 
 
 @rig.command("check", epilog="Example: mmrjax rig check my-rig.toml my-runs.csv")
@@ -555,7 +557,7 @@ def rig_check(
     _start_jax(no_cache)
     from sweeps.commands import rig_check as room
 
-    return room.check(file, data, tuple(effects or ()), json, columns)
+    return room.check_rig_file(file, data, tuple(effects or ()), json, columns)
 
 
 @app.command("inspect", epilog="Example: mmrjax inspect log.bag; mmrjax inspect log.h5::/run1 --json")
@@ -569,7 +571,7 @@ def inspect_file(
     """
     from sweeps.commands import inspect as room
 
-    return room.inspect(file, json)
+    return room.inspect_file(file, json)
 
 
 @app.command(epilog="Example: mmrjax explain series_resistance")
@@ -584,7 +586,7 @@ def explain(
     _start_jax(no_cache)
     from sweeps.commands import explain as room
 
-    return room.explain(name, tuple(effects or ()))
+    return room.explain_name(name, tuple(effects or ()))
 
 
 @app.command()
@@ -593,7 +595,7 @@ def doctor(no_cache: _NoCache = False) -> int:
     _start_jax(no_cache)
     from sweeps.commands import doctor as room
 
-    return room.doctor()
+    return room.check_installation()
 
 
 def _prepared(resolved: Any, no_cache: bool = False) -> Any:

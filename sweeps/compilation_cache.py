@@ -28,7 +28,7 @@ OFF = ("off", "0", "no", "false")
 LIMIT = 4 * 2**30
 
 
-def location(path: Path | None = None) -> Path | None:
+def cache_location(path: Path | None = None) -> Path | None:
     """Folder of the cache, which need not exist yet; None where it is switched off or no place for it is known.
 
     Args:
@@ -73,7 +73,7 @@ def keep_programs() -> Path | None:
     """
     if _refused(os.environ.get(PROGRAMS, "")):
         os.environ[PROGRAMS] = ""
-    folder = location()
+    folder = cache_location()
     if folder is None:
         return None
     # On some processors XLA logs an error for each program that it reads: tuning flags of its own compiler that it
@@ -110,9 +110,11 @@ def _refused(folder: str) -> bool:
     """True if others could change a folder of programs, which is reported: their code would be run."""
     reason = exposure_reason(Path(folder)) if folder else ""
     if reason:
-        from sweeps.console import tell
+        from sweeps.console import print_message
 
-        tell(f"compiled programs are not kept: {reason}; name a folder of your own in {VARIABLE}, or chmod go-w it")
+        print_message(
+            f"compiled programs are not kept: {reason}; name a folder of your own in {VARIABLE}, or chmod go-w it"
+        )
     return bool(reason)
 
 
@@ -165,9 +167,9 @@ class Contents:
         return f"{self.path}: {self.entries} programs, {self.size / 1e6:.1f} MB"
 
 
-def describe(path: Path | None = None) -> Contents:
+def describe_cache(path: Path | None = None) -> Contents:
     """Returns the folder of the cache and its contents."""
-    folder = location(path)
+    folder = cache_location(path)
     entries = [] if folder is None else _entries(folder)
     exposed = "" if folder is None else exposure_reason(folder)
     return Contents(folder, len(entries), sum(entry[1] for entry in entries), exposed)

@@ -14,14 +14,14 @@ from pydantic_core import PydanticCustomError
 
 from calibration.data import presets_file
 from calibration.data.columns import ROWS
-from calibration.data.input_errors import BadConfiguration, allowed_words, parsed
+from calibration.data.input_errors import BadConfiguration, allowed_words, parse_number
 from calibration.data.input_files import toml_content, toml_text
 from calibration.inference import solvers
 from mmrjax import fidelities
 from mmrjax.model import channels
 from mmrjax.model.paper_tables import BENCH, PAYLOADS_KG, SLOPES_DEG, SURFACES, VOLTAGES_V
 from mmrjax.model.quantities import CONDITIONS
-from sweeps.flags import flags
+from sweeps.flags import options_of_fields
 
 _VOLTAGE, _PAYLOAD, _SLOPE = (CONDITIONS[c].range for c in ("voltage", "payload", "slope_deg"))
 Slope = Annotated[float, Field(ge=_SLOPE[0], le=_SLOPE[1], allow_inf_nan=False)]
@@ -40,7 +40,7 @@ SHOWN = 5.0
 Seed = Annotated[int, Field(ge=0, le=2**32 - 1)]
 
 
-def about(default: Any, description: str, **extra: Any) -> Any:
+def option_field(default: Any, description: str, **extra: Any) -> Any:
     """Field with its description; options, their help and the schema are made from it (`sweeps.options`).
 
     Args:
@@ -63,11 +63,11 @@ class Part(BaseModel):
 class RobotPart(Part):
     """Robot."""
 
-    robot: str = about("nominal", "nominal, sm1, sm2, or a robot's TOML file")
-    set: dict[str, bool | float] = about(
+    robot: str = option_field("nominal", "nominal, sm1, sm2, or a robot's TOML file")
+    set: dict[str, bool | float] = option_field(
         {}, "Change a parameter, SI units, repeatable: 6T2A.ground.friction.static=0.6"
     )
-    effects: tuple[str, ...] = about(
+    effects: tuple[str, ...] = option_field(
         (), "A Python file with effects of your own, repeatable; its code is run", verbatim=True, executes=True
     )
 
@@ -75,7 +75,7 @@ class RobotPart(Part):
 class DataPart(Part):
     """Columns of a table or log that have other names than this program's."""
 
-    columns: str | None = about(
+    columns: str | None = option_field(
         None,
         "Names, units and signs of the data's columns: a preset "
         f"({', '.join(presets_file.PACKAGED)}; with the numbers it asks for, vesc,pole_pairs=7) or a preset's file",
@@ -86,7 +86,7 @@ class DataPart(Part):
 class ModelPart(Part):
     """Fidelity, one of `mmrjax.fidelities`."""
 
-    model: str = about(fidelities.NAMES[0], f"Fidelity: {', '.join(fidelities.NAMES)}")
+    model: str = option_field(fidelities.NAMES[0], f"Fidelity: {', '.join(fidelities.NAMES)}")
 
     @field_validator("model")
     @classmethod
@@ -136,8 +136,8 @@ Duration = Annotated[float, Field(gt=0, le=_most("duration"), allow_inf_nan=Fals
 class FidelityPart(ModelPart):
     """Fidelity of the simulation and its options; None takes the fidelity's default."""
 
-    duration_s: Duration | None = about(None, "Length of a run", usual=_usual("duration", SHOWN))
-    step_s: Annotated[float, Field(gt=0, le=_most("step"), allow_inf_nan=False)] | None = about(
+    duration_s: Duration | None = option_field(None, "Length of a run", usual=_usual("duration", SHOWN))
+    step_s: Annotated[float, Field(gt=0, le=_most("step"), allow_inf_nan=False)] | None = option_field(
         None, "Integration step", usual=_usual("step")
     )
 
@@ -165,7 +165,7 @@ class FidelityPart(ModelPart):
 class BatchPart(FidelityPart):
     """Number of runs in one batch; None takes the fidelity's."""
 
-    chunk: Annotated[int, Field(ge=1, le=1_000_000_000)] | None = about(
+    chunk: Annotated[int, Field(ge=1, le=1_000_000_000)] | None = option_field(
         None,
         "Runs in one vmapped call",
         usual=", ".join(f"{name} {facts.at_once(accelerator=False)}" for name, facts in fidelities.TABLE.items())
@@ -176,8 +176,10 @@ class BatchPart(FidelityPart):
 class SupplyPart(Part):
     """Supply of the motors."""
 
-    battery: bool = about(False, "Supply from the on-board battery")
-    discharge_mAh: Annotated[float, Field(ge=0, le=100_000)] = about(0.0, "Charge already taken from the battery")
+    battery: bool = option_field(False, "Supply from the on-board battery")
+    discharge_mAh: Annotated[float, Field(ge=0, le=100_000)] = option_field(
+        0.0, "Charge already taken from the battery"
+    )
 
     @model_validator(mode="after")
     def _feeds(self) -> Self:
@@ -207,63 +209,65 @@ class OneRun(Part):
     The run itself checks its values (`inputs.one_run`), like a row of a table.
     """
 
-    configuration: str | None = about(
+    configuration: str | None = option_field(
         None, "One of the robot's, such as 6T2A or 4W2T of the packaged one", usual="its first"
     )
-    supply_voltage_V: float | None = about(
+    supply_voltage_V: float | None = option_field(
         None,
         "Supply voltage (V), negative backward",
         usual="33; of a rig its limit; none with --battery",
         flag="--voltage",
     )
-    motor_speed_rpm: float | None = about(
+    motor_speed_rpm: float | None = option_field(
         None, "Motor speed (rpm), negative backward, of a rig on whose motors it is imposed"
     )
-    motor_current_A: float | None = about(
+    motor_current_A: float | None = option_field(
         None,
         "Current of each motor (A), negative backward, of a rig on whose motors it is imposed",
         flag="--motor-current",
     )
-    payload_kg: float | None = about(None, "Additional load mass", usual="0")
-    slope_deg: float | None = about(None, "Slope, positive uphill", usual="0")
-    surface: str | None = about(None, SURFACE, usual=f"{BENCH}; of a rig none")
-    total_mass_kg: float | None = about(
+    payload_kg: float | None = option_field(None, "Additional load mass", usual="0")
+    slope_deg: float | None = option_field(None, "Slope, positive uphill", usual="0")
+    surface: str | None = option_field(None, SURFACE, usual=f"{BENCH}; of a rig none")
+    total_mass_kg: float | None = option_field(
         None, "Total mass", usual="the robot's own mass and the payload", flag="--mass"
     )
-    levers_front_deg: float | None = about(
+    levers_front_deg: float | None = option_field(
         None, "Angle of the front levers, 0 along the wheelbase outward, positive up, 180 folded", usual="the robot's"
     )
-    levers_rear_deg: float | None = about(None, "The same of the rear levers", usual="the robot's")
-    load_torque_Nm: float | None = about(
+    levers_rear_deg: float | None = option_field(None, "The same of the rear levers", usual="the robot's")
+    load_torque_Nm: float | None = option_field(
         None, "Torque of a brake on the output of each drive (N·m), against forward rotation, of a load on a shaft",
         usual="none", flag="--load-torque",
     )  # fmt: skip
 
 
 class GridPart(Part):
-    """The axes of a grid; None leaves them to `sweeps.points.grid.resolved`: Table 8 for the packaged robot.
+    """The axes of a grid; None leaves them to `sweeps.points.grid.resolve_grid`: Table 8 for the packaged robot.
 
     A robot has voltages or motor speeds, on the battery neither; payloads, slopes and surface are of a vehicle.
     """
 
-    configurations: Annotated[tuple[str, ...], Field(min_length=1)] | None = about(
+    configurations: Annotated[tuple[str, ...], Field(min_length=1)] | None = option_field(
         None, "Comma-separated, of the robot's", usual="all that it has"
     )
-    voltages_V: Voltages | None = about(
+    voltages_V: Voltages | None = option_field(
         None, "Supply voltages (V), of a rig thirds of its voltage_limit", usual=_shown(VOLTAGES_V)
     )
-    motor_speeds_rpm: Annotated[tuple[MotorSpeed, ...], Field(min_length=1)] | None = about(
+    motor_speeds_rpm: Annotated[tuple[MotorSpeed, ...], Field(min_length=1)] | None = option_field(
         None, "Motor speeds (rpm) of a rig on whose motors they are imposed", usual="thirds of speed_limit"
     )
-    motor_currents_A: Annotated[tuple[MotorCurrent, ...], Field(min_length=1)] | None = about(
+    motor_currents_A: Annotated[tuple[MotorCurrent, ...], Field(min_length=1)] | None = option_field(
         None, "Currents of each motor (A) of a rig on whose motors they are imposed", flag="--motor-currents"
     )
-    payloads_kg: Payloads | None = about(None, "Additional load masses (kg), of a rig 0", usual=_shown(PAYLOADS_KG))
-    slopes_deg: Annotated[tuple[Slope, ...], Field(min_length=1)] | None = about(
+    payloads_kg: Payloads | None = option_field(
+        None, "Additional load masses (kg), of a rig 0", usual=_shown(PAYLOADS_KG)
+    )
+    slopes_deg: Annotated[tuple[Slope, ...], Field(min_length=1)] | None = option_field(
         None, "Slopes, positive uphill (deg), of a rig 0", usual=_shown(SLOPES_DEG)
     )
-    surface: str | None = about(None, SURFACE, usual=f"{BENCH}; of a rig none")
-    load_torques_Nm: Annotated[tuple[LoadTorque, ...], Field(min_length=1)] | None = about(
+    surface: str | None = option_field(None, SURFACE, usual=f"{BENCH}; of a rig none")
+    load_torques_Nm: Annotated[tuple[LoadTorque, ...], Field(min_length=1)] | None = option_field(
         None, "Torques of a brake on the output of each drive (N·m), of a load on a shaft", usual="none",
         flag="--load-torques",
     )  # fmt: skip
@@ -272,25 +276,25 @@ class GridPart(Part):
 class InferencePart(Part):
     """Prior knowledge and data of a fit."""
 
-    prior: tuple[str, ...] = about(
+    prior: tuple[str, ...] = option_field(
         (), "A prior in SI units, repeatable: 6T2A.ground.friction.static=0.45±0.05", verbatim=True
     )
-    noise: str = about(
+    noise: str = option_field(
         "",
         "Sd of current, motor_speed, speed in % or A, rpm, mm/s: current=2%,speed=5mm/s",
         usual="the file's columns; else calibrate estimates; loop estimates from series, as of slopes (0.7 and 1.4 "
         "times too), and without such assumes 2, 0.5, 1 %, halved and doubled",
     )
-    rows: Annotated[int, Field(ge=100, le=1_000_000)] = about(
+    rows: Annotated[int, Field(ge=100, le=1_000_000)] = option_field(
         ROWS, "Largest number of rows used of a log over time; a longer log is thinned evenly in time"
     )
-    seed: Seed = about(0, "Random seed")
+    seed: Seed = option_field(0, "Random seed")
 
 
 class MembersPart(Part):
     """Folder in which a population keeps its runs; it changes no number."""
 
-    members: Path | None = about(
+    members: Path | None = option_field(
         None, "File that keeps the population's runs; the same command with it goes on from there", solver=True
     )
 
@@ -298,7 +302,7 @@ class MembersPart(Part):
 class LoopBeside(MembersPart):
     """Options of the loop that change no number."""
 
-    within: Annotated[str, Field(pattern=r"^\d+(\.\d+)?(s|min|h)?$")] | None = about(
+    within: Annotated[str, Field(pattern=r"^\d+(\.\d+)?(s|min|h)?$")] | None = option_field(
         None, "Wall-clock time after which it ends with the best that there is, as 90s, 5min or 1h"
     )
 
@@ -318,17 +322,19 @@ Duty = Annotated[float, Field(ge=_DUTY[0], le=_DUTY[1], allow_inf_nan=False)]
 class TurnPart(Part):
     """Different drive of the two sides of one run; None: the same."""
 
-    left_V: Voltage | None = about(None, "Voltage of the left motor (V); with --right the robot is free to turn")
-    right_V: Voltage | None = about(None, "Voltage of the right motor (V)")
-    duty_left: Duty | None = about(None, "Share of the supply's voltage at the left motor, in place of --left")
-    duty_right: Duty | None = about(None, "Share of the supply's voltage at the right motor")
-    speed_m_s: Annotated[float, Field(ge=-100, le=100, allow_inf_nan=False)] | None = about(
+    left_V: Voltage | None = option_field(
+        None, "Voltage of the left motor (V); with --right the robot is free to turn"
+    )
+    right_V: Voltage | None = option_field(None, "Voltage of the right motor (V)")
+    duty_left: Duty | None = option_field(None, "Share of the supply's voltage at the left motor, in place of --left")
+    duty_right: Duty | None = option_field(None, "Share of the supply's voltage at the right motor")
+    speed_m_s: Annotated[float, Field(ge=-100, le=100, allow_inf_nan=False)] | None = option_field(
         None, "Speed of the settled turn (m/s), in place of --left and --right, which are found; with --yaw-rate"
     )
-    yaw_rate_rad_s: Annotated[float, Field(ge=-100, le=100, allow_inf_nan=False)] | None = about(
+    yaw_rate_rad_s: Annotated[float, Field(ge=-100, le=100, allow_inf_nan=False)] | None = option_field(
         None, "Yaw rate of the settled turn (rad/s), positive to the left; with --speed"
     )
-    heading_deg: Annotated[float, Field(ge=_HEADING[0], le=_HEADING[1], allow_inf_nan=False)] | None = about(
+    heading_deg: Annotated[float, Field(ge=_HEADING[0], le=_HEADING[1], allow_inf_nan=False)] | None = option_field(
         None, "Heading at the start, from uphill, positive to the left"
     )
 
@@ -368,7 +374,7 @@ class TurnPart(Part):
 class PosteriorPart(Part):
     """Uncertainty of results from the posterior of a calibrated robot."""
 
-    posterior: Annotated[int, Field(ge=10, le=100_000)] | None = about(
+    posterior: Annotated[int, Field(ge=10, le=100_000)] | None = option_field(
         None, "Give results with ±, from this number of robots drawn from the posterior.nc of the calibrated --robot"
     )
 
@@ -376,14 +382,14 @@ class PosteriorPart(Part):
 class OutputPart(Part):
     """Files written in addition to the numbers."""
 
-    report: bool = about(True, "Write report.html")
-    table: Literal["csv", "parquet"] = about("csv", "Tables of the folder: CSV, or Parquet too")
+    report: bool = option_field(True, "Write report.html")
+    table: Literal["csv", "parquet"] = option_field("csv", "Tables of the folder: CSV, or Parquet too")
 
 
 class ProfilePart(FidelityPart):
     """Mission that the runs follow."""
 
-    profile: Annotated[str, Field(min_length=1)] | None = about(
+    profile: Annotated[str, Field(min_length=1)] | None = option_field(
         None,
         "A mission over time: a CSV with time_s (s) and any of speed_mm_s, motor_speed_rpm, duty, mode, "
         "supply_voltage_V, slope_deg, payload_kg, load_torque_Nm, surface, current_other_A; with sides duty_left and "
@@ -466,19 +472,19 @@ class Resonance(RobotPart, FidelityPart, OutputPart):
     """A map of ripple over speed and payload, of the fidelity that resolves the running gear."""
 
     model: Literal["track"] = "track"
-    duration_s: Duration | None = about(
+    duration_s: Duration | None = option_field(
         None, "Length of a run (s); ripple is read in its second half", usual="1.5", minimum=0.5
     )
-    configuration: str | None = about(None, "One of the robot's", usual="its first")
-    voltages_V: Voltages = about(
+    configuration: str | None = option_field(None, "One of the robot's", usual="its first")
+    voltages_V: Voltages = option_field(
         tuple(10.0 + k for k in range(31)),
         "Supply voltages (V) that set the speed, at least 5 of them",
         usual="10:40:1, that is 31",
         minimum=0,
     )
-    payloads_kg: Payloads = about(PAYLOADS_KG, "Additional load masses")
-    slope_deg: Slope = about(0.0, "Slope, positive uphill")
-    surface: Literal[tuple(SURFACES)] = about(  # type: ignore[valid-type]  # names of a table
+    payloads_kg: Payloads = option_field(PAYLOADS_KG, "Additional load masses")
+    slope_deg: Slope = option_field(0.0, "Slope, positive uphill")
+    surface: Literal[tuple(SURFACES)] = option_field(  # type: ignore[valid-type]  # names of a table
         BENCH, "Surface of Table 5, which scales the adhesion"
     )
 
@@ -490,42 +496,44 @@ Height = Annotated[float, Field(gt=0, le=5000, allow_inf_nan=False)]
 class Climb(RobotPart, SupplyPart, OutputPart):
     """One robot over an obstacle, or the largest that it gets over."""
 
-    configuration: str | None = about(None, "One of the robot's", usual="its first")
-    step_mm: Height | None = about(None, "Height of a step")
-    stairs: str | None = about(None, "RISExTREADxCOUNT in mm, such as 170x290x3")
-    gap_mm: Height | None = about(None, "Width of a trench")
-    terrain: Path | None = about(None, "CSV of a polyline with columns x_m and z_m, or x_mm and z_mm", format="path")
-    nose_mm: Annotated[float, Field(ge=0, le=500, allow_inf_nan=False)] = about(
+    configuration: str | None = option_field(None, "One of the robot's", usual="its first")
+    step_mm: Height | None = option_field(None, "Height of a step")
+    stairs: str | None = option_field(None, "RISExTREADxCOUNT in mm, such as 170x290x3")
+    gap_mm: Height | None = option_field(None, "Width of a trench")
+    terrain: Path | None = option_field(
+        None, "CSV of a polyline with columns x_m and z_m, or x_mm and z_mm", format="path"
+    )
+    nose_mm: Annotated[float, Field(ge=0, le=500, allow_inf_nan=False)] = option_field(
         0.0, "Radius of the noses of step or stairs"
     )
-    levers_front_deg: Angle | None = about(
+    levers_front_deg: Angle | None = option_field(
         None, "Front levers, 0 along the wheelbase outward, positive up, 180 folded", usual="as the robot states them"
     )
-    levers_rear_deg: Angle | None = about(None, "Rear levers, the same", usual="as the robot states them")
-    sequence: Path | None = about(
+    levers_rear_deg: Angle | None = option_field(None, "Rear levers, the same", usual="as the robot states them")
+    sequence: Path | None = option_field(
         None, "CSV of lever angles: x_mm (middle of the robot from the obstacle) or time_s, front_deg, rear_deg; or "
         "voltages of their motors, front_V, rear_V, beginning at the stated angles",
         format="path",
     )  # fmt: skip
-    levers_voltage_V: Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False)] | None = about(
+    levers_voltage_V: Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False)] | None = option_field(
         None, "Highest voltage of the levers' motors (V)", usual="that of the supply", flag="--levers-voltage"
     )
-    supply_voltage_V: Voltage | None = about(None, "Supply voltage (V)", usual="12", flag="--voltage")
-    payload_kg: Payload = about(0.0, "Additional load mass")
-    surface: Literal[tuple(SURFACES)] = about(  # type: ignore[valid-type]  # names of a table
+    supply_voltage_V: Voltage | None = option_field(None, "Supply voltage (V)", usual="12", flag="--voltage")
+    payload_kg: Payload = option_field(0.0, "Additional load mass")
+    surface: Literal[tuple(SURFACES)] = option_field(  # type: ignore[valid-type]  # names of a table
         BENCH, "Surface of Table 5, which scales the adhesion"
     )
-    find: Literal["step", "stairs", "gap"] | None = about(
+    find: Literal["step", "stairs", "gap"] | None = option_field(
         None, "Look for the largest that it gets over, in place of one run; of stairs the rise at --stairs' tread"
     )
-    derivatives: tuple[str, ...] = about(
+    derivatives: tuple[str, ...] = option_field(
         (),
         "Derivatives of margins, time, energy and currents by these, comma-separated: parameters, adhesion, payload, "
         "voltage, levers_front_deg, levers_rear_deg, obstacle_mm",
     )
-    film: bool = about(False, "Write climb.gif")
-    duration_s: Annotated[float, Field(gt=0, le=600, allow_inf_nan=False)] = about(20.0, "Longest run")
-    time_step_s: Annotated[float, Field(gt=0, le=1e-3, allow_inf_nan=False)] = about(
+    film: bool = option_field(False, "Write climb.gif")
+    duration_s: Annotated[float, Field(gt=0, le=600, allow_inf_nan=False)] = option_field(20.0, "Longest run")
+    time_step_s: Annotated[float, Field(gt=0, le=1e-3, allow_inf_nan=False)] = option_field(
         1e-4, "Integration step", solver=True
     )
 
@@ -555,49 +563,49 @@ class Climb(RobotPart, SupplyPart, OutputPart):
 class Reproduce(RobotPart, ModelPart):
     """The paper's figures and tables."""
 
-    model: str = about(fidelities.NAMES[0], "steady, or track for Figs. 23-27 too")
+    model: str = option_field(fidelities.NAMES[0], "steady, or track for Figs. 23-27 too")
 
 
 class Calibrate(RobotPart, DataPart, InferencePart, OutputPart):
     """Options of a calibration; for None the fidelity or the data decide."""
 
-    model: Annotated[str, AfterValidator(_fidelity)] | None = about(
+    model: Annotated[str, AfterValidator(_fidelity)] | None = option_field(
         None, f"Fidelity: {', '.join(fidelities.NAMES)}", usual="drive for a log over time, else steady"
     )
-    free: tuple[str, ...] = about(
+    free: tuple[str, ...] = option_field(
         (), "Parameters to free, comma-separated; default is the default set, motor.* a group"
     )
-    fix: tuple[str, ...] = about((), "Parameters to hold, comma-separated")
-    starts: Annotated[int, Field(ge=1, le=100_000)] | None = about(
+    fix: tuple[str, ...] = option_field((), "Parameters to hold, comma-separated")
+    starts: Annotated[int, Field(ge=1, le=100_000)] | None = option_field(
         None, "Searches", usual="64; histories 8; settled turns 4; rows with drive or track 1"
     )
-    population: Annotated[int, Field(ge=0, le=1_000_000)] | None = about(
+    population: Annotated[int, Field(ge=0, le=1_000_000)] | None = option_field(
         None,
         "Members of each generation of a search without gradients, with which one with drive or track begins",
         usual="256 where the running gear is free, else 0",
         solver=True,
     )
-    generations: Annotated[int, Field(ge=1, le=10_000)] | None = about(
+    generations: Annotated[int, Field(ge=1, le=10_000)] | None = option_field(
         None, "Of the population, at most", usual="30", solver=True
     )
-    solver: Annotated[str, AfterValidator(_solver)] | None = about(
+    solver: Annotated[str, AfterValidator(_solver)] | None = option_field(
         None,
         f"Solver of the searches, of optimistix ({', '.join(solvers.OF_OPTIMISTIX)}) or optax "
         f"({', '.join(solvers.OF_OPTAX)})",
         usual="our Levenberg-Marquardt",
         solver=True,
     )
-    profiles: bool | None = about(None, "Profile likelihood of each", usual="steady only, but of turns")
-    hold_out: bool | None = about(None, "Fit again without each block", usual="steady only")
+    profiles: bool | None = option_field(None, "Profile likelihood of each", usual="steady only, but of turns")
+    hold_out: bool | None = option_field(None, "Fit again without each block", usual="steady only")
 
 
 class Settle(RobotPart, DataPart, OutputPart):
     """Options for extracting settled runs from a log over time."""
 
-    shortest_s: Annotated[float, Field(gt=0, le=3600, allow_inf_nan=False)] | None = about(
+    shortest_s: Annotated[float, Field(gt=0, le=3600, allow_inf_nan=False)] | None = option_field(
         None, "Shortest stretch that is taken for settled", usual="0.3, and at least 20 samples"
     )
-    drift: Annotated[float, Field(gt=0, le=0.5)] = about(
+    drift: Annotated[float, Field(gt=0, le=0.5)] = option_field(
         0.02, "Largest change of a channel's mean within a stretch, as a share of it"
     )
 
@@ -605,42 +613,44 @@ class Settle(RobotPart, DataPart, OutputPart):
 class Export(RobotPart, OutputPart):
     """A drive in the format of another simulator."""
 
-    robot: str = about("nominal", "nominal, sm1, sm2, or a robot's TOML file", metavar="[ROBOT.toml]", format="path")
-    to: Literal["mujoco", "jax", "onnx", "mjlab", "table", "randomization"] = about(
+    robot: str = option_field(
+        "nominal", "nominal, sm1, sm2, or a robot's TOML file", metavar="[ROBOT.toml]", format="path"
+    )
+    to: Literal["mujoco", "jax", "onnx", "mjlab", "table", "randomization"] = option_field(
         "mujoco", "Format (docs/howto/export.md)"
     )
-    data: str | None = about(
+    data: str | None = option_field(
         None, "A table of runs or a log, with which the exported drive is compared", usual="a grid without readings"
     )
-    configuration: str | None = about(None, "Which of the robot's configurations", usual="its first")
-    joint: str = about("drive", "Name of the joint in the simulator's model, for mujoco")
-    draws: Annotated[int, Field(ge=1, le=100_000)] = about(1000, "Draws of the posterior, for randomization")
-    seed: Seed = about(0, "Of the draws")
+    configuration: str | None = option_field(None, "Which of the robot's configurations", usual="its first")
+    joint: str = option_field("drive", "Name of the joint in the simulator's model, for mujoco")
+    draws: Annotated[int, Field(ge=1, le=100_000)] = option_field(1000, "Draws of the posterior, for randomization")
+    seed: Seed = option_field(0, "Of the draws")
 
 
 class Loop(RobotPart, DataPart, InferencePart, OutputPart):
     """Options of the closed loop."""
 
-    replicates: Annotated[int, Field(ge=250, le=100_000)] = about(
+    replicates: Annotated[int, Field(ge=250, le=100_000)] = option_field(
         500, "Tables of the bootstrap; of time histories at least 333 are made", solver=True
     )
-    prefer: Literal["fit", "held-out"] = about(
+    prefer: Literal["fit", "held-out"] = option_field(
         "fit",
         "By what one of several effects that these data cannot tell apart comes first, held-out being errors of "
         "blocks that a fit has not seen",
     )
-    forbid: tuple[str, ...] = about(
+    forbid: tuple[str, ...] = option_field(
         (), "An experiment that cannot be done, repeatable: stall, lifted, 'one motor', or a configuration"
     )
-    resolve: bool = about(
+    resolve: bool = option_field(
         False,
         "Ask the track model whether a running gear within its priors leaves what remains in slip, track or ground; "
         "tens of minutes on two cores",
     )
-    population: Annotated[int, Field(ge=4, le=1_000_000)] | None = about(
+    population: Annotated[int, Field(ge=4, le=1_000_000)] | None = option_field(
         None, "Members of a generation of --resolve", usual="128", solver=True
     )
-    generations: Annotated[int, Field(ge=1, le=10_000)] | None = about(
+    generations: Annotated[int, Field(ge=1, le=10_000)] | None = option_field(
         None, "Of --resolve, at most", usual="20", solver=True
     )
 
@@ -648,7 +658,7 @@ class Loop(RobotPart, DataPart, InferencePart, OutputPart):
 class RequirementsPart(Part):
     """Requirements on a robot."""
 
-    requirements: str = about(
+    requirements: str = option_field(
         "paper",
         "TOML file (docs/reference/requirements.md)",
         usual="the paper's aims",
@@ -660,67 +670,69 @@ class RequirementsPart(Part):
 class Check(RequirementsPart, RobotPart, OutputPart):
     """A robot held against requirements."""
 
-    changes: bool = about(True, "Look for what would meet what is missed")
+    changes: bool = option_field(True, "Look for what would meet what is missed")
 
 
 class Size(RequirementsPart, RobotPart, OutputPart):
     """A search for a robot that meets requirements."""
 
-    objective: str = about("mass", "Quantity to minimise: mass (kg), energy (Wh/m), cost (EUR)")
-    pareto: tuple[str, ...] = about((), "Two objectives, comma-separated, for a front of both instead")
-    motors: tuple[str, ...] = about((), "Motors to choose from, comma-separated", usual="all of the sheets")
-    starts: Annotated[int, Field(ge=1, le=100_000)] = about(256, "Searches in one batch")
-    seed: Seed = about(0, "Of the starts")
+    objective: str = option_field("mass", "Quantity to minimise: mass (kg), energy (Wh/m), cost (EUR)")
+    pareto: tuple[str, ...] = option_field((), "Two objectives, comma-separated, for a front of both instead")
+    motors: tuple[str, ...] = option_field((), "Motors to choose from, comma-separated", usual="all of the sheets")
+    starts: Annotated[int, Field(ge=1, le=100_000)] = option_field(256, "Searches in one batch")
+    seed: Seed = option_field(0, "Of the starts")
 
 
 class Sensitivity(RobotPart, DataPart, FidelityPart, SupplyPart, OutputPart):
     """A sensitivity study.
 
     Operating points are those of a grid; None leaves them to the method: Table 8 where gradients do, its corners and
-    middle where a sample is drawn; of a rig see `sweeps.points.grid.resolved`.
+    middle where a sample is drawn; of a rig see `sweeps.points.grid.resolve_grid`.
     """
 
-    method: str = about(
+    method: str = option_field(
         "sobol",
         "local, sobol, morris, derivative, or shapley (of a posterior)",
         usual="sobol; with --posterior shapley",
     )
-    configurations: Annotated[tuple[str, ...], Field(min_length=1)] | None = about(
+    configurations: Annotated[tuple[str, ...], Field(min_length=1)] | None = option_field(
         None, "Comma-separated, of the robot's", usual="all that it has"
     )
-    voltages_V: Voltages | None = about(
+    voltages_V: Voltages | None = option_field(
         None, "Supply voltages", usual="of Table 8; of a rig thirds of its voltage_limit"
     )
-    motor_speeds_rpm: Annotated[tuple[MotorSpeed, ...], Field(min_length=1)] | None = about(
+    motor_speeds_rpm: Annotated[tuple[MotorSpeed, ...], Field(min_length=1)] | None = option_field(
         None, "Motor speeds (rpm) of a rig on whose motors they are imposed", usual="thirds of speed_limit"
     )
-    payloads_kg: Payloads | None = about(None, "Additional load masses", usual="of Table 8; of a rig 0")
-    slopes_deg: Annotated[tuple[Slope, ...], Field(min_length=1)] | None = about(
+    payloads_kg: Payloads | None = option_field(None, "Additional load masses", usual="of Table 8; of a rig 0")
+    slopes_deg: Annotated[tuple[Slope, ...], Field(min_length=1)] | None = option_field(
         None, "Slopes, positive uphill", usual="of Table 8; of a rig 0"
     )
-    surface: str | None = about(None, SURFACE, usual=f"{BENCH}; of a rig none")
-    parameters: tuple[str, ...] = about(
+    surface: str | None = option_field(None, SURFACE, usual=f"{BENCH}; of a rig none")
+    parameters: tuple[str, ...] = option_field(
         (), "Uncertain parameters, comma-separated, motor.* a group", usual="all that have a prior"
     )
-    vary: tuple[str, ...] = about((), "A condition that is uncertain too, repeatable: voltage=22:26, slope_deg=0:5")
-    outputs: tuple[str, ...] = about(
+    vary: tuple[str, ...] = option_field(
+        (), "A condition that is uncertain too, repeatable: voltage=22:26, slope_deg=0:5"
+    )
+    outputs: tuple[str, ...] = option_field(
         (),
         "Outputs, comma-separated: those of a run, steepest_slope, highest_step, best_step, start for its three",
         usual="current, speeds, slip, power, efficiency, steepest slope",
     )
-    evaluations: Annotated[int, Field(ge=1, le=1_000_000_000)] | None = about(
+    evaluations: Annotated[int, Field(ge=1, le=1_000_000_000)] | None = option_field(
         None, "Model evaluations, at least, in all", usual="1000000; shapley 300000; runs over time 100000"
     )
-    seed: Seed = about(0, "Of the sample")
-    posterior: bool = about(False, "Take the inputs from the posterior.nc of the calibrated --robot")
-    candidates: str = about(
+    seed: Seed = option_field(0, "Of the sample")
+    posterior: bool = option_field(False, "Take the inputs from the posterior.nc of the calibrated --robot")
+    candidates: str = option_field(
         "",
         "CSV of runs that could be made next",
         usual="Table 8; of a rig the operating points",
         format="path",
     )
-    runs: Annotated[int, Field(ge=1, le=100)] = about(5, "Number of runs to propose")
-    noise: str = about("", "Sd of their readings", usual="current=2%,motor_speed=0.5%,speed=1%")
+    runs: Annotated[int, Field(ge=1, le=100)] = option_field(5, "Number of runs to propose")
+    noise: str = option_field("", "Sd of their readings", usual="current=2%,motor_speed=0.5%,speed=1%")
 
     @model_validator(mode="before")
     @classmethod
@@ -749,7 +761,7 @@ def solver_keys(kind: type[Part]) -> list[str]:
 
 
 def fields_with(kind: type[Part], fact: str) -> list[str]:
-    """Names of the fields whose `about` states a fact."""
+    """Names of the fields whose `option_field` states a fact."""
     extra = {name: f.json_schema_extra for name, f in kind.model_fields.items()}
     return [name for name, said in extra.items() if isinstance(said, dict) and said.get(fact)]
 
@@ -774,17 +786,17 @@ def resolve_beside(kind: type[C], file: Path | None, options: dict[str, Any], tr
     """Returns the options of a command outside its configuration; a file may state their `[solver]` keys only.
 
     Args:
-        trust: as of `resolve`.
+        trust: as of `resolve_configuration`.
 
     Raises:
-        BadConfiguration: as `resolve`.
+        BadConfiguration: as `resolve_configuration`.
     """
     table = {} if file is None else read_toml(file).get("solver", {})
     stated = {key: table[key] for key in solver_keys(kind) if key in table}
     return _checked(kind, file, stated, options, trust)
 
 
-def resolve(
+def resolve_configuration(
     kind: type[C],
     file: Path | None,
     options: dict[str, Any],
@@ -807,7 +819,7 @@ def _checked(kind: type[C], file: Path | None, values: dict[str, Any], options: 
     given = {k: v for k, v in options.items() if v is not None}
     for name in fields_with(kind, "executes"):
         if file is not None and values.get(name) and name not in given and not trust:
-            option = flags(kind)[name]
+            option = options_of_fields(kind)[name]
             raise BadConfiguration(
                 f"{file.name}, {name}: would run code, which a file cannot ask for; state {option} on the command "
                 "line, or --trust if you trust who wrote the file"
@@ -823,7 +835,7 @@ def _checked(kind: type[C], file: Path | None, values: dict[str, Any], options: 
 
 
 def _sentence(kind: type[Part], error: ValidationError, file: Path | None, given: dict[str, Any]) -> str:
-    first, options = error.errors()[0], flags(kind)
+    first, options = error.errors()[0], options_of_fields(kind)
 
     def called(name: str) -> str:
         """A field as whoever stated it did, or would: by its option, or its key in the file."""
@@ -856,7 +868,7 @@ def _sentence(kind: type[Part], error: ValidationError, file: Path | None, given
     return f"{where}: got {first['input']!r}; {wanted}"
 
 
-def settings(options: list[str] | None) -> dict[str, bool | float] | None:
+def parse_settings(options: list[str] | None) -> dict[str, bool | float] | None:
     """The `--set NAME=VALUE` options as a table.
 
     Raises:
@@ -869,7 +881,7 @@ def settings(options: list[str] | None) -> dict[str, bool | float] | None:
         name, equals, value = option.partition("=")
         try:
             word = value.strip()
-            table[name.strip()] = word == "true" if word in ("true", "false") else parsed(word)
+            table[name.strip()] = word == "true" if word in ("true", "false") else parse_number(word)
         except ValueError:
             raise BadConfiguration(
                 f"--set: got {option}; expected NAME=VALUE with a number, such as motor.resistance=0.9"
@@ -879,12 +891,12 @@ def settings(options: list[str] | None) -> dict[str, bool | float] | None:
     return table
 
 
-def words(options: list[str] | None) -> tuple[str, ...] | None:
+def split_words(options: list[str] | None) -> tuple[str, ...] | None:
     """Repeated, comma-separated options as one tuple."""
     return tuple(w.strip() for o in options for w in o.split(",") if w.strip()) if options else None
 
 
-def axis(option: str, text: str | None) -> tuple[float, ...] | None:
+def parse_axis(option: str, text: str | None) -> tuple[float, ...] | None:
     """An axis of a grid: `0,5,10`, or `0:20:0.5` for first, last and step, or both mixed.
 
     Raises:
@@ -895,7 +907,7 @@ def axis(option: str, text: str | None) -> tuple[float, ...] | None:
     values: list[float] = []
     for part in text.split(","):
         try:
-            numbers = [parsed(n) for n in part.split(":")]
+            numbers = [parse_number(n) for n in part.split(":")]
             if len(numbers) == 1:
                 values += numbers
                 continue

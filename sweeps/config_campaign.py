@@ -14,8 +14,18 @@ from pydantic_core import PydanticCustomError
 from calibration.data.input_errors import BadConfiguration, allowed_words
 from mmrjax.model.paper_tables import COULOMB_PER_MAH
 from mmrjax.model.quantities import RPM
-from sweeps.config import BatchPart, OutputPart, Part, ProfilePart, RobotPart, Sweep, about, read_toml, resolve
-from sweeps.flags import flags
+from sweeps.config import (
+    BatchPart,
+    OutputPart,
+    Part,
+    ProfilePart,
+    RobotPart,
+    Sweep,
+    option_field,
+    read_toml,
+    resolve_configuration,
+)
+from sweeps.flags import options_of_fields
 
 #: Keys that only a sweep into a store has.
 KEYS = ("axes", "samples", "conditions", "outputs", "storage", "compression", "profile", "obstacle")
@@ -80,10 +90,10 @@ class Campaign(RobotPart, ProfilePart, BatchPart, OutputPart):
 class SharePart(Part):
     """Who simulates a sweep, which changes no number."""
 
-    shard: str | None = about(
+    shard: str | None = option_field(
         None, "Simulate the i-th of n shares, as 3/8: a process of a job array each", solver=True
     )
-    scheduler: str | None = about(
+    scheduler: str | None = option_field(
         None, "Address of a dask scheduler whose workers simulate, as tcp://host:8786", solver=True, executes=True
     )
 
@@ -106,7 +116,7 @@ class How:
     outputs: tuple[str, ...] = ()
 
 
-def how(
+def sweep_options(
     shard: str | None,
     scheduler: str | None,
     export: Sequence[str] | None,
@@ -156,11 +166,14 @@ def resolve_campaign(file: Path | None, options: dict[str, Any], trust: bool = F
         for name in GRID:
             if options.get(name) is not None:
                 raise BadConfiguration(
-                    f"{flags(Sweep)[name]}: acts with a grid of options only; expected it in {file.name}, among its "
+                    f"{options_of_fields(Sweep)[name]}: acts with a grid of options only; expected it in "
+                    f"{file.name}, among its "
                     "axes or conditions"
                 )
-        return resolve(Campaign, file, {k: v for k, v in options.items() if k not in GRID}, SharePart, trust)
-    return resolve(Sweep, file, options, SharePart, trust)
+        return resolve_configuration(
+            Campaign, file, {k: v for k, v in options.items() if k not in GRID}, SharePart, trust
+        )
+    return resolve_configuration(Sweep, file, options, SharePart, trust)
 
 
 def of_grid(grid: Sweep) -> Campaign:

@@ -23,7 +23,7 @@ from rich.progress import (
 )
 from rich.text import Text
 
-from calibration.data.writing import naming
+from calibration.data.writing import naming_file
 
 #: Widest line of text on a terminal.
 COLUMNS = 80
@@ -36,26 +36,26 @@ _out = Console(highlight=False, soft_wrap=True, markup=False, width=_WIDTH)
 _err = Console(stderr=True, highlight=False, soft_wrap=True, markup=False)
 
 
-def say(what: Any) -> None:
+def print_output(what: Any) -> None:
     """Print text or a table to stdout."""
-    with naming(OUTPUT):
-        _out.print(wrapped(what) if isinstance(what, str) and sys.stdout.isatty() else what)
+    with naming_file(OUTPUT):
+        _out.print(wrap_for_terminal(what) if isinstance(what, str) and sys.stdout.isatty() else what)
 
 
-def tell(text: str) -> None:
+def print_message(text: str) -> None:
     """Print a line to stderr, in place of a progress line."""
-    again("")
-    _err.print(wrapped(text) if sys.stderr.isatty() else text)
+    rewrite_line("")
+    _err.print(wrap_for_terminal(text) if sys.stderr.isatty() else text)
 
 
-def again(text: str) -> None:
+def rewrite_line(text: str) -> None:
     """Write the last line of a terminal anew; a file, which keeps every line, gets none."""
     if sys.stderr.isatty():
         sys.stderr.write(f"\r\x1b[K{text[: COLUMNS - 1]}")
         sys.stderr.flush()
 
 
-def wrapped(text: str) -> str:
+def wrap_for_terminal(text: str) -> str:
     """Text for a terminal, in lines of at most `COLUMNS`, what is listed indented; a file gets it as it is."""
     return "\n".join(
         textwrap.fill(
@@ -67,9 +67,9 @@ def wrapped(text: str) -> str:
 
 
 @contextmanager
-def working(name: str) -> Iterator[None]:
+def report_working(name: str) -> Iterator[None]:
     """Say that a command works where it has not ended soon: what it imports and compiles can take longer."""
-    soon = threading.Timer(FIRST, tell, [f"{name}: working"])
+    soon = threading.Timer(FIRST, print_message, [f"{name}: working"])
     soon.daemon = True
     soon.start()
     try:
@@ -79,8 +79,8 @@ def working(name: str) -> Iterator[None]:
 
 
 @contextmanager
-def pulse(
-    tell: Callable[[str], None], doing: str, silence: float = SILENCE, again: Callable[[str], None] = again
+def step_reporter(
+    tell: Callable[[str], None], doing: str, silence: float = SILENCE, again: Callable[[str], None] = rewrite_line
 ) -> Iterator[Callable[[str], None]]:
     """A function that prints the current step; after a silence the step is repeated with its time and the number of
     programs compiled.
@@ -91,7 +91,7 @@ def pulse(
     """
     import jax
 
-    from sweeps.report.words.step_words import still
+    from sweeps.report.words.step_words import still_running_sentence
 
     compiled, said = 0, [(doing, time.monotonic(), 0)]
     spoke, over = threading.Event(), threading.Event()
@@ -111,7 +111,7 @@ def pulse(
             spoke.clear()
             if not heard and not over.is_set():
                 text, since, before = said[0]
-                again(still(text, time.monotonic() - since, compiled - before))
+                again(still_running_sentence(text, time.monotonic() - since, compiled - before))
 
     jax.monitoring.register_event_duration_secs_listener(count)
     thread = threading.Thread(target=beat, daemon=True)
@@ -125,14 +125,14 @@ def pulse(
 
 
 @contextmanager
-def stage(number: int, total: int, doing: str, silent: bool = False) -> Iterator[None]:
+def report_stage(number: int, total: int, doing: str, silent: bool = False) -> Iterator[None]:
     """Report a stage of a command and, while it lasts, its time; `silent`: without the time, next to a bar."""
     text = f"{number} of {total}, {doing}"
     if silent:
-        tell(text)
+        print_message(text)
         yield
         return
-    with pulse(tell, doing) as heard:
+    with step_reporter(print_message, doing) as heard:
         heard(text)
         yield
 
@@ -147,7 +147,7 @@ class RateColumn(ProgressColumn):
 
 
 @contextmanager
-def progress(
+def progress_bar(
     total: int, quiet: bool, doing: str = "simulating", done: int = 0, rate: bool = False
 ) -> Iterator[Callable[[float], None]]:
     """A bar on stderr; gives a function that is called with how much more is done.

@@ -21,7 +21,7 @@ UNITS = {
 }
 
 
-def facts(kind: type[BaseModel]) -> dict[str, dict[str, Any]]:
+def schema_facts(kind: type[BaseModel]) -> dict[str, dict[str, Any]]:
     """Schema of each field of a configuration, in the order of its parts, its own first."""
     schema = kind.model_json_schema()["properties"]
     own = [
@@ -35,7 +35,7 @@ def facts(kind: type[BaseModel]) -> dict[str, dict[str, Any]]:
     return found
 
 
-def flag(name: str, fact: Mapping[str, Any]) -> str:
+def option_of_field(name: str, fact: Mapping[str, Any]) -> str:
     """The option of a field: `--discharge` of `discharge_mAh`."""
     stem, _ = of_unit(name)
     return str(fact.get("flag") or "--" + stem.replace("_", "-"))
@@ -48,6 +48,6 @@ def of_unit(name: str) -> tuple[str, str]:
     )
 
 
-def flags(kind: type[BaseModel]) -> dict[str, str]:
+def options_of_fields(kind: type[BaseModel]) -> dict[str, str]:
     """The option of each field."""
-    return {name: flag(name, fact) for name, fact in facts(kind).items()}
+    return {name: option_of_field(name, fact) for name, fact in schema_facts(kind).items()}

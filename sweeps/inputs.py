@@ -10,7 +10,7 @@ from typing import Any
 from calibration.data import effect_file, posterior_file, robot_file, surface_labels
 from calibration.data import runs as records
 from calibration.data.columns import IMPOSED, Layout
-from calibration.data.contradictions import misplaced
+from calibration.data.contradictions import misplaced_levers
 from calibration.data.input_errors import BadConfiguration, allowed_words
 from calibration.data.posterior_file import Posterior
 from calibration.data.robot_file import RobotFile
@@ -21,13 +21,13 @@ from mmrjax.model.quantities import RPM
 from mmrjax.model.robot import Robot, turn_error
 from sweeps import capabilities, store
 from sweeps.config import FidelityPart, OneRun, RobotPart
-from sweeps.console import tell
-from sweeps.flags import flags
+from sweeps.console import print_message
+from sweeps.flags import options_of_fields
 from sweeps.pages import turn_words
 from sweeps.points import imposed
 
 #: Option that states a condition of one run.
-OPTIONS = flags(OneRun)
+OPTIONS = options_of_fields(OneRun)
 
 
 def load_robot(config: RobotPart) -> RobotFile:
@@ -39,19 +39,23 @@ def load_robot(config: RobotPart) -> RobotFile:
         BadConfiguration: no such robot, a file or a change that is refused.
     """
     notes: list[str] = []
-    file = robot_file.find(config.robot, effect_file.library(config.effects), notes)
-    robot = robot_file.change(file.robot, config.set, where="--set", notes=notes)
+    file = robot_file.find_robot_file(config.robot, effect_file.effect_library(config.effects), notes)
+    robot = robot_file.change_robot(file.robot, config.set, where="--set", notes=notes)
     unlike = () if getattr(config, "turns", False) else _unlike(file.name, robot)
     for note in (*notes, *unlike):
-        tell(note)
+        print_message(note)
     resolves = isinstance(config, FidelityPart) and fidelities.fidelity_facts(config.model).resolves
     runs = (
         robot.has_ground
         and robot.rig.imposed == "voltage"
         and all(c.inertia > 0 for _, c in robot.configurations.items())
     )
-    if resolves and runs and not capabilities.states(robot, "running_gear."):  # else the model itself is refused
-        tell("the robot's file states no running_gear: wheelbase, belt and masses within are those of an example")
+    if (
+        resolves and runs and not capabilities.states_parameter(robot, "running_gear.")
+    ):  # else the model itself is refused
+        print_message(
+            "the robot's file states no running_gear: wheelbase, belt and masses within are those of an example"
+        )
     return dataclasses.replace(file, robot=robot, remarks=unlike)
 
 
@@ -60,11 +64,11 @@ def _unlike(name: str, robot: Robot) -> tuple[str, ...]:
     if not robot.unlike or not robot.has_ground:
         return ()
     if why := turn_error(robot, robot.configurations):
-        return (turn_words.unlike(name, robot.unlike, f"how it would turn is not known: {why}"),)
-    value = imposed.usual(robot)
+        return (turn_words.unlike_sides_note(name, robot.unlike, f"how it would turn is not known: {why}"),)
+    value = imposed.imposed_example(robot)
     found = turns_under_equal_commands(robot, value * RPM if robot.rig.imposed == "motor_speed" else value)
     turns = turn_words.by_itself(robot, found, value)
-    return (turn_words.unlike(name, robot.unlike, turns),) if turns else ()
+    return (turn_words.unlike_sides_note(name, robot.unlike, turns),) if turns else ()
 
 
 def beside_robot(file: RobotFile) -> Posterior:
@@ -79,7 +83,7 @@ def beside_robot(file: RobotFile) -> Posterior:
             f"--posterior: {file.source} has none; expected --robot FOLDER/robot.toml of calibrate or loop"
         )
     path = Path(file.source).with_name(posterior_file.FILE)
-    found = posterior_file.read(path)
+    found = posterior_file.read_posterior(path)
     found.check(file.robot, str(path))
     return found
 
@@ -114,7 +118,9 @@ def check_surface(robot: Robot, names: Collection[str], surface: str | None, whe
         BadConfiguration: the message has `where` and the known surfaces.
     """
     known = surface is None or surface in SURFACES or not robot.rig.scales_adhesion
-    if not known and not all(surface_labels.named(name, str(surface)) in robot.configurations for name in names):
+    if not known and not all(
+        surface_labels.configuration_on_surface(name, str(surface)) in robot.configurations for name in names
+    ):
         raise BadConfiguration(
             f"{where}: got {surface}, whose friction is not known; {allowed_words(str(surface), SURFACES)}"
         )
@@ -136,24 +142,24 @@ def read_runs(
         source: a file of any format, or a packaged table.
         robot: has the configurations of the table.
         measured: whether readings are needed; series: whether time histories are taken.
-        columns: a preset or its file, see `records.read`.
-        battery: whether the runs are on the battery, see `records.read`.
+        columns: a preset or its file, see `records.read_runs`.
+        battery: whether the runs are on the battery, see `records.read_runs`.
         of_turns: whether a table of turns has each channel of both sides, and of the yaw, for which it has a column.
 
     Raises:
-        BadData: what `records.read` refuses, time histories where none are taken, or a configuration that the
+        BadData: what `records.read_runs` refuses, time histories where none are taken, or a configuration that the
             robot does not have.
     """
-    runs = records.read(source, robot, columns=columns, measured=measured, battery=battery, of_turns=of_turns)
+    runs = records.read_runs(source, robot, columns=columns, measured=measured, battery=battery, of_turns=of_turns)
     if not series:
         from calibration.inference import observers
 
         observers.observer_kind(runs).check_settled(runs)
     runs.configurations(robot)
     for note in runs.notes:
-        tell(note)
+        print_message(note)
     if runs.unknown:
-        tell(f"{runs.source}: not used: {', '.join(runs.unknown)}")
+        print_message(f"{runs.source}: not used: {', '.join(runs.unknown)}")
     return runs
 
 
@@ -181,20 +187,20 @@ def one_run(
     layout = Layout.of(robot)
     column = layout.imposed_column
     for other in (c for c, _ in IMPOSED.values() if c != column and c in given):
-        raise BadConfiguration(imposed.refused(robot, OPTIONS[other], OPTIONS[column]))
+        raise BadConfiguration(imposed.option_refusal(robot, OPTIONS[other], OPTIONS[column]))
     idle = [OPTIONS[key] for key in given if key in layout.idle]
     imposed.check_acting(robot, idle, idle)
     if battery:
         imposed.check_battery(robot)
     elif column not in given:
         rest = 0.0 if column in elsewhere else None
-        given[column] = imposed.default(robot, OPTIONS[column]) if rest is None else rest
+        given[column] = imposed.imposed_default(robot, OPTIONS[column]) if rest is None else rest
     if robot.has_ground:
         bench = {"surface": BENCH} if robot.rig.scales_adhesion else {}
         given = {**bench, "payload_kg": 0.0, "slope_deg": 0.0, **given}
         check_surface(robot, (name,), given.get("surface"), "--surface")
-    run = records.single({**given, "configuration": name}, layout)
-    if found := misplaced(run, robot):
+    run = records.single_run({**given, "configuration": name}, layout)
+    if found := misplaced_levers(run, robot):
         _, column, why = found
         raise BadConfiguration(f"{OPTIONS[column]}: {why}")
     return run

@@ -12,13 +12,13 @@ import typer
 
 from sweeps import config
 from sweeps.config import Part
-from sweeps.flags import facts, flag, of_unit
+from sweeps.flags import of_unit, option_of_field, schema_facts
 
 _TYPES = {"boolean": bool, "integer": int, "number": float, "string": str, "object": list[str]}
 _LISTS = {"number": str, "string": list[str]}  # an axis is one text
 
 
-def described(name: str, fact: Mapping[str, Any]) -> str:
+def option_help(name: str, fact: Mapping[str, Any]) -> str:
     """Meaning, unit, choices, bounds and default of a field, as a help text has them."""
     _, unit = of_unit(name)
     texts = [str(fact.get("description", name)).rstrip(".")]
@@ -43,7 +43,7 @@ def _bounds(fact: Mapping[str, Any]) -> str:
 def _default(name: str, fact: Mapping[str, Any]) -> str:
     value = fact.get("usual", fact.get("default"))
     if isinstance(value, bool):
-        return "default: " + flag(name, fact).removeprefix("--") if value else ""
+        return "default: " + option_of_field(name, fact).removeprefix("--") if value else ""
     if isinstance(value, list):
         value = ",".join(f"{v:g}" if isinstance(v, float) else str(v) for v in value)
     return (
@@ -51,22 +51,22 @@ def _default(name: str, fact: Mapping[str, Any]) -> str:
     )
 
 
-def parameters(kind: type[Part], arguments: tuple[str, ...] = ()) -> Iterator[inspect.Parameter]:
+def option_parameters(kind: type[Part], arguments: tuple[str, ...] = ()) -> Iterator[inspect.Parameter]:
     """A parameter of a command's function for each field that can be chosen, None where it is not given.
 
     Args:
         arguments: fields that are arguments and not options.
     """
-    for name, fact in facts(kind).items():
+    for name, fact in schema_facts(kind).items():
         if "const" in fact:  # one choice is none
             continue
         if name in arguments:
-            told: Any = typer.Argument(metavar=fact["metavar"], help=described(name, fact))
+            told: Any = typer.Argument(metavar=fact["metavar"], help=option_help(name, fact))
         else:
-            word = flag(name, fact)
+            word = option_of_field(name, fact)
             pair = fact.get("type") == "boolean" and fact.get("default") is not False
             names = f"{word}/--no-{word.removeprefix('--')}" if pair else word
-            told = typer.Option(names, help=described(name, fact), hidden=bool(fact.get("solver")))
+            told = typer.Option(names, help=option_help(name, fact), hidden=bool(fact.get("solver")))
         yield inspect.Parameter(
             name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=Annotated[_type(fact) | None, told]
         )
@@ -78,30 +78,35 @@ def _type(fact: Mapping[str, Any]) -> Any:
     return _LISTS[fact["items"]["type"]] if fact["type"] == "array" else _TYPES[fact["type"]]
 
 
-def taken(kind: type[Part], values: dict[str, Any]) -> dict[str, Any]:
+def take_options(kind: type[Part], values: dict[str, Any]) -> dict[str, Any]:
     """Takes what was given for the fields of a configuration out of the values of a command, and reads their texts.
 
     Raises:
         BadConfiguration: an axis or a change that cannot be read.
     """
-    return {name: _read(name, fact, values.pop(name, None)) for name, fact in facts(kind).items()}
+    return {name: _read(name, fact, values.pop(name, None)) for name, fact in schema_facts(kind).items()}
 
 
 def _read(name: str, fact: Mapping[str, Any], value: Any) -> Any:
     if value is None:
         return None
     if fact["type"] == "object":
-        return config.settings(value)
+        return config.parse_settings(value)
     if fact["type"] == "array" and fact["items"]["type"] == "number":
-        return config.axis(flag(name, fact), value)
+        return config.parse_axis(option_of_field(name, fact), value)
     if fact["type"] == "array":
-        return (tuple(value) or None) if fact.get("verbatim") else config.words(value)
+        return (tuple(value) or None) if fact.get("verbatim") else config.split_words(value)
     return str(value) if isinstance(value, Path) else value
 
 
 def help_all(kinds: tuple[type[Part], ...]) -> Iterator[inspect.Parameter]:
     """The option that shows those of solvers too, where a command has any."""
-    hidden = [flag(name, fact) for kind in kinds for name, fact in facts(kind).items() if fact.get("solver")]
+    hidden = [
+        option_of_field(name, fact)
+        for kind in kinds
+        for name, fact in schema_facts(kind).items()
+        if fact.get("solver")
+    ]
     if hidden:
         told = typer.Option(
             "--help-all", is_eager=True, callback=_show_all,

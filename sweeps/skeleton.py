@@ -11,7 +11,7 @@ from calibration.data.robot_file import RobotFile
 from calibration.data.runs import Runs
 from sweeps import config as configuration
 from sweeps.config import RobotPart
-from sweeps.console import say
+from sweeps.console import print_output
 from sweeps.report import terminal_renderer
 from sweeps.report.document import Document
 from sweeps.store import DONE, SOLVER_FAILED, Folder
@@ -19,21 +19,28 @@ from sweeps.store import DONE, SOLVER_FAILED, Folder
 Page = Callable[[Path], Any]
 
 
-def page(name: str, *found: Any, **known: Any) -> Page:
-    """The page of `sweeps/pages` by name, of what its `write` takes after the folder.
+def page_writer(name: str, *found: Any, **known: Any) -> Page:
+    """Writer of the page `sweeps/pages/{name}_page.py`, of what its `write_{name}_page` takes after the folder.
 
-    It is imported when it is written: figures cost half a second, which --no-report saves.
+    The module is imported when the page is written: figures cost half a second, which --no-report saves.
     """
-    return lambda folder: importlib.import_module(f"sweeps.pages.{name}_page").write(folder, *found, **known)
+
+    def write(folder: Path) -> None:
+        module = importlib.import_module(f"sweeps.pages.{name}_page")
+        getattr(module, f"write_{name}_page")(folder, *found, **known)
+
+    return write
 
 
-def report(document: Document, file: RobotFile | None = None) -> Page:
+def print_report(document: Document, file: RobotFile | None = None) -> Page:
     """Print a document and return its page, which ends with the robot's parameters if its file is given."""
-    terminal_renderer.show(document)
-    return lambda folder: importlib.import_module("sweeps.report.page_renderer").write(folder, document, file)
+    terminal_renderer.print_document(document)
+    return lambda folder: importlib.import_module("sweeps.report.page_renderer").write_report_page(
+        folder, document, file
+    )
 
 
-def leave(
+def finish_run_folder(
     folder: Folder,
     config: RobotPart,
     manifest: dict[str, Any],
@@ -55,5 +62,5 @@ def leave(
     folder.write_text("config.resolved.toml", configuration.as_toml(config))
     if page is not None and getattr(config, "report", True):
         page(folder.partial)
-    say(str(folder.finish(manifest, runs)))
+    print_output(str(folder.finish(manifest, runs)))
     return DONE if solved else SOLVER_FAILED

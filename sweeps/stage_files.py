@@ -40,7 +40,7 @@ class Unreadable(Exception):
     """A file that is damaged, or not one of a stage."""
 
 
-def write(file: Path, value: Any) -> None:
+def write_stage(file: Path, value: Any) -> None:
     """Write a value.
 
     Raises:
@@ -57,8 +57,8 @@ def write(file: Path, value: Any) -> None:
         np.savez(stream, allow_pickle=False, tree=np.frombuffer(tree, np.uint8), data=data)
 
 
-def read(file: Path) -> Any:
-    """Value that `write` wrote.
+def read_stage(file: Path) -> Any:
+    """Value that `write_stage` wrote.
 
     Raises:
         Unreadable: it cannot be read, or names what it may not.

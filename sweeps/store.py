@@ -27,7 +27,7 @@ from mmrjax import __version__
 from mmrjax.model import params
 from mmrjax.model.robot import Robot
 from sweeps.config import RobotPart
-from sweeps.console import tell
+from sweeps.console import print_message
 
 T = TypeVar("T")
 #: Exit codes of a command that is done: every solver gave an answer, or one failed. A run that stalls or slides, a
@@ -77,7 +77,7 @@ class Folder:
             hint = "it is a file"
         elif not force:
             hint = "--force replaces a run folder"
-        elif (left := contents(self.path)) is None:
+        elif (left := listed_names(self.path)) is None:
             hint = "it is no run folder that --force could replace"
         else:
             foreign = sorted({p.name for p in self.path.iterdir()} - {*left, *self.further})
@@ -97,7 +97,7 @@ class Folder:
         """
         if not os.path.lexists(self.partial) or (self.partial.is_dir() and not any(self.partial.iterdir())):
             return
-        mark = unfinished(self.partial)
+        mark = interrupted_run(self.partial)
         if mark is None:
             raise BadConfiguration(f"--out: {self.partial} is in the way and is no run of ours; choose another path")
         if mark["command"] not in ("", command) and not force and holds_work(self.partial):
@@ -112,7 +112,7 @@ class Folder:
 
     def write_bytes(self, name: str, content: bytes) -> None:
         """Write a file of bytes."""
-        with writing.naming(self.partial / name):
+        with writing.naming_file(self.partial / name):
             (self.partial / name).write_bytes(content)
 
     def write_json(self, name: str, content: dict[str, Any]) -> None:
@@ -129,7 +129,7 @@ class Folder:
         Hashes of the folder's `robot.toml` and of the file that `runs` came from, if any, are added, and the names of
         all that the folder holds: `--force` deletes nothing else.
         """
-        hashes = {"robot": digest((self.partial / "robot.toml").read_bytes()), **manifest.get("hashes", {})}
+        hashes = {"robot": sha256_hex((self.partial / "robot.toml").read_bytes()), **manifest.get("hashes", {})}
         if runs is not None and runs.digest:
             hashes[runs.source] = runs.digest
         now = datetime.datetime.now(datetime.UTC)
@@ -138,7 +138,7 @@ class Folder:
             "seconds": round((now - self.started).total_seconds(), 3),
         }
         names = {"manifest.json", *(p.name for p in self.partial.iterdir())} - {LOCK, CHUNKS}
-        whole = {**provenance(), **times, **manifest, "hashes": hashes, "contents": sorted(names)}
+        whole = {**result_provenance(), **times, **manifest, "hashes": hashes, "contents": sorted(names)}
         self.write_json("manifest.json", whole)
         return self.move_into_place()
 
@@ -147,7 +147,7 @@ class Folder:
         raise NotImplementedError
 
 
-def contents(folder: Path) -> list[str] | None:
+def listed_names(folder: Path) -> list[str] | None:
     """Names that the manifest of a run folder lists; None if it is no run folder of ours."""
     found = _json(folder / "manifest.json")
     names = found.get("contents")
@@ -156,7 +156,7 @@ def contents(folder: Path) -> list[str] | None:
     return [name for name in names if isinstance(name, str)]
 
 
-def unfinished(partial: Path) -> dict[str, str] | None:
+def interrupted_run(partial: Path) -> dict[str, str] | None:
     """Command and identity of an interrupted run; None if a folder is not one of ours.
 
     Of a run that was killed before it could write them both are empty.
@@ -173,7 +173,7 @@ def unfinished(partial: Path) -> dict[str, str] | None:
     return None
 
 
-def marked(command: str, identity: str = "") -> str:
+def lock_text(command: str, identity: str = "") -> str:
     """Text of the file `lock`, which marks a folder as ours."""
     return json.dumps({"schema": UNFINISHED, "command": command, "identity": identity})
 
@@ -193,12 +193,12 @@ def share_at_work(partial: Path, own: Path | None = None) -> str | None:
     for file in sorted((partial / "journal").glob("*.jsonl")):
         if file != own:
             with file.open("a") as journal:
-                if not lockable(journal):
+                if not try_to_lock(journal):
                     return file.stem
     return None
 
 
-def lockable(file: TextIO) -> bool:
+def try_to_lock(file: TextIO) -> bool:
     """Lock an open file until it is closed; False if another process has locked it."""
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -241,7 +241,7 @@ class RunFolder(Folder):
         """
         super().__init__(path)
         self._force, self._command = force, str(identity.get("command", ""))
-        self._digest = digest(json.dumps(identity, sort_keys=True, default=str).encode())
+        self._digest = sha256_hex(json.dumps(identity, sort_keys=True, default=str).encode())
         self._lock: TextIO | None = None
         self.refuse_taken(force)
         try:
@@ -259,7 +259,7 @@ class RunFolder(Folder):
         """Lock of the partial folder; None if another process has removed or moved the folder meanwhile."""
         self.partial.mkdir(parents=True, exist_ok=True)
         lock = (self.partial / LOCK).open("a+", encoding="utf-8")
-        if not lockable(lock) or share_at_work(self.partial) is not None:
+        if not try_to_lock(lock) or share_at_work(self.partial) is not None:
             lock.close()
             raise BadConfiguration(
                 f"--out: another process is at work on {self.partial}; wait for it, or choose another path"
@@ -277,15 +277,15 @@ class RunFolder(Folder):
         except BadConfiguration:
             self._remove()
             raise
-        mark = unfinished(self.partial)
+        mark = interrupted_run(self.partial)
         if mark is None or mark["identity"] != self._digest:
             if mark is not None and holds_work(self.partial):
-                tell(f"{self.partial}: of another configuration; begun anew")
+                print_message(f"{self.partial}: of another configuration; begun anew")
             for entry in self.partial.iterdir():
                 if entry.name != LOCK:
                     shutil.rmtree(entry) if entry.is_dir() and not entry.is_symlink() else entry.unlink()
             self._lock.truncate(0)
-            self._lock.write(marked(self._command, self._digest))
+            self._lock.write(lock_text(self._command, self._digest))
             self._lock.flush()
         (self.partial / CHUNKS).mkdir(exist_ok=True)
 
@@ -324,14 +324,14 @@ class RunFolder(Folder):
         try:
             return stage_files.read_arrays(file)
         except Exception:  # whatever a damaged file makes the reader raise
-            tell(f"{file}: damaged; computed again")
+            print_message(f"{file}: damaged; computed again")
             return None
 
     def keep_chunk(self, name: str, columns: dict[str, np.ndarray]) -> None:
         """Keep a finished chunk for a run that is taken up again."""
         file = self.partial / CHUNKS / f"{name}.npz"
         aside = file.with_suffix(".writing")
-        with writing.naming(file), aside.open("wb") as stream:
+        with writing.naming_file(file), aside.open("wb") as stream:
             np.savez(stream, allow_pickle=False, **columns)
         aside.replace(file)
 
@@ -345,14 +345,14 @@ class RunFolder(Folder):
         file = self._of_stage(name)
         if file.is_file():
             try:
-                kept: T = stage_files.read(file)
+                kept: T = stage_files.read_stage(file)
                 return kept
             except stage_files.Unreadable:
-                tell(f"{file}: damaged; computed again")
+                print_message(f"{file}: damaged; computed again")
         made = make()
         aside = file.with_suffix(".writing")
         with contextlib.suppress(OSError, stage_files.Unwritable):
-            stage_files.write(aside, made)
+            stage_files.write_stage(aside, made)
             aside.replace(file)
         return made
 
@@ -405,14 +405,14 @@ def open_folder(
         "config": config.model_dump(exclude={"report", "table"}),
         "robot": {p.name: float(p.value) for p in params.walk_parameters(robot)},
         "runs": None if runs is None else {key: value.tolist() for key, value in runs.columns.items()},
-        "effects": [digest(Path(file).read_bytes()) for file in config.effects],
+        "effects": [sha256_hex(Path(file).read_bytes()) for file in config.effects],
     }
     folder = RunFolder(out or default_path(command), identity, force=force)
     folder.tables = getattr(config, "table", folder.tables)
     return folder
 
 
-def provenance() -> dict[str, Any]:
+def result_provenance() -> dict[str, Any]:
     """Program, versions and devices that made a result."""
     import jax
     import jax.numpy as jnp
@@ -434,11 +434,11 @@ def rows_of_fit(robot: Path) -> frozenset[str]:
     hashes, arguments = found.get("hashes"), found.get("arguments")
     if not isinstance(hashes, dict) or not isinstance(arguments, list) or arguments[:1] not in FITS:
         return frozenset()
-    fitted = robot.name != "robot.toml" or hashes.get("robot") == digest(robot.read_bytes())
+    fitted = robot.name != "robot.toml" or hashes.get("robot") == sha256_hex(robot.read_bytes())
     return frozenset(str(value) for name, value in hashes.items() if name != "robot") if fitted else frozenset()
 
 
-def digest(content: bytes) -> str:
+def sha256_hex(content: bytes) -> str:
     """SHA-256 of some bytes, in hexadecimal."""
     return hashlib.sha256(content).hexdigest()
 

@@ -11,7 +11,7 @@ from typing import Any
 from worlds import settled
 
 from calibration.data.runs import Runs
-from calibration.data.runs import read as read_runs
+from calibration.data.runs import read_runs as read_runs
 from calibration.discovery import discover
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.candidates import BaseFit, fit_base

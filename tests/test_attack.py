@@ -57,11 +57,11 @@ def base(tmp_path_factory):
     rigs.case(world).write(folder)
     rigs.log(world, rng, hold=1.0, rate=50.0).write(folder / "log.csv")
     robot = paper_robots.nominal()
-    robot_file.write(robot, folder / "robot.toml")
+    robot_file.write_robot(robot, folder / "robot.toml")
     names = ("motor.resistance", "motor.friction_coulomb", "6T2A.ground.friction.static")
     at = priors.parameter_coordinates(robot, names, {})
     spread = np.diag(rng.uniform(0.5, 1.0, 3))
-    posterior_file.write(posterior_of_coordinates(at, np.zeros(3), spread), folder / "posterior.nc")
+    posterior_file.write_posterior(posterior_of_coordinates(at, np.zeros(3), spread), folder / "posterior.nc")
     (folder / "plan.toml").write_text(
         'model = "steady"\noutputs = ["speed", "flags"]\n[set]\n"motor.resistance" = 0.7\n[conditions]\npayload = 2.0\n'
         '[axes]\nconfiguration = "all"\nvoltage = { start = 15, stop = 33, number = 3 }\nslope_deg = "0:10:5"\n'
@@ -172,7 +172,7 @@ def accepted(*_, **__):
 
 #: Computations that take long, in the place of which a command ends: what comes before them is attacked here.
 HEAVY = (
-    "calibration.sizing.sheet.check_requirements", "sweeps.commands.missions.simulated", "sweeps.commands.climb.climb_batch",
+    "calibration.sizing.sheet.check_requirements", "sweeps.commands.missions.run_missions", "sweeps.commands.climb.climb_batch",
     "sweeps.commands.loop.discover", "sweeps.commands.calibrate.run", "sweeps.commands.sensitivity.analyse",
     "sweeps.commands.size.search", "sweeps.commands.render._write",
 )  # fmt: skip

@@ -131,12 +131,12 @@ backlash = "0.08 ± 30 %"
 def test_a_file_with_backlash_is_followed_with_it_and_needs_inertia(tmp_path):
     path = tmp_path / "rig.toml"
     path.write_text(FILE)
-    assert robot_file.load(str(path)).loose
+    assert robot_file.load_robot(str(path)).loose
     path.write_text(FILE.replace("inertia = 2e-6\n", ""))
     with pytest.raises(
         BadConfiguration, match=r"bench\.backlash: got 0\.08 rad; .* motor\.inertia and bench\.inertia"
     ):
-        robot_file.load(str(path))
+        robot_file.load_robot(str(path))
 
 
 @pytest.mark.nightly
@@ -144,7 +144,7 @@ def test_a_file_with_backlash_is_followed_with_it_and_needs_inertia(tmp_path):
 def test_backlash_is_found_in_a_history_of_reversals(tmp_path):
     path = tmp_path / "rig.toml"
     path.write_text(FILE)
-    robot = robot_file.load(str(path))
+    robot = robot_file.load_robot(str(path))
     truth = params.replace(robot, {"bench.backlash": 0.06})
     seen = driven(truth)
     at = np.searchsorted(TIMES, SAMPLES)
@@ -156,7 +156,7 @@ def test_backlash_is_found_in_a_history_of_reversals(tmp_path):
         lines.append(f"{t:.9g},{VOLTAGE[k]:g},{speed:.6g},5,{angle:.6g},0.2")
     table = tmp_path / "table.csv"
     table.write_text("\n".join(lines))
-    runs = records.read(table, robot=robot)
+    runs = records.read_runs(table, robot=robot)
     found = calibrate(
         runs, robot, free=["bench.backlash", "bench.loss_coulomb"], model="drive", starts=2, blocks=False,
         profiles=False,

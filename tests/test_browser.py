@@ -124,7 +124,7 @@ def test_the_page_of_nothing_missing_can_be_read_everywhere(browser, tmp_path):
     found = commanded().found
     summary = dataclasses.replace(found.summary, verdict="none")
     none = dataclasses.replace(found, verdict="none", effects=(), support=None, summary=summary)
-    assert wrong(browser, loop_page.write(tmp_path, none, robot_name="nominal")) == {}
+    assert wrong(browser, loop_page.write_loop_page(tmp_path, none, robot_name="nominal")) == {}
 
 
 def test_the_page_of_histories_can_be_read_everywhere(browser, tmp_path):
@@ -182,7 +182,7 @@ def drag(browser, element, begin, end):
 def test_a_time_overlay_zooms_and_its_residual_follows(browser, tmp_path):
     figure = Figure("histories", "The simulated speed is off by 5.", "**Over time.**", overlay)
     made = Document("Overlay", "The simulated speed is off by 5 rpm.", (), (Section("Over time", (figure,)),))
-    page = page_renderer.write(tmp_path, made)
+    page = page_renderer.write_report_page(tmp_path, made)
     assert wrong(browser, page) == {}
     browser.open(page, 1280)
     ranges = "document.querySelector('.overlay').ranges()"

@@ -44,7 +44,7 @@ STATED = "current=9%,motor_speed=6%,speed=4%"
 
 @pytest.fixture(scope="module")
 def measured():
-    return records.read("measured")
+    return records.read_runs("measured")
 
 
 @pytest.fixture(scope="module", params=["few starts", pytest.param("all of it", marks=pytest.mark.slow)])
@@ -129,7 +129,7 @@ def test_saved_result_has_a_robot_that_reaches_every_row(found, measured, tmp_pa
     files = ["posterior.nc", "result.json", "robot.toml", "rows.csv"]
     assert sorted(p.name for p in (tmp_path / "fitted").iterdir()) == files
     jsonschema.validate(json.loads((tmp_path / "fitted" / "result.json").read_text()), SCHEMA)
-    again = robot_file.read(tmp_path / "fitted" / "robot.toml")
+    again = robot_file.read_robot(tmp_path / "fitted" / "robot.toml")
     answer = steady_batch(again, measured.conditions(again))
     np.testing.assert_array_equal(answer.status, 0)
     np.testing.assert_allclose(answer.speed, found.readings["speed"].after, rtol=1e-9)
@@ -475,7 +475,7 @@ static = 0.6
 @pytest.mark.slow
 def test_a_robot_with_a_configuration_of_its_own_calibrates_from_its_file_alone(tmp_path):
     (tmp_path / "rover.toml").write_text(ROVER)
-    rover = robot_file.read(tmp_path / "rover.toml")
+    rover = robot_file.read_robot(tmp_path / "rover.toml")
     conditions = records.Runs(
         "rover.csv",
         {
@@ -484,7 +484,7 @@ def test_a_robot_with_a_configuration_of_its_own_calibrates_from_its_file_alone(
         },
     )  # fmt: skip
     creep = "rover.ground.friction.speed_static"
-    truth = robot_file.change(rover, {creep: 0.05}, where="test")
+    truth = robot_file.change_robot(rover, {creep: 0.05}, where="test")
     shown = steady_batch(truth, conditions.conditions(truth))
     runs = changed(
         conditions, **{c.column: np.asarray(shown.reading[c.name]) / c.factor for c in channels.usual_channels()}
@@ -495,7 +495,7 @@ def test_a_robot_with_a_configuration_of_its_own_calibrates_from_its_file_alone(
     assert made.converged and low < 0.05 < high and made.parameters[creep].value > 0.03  # nominal 0.02
     assert max(e.rms_sigma for e in made.errors_after.values()) < 0.5
     made.save(tmp_path / "fitted")
-    again = robot_file.read(tmp_path / "fitted" / "robot.toml")
+    again = robot_file.read_robot(tmp_path / "fitted" / "robot.toml")
     assert again.configurations.names == ("rover",) and again.sides == 4 and again.battery.cells == 4
 
 
@@ -503,7 +503,7 @@ def test_a_configuration_that_the_robot_lacks_lists_those_that_it_has(measured, 
     (tmp_path / "rover.toml").write_text(ROVER)
     says = r"measured row 1?1?, configuration: got (4W2T|6T2A); expected one of these; .*allowed: rover"
     with pytest.raises(BadData, match=says):
-        quick(measured, robot_file.read(tmp_path / "rover.toml"))
+        quick(measured, robot_file.read_robot(tmp_path / "rover.toml"))
 
 
 FOURTH_CHANNEL = """
@@ -550,7 +550,7 @@ def test_public_names_load_no_jax_until_they_are_asked_for():
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)
     assert done.stdout.startswith("False read"), done.stdout + done.stderr
-    assert calibration.calibrate is calibrate and calibration.read_robot is robot_file.load
+    assert calibration.calibrate is calibrate and calibration.read_robot is robot_file.load_robot
     with pytest.raises(AttributeError, match="no attribute calibrat"):
         calibration.calibrat  # noqa: B018
 
@@ -561,7 +561,7 @@ def test_a_calibration_is_the_same_where_jax_is_single(measured):
     stated = {"noise": "current=9%,motor_speed=6%,speed=4%", "blocks": True}
     double = quick(measured, **stated)
     with jax.enable_x64(False):
-        single = quick(measured, robot_file.load("nominal"), **stated)
+        single = quick(measured, robot_file.load_robot("nominal"), **stated)
         resistance = single.robot.motor.friction_coulomb
     assert isinstance(resistance, np.ndarray) and resistance == double.robot.motor.friction_coulomb
     assert json.dumps(single.to_json()) == json.dumps(double.to_json())
@@ -584,9 +584,9 @@ def test_clusters_are_in_the_document_and_on_the_page_of_a_calibration(tmp_path)
     document = json.loads(json.dumps(made.to_json()))
     jsonschema.validate(document, SCHEMA)
     assert document["residual_clusters"][0]["statement"] == found.statement
-    page = calibration_page.write(tmp_path / "with", made, robot_name="nominal").read_text("utf-8")
+    page = calibration_page.write_calibration_page(tmp_path / "with", made, robot_name="nominal").read_text("utf-8")
     assert "cluster by idle_wheel" in page and (tmp_path / "with" / "figures" / "clusters.svg").exists()
     bare = dataclasses.replace(plain, residual_clusters=())
-    assert 'id="clusters"' not in calibration_page.write(tmp_path / "bare", bare, robot_name="nominal").read_text(
-        "utf-8"
-    )
+    assert 'id="clusters"' not in calibration_page.write_calibration_page(
+        tmp_path / "bare", bare, robot_name="nominal"
+    ).read_text("utf-8")

@@ -37,7 +37,7 @@ def base():
 @pytest.fixture(scope="module")
 def seen(base):
     """Two runs of a robot whose guides rub with 0.12: longer ones than the fit makes."""
-    conditions = records.read("measured").where(np.array([5, 7]))
+    conditions = records.read_runs("measured").where(np.array([5, 7]))
     robot = params.replace(base, {GUIDE_FRICTION: jnp.asarray(TRUTH), GUIDE_SHARE: jnp.asarray(GUIDED)})
     run = jax.jit(jax.vmap(lambda c: track(robot, c, duration=1.0, rolling=True)))
     return conditions, run(conditions.conditions(robot))
@@ -134,7 +134,7 @@ def test_a_belt_too_stiff_for_the_step_is_said(base, made):
 @pytest.mark.slow
 def test_packaged_data_calibrate_through_the_track_model_and_agree_with_steady():
     """docs/lab/figures.md, Calibration through the track model; some ten minutes on two cores."""
-    runs = records.read("measured")
+    runs = records.read_runs("measured")
     found = calibrate(runs, paper_robots.nominal(), model="track", starts=1)
     assert found.converged and (found.status == "converged").all()
     steady = calibrate(runs, paper_robots.nominal(), blocks=()).parameters

@@ -283,7 +283,7 @@ def test_two_rigs_are_calibrated_side_by_side_as_alone(tmp_path):
 
 @pytest.mark.slow
 def test_the_file_of_a_new_bench_is_calibrated_and_saved(tmp_path):
-    (tmp_path / "bench.toml").write_text(rig_new.template("bench"), encoding="utf-8")
+    (tmp_path / "bench.toml").write_text(rig_new.rig_template("bench"), encoding="utf-8")
     robot = calibration.read_robot(str(tmp_path / "bench.toml"))
     shown = made_up(robot)
     columns = {"configuration": np.full(12, robot.configurations.names[0]), "supply_voltage_V": VOLTAGES}

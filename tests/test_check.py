@@ -32,7 +32,7 @@ SCHEMA = json.loads((Path(__file__).parents[1] / "docs" / "schemas" / "check.sch
 
 
 def read(text):
-    return requirements_file.read(text, "r.toml")
+    return requirements_file.parse_requirements(text, "r.toml")
 
 
 def some_of_the_papers(*kept: str) -> str:
@@ -123,13 +123,13 @@ def test_worst_corner_is_the_worst_of_a_finer_grid(values, robot):
 @pytest.mark.slow
 def test_every_change_meets_its_requirement_and_breaks_what_it_says(folder, result, robot):
     """Each stated value, put into the robot as `--set` does, and checked anew; and half of the change does not."""
-    asked, tried = requirements_file.load(folder / "requirements.toml"), 0
+    asked, tried = requirements_file.load_requirements(folder / "requirements.toml"), 0
     names = [r["name"] for r in result["requirements"]]
     for k, r in enumerate(result["requirements"]):
         assert bool(r["change"]) <= (not r["met"])
         for c in r["change"]:
             outcomes = sheet.check_requirements(
-                robot_file.change(robot, {c["parameter"]: c["to"]}, "test"), asked, changes=False
+                robot_file.change_robot(robot, {c["parameter"]: c["to"]}, "test"), asked, changes=False
             )
             assert outcomes[k].met, (r["name"], c)
             before = [x["met"] for x in result["requirements"]]
@@ -140,7 +140,7 @@ def test_every_change_meets_its_requirement_and_breaks_what_it_says(folder, resu
             )
             alone = dataclasses.replace(asked, each=(asked.each[k],))
             (short,) = sheet.check_requirements(
-                robot_file.change(robot, {c["parameter"]: near}, "test"), alone, changes=False
+                robot_file.change_robot(robot, {c["parameter"]: near}, "test"), alone, changes=False
             )
             assert not short.met, (r["name"], c, near)
             tried += 1
@@ -318,7 +318,7 @@ def test_report_shows_the_sheet(folder, result):
 
 
 def test_paper_file_states_where_each_aim_comes_from():
-    asked = requirements_file.load(None)
+    asked = requirements_file.load_requirements(None)
     assert all("Section" in r.source or "Table" in r.source or "sheet" in r.source for r in asked.each)
     assert {r.name for r in asked.each} >= {"speed_m_s", "slope_deg", "payload_kg", "endurance_min", "mass_kg"}
     assert set(STATUSES) >= {"cut_off", "slides"} and len({q.name for q in QUANTITIES.values()}) == len(QUANTITIES)
@@ -420,7 +420,7 @@ payload_kg = [0, 8]
 
 @pytest.fixture(scope="module")
 def of_posture(robot):
-    asked = requirements_file.read(OF_POSTURE, "posture.toml")
+    asked = requirements_file.parse_requirements(OF_POSTURE, "posture.toml")
     return {o.requirement.name: o for o in sheet.check_requirements(robot, asked, changes=False)}
 
 
@@ -436,7 +436,7 @@ def test_steps_and_sizes_of_section_2_2(of_posture):
 
 @pytest.mark.slow
 def test_longer_levers_would_get_over_the_step(robot):
-    alone = requirements_file.read("step_mm = 300\n[envelope]\npayload_kg = [0, 8]\n", "posture.toml")
+    alone = requirements_file.parse_requirements("step_mm = 300\n[envelope]\npayload_kg = [0, 8]\n", "posture.toml")
     (found,) = sheet.check_requirements(robot, alone)
     (longer,) = (c for c in found.change if c.parameter == "running_gear.lever_length")
     assert longer.before == pytest.approx(0.205) and longer.after == pytest.approx(0.259, abs=0.002)
@@ -452,7 +452,7 @@ def test_stairs_need_friction_reach_and_a_tread(robot):
 
     def rise(surface):
         (found,) = sheet.check_requirements(
-            robot, requirements_file.read(text.format(surface), "stairs.toml"), changes=False
+            robot, requirements_file.parse_requirements(text.format(surface), "stairs.toml"), changes=False
         )
         assert found.at["tread_mm"] == 290 and not found.met
         return found.value
@@ -464,9 +464,9 @@ def test_stairs_need_friction_reach_and_a_tread(robot):
     angle = math.atan(rise("asphalt") / 290)
     assert reach - high * math.tan(angle) == pytest.approx(0.29 / math.cos(angle), abs=1e-4)
     with pytest.raises(BadConfiguration, match="stairs_rise_mm: stairs without a tread; expected a table such as"):
-        requirements_file.read("stairs_rise_mm = 170", "stairs.toml")
+        requirements_file.parse_requirements("stairs_rise_mm = 170", "stairs.toml")
     with pytest.raises(BadConfiguration, match="step_mm, tread_mm: no such key"):
-        requirements_file.read("step_mm = { least = 100, tread_mm = 290 }", "stairs.toml")
+        requirements_file.parse_requirements("step_mm = { least = 100, tread_mm = 290 }", "stairs.toml")
 
 
 @pytest.mark.slow
@@ -496,7 +496,7 @@ def test_posture_of_a_robot_that_states_no_running_gear_is_not_known(robot):
     gear = tuple(p.name for p in params.walk_parameters(robot) if p.name.startswith("running_gear."))
     bare = dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, unknown=gear))
     with pytest.raises(BadConfiguration, match="step_mm: the robot's file states no running_gear"):
-        sheet.refuse_impossible(bare, requirements_file.read("step_mm = 100", "posture.toml"))
+        sheet.refuse_impossible(bare, requirements_file.parse_requirements("step_mm = 100", "posture.toml"))
 
 
 def test_heat_that_the_file_does_not_state_is_asked_for(tmp_path, capsys):

@@ -300,7 +300,7 @@ def test_track_run_is_interrupted_while_it_runs_and_leaves_nothing(mmrjax, tmp_p
 
 def test_shares_of_a_batch_add_up_to_its_runs():
     told = []
-    share = scale.shares(told.append, 180)
+    share = scale.share_counter(told.append, 180)
     for k in range(21):
         share(k / 20)
     share(1.0)
@@ -412,7 +412,7 @@ def test_full_disk_names_the_file_whichever_it_is(mmrjax, tmp_path, monkeypatch)
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(Path, "write_text", honest)
-    monkeypatch.setattr("sweeps.pages.runs_page.write", picture)
+    monkeypatch.setattr("sweeps.pages.runs_page.write_runs_page", picture)
     code, _, err = mmrjax("simulate", "--out", "r")
     assert code == 2 and "r.partial: No space left on device" in err
 
@@ -530,7 +530,7 @@ def test_track_model_runs_xla_on_one_thread_unless_told_otherwise(monkeypatch, g
     monkeypatch.setenv("XLA_FLAGS", given or "")  # so that it is put back
     if given is None:
         monkeypatch.delenv("XLA_FLAGS")
-    resolved = config.resolve(config.Sweep, None, {"model": model})
+    resolved = config.resolve_configuration(config.Sweep, None, {"model": model})
     assert cli._prepared(resolved) is resolved
     ours = "--xla_cpu_multi_thread_eigen=false" if model == "track" else None
     assert os.environ.get("XLA_FLAGS") == (ours if given is None else given)
@@ -614,10 +614,10 @@ def test_every_command_that_compiles_can_do_without_the_cache(monkeypatch, capsy
 
 
 def test_axis_takes_values_and_ranges():
-    assert config.axis("--slopes", "0,5,10") == (0.0, 5.0, 10.0)
-    assert config.axis("--slopes", "0:1:0.25") == (0.0, 0.25, 0.5, 0.75, 1.0)
-    assert config.axis("--slopes", "0:1:0.3,9") == (0.0, 0.3, 0.6, pytest.approx(0.9), 9.0)
-    assert len(config.axis("--slopes", "0:20:0.1")) == 201
+    assert config.parse_axis("--slopes", "0,5,10") == (0.0, 5.0, 10.0)
+    assert config.parse_axis("--slopes", "0:1:0.25") == (0.0, 0.25, 0.5, 0.75, 1.0)
+    assert config.parse_axis("--slopes", "0:1:0.3,9") == (0.0, 0.3, 0.6, pytest.approx(0.9), 9.0)
+    assert len(config.parse_axis("--slopes", "0:20:0.1")) == 201
 
 
 def test_configuration_has_what_applies_to_its_command_alone():
@@ -625,24 +625,24 @@ def test_configuration_has_what_applies_to_its_command_alone():
     assert not told[config.Loop] & {"model", "duration_s", "step_s", "battery", "chunk", "voltages_V"}
     assert "model" in told[config.Calibrate] and not told[config.Calibrate] & {"duration_s", "battery", "chunk"}
     assert not told[config.Compare] & {"battery", "discharge_mAh", "chunk", "slopes_deg"}
-    assert "model" not in config.as_toml(config.resolve(config.Loop, None, {"seed": 1}))
+    assert "model" not in config.as_toml(config.resolve_configuration(config.Loop, None, {"seed": 1}))
     with pytest.raises(BadConfiguration, match=r"^model: no such key"):
-        config.resolve(config.Loop, None, {"model": "steady"})
+        config.resolve_configuration(config.Loop, None, {"model": "steady"})
 
 
 @pytest.mark.parametrize("model, expected", [("steady", {}), ("drive", {"duration_s": 30.0}),
                                              ("track", {"duration_s": 1.5, "step_s": 1e-4})])  # fmt: skip
 def test_resolved_configuration_states_the_options_of_its_fidelity(tmp_path, model, expected):
-    written = config.as_toml(config.resolve(config.Sweep, None, {"model": model}))
+    written = config.as_toml(config.resolve_configuration(config.Sweep, None, {"model": model}))
     stated = tomllib.loads(written)
     assert {key: stated[key] for key in ("duration_s", "step_s") if key in stated} == expected
     (tmp_path / "again.toml").write_text(written)
-    assert config.as_toml(config.resolve(config.Sweep, tmp_path / "again.toml", {})) == written
+    assert config.as_toml(config.resolve_configuration(config.Sweep, tmp_path / "again.toml", {})) == written
 
 
 def test_configurations_of_former_versions_are_read(tmp_path):
     (tmp_path / "old.toml").write_text('model = "steady"\nstep_s = 0.0001\nrobot = "sm1"\n')
-    assert config.resolve(config.Sweep, tmp_path / "old.toml", {}).robot == "sm1"
+    assert config.resolve_configuration(config.Sweep, tmp_path / "old.toml", {}).robot == "sm1"
 
 
 @pytest.fixture(scope="module")

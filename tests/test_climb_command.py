@@ -15,7 +15,7 @@ from calibration.data.input_errors import BadConfiguration, BadData
 from mmrjax.climbing.climb_simulation import LOSSES
 from mmrjax.model.paper_robots import nominal
 from sweeps.commands import climb as room
-from sweeps.results.climb_results import Seen, coordinates
+from sweeps.results.climb_results import Seen, footing_coordinates
 
 SCHEMA = json.loads((Path(__file__).parents[1] / "docs" / "schemas" / "climb.schema.json").read_text("utf-8"))
 
@@ -132,9 +132,9 @@ def test_sequences_that_are_none_are_refused_in_one_sentence(tmp_path, text, mes
 
 
 def test_stairs_are_read_and_refused_as_they_are_written():
-    assert terrains.stairs("170x290x3") == (0.17, 0.29, 3)
+    assert terrains.parse_stairs("170x290x3") == (0.17, 0.29, 3)
     with pytest.raises(BadConfiguration, match=r"count of 2\.5"):
-        terrains.stairs("170x290x2.5")
+        terrains.parse_stairs("170x290x2.5")
 
 
 @pytest.mark.parametrize("limit", [87.3, 449.0, 5.0])
@@ -180,7 +180,7 @@ def test_one_climb_leaves_a_folder_whose_energy_adds_up(mmrjax, tmp_path):
     assert 0 < result["margins"]["margin_success"] < 1 == result["margins"]["margin_reach"]
 
     seen = Seen.read(folder)
-    assert coordinates(seen.table)[-1, 4] == pytest.approx(np.radians(45), abs=2e-3)
+    assert footing_coordinates(seen.table)[-1, 4] == pytest.approx(np.radians(45), abs=2e-3)
     assert float(seen.terrain.finish) == pytest.approx(0.06)
     code, out, _ = mmrjax("render", "c.png", "--climb", "c")
     assert code == 0 and (tmp_path / "c.png").stat().st_size > 5000

@@ -43,7 +43,7 @@ CLOCKS = {
 def robot(tmp_path_factory):
     path = tmp_path_factory.mktemp("rig") / "rig.toml"
     path.write_text(RIG, encoding="utf-8")
-    return robot_file.read(path)
+    return robot_file.read_robot(path)
 
 
 def frame(**columns):
@@ -59,14 +59,14 @@ def test_a_clock_is_counted_from_the_first_row(tmp_path, robot, case, as_text):
     if as_text:
         source.to_csv(tmp_path / "log.csv", index=False)
         source = tmp_path / "log.csv"
-    found = records.read(source, robot)
+    found = records.read_runs(source, robot)
     np.testing.assert_allclose(found["time_s"], TABLE["t"], rtol=0, atol=1e-6)
     assert any(says in note for note in found.notes)
 
 
 def test_each_recording_has_wraps_of_its_own():
     once = (np.arange(60.0) * 1000 + 2**32 - 20_000) % 2**32
-    found, period = counters.unwrapped(np.concatenate([once, once]), np.repeat([0, 1], 60))
+    found, period = counters.unwrap_counter(np.concatenate([once, once]), np.repeat([0, 1], 60))
     assert period == 2**32 and found[60] == once[0]
     for part in (found[:60], found[60:]):
         np.testing.assert_array_equal(part - part[0], np.arange(60) * 1000)
@@ -79,23 +79,23 @@ def test_each_recording_has_wraps_of_its_own():
 )
 def test_a_clock_that_does_not_wrap_stays_as_it_is(time):
     run = np.zeros(len(time), int)
-    assert counters.unwrapped(time, run)[1] == 0 and counters.spread(time, run)[1] == 0
+    assert counters.unwrap_counter(time, run)[1] == 0 and counters.spread_shared_stamps(time, run)[1] == 0
 
 
 def test_stamps_that_are_rarely_shared_are_not_spread():
     time = np.sort(np.r_[np.arange(100.0), 40.0])
-    assert counters.spread(time, np.zeros(101, int))[1] == 0
+    assert counters.spread_shared_stamps(time, np.zeros(101, int))[1] == 0
 
 
 def test_a_row_that_stands_twice_is_left_out(robot):
     twice = frame(time_s=TABLE["t"]).iloc[np.sort(np.r_[np.arange(200), 77, 120])]
-    found = records.read(twice, robot)
+    found = records.read_runs(twice, robot)
     assert len(found) == 200 and any(
         "2 rows, the first row 79, are the row before once more" in n for n in found.notes
     )
     other = frame(time_s=TABLE["t"])
     other.loc[len(other) / 2 - 1, "time_s"] = other["time_s"][len(other) // 2]
-    assert len(records.read(other, robot)) == 200
+    assert len(records.read_runs(other, robot)) == 200
 
 
 # --- readings that repeat ---------------------------------------------------------------------------
@@ -122,7 +122,7 @@ EVERY_ROW = {
 
 @pytest.mark.parametrize("rows", [2, 2.5, 15, 40.4])
 def test_the_period_of_a_slow_sensor_is_found(rows):
-    assert repeated_readings.period(held(WALK, rows)) == pytest.approx(rows, rel=0.02)
+    assert repeated_readings.reading_period(held(WALK, rows)) == pytest.approx(rows, rel=0.02)
 
 
 @pytest.mark.parametrize("case", EVERY_ROW)
@@ -142,8 +142,10 @@ def test_each_reading_of_a_slow_sensor_is_used_once():
 
 
 def test_repeats_are_reported_and_weigh_nothing(robot):
-    found = records.read(frame(time_s=TABLE["t"], motor_speed_rpm=held(TABLE["rpm"][::10], 10)), robot)
+    found = records.read_runs(frame(time_s=TABLE["t"], motor_speed_rpm=held(TABLE["rpm"][::10], 10)), robot)
     assert any("motor_speed_rpm repeats each reading in 10 rows" in note for note in found.notes)
     assert np.isfinite(found["motor_speed_rpm"]).sum() == 20 and np.isfinite(found["total_current_A"]).all()
-    settled = records.read(frame(motor_speed_rpm=held(TABLE["rpm"][::10], 10)), robot)  # without time they are runs
+    settled = records.read_runs(
+        frame(motor_speed_rpm=held(TABLE["rpm"][::10], 10)), robot
+    )  # without time they are runs
     assert np.isfinite(settled["motor_speed_rpm"]).all()

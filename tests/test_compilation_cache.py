@@ -66,7 +66,7 @@ def test_second_process_compiles_nothing_and_answers_the_same(first):
     assert began["kept"] > 2 and began["read"] == 0
     assert again["kept"] == 0 and again["read"] == began["kept"]
     assert again["answer"] == began["answer"]
-    described = compilation_cache.describe(cache)
+    described = compilation_cache.describe_cache(cache)
     assert described.entries == began["kept"] and described.size > 10_000
     assert str(described.path) == began["folder"] and f"{described.entries} programs" in str(described)
 
@@ -100,9 +100,9 @@ def test_broken_entries_are_compiled_again(tmp_path):
 @pytest.mark.parametrize("word", ["off", "OFF", "0"])
 def test_cache_switched_off_has_no_place(word, monkeypatch):
     monkeypatch.setenv("MMRJAX_CACHE", word)
-    assert compilation_cache.location() is None
+    assert compilation_cache.cache_location() is None
     assert compilation_cache.keep_programs() is None
-    assert str(compilation_cache.describe()) == "off (MMRJAX_CACHE=off)"
+    assert str(compilation_cache.describe_cache()) == "off (MMRJAX_CACHE=off)"
 
 
 @pytest.mark.slow
@@ -122,14 +122,14 @@ def test_unwritable_place_switches_the_cache_off(tmp_path):
 def test_place_is_the_users_by_default(monkeypatch, tmp_path):
     monkeypatch.delenv("MMRJAX_CACHE", raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert compilation_cache.location().parent == tmp_path / "mmrjax"
+    assert compilation_cache.cache_location().parent == tmp_path / "mmrjax"
     for ignored in ("", "relative"):
         monkeypatch.setenv("XDG_CACHE_HOME", ignored)
         monkeypatch.setenv("HOME", str(tmp_path))
-        assert compilation_cache.location().parent == tmp_path / ".cache" / "mmrjax"
+        assert compilation_cache.cache_location().parent == tmp_path / ".cache" / "mmrjax"
     import jaxlib
 
-    assert f"-{jaxlib.__version__}-" in compilation_cache.location().name
+    assert f"-{jaxlib.__version__}-" in compilation_cache.cache_location().name
 
 
 @pytest.mark.slow

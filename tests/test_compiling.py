@@ -29,8 +29,8 @@ from mmrjax.model.rig import Instrument, Rig
 def space_of(world, folder):
     """The space of candidates of a clean case, as the loop makes it."""
     rigs.case(world).write(folder)
-    robot = robot_file.read(folder / "rig.toml")
-    runs = records.read(folder / "table.csv", robot=robot)
+    robot = robot_file.read_robot(folder / "rig.toml")
+    runs = records.read_runs(folder / "table.csv", robot=robot)
     observer = observers.observer_kind(runs)
     library = scales.library_of_size(robot, runs.conditions(robot), effects.BY_NAME)
     sd = noise.noise_from_table(runs, observer.sizes(runs)).sd

@@ -9,14 +9,14 @@ import pytest
 
 from calibration.inference.fit_notes import Step
 from sweeps import console
-from sweeps.console import pulse
+from sweeps.console import step_reporter
 from sweeps.report.words import step_words as steps
-from sweeps.report.words.step_words import still
+from sweeps.report.words.step_words import still_running_sentence
 
 
 def test_silence_is_broken_by_what_goes_on():
     said = []
-    with pulse(said.append, "reading", silence=0.2, again=said.append) as tell:
+    with step_reporter(said.append, "reading", silence=0.2, again=said.append) as tell:
         time.sleep(0.5)
         tell("fitting")
         jax.jit(lambda x: jnp.cosh(x) * 0.137)(jnp.ones(3))
@@ -36,39 +36,39 @@ def test_silence_is_broken_by_what_goes_on():
 
 
 def test_what_goes_on_is_said_with_what_was_compiled():
-    assert still("fitting", 41.6, 0) == "still fitting (42 s)"
-    assert still("fitting", 41.6, 1) == "still fitting (42 s, 1 program compiled)"
-    assert still("fitting", 9.6, 12) == "still fitting (10 s, 12 programs compiled)"
+    assert still_running_sentence("fitting", 41.6, 0) == "still fitting (42 s)"
+    assert still_running_sentence("fitting", 41.6, 1) == "still fitting (42 s, 1 program compiled)"
+    assert still_running_sentence("fitting", 9.6, 12) == "still fitting (10 s, 12 programs compiled)"
 
 
 @pytest.mark.parametrize("terminal", [True, False])
 def test_a_terminal_writes_one_line_again_and_a_file_gets_none(monkeypatch, capsys, terminal):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal, raising=False)
-    with pulse(console.tell, "reading", silence=0.05):
+    with step_reporter(console.print_message, "reading", silence=0.05):
         time.sleep(0.3)
     err = capsys.readouterr().err
     assert err.count("\r\x1b[Kstill") >= 2 * terminal and bool(err) == terminal, repr(err)
 
 
 def test_a_stage_of_the_loop_has_a_number_and_what_is_left():
-    text = steps.step(Step("bootstrap", (500,)))
+    text = steps.step_sentence(Step("bootstrap", (500,)))
     assert text.startswith(f"2 of {steps.OF}, bootstrap of 500")
-    assert steps.expected(text, 45.0) == pytest.approx(55.0)  # 45 % are over when it begins
-    assert steps.expected("writing the report", 45.0) is steps.expected("1 of 7, fitting", 9.0) is None
+    assert steps.expected_time(text, 45.0) == pytest.approx(55.0)  # 45 % are over when it begins
+    assert steps.expected_time("writing the report", 45.0) is steps.expected_time("1 of 7, fitting", 9.0) is None
     assert set(steps.STAGES) <= set(steps.STEPS)
 
 
 def test_a_command_says_soon_that_it_works(monkeypatch, capsys):
     monkeypatch.setattr(console, "FIRST", 0.2)
-    with console.working("rig check"):
+    with console.report_working("rig check"):
         pass
-    with console.working("size"):
+    with console.report_working("size"):
         time.sleep(0.4)
     assert capsys.readouterr().err == "size: working\n"
 
 
 def test_a_stage_is_reported_as_it_begins(capsys):
-    with console.stage(2, 3, "posture"):
+    with console.report_stage(2, 3, "posture"):
         assert capsys.readouterr().err == "2 of 3, posture\n"
-    with console.stage(3, 3, "a bar", silent=True):
+    with console.report_stage(3, 3, "a bar", silent=True):
         assert capsys.readouterr().err == "3 of 3, a bar\n"

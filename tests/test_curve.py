@@ -194,9 +194,9 @@ def test_curve_of_any_reading_obeys(name, law):
 
 def test_robot_with_curves_written_and_read_is_the_same(tmp_path):
     mine = robot(0.1 * jnp.asarray([laws.size(e) for e in UNNAMED.values()]), UNNAMED)
-    robot_file.write(mine, tmp_path / "robot.toml")
+    robot_file.write_robot(mine, tmp_path / "robot.toml")
     for library in ({}, effects.BY_NAME):
-        again = robot_file.read(tmp_path / "robot.toml", library)
+        again = robot_file.read_robot(tmp_path / "robot.toml", library)
         assert [(p.name, float(p.value)) for p in params.walk_parameters(again)] == [
             (p.name, float(p.value)) for p in params.walk_parameters(mine)
         ]
@@ -208,4 +208,4 @@ def test_curve_without_a_range_is_refused(tmp_path):
     with pytest.raises(
         BadConfiguration, match=r"mine\.toml, effects\.curve_track_payload\.high: got 3; expected more than low, 3"
     ):
-        robot_file.read(path)
+        robot_file.read_robot(path)

@@ -61,7 +61,7 @@ def test_what_to_check_first_is_said_with_the_columns_that_are_not_used():
     extras = {"brake_Nm": np.linspace(0, 1, 4), "constant": np.ones(4), "who": np.array(list("abab"))}
     assert unused_inputs(Runs("runs.csv", {"order": np.arange(4.0)}, extras=extras)) == ("brake_Nm",)
     missed = (Missed("total_current", 0.484, 0.02),)
-    said = loop_words.statement(
+    said = loop_words.verdict_sentences(
         Summary("undescribed", 0.004, None, missed=missed, unused=("brake_Nm",), far=("motor.r",))
     )
     assert said == (

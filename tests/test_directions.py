@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from synthetic import Analyst
 
-from calibration.data.runs import Runs, read
+from calibration.data.runs import Runs, read_runs
 from calibration.discovery import discover
 from calibration.discovery.location import DiscrepancyLocation, varied_by_duty
 from calibration.discovery.settings import settings_for
@@ -53,7 +53,7 @@ def table(name: str, amplitude: float, voltages: tuple[float, ...]) -> Runs:
 
 
 def test_runs_that_go_both_ways_are_known_by_what_drives_them_or_by_a_speed():
-    measured = read("measured")
+    measured = read_runs("measured")
     assert not discover.goes_both_ways(measured)
     columns, rows = dict(measured.columns), len(measured)
     speeds = [c.column for c in channels.usual_channels() if c.zero_at_rest]

@@ -15,7 +15,7 @@ from synthetic import FEW, SETTLED, known, parts, small, table
 from worlds import settled, tables
 
 from calibration.data.runs import Runs
-from calibration.data.runs import read as read_runs
+from calibration.data.runs import read_runs as read_runs
 from calibration.discovery import discover
 from calibration.discovery.candidates import fit_base
 from calibration.discovery.outliers import screen_outliers

@@ -115,8 +115,8 @@ def test_blocks_that_are_left_out_are_not_seen(found):
 
 def test_robot_written_and_read_gives_the_same_readings(found, tmp_path):
     path = tmp_path / "robot.toml"
-    robot_file.write(found.what.robot, path, note="a discrepancy without a name")
-    robot = robot_file.load(str(path))
+    robot_file.write_robot(found.what.robot, path, note="a discrepancy without a name")
+    robot = robot_file.load_robot(str(path))
     assert (
         [e.name for e in robot.effects]
         == [found.what.effect]
@@ -169,8 +169,8 @@ def test_curve_of_a_result_is_in_its_robot_and_takes_the_discrepancy_out(tmp_pat
     assert found.after.adequate and not found.before.adequate
     assert what.at.shape == what.value.shape == what.sd.shape and (what.sd > 0).all()
     assert np.abs(what.value / what.sd).max() > 5
-    robot_file.write(found.robot, path, note="a discrepancy without a name")
-    robot = robot_file.load(str(path))
+    robot_file.write_robot(found.robot, path, note="a discrepancy without a name")
+    robot = robot_file.load_robot(str(path))
     assert [e.name for e in robot.effects] == [what.effect]
     reading = steady_batch(robot, found.runs.conditions(robot)).reading
     seen = np.stack([np.asarray(reading[name]) for name in channels.USUAL], -1)

@@ -38,7 +38,7 @@ torque_constant = "10 ± 0"
 def space(tmp_path_factory):
     file = tmp_path_factory.mktemp("rig") / "rig.toml"
     file.write_text(RIG, encoding="utf-8")
-    robot = robot_file.read(file)
+    robot = robot_file.read_robot(file)
     speeds = np.tile([-3000.0, -1000.0, -500.0, 500.0, 1000.0, 3000.0], 2)
     columns = {
         "configuration": np.repeat(["down", "up"], 6), "motor_speed_rpm": speeds, "motor_current_A": np.ones(12),

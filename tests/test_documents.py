@@ -20,7 +20,7 @@ from pages import Tables, drawn, outside
 
 from calibration.data import requirements_file, settling
 from calibration.data import runs as records
-from calibration.data.parts import cells
+from calibration.data.parts import packaged_cells
 from calibration.data.robot_file import RobotFile
 from calibration.sizing import sheet
 from calibration.sizing.design_search import SizedDesign, Sizing
@@ -38,7 +38,7 @@ from sweeps.report import (
 )
 from sweeps.report.document import Cell, Column, Document, Figure, Note, Section, Table
 from sweeps.results.check_results import CheckResult
-from sweeps.results.comparison_results import Comparison, compared
+from sweeps.results.comparison_results import Comparison, compare_readings
 from sweeps.results.size_results import SizeResult
 
 RECORD = Path(__file__).parent / "record" / "pages"
@@ -64,7 +64,7 @@ def as_text(document: Document) -> str:
 
 def outcomes() -> tuple[sheet.Outcome, ...]:
     """A requirement that is met, one missed with two changes, and one without a value."""
-    asked = requirements_file.read("speed_m_s = 1\nmass_kg = 15\nslope_deg = 20\n", "aims.toml")
+    asked = requirements_file.parse_requirements("speed_m_s = 1\nmass_kg = 15\nslope_deg = 20\n", "aims.toml")
     at = {"configuration": "6T2A", "surface": "lacquered_wood", "payload_kg": 8.0, "slope_deg": 10.0}
     changes = (
         sheet.Change("gearbox.ratio", 48.0, 45.27, "-", -0.02),
@@ -79,34 +79,34 @@ def outcomes() -> tuple[sheet.Outcome, ...]:
 
 
 def check() -> Document:
-    asked = requirements_file.read("speed_m_s = 1\nmass_kg = 15\nslope_deg = 20\n", "aims.toml")
-    return check_report.document(CheckResult(asked, nominal(), outcomes()), "nominal (PM)")
+    asked = requirements_file.parse_requirements("speed_m_s = 1\nmass_kg = 15\nslope_deg = 20\n", "aims.toml")
+    return check_report.check_document(CheckResult(asked, nominal(), outcomes()), "nominal (PM)")
 
 
 def size() -> Document:
     robot, drive = nominal(), drive_options(("RE 40 24 V",))[0]
-    asked = requirements_file.read("mass_kg = 15\n", "aims.toml")
+    asked = requirements_file.parse_requirements("mass_kg = 15\n", "aims.toml")
     best = SizedDesign(
-        drive, cells()[0], 12.5, 0.0414, 3, 4.0, {"mass": 14.14, "energy": 0.031},
+        drive, packaged_cells()[0], 12.5, 0.0414, 3, 4.0, {"mass": 14.14, "energy": 0.031},
         {"winding": 0.002, "cell current": 0.4}, ("largest ratio",), robot,
     )  # fmt: skip
     short = dataclasses.replace(best, margins={"winding": -0.08}, objectives={"mass": 13.7}, bounds=())
     sizing = Sizing(
         None, None, "mass", ("steepest slope held",), best, best, (), {"a": best, "b": short}, (), 256, 31000
     )  # fmt: skip
-    return size_report.document(SizeResult(asked, robot, sizing, ("mass",), outcomes()), "nominal (PM)")
+    return size_report.size_document(SizeResult(asked, robot, sizing, ("mass",), outcomes()), "nominal (PM)")
 
 
 def comparison(log: bool = False) -> Document:
     """The bench's rows with a simulation 4 % above them, the first row without one; of a log as its first 2.8 s."""
-    measured = records.read("measured")
+    measured = records.read_runs("measured")
     error = np.where(np.arange(len(measured)) == 0, np.nan, 1.04 + 0.001 * measured["slope_deg"])
     simulated = {c: measured[c] for c in ("configuration", *measured.axes)}
     simulated |= {c.column: error * measured[c.column] for c in measured.channels}
     simulated["status"] = np.where(np.isnan(error), "slides", "converged")
-    table, summary = compared(measured, simulated)
+    table, summary = compare_readings(measured, simulated)
     time = {"time_s": 0.1 * np.arange(len(measured))} if log else {}
-    return comparison_report.document(
+    return comparison_report.comparison_document(
         Comparison(
             table | time, summary, measured.channels, "measured", "steady", "nominal (PM)", "" if log else "these",
             {"time_s": "time [s]"} if log else None, ("a note",),
@@ -132,7 +132,7 @@ def settle() -> Document:
             "motor_speed_rpm": 350 * volts * (1 - 0.5 * lag) + 3 * rng.standard_normal(len(volts)),
         },
     )  # fmt: skip
-    return settle_report.document(settling.settle(runs), "Too few for the loop.", ("a further note",))
+    return settle_report.settle_document(settling.settle_log(runs), "Too few for the loop.", ("a further note",))
 
 
 DOCUMENTS: dict[str, Callable[[], Document]] = {
@@ -162,13 +162,13 @@ SMALL = Document(
 
 
 def test_a_robot_is_fitted_to_the_rows_that_its_folder_records(tmp_path):
-    robot, runs = tmp_path / "robot.toml", records.read("measured")
+    robot, runs = tmp_path / "robot.toml", records.read_runs("measured")
     robot.write_text("# a robot\n")
     file = RobotFile(nominal(), str(robot))
     assert fit_of(file, runs) == "" == fit_of(RobotFile(nominal(), "nominal"), runs)
     manifest = {
         "arguments": ["loop", "x.csv"],
-        "hashes": {"robot": store.digest(robot.read_bytes()), "x.csv": runs.digest},
+        "hashes": {"robot": store.sha256_hex(robot.read_bytes()), "x.csv": runs.digest},
     }
     (tmp_path / "manifest.json").write_text(json.dumps(manifest))
     assert fit_of(file, runs) == "these"
@@ -180,7 +180,7 @@ def test_a_robot_is_fitted_to_the_rows_that_its_folder_records(tmp_path):
 
 
 def test_page_terminal_and_csv_show_the_same_cells(tmp_path, capsys):
-    page = page_renderer.write(tmp_path, SMALL).read_text(encoding="utf-8")
+    page = page_renderer.write_report_page(tmp_path, SMALL).read_text(encoding="utf-8")
     rows = Tables(page).tables["rows"]
     assert rows == [
         ["run", "current", "source"], ["measured [A]", "error [%]"], ["a", "1.2", "0.00", "<hand>"], ["b", "–", "–", "log"],
@@ -195,7 +195,7 @@ def test_page_terminal_and_csv_show_the_same_cells(tmp_path, capsys):
         and "<code>x_m</code>" in page
         and not outside(tmp_path)
     )
-    terminal_renderer.show(SMALL)
+    terminal_renderer.print_document(SMALL)
     shown = capsys.readouterr().out
     assert (
         shown.startswith("Speed 0.5 m/s.\n- one x_m\n- two\n") and "page only" not in shown and "<hand>" not in shown
@@ -206,15 +206,15 @@ def test_page_terminal_and_csv_show_the_same_cells(tmp_path, capsys):
 def test_a_long_table_is_cut_and_names_its_file(tmp_path, capsys):
     table = Table("rows", (Column("run", form="{}"),), [(k,) for k in range(250)], file="runs.csv")
     document = Document("T", "A.", (), (Section("Rows", (table,)),))
-    page = page_renderer.write(tmp_path, document).read_text(encoding="utf-8")
+    page = page_renderer.write_report_page(tmp_path, document).read_text(encoding="utf-8")
     assert len(Tables(page).tables["rows"]) == 201 and "The first 200 of 250 rows" in page
     assert '<a class="csv" download href="runs.csv">' in page
-    terminal_renderer.show(document)
+    terminal_renderer.print_document(document)
     assert capsys.readouterr().out == "A.\n250 rows: see runs.csv\n"
 
 
 def test_the_page_of_check_shows_its_figure_with_its_finding(tmp_path):
-    page = page_renderer.write(tmp_path, check()).read_text(encoding="utf-8")
+    page = page_renderer.write_report_page(tmp_path, check()).read_text(encoding="utf-8")
     assert drawn(page) == {"margins"}
     assert 'aria-label="2 of 3 requirements are missed: ' in page
 

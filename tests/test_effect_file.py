@@ -69,17 +69,17 @@ def stating(*lines):
 @pytest.mark.slow
 @pytest.mark.parametrize("text", [GOOD, EXPLICIT], ids=["derived", "explicit"])
 def test_user_effect_is_usable_by_name_in_a_robot_file(tmp_path, text):
-    library = effect_file.library([written(tmp_path, text)])
+    library = effect_file.effect_library([written(tmp_path, text)])
     assert list(library) == [*BY_NAME, "seal_drag"] and "seal_drag" not in BY_NAME
     path = tmp_path / "robot.toml"
     path.write_text("[effects.seal_drag]\namplitude = 0.05\n")
-    robot = robot_file.load(str(path), library)
-    more = params.replace(robot_file.load("nominal"), {"6T2A.track.loss_coulomb": 0.4})
+    robot = robot_file.load_robot(str(path), library)
+    more = params.replace(robot_file.load_robot("nominal"), {"6T2A.track.loss_coulomb": 0.4})
     run = Conditions(voltage=[15.0])
     got, expected = (steady_batch(r, run).total_current for r in (robot, more))
     np.testing.assert_allclose(got, expected, rtol=1e-10)
-    robot_file.write(robot, tmp_path / "again.toml")
-    again = robot_file.load(str(tmp_path / "again.toml"), library)
+    robot_file.write_robot(robot, tmp_path / "again.toml")
+    again = robot_file.load_robot(str(tmp_path / "again.toml"), library)
     assert float(again.effects[0].amplitude) == 0.05
 
 
@@ -87,7 +87,7 @@ def test_user_effect_states_what_the_library_states(tmp_path):
     text = stating(
         "transient = True", 'settles_to = "churning"', "odd_in_travel = True", 'configurations = ("4W2T",)'
     )
-    drag = effect_file.library([written(tmp_path, text)])["seal_drag"]
+    drag = effect_file.effect_library([written(tmp_path, text)])["seal_drag"]
     assert (drag.transient, drag.settles_to, drag.odd_in_travel, drag.needs_battery) == (
         True,
         "churning",
@@ -97,13 +97,13 @@ def test_user_effect_states_what_the_library_states(tmp_path):
     assert drag().configurations == ("4W2T",)
     power = GOOD.replace("signals.direction", "signals.direction * signals.battery")
     text = power.replace("    dissipative = True\n", "    needs_battery = True\n")
-    assert effect_file.library([written(tmp_path, text, "on_battery.py")])["seal_drag"].needs_battery
+    assert effect_file.effect_library([written(tmp_path, text, "on_battery.py")])["seal_drag"].needs_battery
 
 
 def test_user_effect_may_settle_to_another_of_the_users(tmp_path):
     one = stating('settles_to = "seal_wear"')
     two = GOOD.replace("SealDrag", "SealWear")
-    library = effect_file.library([written(tmp_path, one), written(tmp_path, two, "other.py")])
+    library = effect_file.effect_library([written(tmp_path, one), written(tmp_path, two, "other.py")])
     assert library["seal_drag"].settles_to == "seal_wear"
 
 
@@ -111,7 +111,7 @@ def test_robot_file_without_the_users_library_says_so(tmp_path):
     path = tmp_path / "robot.toml"
     path.write_text("[effects.seal_drag]\namplitude = 0.05\n")
     with pytest.raises(BadConfiguration, match=r"effects\.seal_drag: no such effect"):
-        robot_file.load(str(path))
+        robot_file.load_robot(str(path))
 
 
 REFUSED = {
@@ -196,13 +196,13 @@ REFUSED = {
 def test_bad_effect_files_are_refused_in_one_sentence(tmp_path, case):
     text, sentence = REFUSED[case]
     with pytest.raises(BadConfiguration, match=sentence) as refusal:
-        effect_file.library([written(tmp_path, text)])
+        effect_file.effect_library([written(tmp_path, text)])
     assert "\n" not in str(refusal.value)
 
 
 def test_missing_effect_file_is_refused(tmp_path):
     with pytest.raises(BadConfiguration, match=r"--effects: got .*none\.py, no such file"):
-        effect_file.library([tmp_path / "none.py"])
+        effect_file.effect_library([tmp_path / "none.py"])
 
 
 @pytest.mark.slow
@@ -217,23 +217,23 @@ def test_packaged_effects_pass_the_users_checks():
 def test_robot_file_names_the_configurations_of_an_effect(tmp_path):
     path = tmp_path / "robot.toml"
     path.write_text('[effects.churning]\nconfigurations = ["4W2T"]\namplitude = 1e-4\n[effects.mass_offset]\n')
-    robot = robot_file.read(path)
+    robot = robot_file.read_robot(path)
     assert [e.configurations for e in robot.effects] == [("4W2T",), ()]
     assert float(robot.effects[0].amplitude) == 1e-4
-    robot_file.write(robot, tmp_path / "again.toml")
+    robot_file.write_robot(robot, tmp_path / "again.toml")
     assert "configurations" in (tmp_path / "again.toml").read_text()
-    again = robot_file.read(tmp_path / "again.toml")
+    again = robot_file.read_robot(tmp_path / "again.toml")
     assert [e.configurations for e in again.effects] == [("4W2T",), ()]
 
 
 def test_robot_file_may_undo_the_configurations_of_a_class(tmp_path):
-    library = effect_file.library([written(tmp_path, stating('configurations = ("4W2T",)'))])
+    library = effect_file.effect_library([written(tmp_path, stating('configurations = ("4W2T",)'))])
     robot = robot_file.with_effects(paper_robots.nominal(), ("seal_drag",), library)
     assert robot.effects[0].configurations == ("4W2T",)
     robot = robot_file.with_effects(paper_robots.nominal(), ("seal_drag",), library, {"seal_drag": []})
     assert robot.effects[0].configurations == ()
-    robot_file.write(robot, tmp_path / "robot.toml")
-    assert robot_file.read(tmp_path / "robot.toml", library).effects[0].configurations == ()
+    robot_file.write_robot(robot, tmp_path / "robot.toml")
+    assert robot_file.read_robot(tmp_path / "robot.toml", library).effects[0].configurations == ()
 
 
 @pytest.mark.parametrize(
@@ -249,4 +249,4 @@ def test_wrong_configurations_of_an_effect_are_refused(tmp_path, value, sentence
     path = tmp_path / "mine.toml"
     path.write_text(f"[effects.mass_offset]\nconfigurations = {value}\n")
     with pytest.raises(BadConfiguration, match=r"mine\.toml, effects\.mass_offset\.configurations: " + sentence):
-        robot_file.read(path)
+        robot_file.read_robot(path)

@@ -136,7 +136,7 @@ def test_where_a_driver_passes_on_a_share_of_one_voltage_that_is_the_axis():
 
 def test_defects_of_turns_are_drawn_by_side_over_what_that_side_does():
     table = turns()
-    fig = loop_figures.defects(table, "none", crosses_zero=True)
+    fig = loop_figures.draw_defects(table, "none", crosses_zero=True)
     for axes, column in zip(
         fig.axes, ("motor_current_{}_A", "motor_speed_{}_rpm", "motor_speed_{}_rpm"), strict=True
     ):
@@ -157,4 +157,4 @@ def test_change_of_a_reading_that_crosses_zero_is_of_its_size(monkeypatch):
         runs=SimpleNamespace(conditions=lambda robot: None), included=np.ones(3, bool),
         readings_of_rows=SimpleNamespace(measured=np.array([[1.0], [-1.0], [0.0]])),
     )  # fmt: skip
-    assert page.changes(found)["iron_loss"].rms == pytest.approx(10 * np.sqrt(1.5), rel=1e-6)
+    assert page.changes_by_effect(found)["iron_loss"].rms == pytest.approx(10 * np.sqrt(1.5), rel=1e-6)

@@ -16,13 +16,13 @@ DOCS = Path(__file__).resolve().parents[1] / "docs"
 @pytest.mark.quick(1)
 @pytest.mark.parametrize(("status", "code"), [(status, 3 if status == "failed" else 0) for status in words.STATUSES])
 def test_only_a_solver_that_failed_ends_with_3(status, code, mmrjax, monkeypatch):
-    honest = run.evaluate
+    honest = run.evaluate_runs
 
     def evaluate(*given, **options):
         found = honest(*given, **options)
         return {**found, "status": np.array([status, *found["status"][1:]])}
 
-    monkeypatch.setattr(run, "evaluate", evaluate)
+    monkeypatch.setattr(run, "evaluate_runs", evaluate)
     assert mmrjax("compare", "measured", "--no-report", "--out", "s")[0] == code
 
 

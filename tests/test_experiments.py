@@ -330,7 +330,7 @@ static = 0.6
 @pytest.fixture
 def rover(tmp_path):
     (tmp_path / "rover.toml").write_text(ROVER)
-    return robot_file.read(tmp_path / "rover.toml")
+    return robot_file.read_robot(tmp_path / "rover.toml")
 
 
 def grid(voltages, slopes, payloads):
@@ -380,7 +380,7 @@ def test_level_table_without_payload_asks_for_neither_slope_nor_payload(rover):
 
 @pytest.mark.slow
 def test_higher_voltage_needs_a_rating_and_is_watched(rover):
-    rated = robot_file.change(rover, {"motor.voltage_limit": 18.0}, where="test")
+    rated = robot_file.change_robot(rover, {"motor.voltage_limit": 18.0}, where="test")
     within = reach_of_table(rated, ROVERS_TABLE, channels.USUAL)
     run = next(r for r in runs_of(menu.experiment_menu(within)) if r.name == "other voltages, rover")
     assert max(run.voltage) == 18.0
@@ -422,7 +422,7 @@ def test_robot_with_one_motor_is_not_told_to_disconnect_the_other(rover):
 
 @pytest.mark.slow
 def test_voltages_without_load_stay_below_the_permissible_speed():
-    slow = robot_file.change(CLIMBING, {"motor.speed_limit": 900.0, "gearbox.speed_limit": 500.0}, where="test")
+    slow = robot_file.change_robot(CLIMBING, {"motor.speed_limit": 900.0, "gearbox.speed_limit": 500.0}, where="test")
     within = reach_of_table(slow, conditions(settled.table8(voltages=(12.0,))), channels.USUAL)
     runs = {r.name: r for r in runs_of(menu.experiment_menu(within))}
     seen = within.motor_speed  # the table went there itself
@@ -545,6 +545,6 @@ def test_finer_steps_are_within_the_tables_ranges(rover):
 
 
 def test_every_experiment_is_kept_in_a_stage(tmp_path):
-    stage_files.write(tmp_path / "menu", MENU)
-    assert stage_files.read(tmp_path / "menu") == MENU
+    stage_files.write_stage(tmp_path / "menu", MENU)
+    assert stage_files.read_stage(tmp_path / "menu") == MENU
     assert {type(e) for e in MENU} == {menu.Act, menu.Run}

@@ -25,7 +25,7 @@ def unsimulated(monkeypatch):
 def test_every_name_has_an_explanation_of_its_kind(unsimulated):
     kinds = {"effects": "effect", "statuses": "status", "flags": "flag", "channels": "channel", "conditions": "condition", "outputs": "output",
              "parameters": "parameter", "verdicts of the loop": "verdict of the loop", "verdicts of a climb": "verdict of a climb"}  # fmt: skip
-    for kind, those in explain.names(EVERY).items():
+    for kind, those in explain.explainable_names(EVERY).items():
         for name in those:
             lines = said(kinds[kind], name)
             assert lines and all(text and "None" not in text for _, text in lines), (name, lines)
@@ -35,16 +35,16 @@ def test_an_effect_is_explained_by_what_its_class_states(unsimulated):
     for name, effect in EVERY.items():
         lines = dict(said("effect", name))
         spec = next(p.spec for p in params.walk_parameters(effect()) if p.spec.amplitude)
-        equation, meaning, source = words_of.about(effect)
+        equation, meaning, source = words_of.effect_summary(effect)
         assert (lines["equation"], lines["stands for"], lines["source"]) == (equation, meaning, source)
         assert lines["typical size"].startswith(f"{spec.sd:g} {spec.unit}") and spec.source in lines["typical size"]
         assert effect.balance in lines["enters"] and lines["in data"].startswith(effect.family())
-        assert "on a bench" in lines and list(words_of.tests(effect))
+        assert "on a bench" in lines and list(words_of.effect_tests(effect))
 
 
 def test_an_effect_of_ones_own_may_go_with_anything():
     own = type("Damp", (effects.BY_NAME["churning"],), {"driver": "humidity"})
-    assert list(words_of.tests(own))[-1] == "Vary the humidity"
+    assert list(words_of.effect_tests(own))[-1] == "Vary the humidity"
 
 
 @pytest.mark.slow

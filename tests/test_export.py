@@ -53,14 +53,14 @@ def of_effects(amplitudes):
     known = {**effects.BY_NAME, **effects.BESIDE}
     having = tuple(known[name](amplitude=a) for name, a in amplitudes.items())
     return dataclasses.replace(
-        robot_file.find("nominal"), robot=dataclasses.replace(paper_robots.nominal(), effects=having)
+        robot_file.find_robot_file("nominal"), robot=dataclasses.replace(paper_robots.nominal(), effects=having)
     )
 
 
 def compared(file):
     """A drive on wheels and the native model over Table 8."""
-    drive = joints.joint(file, WHEELS)
-    runs = situation.situation(drive, None)
+    drive = joints.joint_of_robot(file, WHEELS)
+    runs = situation.situation_of_joint(drive, None)
     return drive, runs, constants.constants_of(drive, runs.signals, None)
 
 
@@ -78,14 +78,14 @@ def plain():
 def translated(drive, runs):
     """Comparison with MuJoCo, its files and its numbers."""
     normal = float(np.mean(runs.signals.normal))
-    found = comparison.compare(
-        runs, mujoco.law_of(normal), mujoco.fates(drive, normal), mujoco.TERMS, mujoco.approximated
+    found = comparison.compare_format(
+        runs, mujoco.law_of(normal), mujoco.fates_in_mujoco(drive, normal), mujoco.TERMS, mujoco.approximated_terms
     )
-    motor = mujoco.motor(drive, found.refitted)
+    motor = mujoco.mjcf_motor(drive, found.refitted)
     about = dict.fromkeys(("frictionloss", "damping", "armature"), "")
     files = {
-        "drive.xml": mujoco.fragment(drive, motor, about, [], "motor", "drive", 33.0),
-        "scene.xml": mujoco.scene(drive, 11.5, "motor", "drive", 24.0, 0.5),
+        "drive.xml": mujoco.mjcf_fragment(drive, motor, about, [], "motor", "drive", 33.0),
+        "scene.xml": mujoco.mjcf_scene(drive, 11.5, "motor", "drive", 24.0, 0.5),
     }
     return found, motor, files
 
@@ -103,7 +103,7 @@ def test_text_of_every_effect_computes_what_the_balances_do():
         if kind.balance in joints.INSIDE and not kind.needs_battery
     }
     kinds |= {n: effects.UNNAMED[n] for n in ("curve_track_speed", "wave_electrical")}
-    drive = joints.joint(of_effects(dict.fromkeys(kinds, 0.1)), TRACKS)
+    drive = joints.joint_of_robot(of_effects(dict.fromkeys(kinds, 0.1)), TRACKS)
     assert {p.effect for p in drive.parts} - {""} == set(kinds)
     text = expressions_text(drive)
     rng = np.random.default_rng(1)
@@ -137,16 +137,16 @@ def expressions_text(drive):
     """Function from part, suffix and signals to the number that its text computes."""
     known = [
         law_source.Constant(n, x, "", "", "")
-        for n, x in {**joints.values(drive), **dict.fromkeys(drive.surroundings(), 0.7)}.items()
+        for n, x in {**joints.parameter_values(drive), **dict.fromkeys(drive.surroundings(), 0.7)}.items()
     ]
     source = law_source.jax_source(drive, known)
-    module = law_source.executed(
+    module = law_source.module_from_source(
         source.replace("import jax.numpy as jnp", "import numpy as jnp")
     )  # it compiles nothing
 
     def text(part, suffix, given):
         symbol = {"": part.value, "_slope": part.slope, "_rate": part.rate, "_rate_slope": part.rate_slope}[suffix]
-        words = [given[name] for name in law_source.arguments(symbol)]
+        words = [given[name] for name in law_source.function_arguments(symbol)]
         return float(getattr(module, part.name + suffix)(module.PARAMS, *words))
 
     return text
@@ -175,15 +175,15 @@ def test_mujoco_runs_the_drive_as_the_native_model_over_table_8(plain):
     drive, runs, _ = plain
     found, motor, files = translated(drive, runs)
     rows = np.linspace(0, len(runs.command) - 1, 6).astype(int)
-    got = mujoco.run(files, motor, runs, found.exported, rows.tolist())
+    got = mujoco.settle_in_mujoco(files, motor, runs, found.exported, rows.tolist())
     assert apart(got.current, runs.inside.current[rows]) < 1e-3
     assert apart(got.speed, runs.inside.speed[rows]) < 1e-3
     assert found.translated == found.refitted  # exact already: no refit changes it
     wrong = dataclasses.replace(motor, values={**motor.values, mujoco.RESISTANCE: 0.9})
-    other = mujoco.fragment(
+    other = mujoco.mjcf_fragment(
         drive, wrong, dict.fromkeys(("frictionloss", "damping", "armature"), ""), [], "motor", "drive", 33.0
     )
-    assert apart(mujoco.run({**files, "drive.xml": other}, wrong, runs, found.exported, rows[:2].tolist()).speed,
+    assert apart(mujoco.settle_in_mujoco({**files, "drive.xml": other}, wrong, runs, found.exported, rows[:2].tolist()).speed,
                  runs.inside.speed[rows[:2]]) > 1e-3  # fmt: skip
 
 
@@ -191,7 +191,7 @@ def test_stated_loss_of_mujoco_is_the_measured_one(with_effects):
     drive, runs, _ = with_effects
     found, motor, files = translated(drive, runs)
     rows = np.linspace(0, len(runs.command) - 1, 8).astype(int)
-    got = mujoco.run(files, motor, runs, found.exported, rows.tolist())
+    got = mujoco.settle_in_mujoco(files, motor, runs, found.exported, rows.tolist())
     for mine, law, native in (
         (got.current, found.exported.current, runs.inside.current),
         (got.speed, found.exported.speed, runs.inside.speed),
@@ -211,13 +211,13 @@ def test_stated_loss_of_mujoco_is_the_measured_one(with_effects):
 def test_actuator_is_the_native_law_and_needs_jax_alone(with_effects):
     drive, runs, known = with_effects
     law = jax_actuator.law_of(runs, known)(drive, {})
-    current, speed = comparison.evaluated(law, law.start, runs.command, runs.load, runs.way)
+    current, speed = comparison.evaluate_law(law, law.start, runs.command, runs.load, runs.way)
     np.testing.assert_allclose(current, runs.inside.current, rtol=1e-9)
     np.testing.assert_allclose(speed, runs.inside.speed, rtol=1e-9)
     source = law_source.jax_source(drive, known)
     imported = [n for n in ast.walk(ast.parse(source)) if isinstance(n, ast.Import | ast.ImportFrom)]
     assert [ast.unparse(n) for n in imported] == ["import jax.numpy as jnp"]
-    module = law_source.executed(source)
+    module = law_source.module_from_source(source)
 
     def power(voltage):
         state, speed = module.initial_state(), jnp.asarray(0.0)
@@ -232,17 +232,17 @@ def test_actuator_is_the_native_law_and_needs_jax_alone(with_effects):
 
 def test_energy_of_the_actuator_is_what_is_given_and_lost(with_effects):
     drive, _, known = with_effects
-    module = law_source.executed(law_source.jax_source(drive, known))
+    module = law_source.module_from_source(law_source.jax_source(drive, known))
     speed = jnp.asarray([3.0, 8.0, -5.0])
-    torque, info = jax_actuator.settled(module, module.PARAMS, jnp.asarray([12.0, 24.0, -15.0]), speed)
+    torque, info = jax_actuator.settled_actuator(module, module.PARAMS, jnp.asarray([12.0, 24.0, -15.0]), speed)
     lost = sum(info[name] for name in info if name.startswith("lost"))
     np.testing.assert_allclose(info["power"], torque * speed + lost, rtol=1e-9)
 
 
 def test_serialised_actuator_computes_what_its_source_does(with_effects):
     drive, _, known = with_effects
-    files = jax_actuator.files(drive, known, [])
-    module = law_source.executed(files["actuator.py"])
+    files = jax_actuator.jax_files(drive, known, [])
+    module = law_source.module_from_source(files["actuator.py"])
     with jax.enable_x64(False):
         kept = jax.export.deserialize(bytearray(files["actuator.jaxexport"]))
         numbers = {n: jnp.float32(v) for n, v in module.PARAMS.items()}
@@ -255,7 +255,7 @@ def test_serialised_actuator_computes_what_its_source_does(with_effects):
 def test_tables_read_in_c_as_in_csv(with_effects, tmp_path):
     drive, runs, known = with_effects
     found = feed_forward.map_of(runs, known)
-    files = feed_forward.files(drive, found, [])
+    files = feed_forward.table_files(drive, found, [])
     rows = list(csv.DictReader(io.StringIO(files["feed_forward.csv"])))
     assert len(rows) == len(found.speed) * len(found.torque)
     row = next(r for r in rows if float(r["joint_speed_rad_s"]) > 5 and float(r["joint_torque_Nm"]) > 0.5)
@@ -263,7 +263,7 @@ def test_tables_read_in_c_as_in_csv(with_effects, tmp_path):
     lost = sum(v for n, v in given.items() if n.startswith("lost"))
     assert given["power_W"] == pytest.approx(given["joint_speed_rad_s"] * given["joint_torque_Nm"] + lost, rel=1e-5)
     law = feed_forward.law_of(runs, known)(drive, {})
-    current, speed = comparison.evaluated(law, law.start, runs.command, runs.load, runs.way)
+    current, speed = comparison.evaluate_law(law, law.start, runs.command, runs.load, runs.way)
     assert (
         apart(np.asarray(speed), runs.inside.speed) < 2e-3 and apart(np.asarray(current), runs.inside.current) < 1e-2
     )
@@ -285,15 +285,15 @@ def test_onnx_model_is_the_step_of_jax(with_effects):
     pytest.importorskip("jax2onnx")
     pytest.importorskip("onnxruntime")
     drive, _, known = with_effects
-    files = onnx.files(drive, known)
-    assert onnx.difference(drive, known, files["actuator.onnx"]) < 1e-5
+    files = onnx.onnx_files(drive, known)
+    assert onnx.difference_from_jax(drive, known, files["actuator.onnx"]) < 1e-5
 
 
 def test_missing_onnx_library_names_the_extra(with_effects, monkeypatch):
     drive, _, known = with_effects
     monkeypatch.setitem(sys.modules, "jax2onnx", None)
     with pytest.raises(BadConfiguration, match=r'jax2onnx is not installed; pip install "mmrjax\[export\]"'):
-        onnx.files(drive, known)
+        onnx.onnx_files(drive, known)
 
 
 def stand_in(monkeypatch):
@@ -333,7 +333,7 @@ def test_mjlab_actuator_gives_the_torque_of_jax_within_a_stand_in(with_effects, 
 
     stand_in(monkeypatch)
     drive, _, known = with_effects
-    (tmp_path / "mjlab_actuator.py").write_text(mjlab.files(drive, known, [])["mjlab_actuator.py"])
+    (tmp_path / "mjlab_actuator.py").write_text(mjlab.mjlab_files(drive, known, [])["mjlab_actuator.py"])
     monkeypatch.syspath_prepend(tmp_path)
     module = importlib.import_module("mjlab_actuator")
     cfg = module.DriveActuatorCfg(target_names_expr=("left", "right"))
@@ -347,7 +347,7 @@ def test_mjlab_actuator_gives_the_torque_of_jax_within_a_stand_in(with_effects, 
     assert model.nu == 2 and model.dof_armature[0] == pytest.approx(3.35e-6 * 48**2 * 0.74)
     actuator.initialize(model, None, types.SimpleNamespace(nworld=3), "cpu")
     rng = np.random.default_rng(3)
-    native = law_source.executed(law_source.jax_source(drive, known))
+    native = law_source.module_from_source(law_source.jax_source(drive, known))
     state = native.initial_state((3, 2))
     for _ in range(3):
         volts, speeds = rng.uniform(-24, 24, (3, 2)), rng.uniform(-8, 8, (3, 2))
@@ -369,22 +369,22 @@ def test_draws_are_correlated_as_the_posterior_and_in_both_formats(plain, tmp_pa
     spread = np.array([[0.3, 0.0], [-0.24, 0.18]])
     posterior = posterior_of_coordinates(at, np.zeros(2), spread @ spread.T)
     normal = float(np.mean(runs.signals.normal))
-    law = mujoco.translated(drive, normal)
+    law = mujoco.translate_law(drive, normal)
     refitted = dict(zip(law.names, map(float, law.start), strict=True))
     refitted[mujoco.RESISTANCE] *= 1.1  # as if a refit had found more
-    found = randomization.drawn(drive, posterior, known, refitted, normal, 400, 7)
+    found = randomization.draw_parameters(drive, posterior, known, refitted, normal, 400, 7)
     resistance, friction = found["actuator/motor.resistance"], found["actuator/motor.friction_coulomb"]
     np.testing.assert_allclose(found["mujoco/resistance"], 1.1 * resistance / 0.74, rtol=1e-9)
     assert np.corrcoef(resistance, friction)[0, 1] == pytest.approx(-0.8, abs=0.06)
     assert np.corrcoef(found["mujoco/resistance"], found["mujoco/frictionloss"])[0, 1] == pytest.approx(
         -0.8, abs=0.06
     )
-    files = randomization.files(found)
+    files = randomization.randomization_files(found)
     kept = np.load(io.BytesIO(files["draws.npz"]))
     assert set(kept) == set(found)
     assert len(json.loads(files["draws.json"])["mujoco"]["motorconst"]) == 400
     with pytest.raises(BadConfiguration, match=f"no {posterior_file.FILE} next to"):
-        randomization.drawn(drive, None, known, refitted, normal, 4, 0)
+        randomization.draw_parameters(drive, None, known, refitted, normal, 4, 0)
 
 
 RIG = """
@@ -428,13 +428,13 @@ def rig(tmp_path):
 
 def xml_of(file):
     """MJCF of a rig by translation alone."""
-    drive = joints.joint(robot_file.find(str(file)))
-    law = mujoco.translated(drive, 0.0)
-    motor = mujoco.motor(drive, dict(zip(law.names, map(float, law.start), strict=True)))
+    drive = joints.joint_of_robot(robot_file.find_robot_file(str(file)))
+    law = mujoco.translate_law(drive, 0.0)
+    motor = mujoco.mjcf_motor(drive, dict(zip(law.names, map(float, law.start), strict=True)))
     about = dict.fromkeys(("frictionloss", "damping", "armature"), "")
     return {
-        "drive.xml": mujoco.fragment(drive, motor, about, [], "motor", "drive", 12.0),
-        "scene.xml": mujoco.scene(drive, 0.0, "motor", "drive", 12.0, 0.1),
+        "drive.xml": mujoco.mjcf_fragment(drive, motor, about, [], "motor", "drive", 12.0),
+        "scene.xml": mujoco.mjcf_scene(drive, 0.0, "motor", "drive", 12.0, 0.1),
     }
 
 
@@ -443,11 +443,11 @@ def test_rig_that_was_exported_comes_back_to_the_last_digit(rig, tmp_path):
     for name, text in first.items():
         (tmp_path / name).write_text(text)
     again = tmp_path / "again.toml"
-    again.write_text(rig_new.text(None, tmp_path / "scene.xml", "drive", None))
+    again.write_text(rig_new.new_rig_text(None, tmp_path / "scene.xml", "drive", None))
     second = xml_of(again)
     lines = [[line for line in f["drive.xml"].splitlines() if "<!--" not in line] for f in (first, second)]
     assert lines[0] == lines[1]
-    before, after = (robot_file.find(str(f)).robot for f in (rig, again))
+    before, after = (robot_file.find_robot_file(str(f)).robot for f in (rig, again))
     numbers = {p.name: float(p.value) for p in params.walk_parameters(after)}
     for p in params.walk_parameters(before):
         name = p.name
@@ -477,7 +477,7 @@ def test_models_without_a_driven_joint_are_refused_in_a_sentence(source, joint, 
     bodies = "".join(map(body.format, ("name='drive'", "name='other'", "name='slide' type='slide'")))
     (tmp_path / "two.xml").write_text(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
     with pytest.raises(BadConfiguration, match=message):
-        rig_new.text(None, tmp_path / source, joint, None)
+        rig_new.new_rig_text(None, tmp_path / source, joint, None)
 
 
 def test_older_mujoco_is_refused_with_the_version_that_it_takes(monkeypatch, rig):
@@ -485,7 +485,7 @@ def test_older_mujoco_is_refused_with_the_version_that_it_takes(monkeypatch, rig
 
     monkeypatch.setattr(library, "__version__", "3.6.0")
     with pytest.raises(BadConfiguration, match=r"got MuJoCo 3.6.0, which has no <dcmotor>; expected 3.7 or later"):
-        formats.exported(robot_file.find(str(rig)), "mujoco")
+        formats.export_format(robot_file.find_robot_file(str(rig)), "mujoco")
 
 
 @pytest.mark.parametrize(
@@ -497,13 +497,13 @@ def test_older_mujoco_is_refused_with_the_version_that_it_takes(monkeypatch, rig
 )
 def test_drives_that_are_no_joint_are_refused_in_a_sentence(amplitudes, configuration, message):
     with pytest.raises(BadConfiguration, match=message):
-        joints.joint(of_effects(amplitudes), configuration)
+        joints.joint_of_robot(of_effects(amplitudes), configuration)
 
 
 def test_rig_with_another_command_is_refused(rig):
     rig.write_text(RIG.replace('imposed = "voltage"', 'imposed = "motor_current"'))
     with pytest.raises(BadConfiguration, match=r"\[rig\] imposed: got motor_current; expected voltage"):
-        joints.joint(robot_file.find(str(rig)))
+        joints.joint_of_robot(robot_file.find_robot_file(str(rig)))
 
 
 @pytest.mark.parametrize(
@@ -517,20 +517,20 @@ def test_rig_with_another_command_is_refused(rig):
 )  # fmt: skip
 def test_runs_of_more_than_one_joint_are_refused(header, row, message, tmp_path):
     (tmp_path / "runs.csv").write_text(f"{header}\n{row}\n")
-    drive = joints.joint(of_effects({}), TRACKS if message == "levers" else WHEELS)
+    drive = joints.joint_of_robot(of_effects({}), TRACKS if message == "levers" else WHEELS)
     with pytest.raises(BadData, match=message):
-        situation.situation(drive, str(tmp_path / "runs.csv"))
+        situation.situation_of_joint(drive, str(tmp_path / "runs.csv"))
 
 
 def test_a_rig_without_a_limit_of_the_voltage_needs_runs(rig):
     rig.write_text(RIG.replace("voltage_limit = 12.0\n", ""))
     with pytest.raises(BadConfiguration, match=r"--data: not stated, and rig\.toml has no motor\."):
-        situation.situation(joints.joint(robot_file.find(str(rig)), "arm"), None)
+        situation.situation_of_joint(joints.joint_of_robot(robot_file.find_robot_file(str(rig)), "arm"), None)
 
 
 def test_a_rig_whose_angle_alone_is_read_is_compared_by_its_motor(rig):
     rig.write_text(RIG.replace('["total_current", "motor_speed"]', '["output_angle"]'))
-    drive = joints.joint(robot_file.find(str(rig)), "arm")
+    drive = joints.joint_of_robot(robot_file.find_robot_file(str(rig)), "arm")
     assert {c.name for c in joints.channels_of(drive)} == {"motor_speed", "motor_current"}
 
 
@@ -570,11 +570,11 @@ def test_command_that_is_refused_leaves_nothing(mmrjax, rig):
 
 def test_symbols_fold_numbers_and_keep_the_order_of_operations():
     a, b = (expressions.Symbol.of("name", (), n) for n in "ab")
-    two = expressions.const(2.0)
-    assert expressions.apply("mul", a, expressions.ZERO) is expressions.ZERO
-    assert expressions.apply("add", a, expressions.ZERO) is a
-    difference = expressions.apply("sub", a, expressions.apply("sub", b, two))
-    text = expressions.lines_of(expressions.apply("mul", difference, difference), expressions.NUMPY, str)
+    two = expressions.constant_symbol(2.0)
+    assert expressions.apply_operation("mul", a, expressions.ZERO) is expressions.ZERO
+    assert expressions.apply_operation("add", a, expressions.ZERO) is a
+    difference = expressions.apply_operation("sub", a, expressions.apply_operation("sub", b, two))
+    text = expressions.lines_of(expressions.apply_operation("mul", difference, difference), expressions.NUMPY, str)
     assert text == ["    x1 = a - (b - 2.0)", "    return x1 * x1"]
     with pytest.raises(BadConfiguration, match="mine: its equation uses"):
-        expressions.traced(lambda x: jnp.sort(jnp.stack([x, 1.0]))[0], ["x"], "mine")
+        expressions.trace_function(lambda x: jnp.sort(jnp.stack([x, 1.0]))[0], ["x"], "mine")

@@ -109,8 +109,8 @@ def test_plain_drives_read_a_file_as_its_generator_means_it(kind, imposed, seed,
 
     case = rigs.case(rigs.world(np.random.default_rng(seed), kind, imposed), seed=seed)
     case.write(tmp_path)
-    robot = robot_file.read(tmp_path / "rig.toml")
-    runs = records.read(tmp_path / "table.csv", robot=robot)
+    robot = robot_file.read_robot(tmp_path / "rig.toml")
+    runs = records.read_runs(tmp_path / "table.csv", robot=robot)
     names = [case.world.rig.public(n) for n in case.world.rig.tolerances]
     drive = plain_drives.drive(runs, robot, priors.parameter_coordinates(robot, names))
     stated = dataclasses.replace(case.world, constants=case.world.rig.stated)
@@ -172,7 +172,7 @@ def test_records_of_others_are_read_from_their_folder(tmp_path):
 
     for name, one in public_records.PUBLIC.items():
         (tmp_path / f"{name}.toml").write_text(one.toml, encoding="utf-8")
-        assert robot_file.read(tmp_path / f"{name}.toml").rig.channels, name
+        assert robot_file.read_robot(tmp_path / f"{name}.toml").rig.channels, name
     (folder / "log.csv").write_text("time,speed\n1,2\n", encoding="utf-8")
     with pytest.raises(public_records.NoRecord, match="no column batteryVoltage"):
         public_records.record("micromouse-left", tmp_path, tmp_path / "public", None, 0)

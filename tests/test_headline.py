@@ -51,18 +51,18 @@ def test_it_is_the_deepest_claim_that_all_verdicts_hold(own, others, level, clai
 
 
 def test_it_is_said_with_the_noises_at_which_it_holds():
-    said = loop_words.headline(headline(law("a"), [(0.7, of_mechanism(DROP)), (1.4, law("a"))]))
+    said = loop_words.loop_headline(headline(law("a"), [(0.7, of_mechanism(DROP)), (1.4, law("a"))]))
     assert said == f"At 0.7, 1 and 1.4 times the noise a {DROP} is established as a mechanism"
-    weak = loop_words.headline(headline(law("a"), [(0.7, law("a", established=False))]))
+    weak = loop_words.loop_headline(headline(law("a"), [(0.7, law("a", established=False))]))
     assert weak == "At 0.7 and 1 times the noise a voltage drop is missing, and no more is established"
-    assert loop_words.headline(headline(nothing())) == "At the stated noise nothing is missing"
-    assert loop_words.headline(headline(law("a", "b"))) == "At the stated noise one of a or b is established"
+    assert loop_words.loop_headline(headline(nothing())) == "At the stated noise nothing is missing"
+    assert loop_words.loop_headline(headline(law("a", "b"))) == "At the stated noise one of a or b is established"
 
 
 def test_what_only_some_noises_cannot_tell_apart_comes_after_what_all_list():
     found = headline(of_mechanism(SLIP, DROP), [(0.7, of_mechanism(DROP)), (1.4, of_mechanism(DROP, "x that is"))])
     assert found.claims == ((DROP, SLIP, "x that is"),) and found.shared == (1,)
-    said = loop_words.headline(found)
+    said = loop_words.loop_headline(found)
     assert f"a {DROP} (not told at each noise from a {SLIP} or a x that is) is established" in said
 
 

@@ -93,7 +93,7 @@ def found():
         if case == "packaged":
             return calibrated()
         if case not in made:
-            runs = records.read("measured")
+            runs = records.read_runs("measured")
             made[case] = calibrate(
                 runs, paper_robots.nominal(), starts=2, profiles=False, blocks=(), **CALIBRATIONS[case]
             )
@@ -123,7 +123,7 @@ def test_calibration_says_it_of_every_parameter_everywhere(case, found, capsys, 
     assert {name for name, line in lines.items() if line.endswith("no")} == held and set(lines) == set(
         made.parameters
     )
-    page = Tables(calibration_page.write(tmp_path, made, robot_name="nominal").read_text("utf-8"))
+    page = Tables(calibration_page.write_calibration_page(tmp_path, made, robot_name="nominal").read_text("utf-8"))
     head, *rows = page.tables["parametertable"]
     at = head.index("determined")
     assert {row[0] for row in rows if row[at].startswith("no")} == held

@@ -25,7 +25,7 @@ def robot():
 
 @pytest.fixture(scope="module")
 def runs(robot):
-    return records.read(HUSKY / "husky.csv", robot=robot)
+    return records.read_runs(HUSKY / "husky.csv", robot=robot)
 
 
 def test_table_is_read_as_turns_of_imposed_speeds(robot, runs):

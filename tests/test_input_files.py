@@ -34,12 +34,12 @@ loss_coulomb = 0.01
 
 def bench(tmp_path, more=""):
     (tmp_path / "rig.toml").write_text(RIG.format(more=more), encoding="utf-8")
-    return robot_file.read(tmp_path / "rig.toml")
+    return robot_file.read_robot(tmp_path / "rig.toml")
 
 
 def table(tmp_path, text, robot):
     (tmp_path / "t.csv").write_text(text, encoding="utf-8")
-    return records.read(tmp_path / "t.csv", robot=robot)
+    return records.read_runs(tmp_path / "t.csv", robot=robot)
 
 
 DEEP = "a." * 4_999 + "a"
@@ -63,7 +63,7 @@ def test_toml_that_cannot_be_is_refused_in_one_short_sentence(tmp_path, case):
     text, says = TOML[case]
     (tmp_path / "r.toml").write_text(text)
     with pytest.raises(BadConfiguration, match=says) as refusal:
-        robot_file.read(tmp_path / "r.toml")
+        robot_file.read_robot(tmp_path / "r.toml")
     assert len(str(refusal.value)) < 400 and "\n" not in str(refusal.value)
 
 
@@ -86,7 +86,7 @@ def test_what_is_no_table_is_refused_in_one_short_sentence(tmp_path, case):
     content, says = TABLES[case]
     (tmp_path / "t.csv").write_bytes(content)
     with pytest.raises(BadData, match=says) as refusal:
-        records.read(tmp_path / "t.csv", robot=bench(tmp_path))
+        records.read_runs(tmp_path / "t.csv", robot=bench(tmp_path))
     assert len(str(refusal.value)) < 400 and "\n" not in str(refusal.value)
 
 
@@ -94,7 +94,7 @@ def test_pipes_devices_and_folders_are_not_read(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     for path, what in ((tmp_path / "pipe", "a pipe"), (tmp_path, "a folder"), ("/dev/zero", "a device")):
         with pytest.raises(BadData, match=f"is {what}; expected a file"):
-            records.read(path)
+            records.read_runs(path)
         with pytest.raises(BadConfiguration, match=f"is {what}; expected a file"):
             input_files.toml_text(records.Path(path), "x")
 
@@ -150,7 +150,7 @@ def test_a_stiff_supply_is_no_stuck_instrument(tmp_path):
     (tmp_path / "rig.toml").write_text(
         RIG.format(more='imposed = "motor_speed"').replace('"output_speed"', '"motor_voltage"')
     )
-    robot = robot_file.read(tmp_path / "rig.toml")
+    robot = robot_file.read_robot(tmp_path / "rig.toml")
     rows = "".join(f"{speed},{0.01 * k},24\n" for k, speed in enumerate((4500, 4400, 4300, 4200)))
     found = table(tmp_path, f"motor_speed_rpm,motor_current_A,motor_voltage_V\n{rows}", robot)
     assert _check_stuck_channels(found) == [StiffSupply("motor_voltage_V", 24.0)]

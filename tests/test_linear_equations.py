@@ -123,7 +123,7 @@ def test_a_step_of_a_search_on_a_log_calls_no_lapack(tmp_path):
     """Batched calls of it, of programs side by side, have waited for each other for ever."""
     log = {name: column[:12] for name, column in servo(np.random.default_rng(1), levels=(0.9,), hold=0.2).items()}
     robot = written(tmp_path, "servo", log)
-    runs = records.read(tmp_path / "log.csv", robot=robot)
+    runs = records.read_runs(tmp_path / "log.csv", robot=robot)
     known = noise.noise_from_table(runs, observers.observer_kind(runs).sizes(runs))
     coordinates = priors.parameter_coordinates(robot, ("motor.torque_constant", "wheel.loss_coulomb"))
     problem = observers.pose_problem(runs, robot, coordinates, known.sd)

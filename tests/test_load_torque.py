@@ -185,8 +185,8 @@ loss_coulomb = 0.0
 def read(tmp_path, lines, head=""):
     (tmp_path / "rig.toml").write_text(RIG.format(head=head))
     (tmp_path / "runs.csv").write_text("\n".join(lines) + "\n")
-    robot = robot_file.read(tmp_path / "rig.toml")
-    return records.read(tmp_path / "runs.csv", robot=robot), robot
+    robot = robot_file.read_robot(tmp_path / "rig.toml")
+    return records.read_runs(tmp_path / "runs.csv", robot=robot), robot
 
 
 @pytest.mark.parametrize(
@@ -234,7 +234,7 @@ def test_a_table_of_a_vehicle_with_a_brake_is_refused(tmp_path):
     path = tmp_path / "runs.csv"
     path.write_text(f"{head}\n6T2A,24,15,0,0,3,0\n6T2A,24,15,0,0,3,20\n")
     with pytest.raises(BadData) as error:
-        records.read(path, robot=mm.nominal())
+        records.read_runs(path, robot=mm.nominal())
     assert str(error.value) == (
         "runs.csv row 2, load_torque_mNm: got 20; the robot is a vehicle; the torque of a brake acts only "
         "on a shaft; state slope_deg or payload_kg, or describe the load as a shaft"
@@ -306,7 +306,7 @@ def test_a_torque_in_another_unit_is_doubted(tmp_path):
     for column, doubted in (("load_torque_Nm", True), ("load_torque_mNm", False)):
         runs, rig = read(tmp_path, [f"supply_voltage_V,motor_speed_rpm,{column}", *rows])
         said = rig_facts.doubtful_torque(runs, rig)
-        assert bool(said) == doubted and rig_facts.doubts(runs, rig) == ((said,) if doubted else ())
+        assert bool(said) == doubted and rig_facts.log_doubts(runs, rig) == ((said,) if doubted else ())
         assert not doubted or said == (
             "runs.csv row 2, load_torque_Nm: got 100 N·m, where the motors stall at 2.39 N·m; is it in mN·m? then state "
             '[columns] load_torque_mNm = "load_torque_Nm"'
@@ -315,12 +315,12 @@ def test_a_torque_in_another_unit_is_doubted(tmp_path):
 
 def test_a_profile_and_a_sweep_state_the_torque(tmp_path):
     (tmp_path / "p.csv").write_text("time_s,duty,load_torque_mNm\n0,1,0\n1,1,300\n2,,\n")
-    table = profiles.read(tmp_path / "p.csv")
+    table = profiles.read_profile(tmp_path / "p.csv")
     np.testing.assert_allclose(table.values["load_torque"], [0.0, 0.3, 0.3])
     assert table.stated == ("load_torque_Nm",)
     (tmp_path / "bad.csv").write_text("time_s,duty,load_torque_Nm\n0,1,0\n1,1,\n2,1,0\n")
     with pytest.raises(BadData, match=r"bad\.csv row 2, load_torque_Nm: got an empty cell; expected a number"):
-        profiles.read(tmp_path / "bad.csv")
+        profiles.read_profile(tmp_path / "bad.csv")
     made = mm.sweep(bench(), voltages=[12.0, 24.0], load_torques=[0.0, 0.5])
     assert made.to_dict()["load_torque_Nm"].tolist() == [0.0, 0.5, 0.0, 0.5]
     free, braked = np.asarray(made.motor_speed).reshape(2, 2).T

@@ -17,10 +17,10 @@ STEP = 1e-4  # of the simulation [s]
 
 def written(tmp_path, kind, columns):
     """A file of `rig new` and a log of these columns beside it."""
-    (tmp_path / "rig.toml").write_text(rig_new.template(kind), encoding="utf-8")
+    (tmp_path / "rig.toml").write_text(rig_new.rig_template(kind), encoding="utf-8")
     lines = [",".join(columns), *(",".join(f"{x:.9g}" for x in row) for row in zip(*columns.values(), strict=True))]
     (tmp_path / "log.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    return robot_file.read(tmp_path / "rig.toml")
+    return robot_file.read_robot(tmp_path / "rig.toml")
 
 
 def sampled(rng, speed, angle, imposed, rate, delay, step, jitter=0.1):
@@ -74,7 +74,7 @@ def carriage(rng, levels=(1.2, 1.6, 2.0, -1.4, -1.8), hold=1.5):
 def test_a_servos_log_of_pwm_and_angle_settles(tmp_path):
     rng = np.random.default_rng(1)
     robot = written(tmp_path, "servo", servo(rng))
-    found = settling.settle(records.read(tmp_path / "log.csv", robot=robot))
+    found = settling.settle_log(records.read_runs(tmp_path / "log.csv", robot=robot))
     volts, r, k, friction, ratio, eta, viscous, dry = 6.0, 4.0, 0.006, 2e-4, 200.0, 0.7, 0.005, 0.05
     duty = np.array([0.4, 0.7, 1.0, -0.6, -0.9])
     torque = ratio * eta * (k * volts * np.abs(duty) / r - friction) - dry
@@ -88,7 +88,7 @@ def test_a_servos_log_of_pwm_and_angle_settles(tmp_path):
 
 def test_a_carriages_log_of_current_and_position_settles(tmp_path):
     robot = written(tmp_path, "carriage", carriage(np.random.default_rng(2)))
-    found = settling.settle(records.read(tmp_path / "log.csv", robot=robot))
+    found = settling.settle_log(records.read_runs(tmp_path / "log.csv", robot=robot))
     radius = 5e-3 / (2 * np.pi)
     current = np.array([1.2, 1.6, 2.0, -1.4, -1.8])
     exact = np.sign(current) * (0.05 * np.abs(current) - 0.004 - 12.0 * radius) / (400.0 * radius**2) * radius * 1e3
@@ -103,10 +103,10 @@ def test_a_carriages_log_of_current_and_position_settles(tmp_path):
 def test_the_model_follows_such_a_log_with_the_numbers_that_it_was_made_of(tmp_path, kind, make, column, least):
     robot = written(tmp_path, kind, make(np.random.default_rng(3), hold=0.4))
     if kind == "carriage":
-        robot = robot_file.change(robot, {"carriage.loss_viscous": 400.0 * (5e-3 / (2 * np.pi)) ** 2}, "a test")
-    runs = records.read(tmp_path / "log.csv", robot=robot)
+        robot = robot_file.change_robot(robot, {"carriage.loss_viscous": 400.0 * (5e-3 / (2 * np.pi)) ** 2}, "a test")
+    runs = records.read_runs(tmp_path / "log.csv", robot=robot)
     ready = prepare(runs, robot)
-    shown = points.followed(ready.robot, runs, None)
+    shown = points.follow_histories(ready.robot, runs, None)
     error = np.std(shown[column] - runs[column])
     assert error < 0.01 * np.ptp(runs[column]) and error > 0.1 * least
 
@@ -121,8 +121,8 @@ def test_curves_are_over_the_voltage_at_motors_whose_speed_no_channel_reads(tmp_
     text = (tmp_path / "log.csv").read_text(encoding="utf-8").splitlines()
     modes = ("mode", *np.where(driven, "voltage", "coast"))
     (tmp_path / "log.csv").write_text("\n".join(map(",".join, zip(text, modes, strict=True))), encoding="utf-8")
-    robot = robot_file.read(tmp_path / "rig.toml")
-    runs = records.read(tmp_path / "log.csv", robot=robot)
+    robot = robot_file.read_robot(tmp_path / "rig.toml")
+    runs = records.read_runs(tmp_path / "log.csv", robot=robot)
     observer = observers.Histories.of(runs, robot)
     seen = {}
     monkeypatch.setattr(bases, "curve_families", lambda columns, *_, **__: seen.update(columns) or ())

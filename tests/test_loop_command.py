@@ -98,7 +98,7 @@ def commanded(every=False) -> SimpleNamespace:
         discovering = room.discover
         patch.setattr(room, "discover", discover)
         if not every:
-            patch.setattr(room, "effect_file", SimpleNamespace(library=lambda paths: FEW.library))
+            patch.setattr(room, "effect_file", SimpleNamespace(effect_library=lambda paths: FEW.library))
         answer = mmrjax(folder, "loop", "runs.csv", "--replicates", 250, "--out", "found", *PRIORS)
     result = json.loads((folder / "found" / "result.json").read_text())
     return SimpleNamespace(
@@ -118,7 +118,7 @@ def few_effects():
         some = {n: BY_NAME[n] for n in ("churning", "series_resistance", "load_slip")}
 
         def library(paths):
-            return some | {e.name: e for path in paths for e in effect_file.read(Path(path))}
+            return some | {e.name: e for path in paths for e in effect_file.read_effect_file(Path(path))}
 
         patch.setattr(room, "effect_file", SimpleNamespace(library=library))
         yield
@@ -148,7 +148,7 @@ def test_command_ends_well_and_says_what_it_found(done):
 def test_what_is_written_predicts_and_the_refit_stands_beside_it(done):
     said = done.result["prediction"]
     assert said["written"] == "found" and said["gain"] > said["se"] > 0
-    refit, found = (robot_file.load(done.folder / "found" / f"{name}.toml") for name in ("fitted", "robot"))
+    refit, found = (robot_file.load_robot(done.folder / "found" / f"{name}.toml") for name in ("fitted", "robot"))
     assert not refit.effects and [e.name for e in found.effects] == [done.result["effects"][0]["name"]]
     values = {p.name: float(p.value) for p in params.walk_parameters(refit)}
     for name, shift in done.result["base_shift"].items():

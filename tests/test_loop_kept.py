@@ -104,7 +104,7 @@ def test_an_interrupted_loop_goes_on_after_its_last_stage(rig, mmrjax, monkeypat
     monkeypatch.setattr(os, "_exit", leave)
     monkeypatch.setattr(command, "discover", first)
     monkeypatch.setattr(
-        command.loop_words, "verdict", lambda found: f"verdict: {found.verdict}, iron_loss or windage"
+        command.loop_words, "verdict_line", lambda found: f"verdict: {found.verdict}, iron_loss or windage"
     )
     code, _, err = mmrjax(*rig, "--within", "5min")
     assert at_once == [ends]
@@ -129,7 +129,7 @@ def test_what_cannot_be_kept_is_not_said_to_be(rig, mmrjax, monkeypatch, tmp_pat
         raise KeyboardInterrupt
 
     monkeypatch.setattr(command, "discover", first)
-    monkeypatch.setattr(command.loop_words, "verdict", lambda found: found.verdict)
+    monkeypatch.setattr(command.loop_words, "verdict_line", lambda found: found.verdict)
     code, _, err = mmrjax(*rig)
     assert code == 130 and "nothing could be kept of verdict; the same command begins anew" in err
     assert "kept: verdict" not in err and not (tmp_path / "found.partial").exists()
@@ -186,14 +186,14 @@ def test_a_loop_of_kept_stages_finds_what_it_found(tmp_path):
     ]  # so that the noise is assumed, and others tried
     rows = [",".join(line.split(",")[k] for k in shown) for line in text]
     (tmp_path / "table.csv").write_text("\n".join(rows) + "\n")
-    robot = robot_file.read(tmp_path / "rig.toml")
-    runs = records.read(tmp_path / "table.csv", robot=robot)
+    robot = robot_file.read_robot(tmp_path / "rig.toml")
+    runs = records.read_runs(tmp_path / "table.csv", robot=robot)
     written: dict[str, object] = {}
 
     def keep(name, make):
         made = make()
-        kept_stages.write(tmp_path / name, made)
-        written[name] = kept_stages.read(tmp_path / name)
+        kept_stages.write_stage(tmp_path / name, made)
+        written[name] = kept_stages.read_stage(tmp_path / name)
         return made
 
     found = room.discover(runs, robot, replicates=250, keep=keep)

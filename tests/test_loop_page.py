@@ -17,7 +17,7 @@ from test_loop_command import commanded
 from test_stated_values import traced as leads
 from worlds import settled, tables
 
-from calibration.data.writing import finite
+from calibration.data.writing import finite_or_null
 from calibration.discovery.clusters import Cluster
 from calibration.discovery.loop_notes import Asked, NameSupport, NameTest, RuledOut
 from calibration.discovery.result import Alternative, Estimate, HiddenEffect, Resolved, StatedValue
@@ -49,7 +49,7 @@ def test_the_legend_of_errors_hides_no_title():
         channels.find_channel(n) for n in ("motor_current_left", "motor_current_right", "yaw_rate", "output_torque")
     )
     rows = {when: {c.name: {"rms_percent": 1.0} for c in shown} for when in (0, 1)}
-    fig = loop_figures.errors(SimpleNamespace(channels=shown, errors=rows, errors_held_out={"slope": rows}))
+    fig = loop_figures.draw_errors(SimpleNamespace(channels=shown, errors=rows, errors_held_out={"slope": rows}))
     fig.canvas.draw()
     legend = [*fig.legends, *(a.get_legend() for a in fig.axes if a.get_legend())]
     assert len(legend) == 1
@@ -81,8 +81,8 @@ def shown(tmp_path_factory):
         if name not in known:
             found = MADE[name]()
             folder = tmp_path_factory.mktemp(name)
-            text = loop_page.write(folder, found, robot_name="nominal").read_text("utf-8")
-            document = finite(found.to_json())
+            text = loop_page.write_loop_page(folder, found, robot_name="nominal").read_text("utf-8")
+            document = finite_or_null(found.to_json())
             known[name] = SimpleNamespace(found=found, document=document, text=text, page=Tables(text))
         capsys.readouterr()
         room.print_discovery(known[name].found)
@@ -94,8 +94,8 @@ def shown(tmp_path_factory):
 def written(folder, found):
     """The page of a result, without its figures: pages with them are those of `shown`."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(page_room, "svg", lambda figure: "<svg/>")
-        return loop_page.write(folder, found, robot_name="nominal").read_text("utf-8")
+        patch.setattr(page_room, "figure_as_svg", lambda figure: "<svg/>")
+        return loop_page.write_loop_page(folder, found, robot_name="nominal").read_text("utf-8")
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -143,7 +143,7 @@ def test_class_lists_family_and_stated_value(shown, capsys):
     row = got.page.tables["effects"][1]
     assert said in row[-1] and "voltage drop that changes with current" in row
     assert said.split(" (")[0] in got.printed and "voltage drop that changes with current, one of" in got.printed
-    why = words.standing(got.found)
+    why = words.support_sentence(got.found)
     assert why.startswith("Each by itself") and "series_resistance" in why
     assert why in got.printed and why in got.page.text and 'id="ruled_out"' not in got.text
 
@@ -154,7 +154,7 @@ def test_class_with_a_stated_value_is_listed_and_said(shown, capsys, tmp_path):
     wrong = StatedValue(1.411, 0.611, "ohm", 13.1, 0.4)
     effect = dataclasses.replace(effect, stated={"motor.resistance": wrong}, families=("losses", "leads"))
     found = dataclasses.replace(found, verdict="class", effects=(effect,))
-    document = finite(found.to_json())
+    document = finite_or_null(found.to_json())
     jsonschema.validate(document, SCHEMA)
     (told,) = document["effects"]
     assert told["class"] == ["churning", "motor.resistance"] and told["families"] == ["losses", "leads"]
@@ -175,7 +175,7 @@ def test_what_is_ruled_out_by_its_size_is_on_the_page(shown, capsys, tmp_path):
     found = dataclasses.replace(
         found, implausible=(Alternative(alone, alone, {"winding_heating": 2.9}, 1.0, reasons),)
     )
-    jsonschema.validate(finite(found.to_json()), SCHEMA)
+    jsonschema.validate(finite_or_null(found.to_json()), SCHEMA)
     said = f"winding_heating would explain as much as the curve, but is ruled out by size or sign alone: {why}."
     text = written(tmp_path, found)
     page = Tables(text)
@@ -224,13 +224,13 @@ def test_cluster_and_names_that_stand_beside_curves_are_said(shown, capsys, tmp_
     cluster = Cluster("time", 0.6, 0.7, "", 12, 13, 1e-5)
     test = NameTest(found.effects[0].name, 6.0, 3.3, (), 5.0, 7, 2.5)
     found = dataclasses.replace(found, cluster=cluster, support=NameSupport(True, "beside", tests=(test,)))
-    document = finite(found.to_json())
+    document = finite_or_null(found.to_json())
     jsonschema.validate(document, SCHEMA)
     assert document["cluster"] == {
         "axis": "time", "low": 0.6, "high": 0.7, "level": "", "inside": 12, "of": 13, "p": 1e-5
     }  # fmt: skip
     page = Tables(written(tmp_path, found))
-    assert words.cluster(cluster) in page.text
+    assert words.cluster_sentence(cluster) in page.text
     said = f"{test.effect} 6.0 σ (chance 3.3, without row 7 2.5)"
     assert f"explains more than chance would: {said}." in page.text
     told = document["effects"][0]
@@ -243,9 +243,12 @@ def test_first_screen_answers_in_a_minute(shown, capsys, tmp_path):
     got = shown("churning", capsys)
     found, page = got.found, got.page
     (effect,) = found.effects
-    assert words.answer(found) == f"No: missing is a {effect.families[0]}." and words.answer(found) in page.text
+    assert (
+        words.completeness_answer(found) == f"No: missing is a {effect.families[0]}."
+        and words.completeness_answer(found) in page.text
+    )
     a = effect.parameters["amplitude"]
-    size, change = f"{a.value:.3g} ± {a.sd:.2g} {a.unit}", loop_page.changes(found)[effect.name]
+    size, change = f"{a.value:.3g} ± {a.sd:.2g} {a.unit}", loop_page.changes_by_effect(found)[effect.name]
     size += f", which changes the {change.channel.label} by {change.rms:.2g} %"
     assert f"{effect.families[0]} ({effect.name}): {size}; {words.how_sure(found, effect)}." in page.text
     stated, again, with_it = page.tables["summary"][1:]
@@ -262,22 +265,22 @@ def test_first_screen_answers_in_a_minute(shown, capsys, tmp_path):
     assert len(without_table.split()) <= 120
     weak = NameTest(effect.name, 6.0, 3.3, (), 5.0, 7, 2.5)
     tentative = dataclasses.replace(found, support=NameSupport(False, "beside", tests=(weak,)))
-    assert words.answer(tentative) == f"No: perhaps a {effect.families[0]}."
+    assert words.completeness_answer(tentative) == f"No: perhaps a {effect.families[0]}."
     twice = dataclasses.replace(tentative, effects=(effect, dataclasses.replace(effect, name="windage")))
-    assert words.answer(twice) == words.answer(tentative)  # one kind, said once
+    assert words.completeness_answer(twice) == words.completeness_answer(tentative)  # one kind, said once
     assert words.how_sure(tentative, effect) == "tentative: it predicts, but rests on row 7"
-    assert words.answer(dataclasses.replace(found, verdict="none", effects=())).startswith("Yes")
+    assert words.completeness_answer(dataclasses.replace(found, verdict="none", effects=())).startswith("Yes")
 
 
 def test_what_an_effect_changes_is_that_of_the_robot_without_it(shown, capsys):
     """And the law that is drawn is of the robot that is written, as the dots are."""
     found = shown("churning", capsys).found
     (effect,) = found.effects
-    change = loop_page.changes(found)[effect.name]
+    change = loop_page.changes_by_effect(found)[effect.name]
     k = [c.name for c in found.channels].index(change.channel.name)
     here = found.included
     np.testing.assert_allclose(change.with_it[here], found.readings_of_rows.after[here, k], rtol=1e-5)
-    assert change.rms > 1.0 and "brush_drop" not in loop_page.changes(found)
+    assert change.rms > 1.0 and "brush_drop" not in loop_page.changes_by_effect(found)
     assert "laws" in drawn(shown("churning", capsys).text)
 
 
@@ -347,7 +350,7 @@ def test_what_a_name_could_hide_is_said(shown, capsys, tmp_path):
         HiddenEffect("load_slip", 1e-4, "1/N", 5.1, "", 0.0),
     )
     found = dataclasses.replace(found, hidden=two)
-    jsonschema.validate(finite(found.to_json()), SCHEMA)
+    jsonschema.validate(finite_or_null(found.to_json()), SCHEMA)
     page = Tables(written(tmp_path, found))
     assert page.tables["hidden"][1:] == [
         ["brush_drop", "0.21 V", "5.5", "stall (expected 7.2 σ)"], ["load_slip", "0.0001 1/N", "5.1", ""]
@@ -401,7 +404,7 @@ def test_what_the_track_model_says_is_shown(shown, capsys, tmp_path, p, outside,
         chi2=(90.0, 29.0), readings=30, rms_percent={"speed": (4.0, 1.2)}, slip_rms=(3.3, 0.6), remarks=("said too",),
     )  # fmt: skip
     found = dataclasses.replace(found, resolved=resolved)
-    document = finite(found.to_json())
+    document = finite_or_null(found.to_json())
     jsonschema.validate(document, SCHEMA)
     assert (
         document["resolved"]["explains"] == (p < 0.01 and not outside)

@@ -321,7 +321,7 @@ def test_names_shared_by_a_run_and_a_mission_are_the_same_quantities(folder, cap
 def test_a_cut_off_above_a_full_cell_is_refused_in_a_file(tmp_path):
     (tmp_path / "low.toml").write_text("[battery]\nvoltage_cutoff = 4.18\n")
     with pytest.raises(BadConfiguration) as said:
-        robot_file.read(tmp_path / "low.toml")
+        robot_file.read_robot(tmp_path / "low.toml")
     assert str(said.value) == (
         "low.toml, battery.voltage_cutoff: got 4.18 V; expected less than voltage_full, 4.17 V: a full cell would be "
         "cut off"
@@ -331,13 +331,13 @@ def test_a_cut_off_above_a_full_cell_is_refused_in_a_file(tmp_path):
 def test_a_cut_off_below_an_empty_cell_is_said_where_a_file_states_it(tmp_path):
     (tmp_path / "low.toml").write_text("[battery]\nvoltage_cutoff = 2.9\n")
     notes: list[str] = []
-    robot_file.read(tmp_path / "low.toml", notes=notes)
+    robot_file.read_robot(tmp_path / "low.toml", notes=notes)
     assert notes == [
         "low.toml, battery.voltage_cutoff: 2.9 V is below the 3.41 V of an empty cell without load: it acts only "
         "beyond 10.4 A"
     ]
     (tmp_path / "low.toml").write_text("[battery]\nvoltage_cutoff = 3.45\n")
-    robot_file.read(tmp_path / "low.toml", notes=(quiet := []))
+    robot_file.read_robot(tmp_path / "low.toml", notes=(quiet := []))
     assert quiet == []
 
 

@@ -27,7 +27,7 @@ SILENT = ("voltage", "no-load-current", "stall-current", "resistance")
 
 @pytest.mark.parametrize("names", [n for n in SUBSETS if n != SILENT], ids="+".join)
 def test_each_sheet_that_determines_the_motor_gives_its_constants(names):
-    found = rig_from_sheet.read({name: EXACT[name] for name in names})
+    found = rig_from_sheet.read_data_sheet({name: EXACT[name] for name in names})
     values = {name.removeprefix("motor."): number.value for name, number in found.items()}
     assert values == {
         "resistance": pytest.approx(2), "torque_constant": pytest.approx(0.05),
@@ -36,7 +36,7 @@ def test_each_sheet_that_determines_the_motor_gives_its_constants(names):
 
 
 def test_printed_sheet_gives_the_makers_torque_constant():
-    found = rig_from_sheet.read(RE30)
+    found = rig_from_sheet.read_data_sheet(RE30)
     assert found["motor.torque_constant"].value == pytest.approx(25.9e-3, rel=1e-3)
     assert found["motor.torque_constant"].source == "data sheet, voltage / no-load speed"
 
@@ -46,13 +46,15 @@ def test_printed_sheet_gives_the_makers_torque_constant():
 )
 def test_torques_are_read_in_the_units_of_makers(text, torque):
     sheet = {"voltage": "12V", "no-load-current": "1A", "resistance": "1 ohm", "stall-torque": text}
-    assert rig_from_sheet.read(sheet)["motor.torque_constant"].value == pytest.approx(torque / 11, rel=1e-3)
+    assert rig_from_sheet.read_data_sheet(sheet)["motor.torque_constant"].value == pytest.approx(
+        torque / 11, rel=1e-3
+    )
 
 
 def test_numbers_that_differ_widen_the_constant():
-    found = rig_from_sheet.read(RE30 | {"stall-torque": "1090 mNm"})
+    found = rig_from_sheet.read_data_sheet(RE30 | {"stall-torque": "1090 mNm"})
     assert float(found["motor.torque_constant"].width.split()[0]) == pytest.approx(7.5, abs=0.3)
-    assert rig_from_sheet.read(RE30)["motor.torque_constant"].width == "3 %"
+    assert rig_from_sheet.read_data_sheet(RE30)["motor.torque_constant"].width == "3 %"
 
 
 @pytest.mark.parametrize(
@@ -71,7 +73,7 @@ def test_numbers_that_differ_widen_the_constant():
 )  # fmt: skip
 def test_sheets_that_contradict_themselves_or_lack_numbers_are_refused(change, message):
     with pytest.raises(BadConfiguration, match=message):
-        rig_from_sheet.read({name: text for name, text in (RE30 | change).items() if text is not None})
+        rig_from_sheet.read_data_sheet({name: text for name, text in (RE30 | change).items() if text is not None})
 
 
 def test_sheet_without_numbers_leaves_no_file(mmrjax, tmp_path):
@@ -89,5 +91,5 @@ def test_rig_new_lists_what_robot_and_sheet_do_not_state(mmrjax, tmp_path):
     assert "not found, so fill in: motor.inertia [kg·m^2], gearbox.efficiency_load [-], rover." in said
     text = (tmp_path / "r.toml").read_text()
     assert text.startswith("# kind wheeled, filled in from joint left_wheel_joint of diffbot.urdf and a data sheet;")
-    found = robot_file.read(tmp_path / "r.toml")
+    found = robot_file.read_robot(tmp_path / "r.toml")
     assert (float(found.motor.resistance), float(found.gearbox.ratio)) == (0.611, 34.0)

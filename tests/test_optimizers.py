@@ -46,7 +46,7 @@ def sds(runs, stated):
 
 @pytest.fixture(scope="module")
 def measured():
-    return records.read("measured")
+    return records.read_runs("measured")
 
 
 @pytest.fixture(scope="module")

@@ -75,7 +75,7 @@ def test_every_field_that_can_be_chosen_is_an_option_that_says_what_the_schema_s
 
 def test_units_bounds_choices_and_defaults_are_read_off_the_field():
     def text(kind, name):
-        return options.described(name, flags.facts(kind)[name]).replace("\\", "")
+        return options.option_help(name, flags.schema_facts(kind)[name]).replace("\\", "")
 
     assert text(config.Sweep, "slopes_deg").endswith("  [-45 to 45]  [default: 0,5,10,15,20]")
     assert text(config.Sweep, "discharge_mAh") == (
@@ -108,14 +108,14 @@ def _file(folder: Path, text: str) -> Path:
 
 def test_solver_table_of_a_file_is_read_and_options_win(tmp_path):
     file = _file(tmp_path, 'seed = 3\n[solver]\nreplicates = 300\npopulation = 8\nmembers = "kept.npz"\n')
-    found = config.resolve(config.Loop, file, {}, config.MembersPart)
+    found = config.resolve_configuration(config.Loop, file, {}, config.MembersPart)
     assert (found.seed, found.replicates, found.population) == (3, 300, 8)
-    assert config.resolve(config.Loop, file, {"population": 16}, config.MembersPart).population == 16
+    assert config.resolve_configuration(config.Loop, file, {"population": 16}, config.MembersPart).population == 16
     assert config.resolve_beside(config.MembersPart, file, {}).members == Path("kept.npz")
     assert config.resolve_beside(config.MembersPart, file, {"members": "other"}).members == Path("other")
     # what a former version left, whose keys all stand at the top, says the same
     flat = _file(tmp_path, "seed = 3\nreplicates = 300\npopulation = 8\n")
-    assert config.resolve(config.Loop, flat, {}) == found
+    assert config.resolve_configuration(config.Loop, flat, {}) == found
 
 
 @pytest.mark.parametrize(
@@ -131,7 +131,7 @@ def test_solver_table_of_a_file_is_read_and_options_win(tmp_path):
 )  # fmt: skip
 def test_solver_tables_that_cannot_be_are_refused_in_a_sentence(kind, text, message, tmp_path):
     with pytest.raises(BadConfiguration, match=message):
-        config.resolve(kind, _file(tmp_path, text), {})
+        config.resolve_configuration(kind, _file(tmp_path, text), {})
 
 
 def test_command_takes_its_solver_table(tmp_path, monkeypatch, said):
@@ -157,16 +157,16 @@ def test_no_message_of_what_was_stated_by_options_names_a_field(tmp_path):
     option are called by it; from a file by their key."""
     source = Path(config.__file__).read_text(encoding="utf-8")
     rules = [m for m in re.findall(r'"idle",\s*(f?"(?:[^"]|"\s*f?")*")', source)]
-    fields = {n for kinds in KINDS.values() for k in kinds for n in flags.flags(k) if "_" in n}
+    fields = {n for kinds in KINDS.values() for k in kinds for n in flags.options_of_fields(k) if "_" in n}
     assert len(rules) > 15 and [r for r in rules for n in fields if re.search(rf"(?<![`\w]){n}(?![`\w])", r)] == []
     given = {"left_V": 5.0, "battery": True}
     with pytest.raises(BadConfiguration, match=r"^--left acts with --right only; state both$"):
-        config.resolve(config.Simulate, None, given)
+        config.resolve_configuration(config.Simulate, None, given)
     (tmp_path / "a.toml").write_text("left_V = 5.0\n")
     with pytest.raises(BadConfiguration, match=r"^a\.toml: left_V acts with right_V only; state both$"):
-        config.resolve(config.Simulate, tmp_path / "a.toml", {})
+        config.resolve_configuration(config.Simulate, tmp_path / "a.toml", {})
     with pytest.raises(BadConfiguration, match=r"^--left: got 500\.0; "):
-        config.resolve(config.Simulate, None, {"left_V": 500.0, "right_V": 1.0})
+        config.resolve_configuration(config.Simulate, None, {"left_V": 500.0, "right_V": 1.0})
 
 
 HARM = "import pathlib\npathlib.Path('harmed').touch()\n"
@@ -197,4 +197,4 @@ def test_a_file_runs_no_code_unless_it_is_trusted(mmrjax, tmp_path, command, tex
 def test_an_empty_list_of_effects_asks_for_nothing(tmp_path):
     (tmp_path / "a.toml").write_text(config.as_toml(config.Simulate()))
     assert "effects = []" in (tmp_path / "a.toml").read_text()
-    assert config.resolve(config.Simulate, tmp_path / "a.toml", {}) == config.Simulate()
+    assert config.resolve_configuration(config.Simulate, tmp_path / "a.toml", {}) == config.Simulate()

@@ -59,8 +59,8 @@ class Written:
         self.runs = unweighed(runs)
 
     def __call__(self, robot):
-        robot_file.write(robot, self.path)
-        back = robot_file.read(self.path)
+        robot_file.write_robot(robot, self.path)
+        back = robot_file.read_robot(self.path)
         have = {e.name: e for e in back.effects}
         assert set(have) == {e.name for e in robot.effects}
         whole = dataclasses.replace(back, effects=tuple(have.get(e.name, e) for e in self.effects))
@@ -177,25 +177,25 @@ def curves(tmp_path_factory):
 
 def test_mass_of_the_table_is_taken_and_said(robot):
     runs = table({"6T2A": 13.1, "4W2T": 13.1})
-    assert own_mass.remarks(robot, runs) == [
+    assert own_mass.mass_notes(robot, runs) == [
         "4W2T: the table states 13.1 kg without payload, the robot's file 11.5 kg; 13.1 kg is used, and written to robot.toml"
     ]
     taken = own_mass.with_table_mass(robot, runs)
     assert float(taken.configurations["4W2T"].mass) == 13.1 and float(taken.configurations["6T2A"].mass) == 13.1
     # Of a sum of floats the rounding is neither written nor said, and what is taken is not taken again.
-    assert own_mass.remarks(taken, runs) == []
+    assert own_mass.mass_notes(taken, runs) == []
 
 
 def test_a_table_without_masses_leaves_the_robots(robot):
     runs = unweighed(table())
     assert own_mass.with_table_mass(robot, runs) is robot or own_mass.stated_masses(robot, runs) == {}
-    assert own_mass.remarks(robot, runs) == []
+    assert own_mass.mass_notes(robot, runs) == []
 
 
 def test_a_mass_that_varies_is_said_and_its_median_written(robot):
     runs = table()
     runs.columns["total_mass_kg"][:6] += [0.0, 0.0, 0.1, 0.2, 0.3, 0.4]
-    (said, _) = own_mass.remarks(robot, runs)
+    (said, _) = own_mass.mass_notes(robot, runs)
     assert said == (
         "6T2A: total_mass_kg less payload_kg varies from 14.2 to 14.6 kg: the fit used the table's, row by row; "
         "14.35 kg, their median, is written, and with it rows of another mass are not as fitted"
@@ -206,17 +206,17 @@ def test_a_mass_that_varies_is_said_and_its_median_written(robot):
 def test_a_total_without_its_payload_is_suspected(robot):
     runs = table()
     runs.columns["total_mass_kg"][:] = 13.1
-    said = own_mass.remarks(robot, runs)
+    said = own_mass.mass_notes(robot, runs)
     assert len(said) == 2 and all(s.endswith("; does total_mass_kg leave the payload out?") for s in said)
 
 
 def test_a_surface_other_than_the_robots_is_said(robot):
-    said = own_mass.remarks(robot, table({"6T2A": 13.1, "4W2T": 11.5}, surface="asphalt"))
+    said = own_mass.mass_notes(robot, table({"6T2A": 13.1, "4W2T": 11.5}, surface="asphalt"))
     assert said == [
         "the table has runs on asphalt: the written friction is for lacquered_wood; simulate with "
         "--surface asphalt to meet what was fitted"
     ]
-    assert own_mass.remarks(robot, table({"6T2A": 13.1, "4W2T": 11.5}, surface="lacquered_wood")) == []
+    assert own_mass.mass_notes(robot, table({"6T2A": 13.1, "4W2T": 11.5}, surface="lacquered_wood")) == []
 
 
 def test_a_mass_that_no_robot_has_is_refused(robot):
@@ -238,12 +238,12 @@ def test_a_prior_of_a_mass_that_the_table_states_is_refused(robot):
 
 @pytest.mark.slow
 def test_calibrated_robot_is_its_fit(tmp_path):
-    runs = records.read("measured")
+    runs = records.read_runs("measured")
     found = calibrate(runs, paper_robots.nominal(), noise="current=2%,motor_speed=1%,speed=1%", starts=4, profiles=False,
                       blocks=())  # fmt: skip
     assert any(n.startswith("4W2T: the table states 13.1 kg without payload") for n in found.notes)
     found.save(tmp_path)
-    again = robot_file.read(tmp_path / "robot.toml")
+    again = robot_file.read_robot(tmp_path / "robot.toml")
     shown = steady_batch(again, unweighed(runs).conditions(again))
     for name, reading in found.readings.items():
         np.testing.assert_allclose(np.asarray(shown.reading[name]), reading.after, rtol=1e-8)

@@ -28,13 +28,16 @@ def run_of(robot, **conditions):
 def judged(robot, run, peak=-95.3):
     zeros = np.zeros(2)
     start = Start("a", "6T2A", "converged", np.arange(2.0), np.array([0.0, peak]), zeros, zeros, None)
-    return {line["words"]: line for line in page.limits(robot, run, [start])}
+    return {line["words"]: line for line in page.limits_used(robot, run, [start])}
 
 
 @pytest.mark.slow
 def test_a_winding_is_judged_by_what_it_may_warm_up_by():
     """28 of 125 °C in a room of 25 °C were once 23 % used."""
-    assert page.warmed(28.0, 125.0, 25.0) == pytest.approx(3.0) and page.warmed(125.0, 125.0, 25.0) == 100.0
+    assert (
+        page.warming_share(28.0, 125.0, 25.0) == pytest.approx(3.0)
+        and page.warming_share(125.0, 125.0, 25.0) == 100.0
+    )
     robot, run = paper_robots.nominal(), run_of(paper_robots.nominal())
     found = judged(robot, run)["winding, long running"]["percent"]
     assert found == pytest.approx(float(run["winding_settled_C"]) - 25.0)  # of 100 K
@@ -88,17 +91,19 @@ def test_every_table_of_a_page_scrolls_in_itself(mmrjax, tmp_path):
 
 def test_every_page_warns_of_curves_that_nobody_has_named(robot):
     """No page is rendered without a word on them; the warning comes before the contents."""
-    assert inspect.signature(frame.render).parameters["curves"].default is inspect.Parameter.empty
+    assert inspect.signature(frame.render_page).parameters["curves"].default is inspect.Parameter.empty
     curved = dataclasses.replace(robot, effects=(effects.UNNAMED["curve_electrical_current"](), effects.ALL[0]()))
-    assert frame.curves(robot) == [] and frame.curves(curved) == ["curve_electrical_current"]
-    text = frame._with_contents("<h1>a</h1><h2>b</h2>", {"curve-warning": words.of_curves(frame.curves(curved))})
+    assert frame.unnamed_curves(robot) == [] and frame.unnamed_curves(curved) == ["curve_electrical_current"]
+    text = frame._with_contents(
+        "<h1>a</h1><h2>b</h2>", {"curve-warning": words.of_curves(frame.unnamed_curves(curved))}
+    )
     assert 0 < text.index("<code>curve_electrical_current</code>") < text.index('<nav id="contents"')
     assert "curve-warning" not in frame._with_contents("<h1>a</h1><h2>b</h2>", {"curve-warning": words.of_curves([])})
 
 
 @pytest.mark.slow
 def test_legend_of_the_energy_split_has_what_is_drawn():
-    fig, _ = paper_runs.energy(paper_robots.nominal(), dict.fromkeys((TRACKED, WHEELED), 1.5))
+    fig, _ = paper_runs.draw_energy(paper_robots.nominal(), dict.fromkeys((TRACKED, WHEELED), 1.5))
     shown = {text.get_text() for text in fig.legends[0].get_texts()}
     drawn = {
         bars.get_label() for bars in fig.axes[0].containers if max(bar.get_width() for bar in bars.patches) > 0.05

@@ -18,7 +18,11 @@ from mmrjax.model.motor import Motor
 from mmrjax.model.power import Battery
 
 ROOT = Path(__file__).resolve().parents[1]
-TABLES = {"motors.csv": parts.motors, "gearboxes.csv": parts.gearboxes, "cells.csv": parts.cells}
+TABLES = {
+    "motors.csv": parts.packaged_motors,
+    "gearboxes.csv": parts.packaged_gearboxes,
+    "cells.csv": parts.packaged_cells,
+}
 #: What a motor has to state to be sized with.
 NEEDED = (
     "voltage_nominal",
@@ -71,15 +75,15 @@ def test_parts_have_sources_and_finite_positive_values(file):
 
 
 def test_parts_motors_are_enough_and_state_what_sizing_needs():
-    assert len(parts.motors()) >= 8
-    assert {m.maker for m in parts.motors()} >= {"maxon", "Faulhaber"}
-    for motor in parts.motors():
+    assert len(parts.packaged_motors()) >= 8
+    assert {m.maker for m in parts.packaged_motors()} >= {"maxon", "Faulhaber"}
+    for motor in parts.packaged_motors():
         assert set(NEEDED) <= set(given(motor)), motor.name
         power = motor.torque_constant * (motor.current_nominal - motor.current_no_load) * motor.speed_no_load
         assert 10 < power < 200, motor.name
 
 
-@pytest.mark.parametrize("motor", parts.motors(), ids=lambda m: m.name)
+@pytest.mark.parametrize("motor", parts.packaged_motors(), ids=lambda m: m.name)
 def test_parts_motor_sheet_is_consistent(motor):
     assert inconsistent(motor) == []
     assert motor.current_no_load < 0.2 * motor.current_nominal
@@ -88,7 +92,7 @@ def test_parts_motor_sheet_is_consistent(motor):
 
 
 def test_parts_consistency_can_fail():
-    (motor,) = (m for m in parts.motors() if m.order_number == "148867")
+    (motor,) = (m for m in parts.packaged_motors() if m.order_number == "148867")
     for name, wrong in (("resistance", ["stall current"]), ("torque_constant", list(inconsistency(motor))[:2])):
         changed = dataclasses.replace(motor, **{name: 1.1 * getattr(motor, name)})
         assert set(wrong) <= set(inconsistent(changed)), name
@@ -96,7 +100,7 @@ def test_parts_consistency_can_fail():
 
 def test_parts_winding_stays_cool_at_the_nominal_current():
     """In still air at 25 °C with hot copper, where the sheet states a limit; no sheet rates itself beyond it."""
-    for m in parts.motors():
+    for m in parts.packaged_motors():
         if math.isnan(m.temperature_winding_max):
             continue
         hot = m.resistance * (1 + 0.00393 * (m.temperature_winding_max - 25))
@@ -105,7 +109,7 @@ def test_parts_winding_stays_cool_at_the_nominal_current():
 
 
 def test_parts_hold_the_robot_of_the_paper():
-    (motor,) = (m for m in parts.motors() if m.name == "RE 30 24 V")
+    (motor,) = (m for m in parts.packaged_motors() if m.name == "RE 30 24 V")
     ours = Motor()
     assert motor.resistance == pytest.approx(float(ours.resistance), rel=1e-12)
     assert motor.inductance == pytest.approx(float(ours.inductance), rel=1e-12)
@@ -114,16 +118,16 @@ def test_parts_hold_the_robot_of_the_paper():
     thermal = motor.resistance_thermal_housing + motor.resistance_thermal_winding
     assert thermal == pytest.approx(float(ours.resistance_thermal), rel=1e-12)
     assert motor.time_constant_winding == pytest.approx(float(ThermalDrift().time_constant), rel=1e-12)
-    (gearbox,) = (g for g in parts.gearboxes() if g.order_number == "166936")
+    (gearbox,) = (g for g in parts.packaged_gearboxes() if g.order_number == "166936")
     assert gearbox.ratio == pytest.approx(576 / 25) and gearbox.family in motor.gearboxes
     assert abs(gearbox.efficiency - float(Gearbox().efficiency_load)) < 0.02  # measured 0.74, catalogue 0.75
-    cell = parts.cells()[0]
+    cell = parts.packaged_cells()[0]
     assert cell.capacity == pytest.approx(float(Battery().capacity))
     assert cell.resistance == pytest.approx(float(Battery().resistance))
 
 
 def test_parts_gearboxes_are_consistent():
-    for g in parts.gearboxes():
+    for g in parts.packaged_gearboxes():
         assert g.torque_intermittent_max > g.torque_max and 0.5 < g.efficiency < 1, g.name
         assert 3 <= g.ratio ** (1 / g.stages) <= 9, g.name
         assert g.name.startswith(g.family) and float(g.name.split()[-1][:-2]) == pytest.approx(g.ratio, rel=0.04)
@@ -133,12 +137,12 @@ def test_parts_gearboxes_are_consistent():
             shaft = g.torque_max * g.speed_input_max / g.ratio
             assert math.isnan(g.power_max) == bool(g.note), g.name
             assert math.isnan(g.power_max) or g.power_max < 1.1 * shaft, g.name
-    families = {g.family for g in parts.gearboxes()}
-    assert all(set(m.gearboxes) <= families and m.gearboxes for m in parts.motors())
+    families = {g.family for g in parts.packaged_gearboxes()}
+    assert all(set(m.gearboxes) <= families and m.gearboxes for m in parts.packaged_motors())
 
 
 def test_parts_cells_weigh_what_cells_weigh():
-    weighed = [c for c in parts.cells() if not math.isnan(c.mass)]
+    weighed = [c for c in parts.packaged_cells() if not math.isnan(c.mass)]
     assert len(weighed) >= 3
     for cell in weighed:
         grams_per_amp_hour = 1e3 * cell.mass / cell.cells / (cell.capacity / 3600)
@@ -156,7 +160,7 @@ def test_parts_columns_are_those_of_the_sheets(tmp_path, monkeypatch):
         with (folder / "cells.csv").open("w", encoding="utf-8", newline="") as out:
             csv.writer(out).writerows(rows)
 
-    read = parts.cells.__wrapped__
+    read = parts.packaged_cells.__wrapped__
     write(header, first)
     assert read()[0].name == "XP2200SL"
     write(header, [v if c != "capacity_mAh" else "2.2 Ah" for c, v in zip(header, first, strict=True)])

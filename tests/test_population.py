@@ -44,7 +44,7 @@ class Stepped(SettledRuns):
 
 @pytest.fixture(scope="module")
 def runs():
-    table = records.read("measured")
+    table = records.read_runs("measured")
     return table.where((table["configuration"] == "6T2A") & (table["slope_deg"] < 10))
 
 
@@ -199,7 +199,7 @@ def test_damaged_members_are_refused_before_the_first_search(tmp_path, monkeypat
     monkeypatch.setattr(multistart, "search_from_starts", never)
     with pytest.raises(BadConfiguration, match="not a readable file of members"):
         calibrate(
-            records.read("measured"),
+            records.read_runs("measured"),
             paper_robots.nominal(),
             model="track",
             population=8,
@@ -333,14 +333,14 @@ def test_population_of_which_no_member_can_be_run_is_refused(runs, monkeypatch):
 )
 def test_options_of_a_population_that_cannot_be_are_refused(options, says):
     with pytest.raises(BadConfiguration, match=says):
-        calibrate(records.read("measured"), paper_robots.nominal(), **options)
+        calibrate(records.read_runs("measured"), paper_robots.nominal(), **options)
 
 
 @pytest.mark.nightly
 @pytest.mark.slow
 def test_running_gear_is_found_through_the_track_model(tmp_path):
     """Readings of a shaking gear; the population comes near its slip, which the flush gear does not."""
-    table = records.read("measured")
+    table = records.read_runs("measured")
     table = table.where(
         (table["configuration"] == "6T2A") & (table["supply_voltage_V"] == 15) & (table["slope_deg"] % 10 == 0)
     )

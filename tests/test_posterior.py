@@ -13,7 +13,7 @@ from calibration.data import posterior_file as room
 from calibration.data import robot_file
 from calibration.data.input_errors import BadData
 from calibration.data.posterior_file import ANGLE, LOG, NORMAL, Posterior
-from calibration.data.runs import read
+from calibration.data.runs import read_runs
 from calibration.inference import priors
 from calibration.inference.fit_posterior import posterior_of_coordinates
 from mmrjax.fidelities.steady import steady_batch
@@ -50,8 +50,8 @@ def test_coordinates_of_a_posterior_are_those_of_the_fit(coordinates, posterior)
 
 
 def test_file_holds_all_of_a_posterior(posterior, tmp_path):
-    room.write(posterior, tmp_path / room.FILE)
-    again = room.read(tmp_path / room.FILE)
+    room.write_posterior(posterior, tmp_path / room.FILE)
+    again = room.read_posterior(tmp_path / room.FILE)
     for field in dataclasses.fields(Posterior):
         a, b = getattr(posterior, field.name), getattr(again, field.name)
         if isinstance(a, np.ndarray):
@@ -62,7 +62,7 @@ def test_file_holds_all_of_a_posterior(posterior, tmp_path):
 
 def test_file_is_a_dataset_with_units_and_names(posterior, tmp_path):
     xarray = pytest.importorskip("xarray")
-    room.write(posterior, tmp_path / room.FILE)
+    room.write_posterior(posterior, tmp_path / room.FILE)
     with xarray.open_dataset(tmp_path / room.FILE) as data:
         data.load()
     assert data.attrs["schema"] == room.SCHEMA
@@ -85,8 +85,8 @@ def test_draws_have_mean_and_covariance_of_the_posterior(posterior):
 
 @pytest.mark.slow
 def test_draws_reproduce_the_linear_standard_error_of_readings(posterior, fitted):
-    runs = read("measured").where(np.array([0, 1, 5, 6]))
-    found = uncertainty.intervals(fitted, posterior, runs, config.Compare(), 500)
+    runs = read_runs("measured").where(np.array([0, 1, 5, 6]))
+    found = uncertainty.simulate_draws(fitted, posterior, runs, config.Compare(), 500)
     conditions = runs.conditions(fitted)
 
     def readings(z):
@@ -110,8 +110,8 @@ def test_draws_that_do_not_travel_are_counted_and_leave_the_rest(robot):
     names = ("6T2A.ground.friction.static",)
     coordinates = priors.parameter_coordinates(robot, names)
     wide = posterior_of_coordinates(coordinates, np.zeros(1), np.eye(1))
-    runs = read("measured").where(np.array([0, 2]))  # flat, and 10°, where one in seven slides
-    found = uncertainty.intervals(robot, wide, runs, config.Compare(), 300)
+    runs = read_runs("measured").where(np.array([0, 2]))  # flat, and 10°, where one in seven slides
+    found = uncertainty.simulate_draws(robot, wide, runs, config.Compare(), 300)
     share = found.columns[uncertainty.SHARE]
     assert share[0] == 1 and 0.7 < share[1] < 0.95
     assert np.isfinite(found.sd("speed_mm_s")).all()
@@ -158,15 +158,15 @@ def test_posterior_of_another_robot_is_refused(robot, posterior, fitted):
 def test_missing_and_damaged_files_are_refused(posterior, tmp_path):
     path = tmp_path / room.FILE
     with pytest.raises(BadData, match=r"no such file; expected the posterior\.nc that calibrate and loop write"):
-        room.read(path)
+        room.read_posterior(path)
     path.write_text("nothing of the kind")
     with pytest.raises(BadData, match="not a posterior that can be read"):
-        room.read(path)
+        room.read_posterior(path)
     skew = posterior.covariance.copy()
     skew[0, 1] = skew[1, 0] = 5.0  # more than their sds allow
-    room.write(dataclasses.replace(posterior, covariance=skew), path)
+    room.write_posterior(dataclasses.replace(posterior, covariance=skew), path)
     with pytest.raises(BadData, match="the covariance is not one"):
-        room.read(path)
+        room.read_posterior(path)
 
 
 @pytest.mark.parametrize("field", ["location", "spread", "low", "high", "softness"])
@@ -180,12 +180,14 @@ def test_file_without_a_number_is_refused_and_the_check_does_not_let_it_through(
     sound[field][0] = np.nan
     sound.to_netcdf(tmp_path / room.FILE, engine="scipy")
     with pytest.raises(BadData, match="or a number is missing or out of range; write the file anew"):
-        room.read(tmp_path / room.FILE)
+        room.read_posterior(tmp_path / room.FILE)
 
 
 def test_file_without_bounds_is_read(posterior, tmp_path):
-    room.write(dataclasses.replace(posterior, low=np.full(4, -np.inf), high=np.full(4, np.inf)), tmp_path / room.FILE)
-    assert np.isinf(room.read(tmp_path / room.FILE).high).all()
+    room.write_posterior(
+        dataclasses.replace(posterior, low=np.full(4, -np.inf), high=np.full(4, np.inf)), tmp_path / room.FILE
+    )
+    assert np.isinf(room.read_posterior(tmp_path / room.FILE).high).all()
 
 
 @pytest.mark.parametrize(("column", "value"), [("tied_to", 4), ("tied_to", -1), ("tied_ratio", np.nan)])
@@ -194,13 +196,13 @@ def test_file_of_what_follows_nothing_is_refused(posterior, tmp_path, column, va
     sound[column][0] = value
     sound.to_netcdf(tmp_path / room.FILE, engine="scipy")
     with pytest.raises(BadData, match="or a number is missing or out of range; write the file anew"):
-        room.read(tmp_path / room.FILE)
+        room.read_posterior(tmp_path / room.FILE)
 
 
 def _written(posterior, folder):
     xarray = pytest.importorskip("xarray")
-    room.write(posterior, folder / room.FILE)
-    assert len(room.read(folder / room.FILE)) == len(posterior)
+    room.write_posterior(posterior, folder / room.FILE)
+    assert len(room.read_posterior(folder / room.FILE)) == len(posterior)
     with xarray.open_dataset(folder / room.FILE, engine="scipy") as data:
         return data.load().copy(deep=True)
 
@@ -209,7 +211,7 @@ def test_file_of_another_schema_is_refused(tmp_path):
     xarray = pytest.importorskip("xarray")
     xarray.Dataset({"x": 1.0}).to_netcdf(tmp_path / room.FILE, engine="scipy")
     with pytest.raises(BadData, match=r"not a posterior that can be read \(ValueError: schema None"):
-        room.read(tmp_path / room.FILE)
+        room.read_posterior(tmp_path / room.FILE)
 
 
 def test_draws_of_which_some_never_settle_have_no_spread_and_warn_of_nothing():
@@ -230,8 +232,8 @@ def test_a_value_is_said_to_two_digits_of_its_sd(value, sd, most, said):
 def test_saved_calibration_has_its_posterior(tmp_path):
     found = calibrated()
     found.save(tmp_path)
-    again = room.read(tmp_path / room.FILE)
-    again.check(robot_file.load(str(tmp_path / "robot.toml")), "saved")
+    again = room.read_posterior(tmp_path / room.FILE)
+    again.check(robot_file.load_robot(str(tmp_path / "robot.toml")), "saved")
     for name, sd in zip(again.names, again.sd, strict=True):
         if name in found.parameters:
             assert sd == pytest.approx(found.parameters[name].sd, rel=1e-9)

@@ -24,7 +24,7 @@ def robot():
 def flush(robot):
     cells = {"levers_front_deg": 180.0, "levers_rear_deg": -8.5, "slope_deg": 15.0}
     runs = one_run(robot, cells)
-    return posture_results.postures(robot, runs, runs.conditions(robot))
+    return posture_results.posture_of_runs(robot, runs, runs.conditions(robot))
 
 
 @pytest.mark.slow
@@ -37,7 +37,9 @@ def test_posture_of_a_run(flush):
     assert flush.over.step_mm.max() == pytest.approx(270, abs=0.5) and flush.over.step_mm.shape == (61, 61)
     k = np.argmin(abs(posture_results.ANGLES - 180)), np.argmin(abs(posture_results.ANGLES + 6))
     assert flush.over.step_mm[k] < table["highest_step_mm"][0] + 5
-    assert "steps up to 232 mm" in posture_words.stands(flush) and posture_words.remarks(flush) == []
+    assert (
+        "steps up to 232 mm" in posture_words.posture_sentences(flush) and posture_words.tipping_remarks(flush) == []
+    )
 
 
 @pytest.mark.slow
@@ -45,14 +47,14 @@ def test_a_run_that_would_tip_is_said_to(flush):
     tipping = posture_results.Postures(
         {**flush.table, "margin_mm": np.array([-3.0])}, flush.rest, flush.step, flush.over
     )
-    assert posture_words.remarks(tipping) == [
+    assert posture_words.tipping_remarks(tipping) == [
         "posture: the run would tip over on that slope; currents and speeds are of a robot that is held on it"
     ]
 
 
 def test_runs_without_levers_have_no_posture(robot):
     runs = one_run(robot, {})
-    assert posture_results.postures(robot, runs, runs.conditions(robot)) is None
+    assert posture_results.posture_of_runs(robot, runs, runs.conditions(robot)) is None
 
 
 @pytest.mark.slow
@@ -60,7 +62,7 @@ def test_one_pair_alone_leaves_the_other_as_the_robot_states_it(robot):
     raised = params.replace(robot, {"running_gear.lever_rear": np.pi / 2})
     conditions = one_run(raised, {"levers_front_deg": 20.0}).conditions(raised)
     assert conditions.levers_rear_deg is None and conditions.states_levers
-    tops = posture_results.postures(raised, one_run(raised, {"levers_front_deg": 20.0}), conditions).table
+    tops = posture_results.posture_of_runs(raised, one_run(raised, {"levers_front_deg": 20.0}), conditions).table
     assert tops["tip_rear_mm"][0] == pytest.approx(262, abs=1)
 
 
@@ -90,13 +92,13 @@ def test_a_table_states_levers_by_row(robot, tmp_path):
     head = "configuration,supply_voltage_V,payload_kg,slope_deg,total_mass_kg,levers_front_deg,levers_rear_deg\n"
     path = tmp_path / "runs.csv"
     path.write_text(head + "6T2A,33,0,0,13.1,30,-8\n6T2A,24,0,5,13.1,180,180\n")
-    runs = records.read(path, robot=robot, measured=False)
+    runs = records.read_runs(path, robot=robot, measured=False)
     conditions = runs.conditions(robot)
     assert conditions.levers_front_deg.tolist() == [30, 180] and conditions.levers_rear_deg.tolist() == [-8, 180]
-    assert contradictions.misplaced(runs, robot) is None
+    assert contradictions.misplaced_levers(runs, robot) is None
     path.write_text(head + "6T2A,33,0,0,13.1,30,-8\n4W2T,24,0,5,11.5,180,180\n")
     with pytest.raises(BadData, match=r"runs.csv row 2, levers_front_deg: 4W2T has no levers"):
-        records.read(path, robot=robot, measured=False)
+        records.read_runs(path, robot=robot, measured=False)
 
 
 @pytest.mark.slow

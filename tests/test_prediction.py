@@ -167,7 +167,7 @@ def test_measured_runs_show_a_voltage_drop_and_a_slip_that_rests_on_a_row(tmp_pa
         rms = np.sqrt(np.nanmean(error**2, 0))
         assert (rms < np.array(wanted[kind]) + 0.05).all(), (kind, rms)
     found.save(tmp_path)
-    again = robot_file.read(tmp_path / "robot.toml")
+    again = robot_file.read_robot(tmp_path / "robot.toml")
     assert float(again.configurations["4W2T"].mass) == 13.1
     unweighed = {k: v for k, v in runs.columns.items() if k != "total_mass_kg"}
     shown = steady_batch(again, dataclasses.replace(runs, columns=unweighed).conditions(again)).reading

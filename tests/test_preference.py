@@ -12,7 +12,7 @@ from synthetic import SETTLED, known, table
 from worlds import tables
 
 from calibration.data.input_errors import BadConfiguration
-from calibration.data.writing import finite
+from calibration.data.writing import finite_or_null
 from calibration.discovery import discover, preference
 from calibration.discovery.loop_notes import DRAW, Led
 from calibration.discovery.result import HeldOutAlternative, Worse
@@ -159,7 +159,7 @@ def test_what_gets_worse_stands_before_effects_on_page_and_terminal(traced, tmp_
     found = dataclasses.replace(found, held_out_worse=(rise,))
     said = f"Predicts worse on held-out rows: by slope motor speed 4.3 → 4.7 % (same {rise.rows} rows)."
     schema = json.loads((Path(__file__).parents[1] / "docs" / "schemas" / "loop.schema.json").read_text("utf-8"))
-    document = finite(found.to_json())
+    document = finite_or_null(found.to_json())
     jsonschema.validate(document, schema)
     assert document["held_out_worse"] == [dataclasses.asdict(rise)]
     assert [a["effects"] for a in document["alternatives_held_out"]] == [list(a.effects) for a in traced.held_out]
@@ -172,7 +172,7 @@ def test_what_gets_worse_stands_before_effects_on_page_and_terminal(traced, tmp_
     assert said in " ".join(printed.split()) and printed.index("Predicts worse") < printed.index("effect ")
     assert printed.index("as stated, nothing fitted") < printed.index("before, fitted")
 
-    text = loop_page.write(tmp_path, found, robot_name="nominal").read_text("utf-8")
+    text = loop_page.write_loop_page(tmp_path, found, robot_name="nominal").read_text("utf-8")
     page = Tables(text)
     assert said in page.text
     assert text.index('id="summary"') < text.index('id="worse"') < text.index('id="use"')
@@ -180,4 +180,4 @@ def test_what_gets_worse_stands_before_effects_on_page_and_terminal(traced, tmp_
     assert len(page.tables["alternatives_held_out"]) == 1 + len(traced.held_out)
 
     found = dataclasses.replace(found, held_out_worse=())
-    assert 'id="worse"' not in loop_page.write(tmp_path, found, robot_name="nominal").read_text("utf-8")
+    assert 'id="worse"' not in loop_page.write_loop_page(tmp_path, found, robot_name="nominal").read_text("utf-8")

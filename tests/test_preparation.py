@@ -25,7 +25,7 @@ ALL = {
 def test_a_table_whose_masses_have_another_unit_is_refused_by_all(who):
     """`calibrate` took the table's mass for the robot's own before it compared the two, and fitted a robot of 79 kg;
     `rig check` compared nothing."""
-    runs = records.read("measured")
+    runs = records.read_runs("measured")
     runs = Runs("runs.csv", {**runs.columns, "total_mass_kg": 6 * runs["total_mass_kg"]})
     with pytest.raises(BadData, match=r"runs.csv, total_mass_kg: about 6\.2 times too large for this robot"):
         ALL[who](runs, paper_robots.nominal())
@@ -33,7 +33,9 @@ def test_a_table_whose_masses_have_another_unit_is_refused_by_all(who):
 
 def test_a_prior_of_a_mass_that_the_table_states_is_refused_by_the_loop_too():
     with pytest.raises(BadConfiguration, match=r"--prior 4W2T\.mass: .* states total_mass_kg"):
-        discover.prepare_loop(records.read("measured"), paper_robots.nominal(), stated={"4W2T.mass": (11.0, 0.5)})
+        discover.prepare_loop(
+            records.read_runs("measured"), paper_robots.nominal(), stated={"4W2T.mass": (11.0, 0.5)}
+        )
 
 
 @pytest.mark.slow
@@ -43,7 +45,7 @@ def test_a_campaign_sees_the_instruments_that_the_table_shows(tmp_path):
     text = DRIVE.format(imposed="voltage", channels='"total_current"', start="rest")
     text += '[instruments.total_current]\nsigned = "free"\nquantum = "free"\n'
     path.write_text(text + ARM)
-    robot = robot_file.load(str(path))
+    robot = robot_file.load_robot(str(path))
     assert robot.rig.instruments[0].free
     volts = np.concatenate([np.linspace(-12, -4, 12), np.linspace(4, 12, 12)])
     current = np.round(0.3 + 0.01 * np.abs(volts), 2)
@@ -52,7 +54,7 @@ def test_a_campaign_sees_the_instruments_that_the_table_shows(tmp_path):
     table.write_text(
         "\n".join([",".join(columns), *(",".join(map(str, row)) for row in zip(*columns.values(), strict=True))])
     )
-    given = discover.prepare_loop(records.read(table, robot=robot), robot)
+    given = discover.prepare_loop(records.read_runs(table, robot=robot), robot)
     seen = given.robot.rig.instruments[0]
     assert seen.signed is False and seen.quantum == pytest.approx(0.01)
     assert given.noise.sd.min() >= 0.01 / 12**0.5  # with the error of the step

@@ -35,20 +35,20 @@ VESC = {
 
 def robot(tmp_path, *channels):
     (tmp_path / "rig.toml").write_text(RIG.format(channels=", ".join(f'"{c}"' for c in channels)), encoding="utf-8")
-    return robot_file.read(tmp_path / "rig.toml")
+    return robot_file.read_robot(tmp_path / "rig.toml")
 
 
 @pytest.mark.parametrize("name", presets_file.PACKAGED)
 def test_every_packaged_preset_can_be_read(name):
-    given = ",".join([name, *(f"{key}=2" for key in presets_file.asked(name))])
-    found = presets_file.find(given)
+    given = ",".join([name, *(f"{key}=2" for key in presets_file.numbers_to_state(name))])
+    found = presets_file.find_preset(given)
     assert found.columns and all(column.factor and column.theirs for column in found.columns)
 
 
 def test_vesc_counts_electrical_turns_and_has_two_clocks(tmp_path):
     pd.DataFrame(VESC).to_csv(tmp_path / "log.csv", index=False, sep=";")
     rig = robot(tmp_path, "total_current", "motor_current", "motor_speed")
-    found = records.read(tmp_path / "log.csv", rig, columns="vesc,pole_pairs=7")
+    found = records.read_runs(tmp_path / "log.csv", rig, columns="vesc,pole_pairs=7")
     np.testing.assert_allclose(found["motor_speed_rpm"], [100, 200, 300])
     np.testing.assert_allclose(found["time_s"], [0, 0.14, 0.28])
     np.testing.assert_allclose(found["duty"], [0.1, 0.2, 0.3])
@@ -57,12 +57,14 @@ def test_vesc_counts_electrical_turns_and_has_two_clocks(tmp_path):
     with pytest.raises(
         BadConfiguration, match=r"pole_pairs is missing, the pairs of poles .* --columns vesc,pole_pairs=7"
     ):
-        records.read(tmp_path / "log.csv", rig, columns="vesc")
+        records.read_runs(tmp_path / "log.csv", rig, columns="vesc")
 
 
 def test_simplefoc_prints_milliamperes_and_no_header(tmp_path):
     (tmp_path / "log.txt").write_text("2.0\t2.00\t0\t150\t0\t10.0\t0.1\n3.0\t3.00\t0\t250\t0\t15.0\t0.2\n")
-    found = records.read(tmp_path / "log.txt", robot(tmp_path, "motor_current", "motor_speed"), columns="simplefoc")
+    found = records.read_runs(
+        tmp_path / "log.txt", robot(tmp_path, "motor_current", "motor_speed"), columns="simplefoc"
+    )
     np.testing.assert_allclose(found["motor_current_A"], [0.15, 0.25])
     np.testing.assert_allclose(found["motor_speed_rpm"], np.array([10.0, 15.0]) * 30 / np.pi)
     np.testing.assert_allclose(found["supply_voltage_V"], [2, 3])
@@ -71,7 +73,7 @@ def test_simplefoc_prints_milliamperes_and_no_header(tmp_path):
 def test_sysid_has_a_run_for_each_test(tmp_path):
     test = [[0.02 * k, 0.5 * k, 0.1 * k, 1.0 * k] for k in range(4)]
     (tmp_path / "log.json").write_text(json.dumps({"sysid": True, "slow-forward": test, "fast-forward": test}))
-    found = records.read(tmp_path / "log.json", robot(tmp_path, "output_speed"), columns="sysid")
+    found = records.read_runs(tmp_path / "log.json", robot(tmp_path, "output_speed"), columns="sysid")
     assert dict.fromkeys(found["run_id"].tolist()).keys() == {"slow-forward", "fast-forward"}
     np.testing.assert_allclose(found["output_speed_rpm"], np.tile([0.0, 60, 120, 180], 2))
 
@@ -82,7 +84,7 @@ def test_bam_has_entries_with_a_duty(tmp_path):
         for k in range(4)
     ]
     (tmp_path / "log.json").write_text(json.dumps({"mass": 0.5, "entries": entries}))
-    found = records.read(tmp_path / "log.json", robot(tmp_path, "output_speed"), columns="bam,load_limit=1023")
+    found = records.read_runs(tmp_path / "log.json", robot(tmp_path, "output_speed"), columns="bam,load_limit=1023")
     np.testing.assert_allclose(found["duty"], [0, 0.1, 0.2, 0.3])
     np.testing.assert_allclose(found["output_speed_rpm"], np.arange(4) * 30 / np.pi)
 
@@ -91,7 +93,9 @@ def test_lerobot_has_a_run_for_each_episode(tmp_path):
     states = [[1.0 * k, 10.0 * k] for k in range(4)]
     data = {"observation.state": states, "timestamp": [0.0, 0.1, 0.0, 0.1], "episode_index": [0, 0, 1, 1]}
     pd.DataFrame({**data, "supply_voltage_V": 12.0}).to_parquet(tmp_path / "file-000.parquet")
-    found = records.read(tmp_path / "file-000.parquet", robot(tmp_path, "output_angle"), columns="lerobot,joint=1")
+    found = records.read_runs(
+        tmp_path / "file-000.parquet", robot(tmp_path, "output_angle"), columns="lerobot,joint=1"
+    )
     assert found["run_id"].tolist() == ["0", "0", "1", "1"]
     np.testing.assert_allclose(found["output_angle_deg"], [0, 10, 20, 30])
 
@@ -102,14 +106,14 @@ def test_an_optical_speed_without_readings_gives_way_to_the_electrical(tmp_path)
         "Motor Electrical Speed (RPM)": [1000.0, 2000.0], "Motor Optical Speed (RPM)": [0, 0],
     }  # fmt: skip
     pd.DataFrame(columns).to_csv(tmp_path / "log.csv", index=False)
-    found = records.read(tmp_path / "log.csv", robot(tmp_path, "motor_speed"), columns="rcbenchmark")
+    found = records.read_runs(tmp_path / "log.csv", robot(tmp_path, "motor_speed"), columns="rcbenchmark")
     np.testing.assert_allclose(found["motor_speed_rpm"], [1000, 2000])
 
 
 def test_columns_of_ones_own_win_over_those_of_the_robots_file(tmp_path):
     rig = robot(tmp_path, "motor_speed")
     mine = {"supply_voltage_V": "u", "motor_speed_rad_s": {"column": "w", "factor": -1.0}}
-    found = records.read({"u": [1.0, -2.0], "w": [-3.0, 4.0], "speed": [1.0, 1.0]}, rig, columns=mine)
+    found = records.read_runs({"u": [1.0, -2.0], "w": [-3.0, 4.0], "speed": [1.0, 1.0]}, rig, columns=mine)
     np.testing.assert_allclose(found["motor_speed_rpm"], np.array([3.0, -4.0]) * 30 / np.pi)
 
 
@@ -136,7 +140,7 @@ FILES = {
 def test_a_preset_that_cannot_be_is_refused(case):
     stated, says = WRONG[case]
     with pytest.raises(BadConfiguration, match=says):
-        presets_file.find(stated)
+        presets_file.find_preset(stated)
 
 
 @pytest.mark.parametrize("case", FILES)
@@ -144,9 +148,11 @@ def test_a_presets_file_that_cannot_be_is_refused(tmp_path, case):
     text, says = FILES[case]
     (tmp_path / "mine.toml").write_text(text)
     with pytest.raises(BadConfiguration, match=says):
-        presets_file.find(tmp_path / "mine.toml")
+        presets_file.find_preset(tmp_path / "mine.toml")
 
 
 def test_a_file_of_another_logger_is_refused_with_its_columns(tmp_path):
     with pytest.raises(BadData, match=r"has none of the columns of vesc \(ms_today, .*\), but a, b"):
-        records.read({"a": [1.0, 2.0], "b": [1.0, 2.0]}, robot(tmp_path, "motor_speed"), columns="vesc,pole_pairs=7")
+        records.read_runs(
+            {"a": [1.0, 2.0], "b": [1.0, 2.0]}, robot(tmp_path, "motor_speed"), columns="vesc,pole_pairs=7"
+        )

@@ -177,7 +177,7 @@ def test_stated_prior_moves_the_centre(robot):
 
 def read(tmp_path, text):
     (tmp_path / "mine.toml").write_text(text)
-    return robot_file.read(tmp_path / "mine.toml")
+    return robot_file.read_robot(tmp_path / "mine.toml")
 
 
 def test_friction_left_in_from_another_robot_is_said(tmp_path):

@@ -18,7 +18,7 @@ def cache(tmp_path, monkeypatch):
     """A folder for caches, which the environment names."""
     monkeypatch.setenv("MMRJAX_CACHE", str(tmp_path / "caches"))
     monkeypatch.setenv("MMRJAX_PROGRAMS", "")
-    return compilation_cache.location()
+    return compilation_cache.cache_location()
 
 
 def test_a_folder_of_the_users_alone_is_private(cache):
@@ -63,7 +63,7 @@ def test_a_folder_that_others_could_change_is_not_used_and_that_is_said(cache, c
         assert compilation_cache.keep_programs() is None
         assert f"compiled programs are not kept: {reason}" in capsys.readouterr().err.replace("\n", " ")
         assert not programs._private(str(cache))
-        assert str(compilation_cache.describe()) == f"{cache}: not used, since {reason}"
+        assert str(compilation_cache.describe_cache()) == f"{cache}: not used, since {reason}"
     finally:
         os.geteuid = mine
         jax.config.update("jax_compilation_cache_dir", kept)

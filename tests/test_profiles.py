@@ -23,7 +23,7 @@ def read(tmp_path):
     def one(text: str) -> profiles.ProfileTable:
         path = tmp_path / "mission.csv"
         path.write_text(text)
-        return profiles.read(path)
+        return profiles.read_profile(path)
 
     return one
 
@@ -33,7 +33,7 @@ def read(tmp_path):
 
 @pytest.mark.parametrize("name", profiles.PACKAGED)
 def test_packaged_profile_is_read_by_its_name_and_makes_a_profile(name):
-    table = profiles.read(name)
+    table = profiles.read_profile(name)
     made = table.profile(paper_robots.nominal(), Conditions(configuration=np.array([0, 1])))
     assert (made.segments, made.cycles, made.linear) == (table.segments, table.cycles, table.linear)
     assert float(made.duration) == pytest.approx(table.duration)
@@ -48,7 +48,7 @@ def test_packaged_names_are_the_packaged_files():
 
 
 def test_packaged_patrol_is_an_hour_with_120_starts():
-    table = profiles.read("patrol")
+    table = profiles.read_profile("patrol")
     assert table.duration == 3600
     begins = [a == "speed" and table.demand[k] == 0 for k, a in enumerate(table.modes[:-1])]
     assert table.cycles * sum(begins) == 120
@@ -241,15 +241,15 @@ def test_a_mission_begins_as_its_profile_says(read):
 
 def test_unknown_name_lists_what_is_packaged():
     with pytest.raises(BadData, match=r"patroll: no such file and no packaged profile; .*patrol"):
-        profiles.read("patroll")
+        profiles.read_profile("patroll")
 
 
 def test_folder_is_no_profile(tmp_path):
     with pytest.raises(BadData, match="is a folder; expected a file"):
-        profiles.read(tmp_path)
+        profiles.read_profile(tmp_path)
 
 
 def test_bytes_that_are_no_text(tmp_path):
     (tmp_path / "x.csv").write_bytes(b"time_s,duty\n\0\xff\xfe")
     with pytest.raises(BadData, match=r"x.csv: cannot be read as a text file"):
-        profiles.read(tmp_path / "x.csv")
+        profiles.read_profile(tmp_path / "x.csv")

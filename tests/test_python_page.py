@@ -46,7 +46,7 @@ def test_every_page_with_python_is_run():
 def test_the_effect_of_the_page_is_accepted(tmp_path):
     path = tmp_path / "mine.py"
     path.write_text("\n".join(blocks("howto/own-effect")), encoding="utf-8")
-    assert "puddle" in effect_file.library([path])
+    assert "puddle" in effect_file.effect_library([path])
 
 
 @pytest.mark.slow

@@ -72,12 +72,12 @@ loss_coulomb = 0.03
 @pytest.mark.parametrize("sign", [1, -1])
 def test_a_current_that_one_sign_explains_beside_a_weight_is_doubted(tmp_path, sign):
     (tmp_path / "rig.toml").write_text(WINCH)
-    robot = robot_file.read(tmp_path / "rig.toml")
+    robot = robot_file.read_robot(tmp_path / "rig.toml")
     lifts = np.array([30.0, 120.0, 240.0, -30.0, -120.0, -240.0])
     current = sign * np.where(lifts > 0, 4.7, 3.2)
     rows = "".join(f"{n},{i}\n" for n, i in zip(lifts, current, strict=True))
     (tmp_path / "t.csv").write_text(f"motor_speed_rpm,motor_current_A\n{rows}")
-    found = ranges.turned_signs(records.read(tmp_path / "t.csv", robot=robot), robot)
+    found = ranges.turned_signs(records.read_runs(tmp_path / "t.csv", robot=robot), robot)
     assert [note.column for note in found] == ["motor_current_A"] * (sign < 0)
     assert all(note.turned < 1.0 < 7.0 < note.off for note in found)
 
@@ -86,8 +86,8 @@ def test_a_current_that_one_sign_explains_beside_a_weight_is_doubted(tmp_path, s
 def test_right_units_pass_in_silence(runs, histories):
     robot = paper_robots.nominal()
     assert check_ranges(runs, robot) == check_ranges(histories, robot) == []
-    assert check_ranges(records.read("measured"), robot) == []
-    assert check_ranges(records.read("simulated_by_paper"), robot) == []
+    assert check_ranges(records.read_runs("measured"), robot) == []
+    assert check_ranges(records.read_runs("simulated_by_paper"), robot) == []
 
 
 @pytest.mark.parametrize("case", WRONG)

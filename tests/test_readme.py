@@ -83,9 +83,9 @@ def block(page, kind):
 
 
 def test_files_of_the_how_to_pages_are_read(tmp_path):
-    assert requirements_file.read(block("howto/requirements.md", "toml"), "x.toml")
+    assert requirements_file.parse_requirements(block("howto/requirements.md", "toml"), "x.toml")
     for page in ("howto/describe-a-rig.md", "howto/turn.md"):
         (tmp_path / "robot.toml").write_text(block(page, "toml"), encoding="utf-8")
-        assert robot_file.read(tmp_path / "robot.toml").sides == 2
+        assert robot_file.read_robot(tmp_path / "robot.toml").sides == 2
     (tmp_path / "mission.csv").write_text(block("howto/mission.md", "csv"), encoding="utf-8")
-    assert profiles.read(tmp_path / "mission.csv").cycles == 40
+    assert profiles.read_profile(tmp_path / "mission.csv").cycles == 40

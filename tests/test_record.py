@@ -64,7 +64,7 @@ TABLES = [pytest.param(n, marks=SLOW) for n in RESULTS["loop"]]
 
 def _found(name: str) -> DiscoveryResult:
     stated = {} if name == "measured" else priors.parse_priors(RESULTS["priors"])
-    return discover(tables.read(_source(name)), nominal(), stated=stated)
+    return discover(tables.read_runs(_source(name)), nominal(), stated=stated)
 
 
 def recorded(found: DiscoveryResult) -> dict:
@@ -117,7 +117,7 @@ def test_loop_is_as_recorded(name):
 @pytest.mark.slow
 def test_calibration_is_as_recorded():
     was = RESULTS["calibrate"]["measured"]
-    found = calibrate(tables.read("measured"), nominal(), noise=was["noise"])
+    found = calibrate(tables.read_runs("measured"), nominal(), noise=was["noise"])
     assert found.objective == pytest.approx(was["objective"], rel=1e-3)
     for name, (value, sd) in was["parameters"].items():
         assert abs(found.parameters[name].value - value) < 0.05 * sd, name

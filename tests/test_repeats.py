@@ -67,7 +67,7 @@ def test_the_probability_of_a_median_is_right(count):
 
 def test_every_command_takes_the_larger_noise():
     runs = table(0.2)
-    ready = prepare(runs, robot_file.load("nominal"), "current=0.02A,motor_speed=0.5%")
+    ready = prepare(runs, robot_file.load_robot("nominal"), "current=0.02A,motor_speed=0.5%")
     assert [type(n).__name__ for n in ready.checked][:1] == ["LargerNoise"]
     assert ready.noise.sd[0, 0] > 0.1
 

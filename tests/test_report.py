@@ -46,16 +46,16 @@ def _table(asked, robot=None):
     """A finished table of runs, as the command line hands it over."""
     robot = ROBOTS["nominal"]() if robot is None else robot
     outcome = outputs.output_columns(jax.device_get(steady_batch(robot, asked.conditions(robot))), robot.channels)
-    return {**run.conditions(robot, asked), **outcome}
+    return {**run.condition_table(robot, asked), **outcome}
 
 
 def _runs(configuration, voltage, payload, slope):
     return _table(_asked(configuration, voltage, payload, slope))
 
 
-def _write(folder, runs, robot=None, name="nominal", room=sweep_page):
+def _write(folder, runs, robot=None, name="nominal", write=sweep_page.write_sweep_page):
     robot = ROBOTS["nominal"]() if robot is None else robot
-    path = room.write(folder, RobotFile(robot, name), model="steady", runs=runs)
+    path = write(folder, RobotFile(robot, name), model="steady", runs=runs)
     return path, path.read_text(encoding="utf-8")
 
 
@@ -178,7 +178,9 @@ def test_runs_that_share_a_cell_of_a_map_are_shown_by_their_median():
 def test_report_of_a_file_names_it_without_its_folder_and_lists_what_changed(tmp_path):
     robot = params.replace(ROBOTS["nominal"](), {"motor.resistance": 0.9})
     robot = dataclasses.replace(robot, effects=(BY_NAME["churning"](amplitude=1e-4),))
-    _, page = _write(tmp_path, _runs("6T2A", 33.0, 0.0, 0.0), robot, "/somewhere/else/mine.toml", runs_page)
+    _, page = _write(
+        tmp_path, _runs("6T2A", 33.0, 0.0, 0.0), robot, "/somewhere/else/mine.toml", runs_page.write_runs_page
+    )
     assert "mine.toml" in page and "somewhere" not in page
     changed = {row[0]: row[1:3] for row in Tables(page).tables["changed"][1:]}
     assert changed["motor.resistance"] == ["0.9", "0.611"]
@@ -187,7 +189,7 @@ def test_report_of_a_file_names_it_without_its_folder_and_lists_what_changed(tmp
 
 def test_one_run_is_shown_with_its_readings_limits_and_power(tmp_path):
     runs = _runs("6T2A", 33.0, 0.0, 5.0)
-    _, page = _write(tmp_path, runs, room=runs_page)
+    _, page = _write(tmp_path, runs, write=runs_page.write_runs_page)
     assert drawn(page) == {"power"} and outside(tmp_path) == []
     tables = Tables(page).tables
     row = tables["runs"][1]
@@ -200,7 +202,7 @@ def test_one_run_is_shown_with_its_readings_limits_and_power(tmp_path):
 
 
 def test_run_without_numbers_says_why(tmp_path):
-    _, page = _write(tmp_path, _runs("6T2A", 33.0, 0.0, 40.0), room=runs_page)
+    _, page = _write(tmp_path, _runs("6T2A", 33.0, 0.0, 40.0), write=runs_page.write_runs_page)
     assert (
         drawn(page) == set() and words.STATUSES["slides"].meaning in page and "No run ends in steady travel" in page
     )
@@ -211,8 +213,8 @@ def test_power_chain_sums_to_what_supply_and_slope_give():
     runs = _runs(("6T2A", "4W2T"), (15.0, 33.0), 8.0, (-20.0, -5.0, 0.0, 10.0))
     keep = runs["status"] == "converged"
     runs = {key: value[keep] for key, value in runs.items()}
-    assert power_figures.drawable(runs).all() and keep.sum() >= 14
-    parts, (supply, slope) = power_figures.split(runs), power_figures.sources(runs)
+    assert power_figures.drawable_runs(runs).all() and keep.sum() >= 14
+    parts, (supply, slope) = power_figures.power_by_item(runs), power_figures.power_sources(runs)
     np.testing.assert_allclose(sum(parts.values()), supply + slope, rtol=1e-9)
     downhill = runs["slope_deg"] < 0
     fall = runs["total_mass_kg"] * GRAVITY * np.sin(np.radians(-runs["slope_deg"])) * runs["speed_mm_s"] / 1e3
@@ -229,9 +231,9 @@ def driven(robot, tmp_path_factory):
         "configuration": np.array(["6T2A", "6T2A", "4W2T"]), "supply_voltage_V": np.asarray(asked.voltage),
         "payload_kg": np.zeros(3), "slope_deg": np.asarray(asked.slope_deg),
     })  # fmt: skip
-    table = {**run.conditions(robot, runs), **run.ended(robot, batch)}
+    table = {**run.condition_table(robot, runs), **run.ending_columns(robot, batch)}
     folder = tmp_path_factory.mktemp("driven")
-    runs_page.write(folder, RobotFile(robot, "nominal"), model="drive", runs=table, histories=batch)
+    runs_page.write_runs_page(folder, RobotFile(robot, "nominal"), model="drive", runs=table, histories=batch)
     return folder, (folder / "report.html").read_text(), batch
 
 
@@ -249,10 +251,10 @@ def test_report_shows_the_runs_own_history_with_its_peak(driven):
 
 
 def test_comparison_shows_its_rows_and_escapes_its_title(tmp_path):
-    measured = records.read("measured")
-    table, summary = compare.compared(measured, _table(measured))
+    measured = records.read_runs("measured")
+    table, summary = compare.compare_readings(measured, _table(measured))
     found = Comparison(table, summary, measured.channels, "a&b.csv", "steady", "<b>x.toml")
-    page = page_renderer.write(tmp_path, comparison_report.document(found)).read_text()
+    page = page_renderer.write_report_page(tmp_path, comparison_report.comparison_document(found)).read_text()
     assert "<b>x.toml" not in page and "&lt;b&gt;x.toml" in page and "a&amp;b.csv" in page
     assert drawn(page) == {"parity", "errors"} and outside(tmp_path) == []
     tables = Tables(page).tables

@@ -70,17 +70,17 @@ def test_points_of_the_page_are_drawn_from_all_chunks_where_there_are_many(page,
 def test_share_is_the_variance_between_levels():
     rng = np.random.default_rng(0)
     x, y = rng.integers(0, 5, 20_000).astype(float), rng.standard_normal(20_000)
-    assert campaign_figures.share(x, x) == pytest.approx(1)
-    assert campaign_figures.share(x, y) < 0.01
-    assert campaign_figures.share(y, y) > 0.98
-    assert campaign_figures.share(x, 3 * x + y * 3 * x.std()) == pytest.approx(0.5, abs=0.02)
+    assert campaign_figures.variance_share(x, x) == pytest.approx(1)
+    assert campaign_figures.variance_share(x, y) < 0.01
+    assert campaign_figures.variance_share(y, y) > 0.98
+    assert campaign_figures.variance_share(x, 3 * x + y * 3 * x.std()) == pytest.approx(0.5, abs=0.02)
 
 
 def test_few_points_fill_few_bins():
     """No panel is empty where samples have few points each."""
     resistance, voltage = np.tile(np.linspace(0.5, 0.7, 12), 2), np.repeat([15.0, 33.0], 12)
     varied = {"voltage": campaign_figures.Varied(voltage, "V"), "r": campaign_figures.Varied(resistance, "r")}
-    histogram, *bands, _, _ = campaign_figures.spread(0.1 * voltage + resistance, "I", varied).axes
+    histogram, *bands, _, _ = campaign_figures.draw_output_spread(0.1 * voltage + resistance, "I", varied).axes
     assert [len(b.lines[0].get_xdata()) for b in bands] == [2, 6] and len(histogram.patches) == 6
 
 
@@ -88,10 +88,10 @@ def test_a_share_by_few_points_is_said_only_above_its_chance_level():
     """Of inputs without effect one in 100 has more; 16 points, each a value of its own, fill 6 bins."""
     rng = np.random.default_rng(0)
     x = rng.random((2000, 16))
-    found = [campaign_figures.share(row, rng.standard_normal(16)) for row in x]
+    found = [campaign_figures.variance_share(row, rng.standard_normal(16)) for row in x]
     level = campaign_figures.by_chance(x[0])
     assert 0.003 < np.mean(np.array(found) > level) < 0.02 and level > 0.5
     for output, said in ((rng.standard_normal(16), []), (x[0], ["% of the variance"])):
         varied = {"x": campaign_figures.Varied(x[0], "x")}
-        axes = campaign_figures.spread(output, "y", varied).axes[1]
+        axes = campaign_figures.draw_output_spread(output, "y", varied).axes[1]
         assert [t.get_text()[-17:] for t in axes.texts] == said

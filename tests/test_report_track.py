@@ -29,7 +29,7 @@ SECONDS = 0.9  # of a run; both configurations are under way after 0.5 s
 
 
 def page(folder, robot):
-    path, _ = report.write(folder, RobotFile(robot, "nominal"), model="track", gear=True)
+    path, _ = report.write_paper_page(folder, RobotFile(robot, "nominal"), model="track", gear=True)
     return path.read_text(encoding="utf-8")
 
 
@@ -40,10 +40,10 @@ def drawn(text):
 @pytest.fixture(scope="module")
 def written(robot, tmp_path_factory):
     """Folder and text of the paper remade with the track model, and the run that its figures show."""
-    seen, runs = [], running_gear_figures.runs
+    seen, runs = [], running_gear_figures.simulate_gear_runs
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(running_gear_figures, "SECONDS", SECONDS)
-        patch.setattr(running_gear_figures, "runs", lambda robot: seen.append(runs(robot)) or seen[0])
+        patch.setattr(running_gear_figures, "simulate_gear_runs", lambda robot: seen.append(runs(robot)) or seen[0])
         folder = tmp_path_factory.mktemp("report")
         text = page(folder, robot)
     return folder, text, seen[0]
@@ -89,7 +89,9 @@ def test_section_says_why_its_current_is_not_that_of_the_steady_model(robot, wri
 @pytest.fixture(scope="module")
 def gears(robot, written):
     run = written[2]
-    return gear_figures.gears(robot, run, run.result.status, run.steady.guide_share, (0, 1), ("6T2A", "4W2T"))
+    return gear_figures.members_with_gear(
+        robot, run, run.result.status, run.steady.guide_share, (0, 1), ("6T2A", "4W2T")
+    )
 
 
 @pytest.mark.slow
@@ -110,7 +112,7 @@ def test_figure_25_draws_the_current_and_it_repeats_with_the_pitch(gears, writte
 
 @pytest.mark.slow
 def test_figure_26_marks_a_touchdown_each_pitch(gears, written, period):
-    upper, lower = gear_figures.touchdown(gears[0]).axes
+    upper, lower = gear_figures.draw_touchdowns(gears[0]).axes
     for axes in (upper, lower):
         marks = sorted(line.get_xdata()[0] for line in axes.lines if line.get_linestyle() == ":")
         assert len(marks) >= 3
@@ -122,7 +124,7 @@ def test_figure_26_marks_a_touchdown_each_pitch(gears, written, period):
 
 @pytest.mark.slow
 def test_figure_27_ripples_on_tracks_and_not_on_wheels(gears):
-    tracked, wheeled = gear_figures.reactions(gears).axes
+    tracked, wheeled = gear_figures.draw_reactions(gears).axes
     swing = [np.ptp(axes.lines[0].get_ydata()) / np.mean(axes.lines[0].get_ydata()) for axes in (tracked, wheeled)]
     assert swing[0] > 0.05 and swing[0] > 100 * swing[1]
     half = 6.0 * 9.80665  # roughly what one side bears [N]
@@ -137,7 +139,7 @@ def test_robot_that_does_not_get_under_way_is_said_and_not_drawn(robot, written,
         signals=dataclasses.replace(run.signals, total_current=np.full_like(run.signals.total_current, np.nan)),
         result=dataclasses.replace(run.result, status=np.array([FAILED, CONVERGED])),
     )
-    monkeypatch.setattr(running_gear_figures, "runs", lambda robot: broken)
+    monkeypatch.setattr(running_gear_figures, "simulate_gear_runs", lambda robot: broken)
     text = page(tmp_path, robot)
     assert drawn(text) == set()
     assert re.search(r'id="gear-left-out">.*6T2A: failed, 4W2T: settled', text)
@@ -151,7 +153,7 @@ def test_stiff_robot_is_run_with_a_step_that_it_bears(robot, monkeypatch):
     monkeypatch.setattr(
         running_gear_figures, "track_batch", lambda robot, conditions, **keywords: taken.update(keywords)
     )
-    running_gear_figures.runs(stiff)
+    running_gear_figures.simulate_gear_runs(stiff)
     limit = largest_step(stiff, Conditions(["6T2A", "4W2T"], 33.0).resolved(stiff)).min()
     assert taken["step"] <= limit < 1e-4
     assert (taken["sample"] / taken["step"]) == pytest.approx(round(taken["sample"] / taken["step"]))
@@ -169,8 +171,8 @@ def test_run_of_the_track_model_shows_its_own_running_gear(robot, tmp_path):
     short = dataclasses.replace(batch, history=jax.tree.map(lambda x: x[:, :100], batch.history))
     for name, shown, figures in (("whole", batch, {"history", "power", "slip", "ripple", "reactions"}),
                                  ("short", short, {"history", "power", "slip"})):  # fmt: skip
-        table = {**simulation.conditions(robot, runs), **simulation.ended(robot, batch)}
-        path = runs_page.write(
+        table = {**simulation.condition_table(robot, runs), **simulation.ending_columns(robot, batch)}
+        path = runs_page.write_runs_page(
             tmp_path / name, RobotFile(robot, "nominal"), model="track", runs=table, histories=shown
         )
         assert set(re.findall(r'<figure id="([^"]+)">', path.read_text())) == figures

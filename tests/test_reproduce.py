@@ -99,13 +99,15 @@ def test_robot_of_another_kind_is_shown_and_not_set_against_the_bench(reproduced
 @pytest.mark.slow
 def test_error_table_equals_equation_35(paper):
     tables = paper[2]
-    measured, printed = (data.stacked(records.read(n).columns) for n in ("measured", "simulated_by_paper"))
+    measured, printed = (
+        data.stack_channels(records.read_runs(n).columns) for n in ("measured", "simulated_by_paper")
+    )
     points = outputs.output_columns(
-        steady_batch(ROBOTS["nominal"](), records.read("measured").conditions(ROBOTS["nominal"]())),
+        steady_batch(ROBOTS["nominal"](), records.read_runs("measured").conditions(ROBOTS["nominal"]())),
         channels.usual_channels(),
     )
-    ours = residual.relative_error(data.stacked(points), measured)
-    kind = records.read("measured")["configuration"]
+    ours = residual.relative_error(data.stack_channels(points), measured)
+    kind = records.read_runs("measured")["configuration"]
     rows = tables.tables["errors"][2:]
     for first, errors in ((0, ours), (len(rows) - 3, residual.relative_error(printed, measured))):
         for row, pick in zip(rows[first : first + 3], (kind != "", kind == "6T2A", kind == "4W2T"), strict=True):
@@ -128,7 +130,7 @@ def test_error_table_gives_the_papers_own_errors(paper):
 @pytest.mark.slow
 def test_row_table_shows_bench_paper_and_own_numbers(paper):
     tables = paper[2]
-    measured = records.read("measured")
+    measured = records.read_runs("measured")
     points = outputs.output_columns(
         steady_batch(ROBOTS["nominal"](), measured.conditions(ROBOTS["nominal"]())), channels.usual_channels()
     )
@@ -152,7 +154,7 @@ def test_row_table_shows_bench_paper_and_own_numbers(paper):
 
 @pytest.mark.slow
 def test_raised_adhesion_makes_every_measured_row_climb():
-    rows = data.rows(ROBOTS["nominal"]())
+    rows = data.simulate_measured_rows(ROBOTS["nominal"]())
     assert (rows.plain["status"] == "slides").sum() == 6
     assert (rows.raised["status"] == "converged").all()
     assert rows.ratio["6T2A"] * 0.32 == pytest.approx(0.45) and rows.ratio["4W2T"] * 0.38 == pytest.approx(0.60)
@@ -160,7 +162,7 @@ def test_raised_adhesion_makes_every_measured_row_climb():
 
 def test_raised_adhesion_leaves_a_robot_that_climbs_alone():
     values = {f"{c}.ground.friction.static": 0.9 for c in (TRACKED, WHEELED)}
-    rows = data.rows(params.replace(ROBOTS["nominal"](), values))
+    rows = data.simulate_measured_rows(params.replace(ROBOTS["nominal"](), values))
     assert rows.ratio == {"6T2A": 1.0, "4W2T": 1.0}
 
 
@@ -171,7 +173,7 @@ def test_energy_split_sums_to_the_supply():
     for member in (robot, dataclasses.replace(robot, effects=effects)):
         kind = np.array(["6T2A", "4W2T", "6T2A"])
         points, split = data.energy_split(
-            member, data.conditions(member, kind, slope_deg=np.array([0.0, 10.0, 10.0]))
+            member, data.batch_conditions(member, kind, slope_deg=np.array([0.0, 10.0, 10.0]))
         )
         assert all((split[item] >= 0).all() for item in data.SPLIT)
         np.testing.assert_allclose(split["other"] / points["power_supply_W"], 0, atol=1e-9)
@@ -188,7 +190,7 @@ def test_idle_current_balances_the_losses_by_hand():
 
 @pytest.mark.slow
 def test_stages_follow_the_slide():
-    for start in data.starts(ROBOTS["nominal"]()):
+    for start in data.simulate_starts(ROBOTS["nominal"]()):
         assert 0 < start.starting < start.slipping < start.time[-1]
         sliding = start.theoretical - start.speed
         assert np.all(sliding[start.time > start.slipping] <= 20.0 + 1e-6)  # V_s [mm/s]

@@ -263,7 +263,7 @@ def test_calibration_says_what_its_residuals_cluster_by(shifted, tmp_path):
     document = json.loads(json.dumps(shifted.to_json()))
     jsonschema.validate(document, json.loads((SCHEMAS / "calibrate.schema.json").read_text("utf-8")))
     assert document["residual_clusters"][0]["statement"] == found.statement and found.statement in document["notes"]
-    page = calibration_page.write(tmp_path, shifted, robot_name="nominal").read_text("utf-8")
+    page = calibration_page.write_calibration_page(tmp_path, shifted, robot_name="nominal").read_text("utf-8")
     assert "residuals of speed cluster by idle_wheel" in page and (tmp_path / "figures" / "clusters.svg").exists()
     assert Tables(page).tables
 
@@ -272,7 +272,7 @@ def test_calibration_says_what_its_residuals_cluster_by(shifted, tmp_path):
 def test_clean_table_says_nothing_of_columns_without_a_role(tmp_path):
     clean = calibrate(measured_table(1, 0.0), paper_robots.nominal(), starts=2, profiles=False, blocks=())
     assert clean.residual_clusters == () and "without a role" not in " ".join(clean.notes)
-    page = calibration_page.write(tmp_path, clean, robot_name="nominal").read_text("utf-8")
+    page = calibration_page.write_calibration_page(tmp_path, clean, robot_name="nominal").read_text("utf-8")
     assert 'id="clusters"' not in page
 
 
@@ -310,10 +310,10 @@ def test_columns_without_a_role_keep_their_cells(tmp_path):
         "6T2A,12,12,0,0,300,1,Ann,", "6T2A,18,12,0,0,450,,Bo,", "6T2A,24,12,0,0,600,3,Ann,",
     ]  # fmt: skip
     (tmp_path / "runs.csv").write_text("\n".join(lines), encoding="utf-8")
-    runs = records.read(tmp_path / "runs.csv")
+    runs = records.read_runs(tmp_path / "runs.csv")
     assert runs.unknown == ("idle_wheel", "who", "note") and not set(runs.unknown) & set(runs.columns)
     np.testing.assert_array_equal(runs.extras["idle_wheel"], [1.0, np.nan, 3.0])
     assert runs.extras["who"].tolist() == ["Ann", "Bo", "Ann"] and np.isnan(runs.extras["note"]).all()
     some = runs.where(np.array([False, True, True]))
     assert some.extras["who"].tolist() == ["Bo", "Ann"] and len(some) == 2
-    assert records.read("measured").extras.keys() == set(records.read("measured").unknown)
+    assert records.read_runs("measured").extras.keys() == set(records.read_runs("measured").unknown)

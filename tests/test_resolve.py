@@ -16,7 +16,7 @@ from mmrjax.model import paper_robots
 
 
 def found(unnamed=None, remains=None, effects=(), alternatives=(), scores=("vibration_slip", "series_resistance")):
-    table = records.read("measured")
+    table = records.read_runs("measured")
     return SimpleNamespace(
         unnamed=unnamed, remains=remains, alternatives=alternatives, robot=paper_robots.nominal(), runs=table,
         effects=tuple(SimpleNamespace(name=n, balance=BY_NAME[n].balance) for n in effects),

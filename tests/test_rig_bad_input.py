@@ -30,7 +30,7 @@ WINCH = BRAKE + "torque_constant = 0.2\n"
 def rig_of(tmp_path, text):
     path = tmp_path / "rig.toml"
     path.write_text(text, encoding="utf-8")
-    return robot_file.read(path)
+    return robot_file.read_robot(path)
 
 
 def table(tmp_path, *rows, header="motor_speed_rpm,total_current_A"):
@@ -82,7 +82,7 @@ def test_a_number_that_is_none_is_not_blamed_on_its_sd():
 
 def test_a_folder_is_no_rigs_file(tmp_path):
     with pytest.raises(BadConfiguration, match=r"is a folder; expected a rig's TOML file$"):
-        rig_check.check(tmp_path, None, (), False)
+        rig_check.check_rig_file(tmp_path, None, (), False)
 
 
 @pytest.mark.parametrize("rows", [("900,-0.6", "1800,-0.7"), ("900,-0.6", "1800,0.7", "-900,-0.6")])
@@ -90,23 +90,23 @@ def test_a_current_against_the_imposed_speed_is_refused_forward_too(tmp_path, ro
     robot = rig_of(tmp_path, BRAKE)
     message = r"t\.csv row 1, total_current_A: got -0\.6 at 900 rpm; nothing else drives the motors there, so expected a reading"
     with pytest.raises(BadData, match=message):
-        records.read(table(tmp_path, *rows), robot=robot)
+        records.read_runs(table(tmp_path, *rows), robot=robot)
 
 
 def test_noise_about_zero_and_a_weight_are_no_wrong_signs(tmp_path):
     robot = rig_of(tmp_path, BRAKE)
     rows = ("900,-0.01,0.004", "1800,0.6,0.004", "-900,0.01,0.004")
     header = "motor_speed_rpm,total_current_A,total_current_sd_A"
-    assert len(records.read(table(tmp_path, *rows, header=header), robot=robot)) == 3
+    assert len(records.read_runs(table(tmp_path, *rows, header=header), robot=robot)) == 3
     robot = rig_of(tmp_path, WINCH)
-    assert len(records.read(table(tmp_path, "900,-0.6", "1800,0.7"), robot=robot)) == 2
+    assert len(records.read_runs(table(tmp_path, "900,-0.6", "1800,0.7"), robot=robot)) == 2
 
 
 @pytest.mark.slow
 def test_rig_check_does_not_call_runs_backward_unsettled(tmp_path, capsys):
     rig_of(tmp_path, BRAKE)
     data = table(tmp_path, "900,0.62", "-900,-0.61", "2000,0.64", "-2000,-0.65")
-    assert rig_check.check(tmp_path / "rig.toml", str(data), (), False) == 0
+    assert rig_check.check_rig_file(tmp_path / "rig.toml", str(data), (), False) == 0
     out = capsys.readouterr().out
     assert "motor_speed_rpm" in out and "settles" not in out
     assert not any(word in out for word in ("slope_deg", "payload_kg", "supply_voltage_V"))
@@ -114,7 +114,7 @@ def test_rig_check_does_not_call_runs_backward_unsettled(tmp_path, capsys):
 
 def test_rig_check_says_what_a_file_without_base_takes(tmp_path, capsys):
     (tmp_path / "rig.toml").write_text("[motor]\nresistance = 0.6\n")
-    assert rig_check.check(tmp_path / "rig.toml", None, (), False) == 0
+    assert rig_check.check_rig_file(tmp_path / "rig.toml", None, (), False) == 0
     assert 'is its base\'s, a packaged robot (base = "none" starts from nothing)' in " ".join(
         capsys.readouterr().out.split()
     )
@@ -130,7 +130,7 @@ def test_histories_of_a_shaft_have_bases_of_what_may_be_missing(tmp_path):
     times = np.linspace(0.0, 0.5, 12)
     rows = [f"a,{t:.3f},12,{0.9 - 0.5 * t:.3f}" for t in times]
     data = table(tmp_path, *rows, header="run_id,time_s,supply_voltage_V,total_current_A")
-    runs = records.read(data, robot=robot)
+    runs = records.read_runs(data, robot=robot)
     observer = observers.Histories.of(runs, robot)
     seen = {
         "supply_voltage_V": np.full(12, 12.0),

@@ -20,7 +20,7 @@ from mmrjax.model import channels, params
 from mmrjax.model.paper_robots import nominal
 from sweeps import capabilities
 from sweeps.commands import rig_new
-from sweeps.pages.page import number
+from sweeps.pages.page import printed_number
 from sweeps.points import imposed
 from tests.commands import rows as rows_of
 
@@ -57,7 +57,7 @@ def left_in(folder):
 
 def of_kind(tmp_path, kind, speed=False):
     """A rig's file as `rig new` writes it, with the motors' speed imposed where asked."""
-    text = rig_new.template(kind)
+    text = rig_new.rig_template(kind)
     if speed:
         text = text.replace('imposed = "voltage"', 'imposed = "motor_speed"').replace(' "motor_speed"]', "]", 1)
         text = text.replace('"motor_speed", ', "").replace('"total_current",]', '"total_current"]')
@@ -68,7 +68,7 @@ def of_kind(tmp_path, kind, speed=False):
 
 def table_of(rig, changed, levels, slopes=None, sd=0.01, seed=5):
     """A table of settled runs of a rig with changed parameters, beside its file; every reading with its sd."""
-    robot = robot_file.read(rig)
+    robot = robot_file.read_robot(rig)
     layout = Layout.of(robot)
     levels = np.asarray(levels, float)
     columns = {"configuration": np.full(len(levels), robot.configurations.names[0]), layout.imposed_column: levels}
@@ -254,12 +254,12 @@ def test_a_single_run_takes_the_limit_of_the_file(mmrjax, tmp_path):
 
 
 def test_levels_are_thirds_of_the_limit_to_two_digits(tmp_path):
-    robot = robot_file.change(
-        robot_file.read(of_kind(tmp_path, "bench", speed=True)), {"motor.speed_limit": 500.0}, "x"
+    robot = robot_file.change_robot(
+        robot_file.read_robot(of_kind(tmp_path, "bench", speed=True)), {"motor.speed_limit": 500.0}, "x"
     )
     notes: list[str] = []
     top = 500.0 / channels.RPM
-    found = imposed.levels(robot, "--motor-speeds", notes)
+    found = imposed.imposed_levels(robot, "--motor-speeds", notes)
     assert all(0.9 * share * top < level <= share * top for level, share in zip(found, imposed.SHARES, strict=True))
     assert notes == [
         "--motor-speeds: not stated; thirds of the speed_limit of the robot's file are taken: 1500,3100,4700"
@@ -334,7 +334,7 @@ def test_compare_and_calibrate_take_one_channel_both_ways(mmrjax, tmp_path, benc
     assert errors["unit"] == "A" and 0.01 < errors["rms"] < 0.1 and " A " in out
     code, said, err = mmrjax("calibrate", data, "--robot", rig, "--starts", "2", "--no-profiles", "--out", "fitted")
     assert code == 0 and "rms error: before total current" in said and "motor and speed" not in said, err
-    fitted = robot_file.read(tmp_path / "fitted" / "robot.toml")
+    fitted = robot_file.read_robot(tmp_path / "fitted" / "robot.toml")
     assert float(fitted.configurations["bench"].loss_coulomb) == pytest.approx(0.07, rel=0.05)
     priors = json.loads((tmp_path / "fitted" / "result.json").read_text())["parameters"]
     assert {p["prior"]["source"] for p in priors.values()} <= {params.STATED, params.DEFAULT}
@@ -493,20 +493,20 @@ def test_a_channel_without_readings_has_no_error_and_no_warning():
 
 def test_parameters_of_a_rig_say_where_they_come_from(tmp_path):
     rig = of_kind(tmp_path, "wheeled")
-    found = {name: source for name, *_, source in capabilities.parameters(robot_file.parse(rig))}
+    found = {name: source for name, *_, source in capabilities.rig_parameters(robot_file.parse_robot_file(rig))}
     assert found["motor.resistance"] == "stated in wheeled.toml"
     assert found["rover.ground.friction.speed_static"] == "default" and "battery.voltage_full" not in found
     linear = of_kind(tmp_path, "linear")
-    found = {name: source for name, *_, source in capabilities.parameters(robot_file.parse(linear))}
+    found = {name: source for name, *_, source in capabilities.rig_parameters(robot_file.parse_robot_file(linear))}
     assert found["carriage.inertia"] == "stated in linear.toml"  # by its mass and lead
     bench = of_kind(tmp_path, "bench")
-    assert "bench.radius" not in {p[0] for p in capabilities.parameters(robot_file.parse(bench))}
+    assert "bench.radius" not in {p[0] for p in capabilities.rig_parameters(robot_file.parse_robot_file(bench))}
 
 
 def test_the_packaged_robots_parameters_keep_their_sources(tmp_path):
     specs = {p.name: p.spec for p in params.walk_parameters(nominal())}
     assert "eq. (15)" in specs["motor.resistance"].meaning
-    own_specs = {p.name: p.spec for p in params.walk_parameters(robot_file.read(of_kind(tmp_path, "bench")))}
+    own_specs = {p.name: p.spec for p in params.walk_parameters(robot_file.read_robot(of_kind(tmp_path, "bench")))}
     assert "eq." not in own_specs["motor.resistance"].meaning
     assert (
         own_specs["motor.resistance"].source == params.STATED and own_specs["motor.inertia"].source == params.DEFAULT
@@ -524,7 +524,7 @@ def test_a_page_shows_a_dash_for_a_channel_without_readings(page):
     text = (resources.files("sweeps.pages") / "templates" / f"{page}.html.j2").read_text("utf-8")
     (row,) = re.findall(r"{% for c in columns %}<td>{{ by.*?</td>{% endfor %}", text)
     environment = jinja2.Environment(undefined=jinja2.StrictUndefined)
-    environment.filters["number"] = number
+    environment.filters["number"] = printed_number
     assert (
         environment.from_string(row).render(columns=["speed", "position"], by={"speed": 1.0})
         == "<td>1</td><td>–</td>"

@@ -29,12 +29,12 @@ KINDS = tuple(rig_new.KINDS)
 def read(tmp_path, text):
     path = tmp_path / "rig.toml"
     path.write_text(text, encoding="utf-8")
-    return robot_file.read(path)
+    return robot_file.read_robot(path)
 
 
 def again(tmp_path, robot):
-    robot_file.write(robot, tmp_path / "again.toml", note="of a test")
-    return robot_file.read(tmp_path / "again.toml")
+    robot_file.write_robot(robot, tmp_path / "again.toml", note="of a test")
+    return robot_file.read_robot(tmp_path / "again.toml")
 
 
 def same(a, b):
@@ -92,7 +92,7 @@ load = "linear"
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_template_reads_as_written_and_back(tmp_path, kind):
-    robot = read(tmp_path, rig_new.template(kind))
+    robot = read(tmp_path, rig_new.rig_template(kind))
     assert not robot.rig.inherits and robot.rig.priors and robot.has_ground == (kind in ("tracked", "wheeled"))
     assert same(again(tmp_path, robot), robot)
 
@@ -101,7 +101,7 @@ def test_template_reads_as_written_and_back(tmp_path, kind):
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_line_of_a_template_that_is_commented_out_reads(tmp_path, kind):
     """Each example line, and the table that it stands in, is valid where its comment sign is taken away."""
-    lines = rig_new.template(kind).splitlines()
+    lines = rig_new.rig_template(kind).splitlines()
     tables = {"# [columns]", "# [rig]", "# [driver]"}
     stance = (
         lines.index("# [rover.turning]") if "# [rover.turning]" in lines else len(lines)
@@ -137,7 +137,7 @@ def test_bench_is_what_its_file_states(tmp_path):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_written_rig_mentions_no_other_robot(tmp_path, kind):
-    robot_file.write(read(tmp_path, rig_new.template(kind)), tmp_path / "again.toml")
+    robot_file.write_robot(read(tmp_path, rig_new.rig_template(kind)), tmp_path / "again.toml")
     text = (tmp_path / "again.toml").read_text(encoding="utf-8").lower()
     assert not [w for w in ("nominal", "re30", "gp32", "6t2a", "4w2t", "table ", "maxon", "0.611") if w in text]
 
@@ -254,7 +254,7 @@ def test_like_names_another_load_of_the_file(tmp_path):
 
 
 def test_changed_parameter_takes_its_prior_along(tmp_path):
-    robot = robot_file.change(read(tmp_path, BENCH), {"motor.torque_constant": 0.06}, where="--set")
+    robot = robot_file.change_robot(read(tmp_path, BENCH), {"motor.torque_constant": 0.06}, where="--set")
     assert robot.rig.priors[0] == ("motor.torque_constant", 0.06, 0.002)
 
 
@@ -277,7 +277,7 @@ def test_inductance_that_is_not_stated_follows_the_resistance(tmp_path):
     robot = read(tmp_path, ROVER.replace("resistance = 1.0", "resistance = 3.0"))
     assert float(robot.motor.inductance) == pytest.approx(6e-4, rel=1e-12)
     assert same(again(tmp_path, robot), robot)
-    found = {o.name: o for o in rig_facts.origins(robot_file.parse(tmp_path / "rig.toml"))}
+    found = {o.name: o for o in rig_facts.number_origins(robot_file.parse_robot_file(tmp_path / "rig.toml"))}
     assert found["motor.inductance"].why == "not stated: assumed, 0.2 ms of the resistance"
     stated = read(tmp_path, ROVER.replace("[gearbox]", "inductance = 1e-3\n[gearbox]"))
     assert float(stated.motor.inductance) == 1e-3
@@ -298,7 +298,7 @@ def test_wheels_whose_inertia_is_not_stated_are_disks_of_a_share_of_the_mass(tmp
     assert float(robot.configurations["rover"].inertia) == pytest.approx(0.5 * 0.05 * 4.0 * 0.04**2 / 2, rel=1e-12)
     assert same(again(tmp_path, robot), robot)
     (tmp_path / "rover.toml").write_text(ROVER, encoding="utf-8")
-    found = {o.name: o for o in rig_facts.origins(robot_file.parse(tmp_path / "rover.toml"))}
+    found = {o.name: o for o in rig_facts.number_origins(robot_file.parse_robot_file(tmp_path / "rover.toml"))}
     assert found["rover.inertia"].why == "not stated: assumed, wheels that are disks of 5 % of the mass"
     stated = read(tmp_path, ROVER.replace("radius = 0.04", "radius = 0.04\ninertia = 0.003"))
     assert float(stated.configurations["rover"].inertia) == 0.003
@@ -312,7 +312,11 @@ def test_a_robot_that_turns_states_its_wheelbase_and_is_written_with_it(tmp_path
     robot = read(tmp_path, f"{turns}[running_gear]\nwheelbase = {usual}\n")
     assert same(again(tmp_path, robot), robot)
     (tmp_path / "turns.toml").write_text(f"{turns}[running_gear]\nwheelbase = 0.4\n", encoding="utf-8")
-    (height,) = [o for o in rig_facts.origins(robot_file.parse(tmp_path / "turns.toml")) if "centre_height" in o.name]
+    (height,) = [
+        o
+        for o in rig_facts.number_origins(robot_file.parse_robot_file(tmp_path / "turns.toml"))
+        if "centre_height" in o.name
+    ]
     assert "an example's" in height.why
 
 
@@ -330,7 +334,7 @@ def test_no_winding_is_too_hot_for_a_rig_that_states_no_limit_or_no_heat(tmp_pat
     seen = steady_batch(robot, Conditions(voltage=np.array([40.0]), slope_deg=np.array([20.0])))
     assert float(seen.winding_settled[0]) == np.inf if PATH in stated else np.isnan(float(seen.winding_settled[0]))
     assert bool(int(seen.flags[0]) >> FLAGS.index("winding_hot") & 1) == flagged
-    said = " ".join(rig_check.examined(tmp_path / "rig.toml", None).remarks())
+    said = " ".join(rig_check.examine_rig_file(tmp_path / "rig.toml", None).remarks())
     wanted = "state motor.resistance_thermal_winding and motor.resistance_thermal_housing, without which"
     assert (wanted in said) == lacking
     assert again(tmp_path, robot).rig.unknown == robot.rig.unknown
@@ -441,7 +445,7 @@ def test_packaged_robot_is_as_it_was(tmp_path):
 def test_rig_new_writes_a_file_that_reads(mmrjax, tmp_path, kind):
     code, out, err = mmrjax("rig", "new", "my-rig.toml", "--kind", kind)
     assert (code, err) == (0, "") and "mmrjax rig check my-rig.toml" in out
-    assert not robot_file.load(str(tmp_path / "my-rig.toml")).rig.inherits
+    assert not robot_file.load_robot(str(tmp_path / "my-rig.toml")).rig.inherits
 
 
 def test_rig_new_keeps_a_file_unless_forced(mmrjax, tmp_path):
@@ -450,7 +454,7 @@ def test_rig_new_keeps_a_file_unless_forced(mmrjax, tmp_path):
     assert code == 2 and "my-rig.toml: there already; --force replaces it" in err
     assert (tmp_path / "my-rig.toml").read_text() == "mine"
     assert mmrjax("rig", "new", "my-rig.toml", "--force")[0] == 0
-    assert not robot_file.load(str(tmp_path / "my-rig.toml")).has_ground
+    assert not robot_file.load_robot(str(tmp_path / "my-rig.toml")).has_ground
 
 
 def test_rig_new_lists_the_kinds(mmrjax, tmp_path):
@@ -469,7 +473,7 @@ def test_rig_new_lists_the_kinds(mmrjax, tmp_path):
 def bench(mmrjax, tmp_path):
     """A bench as its template has it, and a table of it with sds, in mA."""
     mmrjax("rig", "new", "my-rig.toml")
-    robot = robot_file.load(str(tmp_path / "my-rig.toml"))
+    robot = robot_file.load_robot(str(tmp_path / "my-rig.toml"))
     voltage = np.linspace(3.0, 24.0, 12)
     seen = steady_batch(robot, Conditions(voltage=voltage))
     rows = zip(voltage, np.asarray(seen.total_current) * 1e3, np.asarray(seen.motor_speed) * 30 / np.pi, strict=True)
@@ -566,19 +570,19 @@ loss_coulomb = 0.1
 @pytest.mark.parametrize("case", ODD)
 def test_facts_say_which_number_to_look_at(tmp_path, case):
     stated, instead, sentence = ODD[case]
-    assert not [f for f in rig_facts.facts(read(tmp_path, SOUND)) if f.odd] and stated in SOUND
-    odd = [f.odd for f in rig_facts.facts(read(tmp_path, SOUND.replace(stated, instead))) if f.odd]
+    assert not [f for f in rig_facts.derived_facts(read(tmp_path, SOUND)) if f.odd] and stated in SOUND
+    odd = [f.odd for f in rig_facts.derived_facts(read(tmp_path, SOUND.replace(stated, instead))) if f.odd]
     assert any(sentence in text for text in odd)
 
 
 def test_facts_of_an_arm_and_a_vehicle_by_hand(tmp_path):
     arm = read(tmp_path, SOUND + "torque_gravity = 0.5\n")
-    found = {f.what: f for f in rig_facts.facts(arm)}
+    found = {f.what: f for f in rig_facts.derived_facts(arm)}
     assert found["bench: swings as a pendulum of"].value == f"{1e3 * 0.001 * GRAVITY / 0.5:.3g} mm"
     current = (0.6 / (16 * 0.9) + 0.002) / 0.05
     assert found["bench: current to hold and lift the arm"].value == f"{current:.3g} A each motor"
     rover = read(tmp_path, ROVER.replace("[gearbox]", "voltage_limit = 12.0\n[gearbox]"))
-    found = {f.what: f for f in rig_facts.facts(rover)}
+    found = {f.what: f for f in rig_facts.derived_facts(rover)}
     assert found["rover: steepest slope that the ground holds"].value == "27°"
     assert found["rover: speed without load at 12 V"].value == f"{12 / 0.05 / 16 * 0.04:.3g} m/s"
     assert found["rover: steepest slope that the stall torque holds at 12 V"].value == "any"
@@ -599,7 +603,7 @@ EXAMPLES = PAGE.split("```toml\n")[1:]
 @pytest.mark.parametrize("text", [e.split("```")[0] for e in EXAMPLES], ids=lambda text: text[2:].split(":")[0])
 def test_example_of_the_page_reads(tmp_path, text):
     robot = read(tmp_path, text)
-    assert not robot.rig.inherits and not [f for f in rig_facts.facts(robot) if f.odd]
+    assert not robot.rig.inherits and not [f for f in rig_facts.derived_facts(robot) if f.odd]
     assert same(again(tmp_path, robot), robot)
 
 

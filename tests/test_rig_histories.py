@@ -69,7 +69,7 @@ def written(tmp_path, robot, columns, sd, readings=0.0):
     lines = [",".join(names), *(",".join(str(c[k]) for c in cells) for k in range(rows))]
     path = tmp_path / "table.csv"
     path.write_text("\n".join(lines))
-    return records.read(path, robot=robot)
+    return records.read_runs(path, robot=robot)
 
 
 def history(tmp_path, robot, truth, columns, sd, seed):
@@ -86,7 +86,7 @@ def test_the_speed_at_which_a_run_begins_moves_with_the_robot(tmp_path):
     cart = '[cart]\nload = "linear"\nmass_kg = 3.0\nlead_mm = 5.0\n'
     path = tmp_path / "rig.toml"
     path.write_text(DRIVE.format(imposed="motor_speed", channels='"speed"', start="rest") + cart)
-    robot, times = robot_file.load(str(path)), jnp.array([0.0, 0.1, 0.2])
+    robot, times = robot_file.load_robot(str(path)), jnp.array([0.0, 0.1, 0.2])
     given = Conditions(motor_speed=100.0, motor_acceleration=0.0)
     names = ("cart.radius", "gearbox.ratio")
     values = {p.name: float(p.value) for p in params.walk_parameters(robot) if p.name in names}
@@ -121,13 +121,13 @@ def test_readings_without_a_sign_are_refused_unless_the_file_says_so(tmp_path, l
     """Of a log that goes both ways: a speed, and a current that nothing but the voltage drives."""
     path = tmp_path / "rig.toml"
     path.write_text(DRIVE.format(imposed="voltage", channels=f'"{shown}"', start="rest") + stated + load)
-    robot, t = robot_file.load(str(path)), np.arange(0, 2, 0.02)
+    robot, t = robot_file.load_robot(str(path)), np.arange(0, 2, 0.02)
     way = np.where(t < 1, 1.0, -1.0)
     driven = {"supply_voltage_V": 12.0, "duty": way / 2} if duty else {"supply_voltage_V": 6 * way}
     columns = {"time_s": t, **driven, channels.find_channel(shown).column: np.abs(way)}
     cells = np.stack(np.broadcast_arrays(*columns.values()), 1)
     np.savetxt(tmp_path / "log.csv", cells, delimiter=",", header=",".join(columns), comments="")
-    runs = records.read(tmp_path / "log.csv", robot=robot)
+    runs = records.read_runs(tmp_path / "log.csv", robot=robot)
     nothing = noise.Noise(*(None for _ in dataclasses.fields(noise.Noise)))
     cure = rf"expected readings with a sign, negative backward; or state \[instruments.{shown}\] signed = false"
     bridge = duty and shown == "total_current"  # which turns the supply's current back
@@ -141,7 +141,7 @@ def test_readings_without_a_sign_are_refused_unless_the_file_says_so(tmp_path, l
 def test_a_delay_of_the_imposed_speed_is_found(tmp_path):
     path = tmp_path / "rig.toml"
     path.write_text(DRIVE.format(imposed="motor_speed", channels='"total_current"', start="measured") + BENCH)
-    robot = robot_file.load(str(path))
+    robot = robot_file.load_robot(str(path))
     truth = params.replace(robot, {"rig.delay": 0.03, "bench.loss_coulomb": 0.26})
     t = np.arange(0, 4, 0.03)
     speed = (200 * np.sin(1.5 * t) + 50 * np.sin(4 * t)) / channels.RPM
@@ -158,7 +158,7 @@ def test_the_beginning_of_an_arm_in_motion_is_found(tmp_path):
     path.write_text(
         DRIVE.format(imposed="voltage", channels='"total_current", "motor_speed", "output_angle"', start="free") + ARM
     )
-    robot = robot_file.load(str(path))
+    robot = robot_file.load_robot(str(path))
     begins = Begins({"begin_a": Begin(motor_speed=30.0, angle=0.3), "begin_b": Begin(motor_speed=-20.0, angle=0.1)})
     truth = params.replace(robot, {"arm.torque_gravity": 0.66, "arm.loss_coulomb": 0.08})
     truth = dataclasses.replace(truth, rig=dataclasses.replace(truth.rig, begins=begins))
@@ -186,12 +186,12 @@ def test_beginnings_are_measured_by_the_first_samples(tmp_path):
     path = tmp_path / "rig.toml"
     for start in ("measured", "free"):
         path.write_text(DRIVE.format(imposed="voltage", channels='"output_speed", "output_angle"', start=start) + ARM)
-        robot = robot_file.load(str(path))
+        robot = robot_file.load_robot(str(path))
         table = tmp_path / "table.csv"
         lines = ["time_s,supply_voltage_V,output_speed_rpm,output_angle_deg"]
         lines += [f"{t},6,{60 + 100 * t},{30 + 360 * t + 300 * t**2}" for t in np.arange(0, 0.2, 0.01)]
         table.write_text("\n".join(lines))
-        runs = records.read(table, robot=robot)
+        runs = records.read_runs(table, robot=robot)
         kind = observers.observer_kind(runs)
         known = noise.noise_from_table(runs, kind.sizes(runs), "output_speed=1rpm,output_angle=1deg")
         begun = kind.with_initial_states(robot, runs, known)
@@ -205,7 +205,7 @@ def test_beginnings_are_measured_by_the_first_samples(tmp_path):
 def test_a_robot_at_rest_has_no_beginnings(tmp_path):
     path = tmp_path / "rig.toml"
     path.write_text(DRIVE.format(imposed="voltage", channels='"motor_speed"', start="rest") + ARM)
-    robot = robot_file.load(str(path))
+    robot = robot_file.load_robot(str(path))
     assert robot.rig.begins is None and jnp.asarray(robot.rig.delay) == 0
 
 
@@ -245,7 +245,7 @@ def imposed_speed(tmp_path, runs, filled=written):
     path = tmp_path / "rig.toml"
     text = DRIVE.format(imposed="motor_speed", channels='"total_current"', start="measured") + BENCH
     path.write_text(text.replace('delay = "0 ± 0.05"', "delay = 0.0"))
-    robot = robot_file.load(str(path))
+    robot = robot_file.load_robot(str(path))
     t = np.tile(np.arange(0, 1, 0.05), runs)
     run = np.repeat(np.arange(runs), 20)
     speed = (200 * np.sin(6 * t + run) + 50 * np.sin(14 * t)) / channels.RPM
@@ -347,7 +347,7 @@ def test_the_loop_looks_for_a_delay_that_no_file_rules_out(tmp_path, stated, fre
     path = tmp_path / "rig.toml"
     text = DRIVE.format(imposed="voltage", channels='"motor_speed"', start="rest") + BENCH
     path.write_text(text.replace('delay = "0 ± 0.05"', f"delay = {stated}" if stated else ""))
-    robot = robot_file.load(str(path))
+    robot = robot_file.load_robot(str(path))
     names = priors.free_names(robot, ("bench",), *observers.Histories.free())
     assert ("rig.delay" in names) == free and "motor.inertia" in names
     of_settled = priors.free_names(robot, ("bench",), *observers.KINDS[1].free())
@@ -360,13 +360,13 @@ def test_steps_follow_the_rows_of_a_log_whose_input_changes_at_each(tmp_path, mo
     path = tmp_path / "rig.toml"
     text = DRIVE.format(imposed="voltage", channels='"total_current", "motor_speed"', start="rest") + BENCH
     path.write_text(text.replace('delay = "0 ± 0.05"', "delay = 0.0").replace("inertia = 0.02", "inertia = 0.002"))
-    robot = robot_file.load(str(path))
+    robot = robot_file.load_robot(str(path))
     t = np.arange(0, 1, 0.02)
     volts = 12 * np.sin(5 * t) + 6 * np.sign(np.sin(11 * t)) + 0.5 * np.random.default_rng(1).standard_normal(50)
     rows = [f"{a:.2f},{b:.4f},0,0" for a, b in zip(t, volts, strict=True)]
     table = tmp_path / "log.csv"
     table.write_text("time_s,supply_voltage_V,total_current_A,motor_speed_rpm\n" + "\n".join(rows))
-    runs = records.read(table, robot=robot)
+    runs = records.read_runs(table, robot=robot)
     made = observers.observer_kind(runs).of(runs, robot)
     shown = np.asarray(made(robot).reading)
     monkeypatch.setattr(histories_room, "CHANGE", (1e-6, 0.1))
@@ -398,13 +398,13 @@ def test_steps_are_short_where_a_drive_passes_through_rest(tmp_path, imposed):
     text = text.replace('delay = "0 ± 0.05"', "delay = 0.02")
     (tmp_path / "stiff.toml").write_text(text)
     (tmp_path / "rig.toml").write_text(text + "backlash = 0.01\n")
-    robot, stiff = (robot_file.load(str(tmp_path / name)) for name in ("rig.toml", "stiff.toml"))
+    robot, stiff = (robot_file.load_robot(str(tmp_path / name)) for name in ("rig.toml", "stiff.toml"))
     t, column = np.arange(0, 2, 0.02), {"voltage": "supply_voltage_V", "motor_current": "motor_current_A"}[imposed]
     speed = 2000 * np.clip((1.5 - t) / 0.3, -1, 1) * np.minimum(t / 0.2, 1)  # through rest at 1.5 s
     angle = np.cumsum(speed) * 0.02 * 6
     rows = [f"{a:.2f},{8 if a < 1.2 else -8},{s:.1f},{x:.2f}" for a, s, x in zip(t, speed, angle, strict=True)]
     (tmp_path / "log.csv").write_text(f"time_s,{column},motor_speed_rpm,output_angle_deg\n" + "\n".join(rows))
-    runs = records.read(tmp_path / "log.csv", robot=robot)
+    runs = records.read_runs(tmp_path / "log.csv", robot=robot)
 
     def longest(runs, begin, end, robot=robot):
         times = np.asarray(Histories.of(runs, robot).times)[0]
@@ -428,11 +428,11 @@ def test_a_voltage_on_lines_is_the_mean_of_each_step_and_no_jump(tmp_path):
     """The means of all steps make up the integral of the broken line; nothing else than what is imposed is on lines."""
     text = DRIVE.format(imposed="voltage", channels='"motor_speed"', start="rest") + BENCH
     (tmp_path / "rig.toml").write_text(text.replace('start = "rest"', 'start = "rest"\nbetween_rows = "linear"'))
-    robot = robot_file.load(str(tmp_path / "rig.toml"))
+    robot = robot_file.load_robot(str(tmp_path / "rig.toml"))
     (tmp_path / "log.csv").write_text(
         "time_s,supply_voltage_V,duty,motor_speed_rpm\n0,2,1,0\n0.1,12,1,0\n0.3,4,0.5,0\n0.4,4,0.5,0\n"
     )
-    runs = records.read(tmp_path / "log.csv", robot=robot)
+    runs = records.read_runs(tmp_path / "log.csv", robot=robot)
     made = observers.observer_kind(runs).of(runs, robot)
     volts, times = np.asarray(made.conditions.voltage)[0], np.asarray(made.times)[0]
     assert np.sum(volts[:-1] * np.diff(times)) == pytest.approx(0.1 * 7 + 0.2 * 8 + 0.1 * 4)
@@ -458,12 +458,12 @@ def test_what_is_imposed_is_held_or_goes_on_lines_between_rows(tmp_path):
 
     def shown(word, step):
         (tmp_path / "rig.toml").write_text(text.replace('start = "rest"', f'start = "rest"\nbetween_rows = "{word}"'))
-        robot = robot_file.load(str(tmp_path / "rig.toml"))
+        robot = robot_file.load_robot(str(tmp_path / "rig.toml"))
         t = np.arange(0, 0.8 + 1e-9, step)
         volts = np.interp(t, [0, 0.3, 0.5, 0.8], [2.0, 14.0, 14.0, -5.0])
         rows = [f"{a:.4f},{b:.6f},0" for a, b in zip(t, volts, strict=True)]
         (tmp_path / "log.csv").write_text("time_s,supply_voltage_V,motor_speed_rpm\n" + "\n".join(rows))
-        runs = records.read(tmp_path / "log.csv", robot=robot)
+        runs = records.read_runs(tmp_path / "log.csv", robot=robot)
         made = observers.observer_kind(runs).of(runs, robot)
         reading = np.asarray(made(robot).reading)[:, 0]
         return reading[:: round(0.02 / step)]
@@ -478,11 +478,11 @@ def test_between_rows_is_one_of_two_words_and_is_written(tmp_path):
     text = DRIVE.format(imposed="voltage", channels='"motor_speed"', start="rest") + BENCH
     path.write_text(text.replace('start = "rest"', 'start = "rest"\nbetween_rows = "spline"'))
     with pytest.raises(BadConfiguration, match=r"rig.toml, between_rows: got spline; .*allowed: held, linear"):
-        robot_file.load(str(path))
+        robot_file.load_robot(str(path))
     path.write_text(text.replace('start = "rest"', 'start = "rest"\nbetween_rows = "linear"'))
-    robot = robot_file.load(str(path))
-    robot_file.write(robot, tmp_path / "robot.toml")
-    assert robot_file.load(str(tmp_path / "robot.toml")).rig.between_rows == robot.rig.between_rows == "linear"
+    robot = robot_file.load_robot(str(path))
+    robot_file.write_robot(robot, tmp_path / "robot.toml")
+    assert robot_file.load_robot(str(tmp_path / "robot.toml")).rig.between_rows == robot.rig.between_rows == "linear"
 
 
 def test_a_jump_of_the_voltage_is_exact_in_every_step(tmp_path):
@@ -492,7 +492,7 @@ def test_a_jump_of_the_voltage_is_exact_in_every_step(tmp_path):
     (tmp_path / "rig.toml").write_text(
         text.replace("[gearbox]", "inductance = 0.01\n[gearbox]").replace("0.02", "1e3")
     )
-    robot = robot_file.load(str(tmp_path / "rig.toml"))
+    robot = robot_file.load_robot(str(tmp_path / "rig.toml"))
     times = jnp.array([0.0, 0.02, 0.03, 0.035, 0.04, 0.04])  # the last instant begins a step, as the observer has it
     driven = Conditions(voltage=np.array([6.0, 6.0, 9.0, 9.0, 9.0, 9.0]))
 
@@ -521,7 +521,7 @@ def through_rest(tmp_path_factory):
     """Derivatives of the speeds of a run by shares of its parameters, and differences of steps without end."""
     path = tmp_path_factory.mktemp("rig") / "robot.toml"
     path.write_text(DRIVE.format(imposed="voltage", channels='"motor_current", "motor_speed"', start="rest") + BENCH)
-    robot = robot_file.read(path)
+    robot = robot_file.read_robot(path)
     every = np.arange(0, 1.2, 0.02)
     values = {p.name: float(p.value) for p in params.walk_parameters(robot)}
 

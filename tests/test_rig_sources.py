@@ -13,7 +13,7 @@ from calibration.data.input_errors import BadConfiguration
 from mmrjax.model import params
 from mmrjax.model.signals import GRAVITY
 from sweeps.commands import rig_from_mujoco, rig_new
-from sweeps.commands.rig_template import examples
+from sweeps.commands.rig_template import example_numbers
 
 DIFFBOT = Path(__file__).parent / "data" / "diffbot.urdf"
 FREE = """<mujoco>
@@ -37,13 +37,13 @@ def values(text, tmp_path):
     """Parameters of a rig's text by name, after it was read."""
     path = tmp_path / "rig.toml"
     path.write_text(text, encoding="utf-8")
-    robot = robot_file.read(path)
+    robot = robot_file.read_robot(path)
     numbers = {"sides": float(robot.sides), **{p.name: float(p.value) for p in params.walk_parameters(robot)}}
     return numbers, {name: sd for name, _, sd in robot.rig.priors}
 
 
 def test_wheel_of_a_urdf_is_a_robot_on_wheels_with_sources(tmp_path):
-    text = rig_new.text(None, DIFFBOT, "left_wheel_joint", None)
+    text = rig_new.new_rig_text(None, DIFFBOT, "left_wheel_joint", None)
     found, sds = values(text, tmp_path)
     expected = {
         "sides": 2, "rover.mass": 5.2, "rover.radius": 0.065, "rover.inertia": 6.8e-4, "gearbox.ratio": 34,
@@ -53,14 +53,14 @@ def test_wheel_of_a_urdf_is_a_robot_on_wheels_with_sources(tmp_path):
     assert sds["rover.inertia"] == pytest.approx(3.4e-4) and sds["rover.mass"] == pytest.approx(1.04)
     assert '"34.0 ± 5 %"  # [-] diffbot.urdf, transmission left_drive, <mechanicalReduction>' in text
     assert "equal wheels: left_wheel_joint, right_wheel_joint" in text
-    assert {name.split()[0] for name in examples(text)} == {
+    assert {name.split()[0] for name in example_numbers(text)} == {
         "motor.resistance", "motor.torque_constant", "motor.friction_coulomb", "motor.friction_viscous",
         "motor.inertia", "gearbox.efficiency_load", "rover.ground.rolling_resistance", "rover.ground.friction.static",
     }  # fmt: skip
 
 
 def test_arm_of_a_urdf_carries_what_is_fixed_to_it(tmp_path):
-    found, _ = values(rig_new.text(None, DIFFBOT, "arm_joint", None), tmp_path)
+    found, _ = values(rig_new.new_rig_text(None, DIFFBOT, "arm_joint", None), tmp_path)
     assert found["arm.inertia"] == pytest.approx(7e-4 + 0.2 * 0.1**2 + 2e-5 + 0.1 * 0.2**2)
     assert found["arm.torque_gravity"] == pytest.approx((0.2 * 0.1 + 0.1 * 0.2) * GRAVITY)
     assert found["arm.angle_zero"] == pytest.approx(math.pi / 2)  # it points forward, and turns down
@@ -79,26 +79,29 @@ def test_urdf_agrees_with_mujoco_in_any_frames(seed, tmp_path):
             velocity="1"/><dynamics damping="0.1" friction="0.2"/></joint>"""
     (tmp_path / "r.urdf").write_text(text + "</robot>")
     for joint in ("j2", "j4"):
-        ours, theirs = rig_new.joint_of(tmp_path / "r.urdf", joint), rig_from_mujoco.read(tmp_path / "r.urdf", joint)
+        ours, theirs = (
+            rig_new.joint_of(tmp_path / "r.urdf", joint),
+            rig_from_mujoco.read_mujoco_hinge(tmp_path / "r.urdf", joint),
+        )
         for key in ("inertia", "weight", "angle", "friction", "damping"):
             assert getattr(ours, key)[0] == pytest.approx(getattr(theirs, key)[0], rel=1e-6), (joint, key)
 
 
 def test_wheel_of_a_mujoco_model_has_the_numbers_of_its_default_class(tmp_path):
     (tmp_path / "free.xml").write_text(FREE)
-    text = rig_new.text(None, tmp_path / "free.xml", "left", None)
+    text = rig_new.new_rig_text(None, tmp_path / "free.xml", "left", None)
     found, _ = values(text, tmp_path)
     expected = {
         "sides": 2, "rover.mass": 6.0, "rover.radius": 0.08, "rover.inertia": 0.5 * 0.5 * 0.08**2,
         "gearbox.ratio": 20, "motor.inertia": 4e-6, "rover.track.loss_coulomb": 0.05, "rover.track.loss_viscous": 0.02,
     }  # fmt: skip
     assert {name: found[name] for name in expected} == pytest.approx(expected, rel=1e-6)
-    assert "free.xml, geom tyre (cylinder)" in text and "motor.resistance [ohm]" in examples(text)
+    assert "free.xml, geom tyre (cylinder)" in text and "motor.resistance [ohm]" in example_numbers(text)
 
 
 def test_armature_without_a_ratio_turns_with_the_load(tmp_path):
     (tmp_path / "free.xml").write_text(FREE.replace(' gear="20"', ""))
-    found, _ = values(rig_new.text("bench", tmp_path / "free.xml", "left", None), tmp_path)
+    found, _ = values(rig_new.new_rig_text("bench", tmp_path / "free.xml", "left", None), tmp_path)
     assert found["motor.inertia"] == 0
     assert found["bench.inertia"] == pytest.approx(0.5 * 0.5 * 0.08**2 + 0.0016, rel=1e-6)
 
@@ -106,7 +109,7 @@ def test_armature_without_a_ratio_turns_with_the_load(tmp_path):
 def test_name_with_a_line_break_stays_in_its_comment(tmp_path):
     robot = DIFFBOT.read_text().replace("left_wheel", "left&#10;mass = 1 #")
     (tmp_path / "r.urdf").write_text(robot)
-    found, _ = values(rig_new.text(None, tmp_path / "r.urdf", "left\nmass = 1 #_joint", None), tmp_path)
+    found, _ = values(rig_new.new_rig_text(None, tmp_path / "r.urdf", "left\nmass = 1 #_joint", None), tmp_path)
     assert found["rover.mass"] == pytest.approx(5.2)
 
 
@@ -138,7 +141,7 @@ def test_robots_with_a_mistake_are_refused_in_a_sentence(old, new, joint, messag
     assert old in text
     (tmp_path / "r.urdf").write_text(text.replace(old, new))
     with pytest.raises(BadConfiguration, match=message) as refusal:
-        rig_new.text(None, tmp_path / "r.urdf", joint, None)
+        rig_new.new_rig_text(None, tmp_path / "r.urdf", joint, None)
     assert "\n" not in str(refusal.value)
 
 

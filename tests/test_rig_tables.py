@@ -56,7 +56,7 @@ def vehicle(mass=10.0, **stated):
 def read(tmp_path, text, robot, **options):
     path = tmp_path / "runs.csv"
     path.write_text(text, encoding="utf-8")
-    return records.read(path, robot=robot, **options)
+    return records.read_runs(path, robot=robot, **options)
 
 
 def measured(tmp_path, robot, conditions, columns, true=None, *, share=0.01, seed=0):
@@ -94,7 +94,7 @@ def test_a_vehicle_takes_its_mass_from_its_file_and_the_flat_without_payload(tmp
 
 
 def test_a_packaged_robot_reads_its_tables_as_ever(robot):
-    with_robot, without = records.read("measured", robot=robot), records.read("measured")
+    with_robot, without = records.read_runs("measured", robot=robot), records.read_runs("measured")
     assert list(with_robot.columns) == list(without.columns) and with_robot.unknown == without.unknown
     assert all((with_robot[c] == without[c]).all() for c in without.columns)
 
@@ -407,7 +407,7 @@ def test_one_surface_alone_and_a_robot_without_the_others_stay_as_they_are(tmp_p
 
 
 def test_surfaces_of_table_5_scale_the_papers_robots_and_others_are_their_own(robot):
-    runs = records.read("measured").where(np.arange(4))
+    runs = records.read_runs("measured").where(np.arange(4))
     columns = {**runs.columns, "surface": np.array(["linoleum", "linoleum", "sand", "sand"])}
     runs = dataclasses.replace(runs, columns=columns)
     apart = surfaces.with_surface_configurations(robot, runs)
@@ -518,7 +518,7 @@ def test_an_arm_is_simulated_over_time_alone():
     with pytest.raises(
         BadConfiguration, match=r"--model steady: rig has a torque of gravity .* --model drive, and tables with a col"
     ):
-        run.refuse(robot, Conditions(np.zeros(1, int), voltage=np.array([9.0])), config)
+        run.check_runs_bearable(robot, Conditions(np.zeros(1, int), voltage=np.array([9.0])), config)
 
 
 QUICK = {"starts": 2, "profiles": False, "blocks": ["speed", "voltage"]}
@@ -656,20 +656,20 @@ def test_an_instrument_left_free_is_what_its_table_shows(tmp_path):
     path.write_text("\n".join(["motor_speed_rpm,total_current_A,total_current_sd_A", *rows]) + "\n", encoding="utf-8")
     free = bench(instruments=(Instrument("total_current", None, None),))
     stated = bench(instruments=(Instrument("total_current", False, 0.03),))
-    runs = records.read(path, robot=free)
+    runs = records.read_runs(path, robot=free)
     (found,) = runs.layout.instruments
     assert found.signed is False and found.quantum == pytest.approx(0.03, rel=1e-9)
     assert instruments.with_inferred_instruments(free, runs).rig.instruments == runs.layout.instruments
     assert instruments.with_inferred_instruments(stated, runs) is stated
     size = np.ones((8, 1))
-    sds = [noise.noise_from_table(records.read(path, robot=r), size).sd for r in (free, stated)]
+    sds = [noise.noise_from_table(records.read_runs(path, robot=r), size).sd for r in (free, stated)]
     np.testing.assert_allclose(sds[0], sds[1], rtol=1e-9)
     np.testing.assert_allclose(sds[0], np.hypot(0.01, 0.03 / np.sqrt(12)), rtol=1e-9)
     with pytest.raises(BadData, match="negative backward; or signed = false"):
-        records.read(path, robot=bench())
+        records.read_runs(path, robot=bench())
     signed = re.sub(r"(-\d+),0", r"\1,-0", path.read_text(encoding="utf-8"))
     path.write_text(signed, encoding="utf-8")
-    assert records.read(path, robot=free).layout.instruments[0].signed is True
+    assert records.read_runs(path, robot=free).layout.instruments[0].signed is True
 
 
 @pytest.mark.slow
@@ -694,10 +694,10 @@ signed = "free"
 quantum = "free"
 """
     (tmp_path / "rig.toml").write_text(text, encoding="utf-8")
-    robot = robot_file.read(tmp_path / "rig.toml")
+    robot = robot_file.read_robot(tmp_path / "rig.toml")
     assert robot.rig.instruments == (Instrument("total_current", None, None),)
-    robot_file.write(robot, tmp_path / "again.toml", note="of a test")
-    assert robot_file.read(tmp_path / "again.toml").rig.instruments == robot.rig.instruments
+    robot_file.write_robot(robot, tmp_path / "again.toml", note="of a test")
+    assert robot_file.read_robot(tmp_path / "again.toml").rig.instruments == robot.rig.instruments
     speeds = np.array([-4000, -3100, -2700, -1900, -1300, -1000, 1000, 1600, 2300, 2900, 3700, 4000.0])
     robot_there = params.replace(robot, {"brake.loss_coulomb": 0.15})
     truth = steady_batch(robot_there, Conditions(motor_speed=speeds * channels.RPM)).reading["total_current"]
@@ -706,7 +706,7 @@ quantum = "free"
     path = tmp_path / "t.csv"
     rows = "".join(f"{n:g},{i:.3f},0.002\n" for n, i in zip(speeds, read, strict=True))
     path.write_text("motor_speed_rpm,total_current_A,total_current_sd_A\n" + rows, encoding="utf-8")
-    found = calibrate(records.read(path, robot=robot), robot, starts=2, profiles=False, blocks=False)
+    found = calibrate(records.read_runs(path, robot=robot), robot, starts=2, profiles=False, blocks=False)
     (instrument,) = found.robot.rig.instruments
     assert instrument.signed is False and instrument.quantum == pytest.approx(0.004, rel=1e-6)
     loss = found.parameters["brake.loss_coulomb"]

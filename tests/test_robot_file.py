@@ -15,16 +15,16 @@ def values(robot):
 
 @pytest.mark.parametrize("name", paper_robots.ROBOTS)
 def test_robot_written_and_read_is_the_same(tmp_path, name):
-    robot = robot_file.with_effects(robot_file.load(name), tuple(effects.BY_NAME))
-    robot = robot_file.change(robot, {"effects.churning.amplitude": 1e-4}, where="test")
-    robot_file.write(robot, tmp_path / "robot.toml", note="a note")
-    assert values(robot_file.load(str(tmp_path / "robot.toml"))) == values(robot)
+    robot = robot_file.with_effects(robot_file.load_robot(name), tuple(effects.BY_NAME))
+    robot = robot_file.change_robot(robot, {"effects.churning.amplitude": 1e-4}, where="test")
+    robot_file.write_robot(robot, tmp_path / "robot.toml", note="a note")
+    assert values(robot_file.load_robot(str(tmp_path / "robot.toml"))) == values(robot)
 
 
 def test_file_states_only_what_differs(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text('base = "sm1"\n[motor]\nresistance = 0.9\n[effects.series_resistance]\namplitude = 0.3\n')
-    robot, base = values(robot_file.read(path)), values(paper_robots.sm1())
+    robot, base = values(robot_file.read_robot(path)), values(paper_robots.sm1())
     assert robot.pop("motor.resistance") == 0.9 and robot.pop("effects.series_resistance.amplitude") == 0.3
     assert base.pop("motor.resistance") == 0.611 and robot == base
 
@@ -68,9 +68,9 @@ dynamic = 0.5
 @pytest.mark.parametrize("text", [ROVER, CRAWLER], ids=["rover", "crawler"])
 def test_a_robot_of_another_build_is_written_and_read_the_same(tmp_path, text):
     (tmp_path / "mine.toml").write_text(text)
-    robot = robot_file.read(tmp_path / "mine.toml")
-    robot_file.write(robot, tmp_path / "again.toml")
-    again = robot_file.read(tmp_path / "again.toml")
+    robot = robot_file.read_robot(tmp_path / "mine.toml")
+    robot_file.write_robot(robot, tmp_path / "again.toml")
+    again = robot_file.read_robot(tmp_path / "again.toml")
     assert eqx.tree_equal(robot, again)
     assert (again.configurations.names, again.sides, again.battery.cells) == (
         robot.configurations.names,
@@ -82,7 +82,7 @@ def test_a_robot_of_another_build_is_written_and_read_the_same(tmp_path, text):
 
 def test_like_starts_from_that_configuration(tmp_path):
     (tmp_path / "mine.toml").write_text(ROVER)
-    robot, base = robot_file.read(tmp_path / "mine.toml"), paper_robots.nominal()
+    robot, base = robot_file.read_robot(tmp_path / "mine.toml"), paper_robots.nominal()
     assert robot.configurations.names == ("rover", "6T2A") and robot.sides == 4 and robot.battery.cells == 4
     rover, wheeled = robot.configurations["rover"], base.configurations["4W2T"]
     assert float(rover.mass) == 6.0 and float(rover.ground.friction.static) == 0.6
@@ -92,7 +92,7 @@ def test_like_starts_from_that_configuration(tmp_path):
 
 def test_movers_start_from_the_defaults_of_the_fields(tmp_path):
     (tmp_path / "mine.toml").write_text(CRAWLER)
-    crawler = robot_file.read(tmp_path / "mine.toml").configurations["crawler-2"]
+    crawler = robot_file.read_robot(tmp_path / "mine.toml").configurations["crawler-2"]
     assert float(crawler.on_tracks) == 1.0
     assert float(crawler.track.guide_friction) == 0.20 and float(crawler.ground.friction.speed_static) == 0.02
 
@@ -101,7 +101,7 @@ def test_set_on_a_configuration_that_is_not_there_lists_those_that_are(robot):
     with pytest.raises(
         BadConfiguration, match=r"--set, rover\.mass: no such parameter; .*the robot has .*, 6T2A, 4W2T"
     ):
-        robot_file.change(robot, {"rover.mass": 3.0}, where="--set")
+        robot_file.change_robot(robot, {"rover.mass": 3.0}, where="--set")
 
 
 REFUSED = {
@@ -191,7 +191,7 @@ def test_bad_robots_are_refused_in_one_sentence(tmp_path, case):
     path = tmp_path / "mine.toml"
     path.write_text(text)
     with pytest.raises(BadConfiguration, match=sentence) as refusal:
-        robot_file.load(str(path))
+        robot_file.load_robot(str(path))
     assert refusal.value.exit_code == 2
 
 
@@ -199,26 +199,26 @@ def test_unknown_name_lists_the_robots():
     with pytest.raises(
         BadConfiguration, match=r"--robot: got nominel, no such file and no known robot; did you mean nominal"
     ):
-        robot_file.load("nominel")
+        robot_file.load_robot("nominel")
 
 
 def test_ratings_are_stated_written_and_checked(tmp_path):
     (tmp_path / "mine.toml").write_text(
         "[motor]\nvoltage_limit = 14.4\nspeed_limit = 900.0\n[gearbox]\nspeed_limit = 600\n"
     )
-    robot = robot_file.read(tmp_path / "mine.toml")
+    robot = robot_file.read_robot(tmp_path / "mine.toml")
     assert (robot.motor.voltage_limit, robot.motor.speed_limit, robot.gearbox.speed_limit) == (14.4, 900.0, 600.0)
     assert paper_robots.nominal().motor.voltage_limit is None  # the bench went to 33 V with a motor of 24 V
-    robot_file.write(robot, tmp_path / "again.toml")
-    assert robot_file.read(tmp_path / "again.toml").motor == robot.motor
-    robot_file.write(paper_robots.nominal(), tmp_path / "nominal.toml")
+    robot_file.write_robot(robot, tmp_path / "again.toml")
+    assert robot_file.read_robot(tmp_path / "again.toml").motor == robot.motor
+    robot_file.write_robot(paper_robots.nominal(), tmp_path / "nominal.toml")
     assert "voltage_limit" not in (tmp_path / "nominal.toml").read_text()
     with pytest.raises(
         BadConfiguration, match=r"motor.voltage_limit: got -3; expected a number, 0.1 to 1000 V \(highest"
     ):
-        robot_file.change(robot, {"motor.voltage_limit": -3}, where="--set")
+        robot_file.change_robot(robot, {"motor.voltage_limit": -3}, where="--set")
     with pytest.raises(BadConfiguration, match=r"motor.speed_limit: got 'fast'; expected a number, 1 to 1"):
-        robot_file.change(robot, {"motor.speed_limit": "fast"}, where="mine.toml")
+        robot_file.change_robot(robot, {"motor.speed_limit": "fast"}, where="mine.toml")
 
 
 def test_robot_file_knows_what_it_states(tmp_path):
@@ -228,13 +228,13 @@ def test_robot_file_knows_what_it_states(tmp_path):
         "[gearbox]\nratio = 10\nefficiency_load = 0.8  # example: yours\n"
         '[screw]\nload = "linear"\nmass_kg = 2\nlead_mm = 5\n[twice]\nlike = "screw"\nmass_kg = 4\n'
     )
-    found = robot_file.parse(path)
+    found = robot_file.parse_robot_file(path)
     assert found.name == "rig.toml" and found.text == path.read_text()
     assert found.linear == {"screw", "twice"}  # what another table states of it is stated
     assert {"motor.resistance", "gearbox.ratio", "screw.inertia", "twice.inertia"} <= found.stated
     assert not found.stated & {"motor.inertia", "screw.mass_kg", "base", "channels"}
-    assert values(found.robot) == values(robot_file.load(str(path)))
-    packaged = robot_file.find("sm1")
+    assert values(found.robot) == values(robot_file.load_robot(str(path)))
+    packaged = robot_file.find_robot_file("sm1")
     assert not packaged.stated and packaged.name == "sm1" and values(packaged.robot) == values(paper_robots.sm1())
 
 
@@ -248,26 +248,26 @@ def test_a_stated_curve_is_that_of_the_capacity_beside_it(tmp_path):
         ("slope = -1e-4", 7920.0),
     ):
         path.write_text(f"[battery]\n{text}\n")
-        battery = robot_file.read(path).battery
+        battery = robot_file.read_robot(path).battery
         assert battery.capacity_curve == of
-        robot_file.write(robot_file.read(path), again)
-        assert robot_file.read(again).battery == battery
+        robot_file.write_robot(robot_file.read_robot(path), again)
+        assert robot_file.read_robot(again).battery == battery
         start = 'base = "none"\nchannels = ["total_current"]\n[motor]\nresistance = 1.0\ntorque_constant = 0.05\n'
         load = '[gearbox]\nratio = 10\nefficiency_load = 0.8\n[arm]\nload = "shaft"\ninertia = 1e-3\nloss_coulomb = 0.01\n'
         path.write_text(f"{start}{load}[battery]\n{text}\n")
-        robot_file.write(robot_file.read(path), again)
-        assert robot_file.read(again).battery == robot_file.read(path).battery
-        assert robot_file.read(again).battery.capacity_curve == of
+        robot_file.write_robot(robot_file.read_robot(path), again)
+        assert robot_file.read_robot(again).battery == robot_file.read_robot(path).battery
+        assert robot_file.read_robot(again).battery.capacity_curve == of
 
 
 def test_a_curve_that_turns_up_is_said_where_a_file_states_it(tmp_path):
     (tmp_path / "up.toml").write_text("[battery]\ncurvature = 1e-8\n")
-    robot_file.read(tmp_path / "up.toml", notes=(notes := []))
+    robot_file.read_robot(tmp_path / "up.toml", notes=(notes := []))
     assert notes == [
         "up.toml, battery.curvature: with this curvature and slope a cell's voltage rises again once 87.7 % of its "
         "capacity is taken (capacity_curve: 7920 C)"
     ]
-    robot = robot_file.change(
+    robot = robot_file.change_robot(
         paper_robots.nominal(), {"battery.capacity": 30_670.0}, where="--set", notes=(quiet := [])
     )
     assert quiet == [] and float(robot.battery.voltage_empty) == float(paper_robots.nominal().battery.voltage_empty)
@@ -276,7 +276,7 @@ def test_a_curve_that_turns_up_is_said_where_a_file_states_it(tmp_path):
 def test_all_that_is_wrong_with_a_file_is_said_at_once(tmp_path):
     (tmp_path / "bad.toml").write_text("[motor]\nresistance = -1\nresistence = 0.6\n[gearbox]\nratio = 'x'\n")
     with pytest.raises(BadConfiguration) as error:
-        robot_file.read(tmp_path / "bad.toml")
+        robot_file.read_robot(tmp_path / "bad.toml")
     said = str(error.value)
     assert said.startswith("bad.toml, motor.resistance: got -1; expected 0.001 to 1000 ohm")
     assert "; also motor.resistence: no such parameter" in said and "; also gearbox.ratio: got 'x'; expected" in said

@@ -30,8 +30,8 @@ def rig(kind, imposed, folder):
     """A rig's robot, its table, and the library at its size."""
     world = rigs.world(np.random.default_rng([27, len(kind)]), kind, imposed, rows=(16, 40))
     rigs.case(world).write(folder)
-    robot = robot_file.read(folder / "rig.toml")
-    runs = records.read(folder / "table.csv", robot=robot)
+    robot = robot_file.read_robot(folder / "rig.toml")
+    runs = records.read_runs(folder / "table.csv", robot=robot)
     return robot, runs, scales.library_of_size(robot, runs.conditions(robot), effects.BY_NAME)
 
 
@@ -70,8 +70,8 @@ def test_every_effect_of_a_rigs_size_is_read_again_as_it_was_written(tmp_path, k
     off_library = 0
     for share in (0.01, 1.0):
         whole = with_all(robot, library, share)
-        robot_file.write(whole, tmp_path / "robot.toml")
-        again = robot_file.read(tmp_path / "robot.toml")
+        robot_file.write_robot(whole, tmp_path / "robot.toml")
+        again = robot_file.read_robot(tmp_path / "robot.toml")
         assert eqx.tree_equal(whole.effects, again.effects)
         specs = [
             {p.name: p.spec for p in params.walk_parameters(r) if p.name.startswith("effects.")}
@@ -95,21 +95,22 @@ def test_effects_of_turns_of_a_rigs_size_are_read_again_as_they_were_written(tmp
     beside = effects.OF_TURNS | effects.OF_CHANNELS
     library = {name: scaled_effect(kind, (3.0, 1.0, 2.0)) for name, kind in beside.items()}
     whole = with_all(robot, library, 0.5)
-    robot_file.write(whole, tmp_path / "robot.toml")
-    assert library and eqx.tree_equal(whole.effects, robot_file.read(tmp_path / "robot.toml").effects)
+    robot_file.write_robot(whole, tmp_path / "robot.toml")
+    assert library and eqx.tree_equal(whole.effects, robot_file.read_robot(tmp_path / "robot.toml").effects)
 
 
 @pytest.mark.slow
 def test_a_robot_with_effects_of_its_size_is_compared_and_swept(tmp_path, mmrjax):
     robot, _, library = rig("bench", "voltage", tmp_path)
     some = {name: library[name] for name in list(library)[:4]}
-    robot_file.write(with_all(robot, some, 0.01), tmp_path / "robot.toml")
+    robot_file.write_robot(with_all(robot, some, 0.01), tmp_path / "robot.toml")
     options = ("--robot", tmp_path / "robot.toml", "--no-report")
     for command in (("compare", tmp_path / "table.csv"), ("sweep", "--voltages", 12)):
         code, _, err = mmrjax(*command, *options, "--out", tmp_path / command[0])
         assert code == 0, err
     assert eqx.tree_equal(
-        robot_file.read(tmp_path / "compare" / "robot.toml").effects, robot_file.read(tmp_path / "robot.toml").effects
+        robot_file.read_robot(tmp_path / "compare" / "robot.toml").effects,
+        robot_file.read_robot(tmp_path / "robot.toml").effects,
     )
 
 
@@ -177,7 +178,7 @@ def test_factors_are_three_positive_numbers(tmp_path, stated):
     with pytest.raises(
         BadConfiguration, match=r"effects\.churning\.scaled: got .* expected three numbers more than 0"
     ):
-        robot_file.read(tmp_path / "robot.toml")
+        robot_file.read_robot(tmp_path / "robot.toml")
 
 
 @pytest.mark.slow
@@ -187,7 +188,7 @@ def test_friction_along_the_travel_is_sized_by_the_travel_and_looked_for_where_a
     (tmp_path / "log.csv").write_text(
         "supply_voltage_V,duty,time_s,output_angle_deg\n" + "\n".join(f"6,{r}" for r in rows) + "\n"
     )
-    runs = records.read(tmp_path / "log.csv", robot=robot)
+    runs = records.read_runs(tmp_path / "log.csv", robot=robot)
     turned = scales.output_rotation(runs, robot)
     assert turned == pytest.approx(2 * np.pi * np.sqrt((1 + 4 + 4) / 3))
     kinds = [
@@ -206,8 +207,8 @@ def test_friction_along_the_travel_is_sized_by_the_travel_and_looked_for_where_a
 
 def servo(folder):
     """The robot of the template of a servo."""
-    (folder / "rig.toml").write_text(rig_new.template("servo"), encoding="utf-8")
-    return robot_file.read(folder / "rig.toml")
+    (folder / "rig.toml").write_text(rig_new.rig_template("servo"), encoding="utf-8")
+    return robot_file.read_robot(folder / "rig.toml")
 
 
 METERED = """
@@ -231,7 +232,7 @@ loss_viscous = "0.001 ± 1 %"
 def metered(tmp_path, off):
     """A bench whose torque meter reads so much high, and its table."""
     (tmp_path / "rig.toml").write_text(METERED)
-    robot = robot_file.read(tmp_path / "rig.toml")
+    robot = robot_file.read_robot(tmp_path / "rig.toml")
     volts = np.repeat(np.linspace(3.0, 24.0, 10), 2)
     seen = mm.simulate(robot, mm.Conditions(voltage=volts))
     noise = 1 + 0.003 * np.random.default_rng(1).standard_normal((3, len(volts)))
@@ -245,7 +246,7 @@ def metered(tmp_path, off):
     rows = [[v, *(y for x in xs for y in (x, 0.003 * x))] for v, xs in zip(volts, read.T, strict=True)]
     lines = [",".join(("supply_voltage_V", *heads)), *(",".join(f"{x:.6g}" for x in row) for row in rows)]
     (tmp_path / "runs.csv").write_text("\n".join(lines) + "\n")
-    return records.read(tmp_path / "runs.csv", robot=robot), robot
+    return records.read_runs(tmp_path / "runs.csv", robot=robot), robot
 
 
 def test_the_loop_looks_for_an_error_of_every_instrument(tmp_path):
@@ -273,7 +274,7 @@ def test_a_current_sensors_offset_is_named(tmp_path, signed):
     """Of a bench driven both ways; where the sensor shows magnitudes a friction may look alike."""
     shown = f"[instruments.motor_current]\nsigned = {str(signed).lower()}\n"
     (tmp_path / "rig.toml").write_text(METERED.replace(', "output_torque"', ', "motor_current"') + shown)
-    robot = robot_file.read(tmp_path / "rig.toml")
+    robot = robot_file.read_robot(tmp_path / "rig.toml")
     off = effects.OF_CHANNELS["motor_current_offset"](amplitude=0.02)
     volts = np.linspace(4.0, 24.0, 8)[:, None] * [1.0, -1.0]
     seen = mm.simulate(dataclasses.replace(robot, effects=(off,)), mm.Conditions(voltage=volts.ravel()))
@@ -284,6 +285,6 @@ def test_a_current_sensors_offset_is_named(tmp_path, signed):
     heads += "total_current_sd_A,motor_speed_sd_rpm,motor_current_sd_A"
     rows = np.column_stack([volts.ravel(), read.T, np.broadcast_to(sd.T, read.T.shape)])
     np.savetxt(tmp_path / "runs.csv", rows, "%.6g", ",", header=heads, comments="")
-    found = mm.discover(records.read(tmp_path / "runs.csv", robot=robot), robot)
+    found = mm.discover(records.read_runs(tmp_path / "runs.csv", robot=robot), robot)
     assert found.verdict in ("named", "class") and [e.name for e in found.effects] == [off.name]
     assert found.effects[0].parameters["amplitude"].value == pytest.approx(0.02, abs=0.005)

@@ -27,7 +27,7 @@ def coarse(tmp_path_factory):
     text = DRIVE.format(imposed="voltage", channels='"total_current"', start="rest") + BENCH
     text = text.replace("resistance = 3.0", "resistance = 3.0\ninductance = 1e-3").replace("0 ± 0.05", "0 ± 0.02")
     (folder / "rig.toml").write_text(text)
-    robot = robot_file.load(str(folder / "rig.toml"))
+    robot = robot_file.load_robot(str(folder / "rig.toml"))
     truth = params.replace(robot, {"rig.delay": TRUTH, "bench.loss_coulomb": 0.24})
     t = np.arange(0, 0.32, 0.02)
     columns = {"time_s": t, "supply_voltage_V": np.where(t < 0.16, 12.0, 6.0)}

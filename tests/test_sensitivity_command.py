@@ -290,12 +290,14 @@ def test_an_output_that_nothing_changes_has_no_figures(tmp_path, monkeypatch):
     """A yaw rate beside straight travel: one without bars leaves no room for its axes."""
     drawn, shares = [], {"speed": np.array([0.4, 0.6]), "yaw_rate": np.zeros(2)}
     monkeypatch.setattr(page.Album, "add", lambda self, name, make: drawn.append(name))
-    monkeypatch.setattr(page, "render", lambda *_, **told: told["sections"])
-    for name in ("_sentence", "_pairs", "_inputs", "_ranges", "_bounds", "_next_runs", "named"):
+    monkeypatch.setattr(page, "render_page", lambda *_, **told: told["sections"])
+    for name in ("_sentence", "_pairs", "_inputs", "_ranges", "_bounds", "_next_runs", "robot_section"):
         monkeypatch.setattr(page, name, lambda *_: {})
     one = {"studied": np.array([True]), "value": np.zeros(1), "row": SimpleNamespace(label=""), "second": None}
     outputs = {k: SimpleNamespace(overall_share=v, convergence=None, **one) for k, v in shares.items()}
-    sections = page.write(tmp_path, SimpleNamespace(outputs=outputs, next_runs=None, method="local"), None)
+    sections = page.write_sensitivity_page(
+        tmp_path, SimpleNamespace(outputs=outputs, next_runs=None, method="local"), None
+    )
     assert drawn == ["overview", "tornado_speed", "indices_speed"] and [s["drawn"] for s in sections] == [True, False]
 
 
@@ -310,8 +312,8 @@ def test_posterior_of_a_robot_is_its_inputs_and_gives_runs_their_uncertainty(mmr
     found = posterior_of_coordinates(coordinates, np.zeros(2), 0.01 * np.eye(2))
     values = np.asarray(found.at(np.zeros(2)))
     fitted = params.replace(robot, {n: jnp.asarray(v) for n, v in zip(found.names, values, strict=True)})
-    robot_file.write(fitted, tmp_path / "robot.toml", note="of a test")
-    posteriors.write(found, tmp_path / posteriors.FILE)
+    robot_file.write_robot(fitted, tmp_path / "robot.toml", note="of a test")
+    posteriors.write_posterior(found, tmp_path / posteriors.FILE)
     code, out, _ = mmrjax(
         "sensitivity", "--robot", "robot.toml", "--posterior", "--voltages", "24", "--payloads", "3", "--slopes", "0",
         "--configurations", "6T2A", "--outputs", "speed", "--evaluations", "6000", "--no-report", "--out", "p",

@@ -21,7 +21,7 @@ from calibration.inference import checks, observers
 from calibration.inference import noise as noises
 from calibration.inference.foresight import Foresight
 from sweeps.commands import rig_check
-from sweeps.commands.settle import rolling
+from sweeps.commands.settle import rolling_readings
 from sweeps.report.words import settle_words as words
 
 
@@ -32,11 +32,11 @@ def made(tmp_path, seed=1, kind="bench", imposed="voltage", **options):
     rigs.case(world).write(tmp_path)
     log = rigs.log(world, rng, **options)
     log.write(tmp_path / "log.csv")
-    return log, world, robot_file.read(tmp_path / "rig.toml")
+    return log, world, robot_file.read_robot(tmp_path / "rig.toml")
 
 
 def settled(tmp_path, robot, **options):
-    return settling.settle(records.read(tmp_path / "log.csv", robot=robot), **options)
+    return settling.settle_log(records.read_runs(tmp_path / "log.csv", robot=robot), **options)
 
 
 def deviations(log, found):
@@ -90,7 +90,7 @@ def test_sds_hold_over_random_logs(tmp_path):
             step=rng.choice([0, 0, 1, 3]),
         )  # fmt: skip
         log.write(tmp_path / "log.csv")
-        found = settled(tmp_path, robot_file.read(tmp_path / "rig.toml"))
+        found = settled(tmp_path, robot_file.read_robot(tmp_path / "rig.toml"))
         z.append(np.abs(deviations(log, found)).ravel())
         levels, kept = levels + len(world.conditions), kept + len(found.kept)
     every = np.concatenate(z)
@@ -158,7 +158,7 @@ loss_coulomb = 0.1
     (tmp_path / "rig.toml").write_text(text, encoding="utf-8")
     lines = [",".join(columns), *(",".join(map(str, row)) for row in zip(*columns.values(), strict=True))]
     (tmp_path / "log.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    return robot_file.read(tmp_path / "rig.toml")
+    return robot_file.read_robot(tmp_path / "rig.toml")
 
 
 def stairs(levels=(6.0, 12.0, 18.0), hold=200, seed=0):
@@ -285,7 +285,7 @@ def test_signs_and_units_that_cannot_be_are_said_with_rows_and_remedy(tmp_path, 
     changes, said = WRONG[case]
     robot = bench(tmp_path, both_ways(**changes), '"total_current", "motor_speed", "output_angle"')
     with pytest.raises(BadData, match=said):
-        settled(tmp_path, robot, rolling=rolling(robot))
+        settled(tmp_path, robot, rolling=rolling_readings(robot))
 
 
 #: What a fit would say of a table, where none is made.
@@ -298,7 +298,7 @@ def test_rig_check_says_of_a_log_that_signs_are_wrong(tmp_path, monkeypatch, cas
     changes, said = WRONG.get(case, ({}, ""))
     bench(tmp_path, both_ways(**changes), '"total_current", "motor_speed", "output_angle"')
     monkeypatch.setattr(rig_check.foresight, "predict_identifiability", lambda runs, robot: NOTHING_FORESEEN)
-    found = rig_check.examined(tmp_path / "rig.toml", str(tmp_path / "log.csv"))
+    found = rig_check.examine_rig_file(tmp_path / "rig.toml", str(tmp_path / "log.csv"))
     if not said:
         assert found.doubts == ()
     else:
@@ -311,7 +311,7 @@ def test_rig_check_says_which_current_a_total_one_is_beside_a_duty(tmp_path, mon
     columns = both_ways() | ({"duty": np.full(800, 0.5)} if duty else {})
     bench(tmp_path, columns)
     monkeypatch.setattr(rig_check.foresight, "predict_identifiability", lambda runs, robot: NOTHING_FORESEEN)
-    said = rig_check.examined(tmp_path / "rig.toml", str(tmp_path / "log.csv")).remarks()
+    said = rig_check.examine_rig_file(tmp_path / "rig.toml", str(tmp_path / "log.csv")).remarks()
     assert any("in a motor's leads measures motor_current" in s for s in said) == duty
 
 
@@ -320,7 +320,7 @@ def test_rig_check_says_which_current_a_total_one_is_beside_a_duty(tmp_path, mon
 def test_signs_and_times_of_random_logs_are_not_doubted(tmp_path, case):
     seed, kind, imposed, options = CASES[case]
     _, _, robot = made(tmp_path, seed, kind, imposed, **options)
-    runs = records.read(tmp_path / "log.csv", robot=robot)
+    runs = records.read_runs(tmp_path / "log.csv", robot=robot)
     assert settling.doubtful_sign(runs) == "" == rig_facts.doubtful_time(runs, robot)
 
 
@@ -331,11 +331,11 @@ def test_time_in_milliseconds_is_doubted_where_a_start_shows_it(tmp_path):
     start = {"supply_voltage_V": np.full(200, 6.0), "motor_speed_rpm": 1000 * (1 - np.exp(-seconds / step))}
     for unit, doubted in ((1.0, False), (1e3, True)):
         bench(tmp_path, {"time_s": unit * seconds, **start})
-        said = rig_facts.doubtful_time(records.read(tmp_path / "log.csv", robot=robot), robot)
+        said = rig_facts.doubtful_time(records.read_runs(tmp_path / "log.csv", robot=robot), robot)
         assert ("is time_s in milliseconds? then name it time_ms" in said) == doubted == bool(said)
     drifts = {"time_s": 1e3 * seconds, **start, "motor_speed_rpm": 1000 + 50 * (1 - np.exp(-seconds / step))}
     bench(tmp_path, drifts)
-    assert rig_facts.doubtful_time(records.read(tmp_path / "log.csv", robot=robot), robot) == ""
+    assert rig_facts.doubtful_time(records.read_runs(tmp_path / "log.csv", robot=robot), robot) == ""
 
 
 @pytest.mark.parametrize("moves", [[8.50, 0.42, -0.1743, -9.796, -11.76, -17.17], [0, 190, 400, 620, 830, 1030]])
@@ -357,12 +357,12 @@ def test_an_angle_that_is_frozen_is_named_itself(tmp_path):
 
 def test_signs_and_units_that_are_right_are_not_doubted(tmp_path):
     robot = bench(tmp_path, both_ways(), '"total_current", "motor_speed", "output_angle"')
-    assert len(settled(tmp_path, robot, rolling=rolling(robot)).kept) == 4
+    assert len(settled(tmp_path, robot, rolling=rolling_readings(robot)).kept) == 4
     text = (tmp_path / "rig.toml").read_text() + "[instruments.total_current]\nsigned = false\n"
     bench(tmp_path, both_ways(total_current_A=np.abs), '"total_current", "motor_speed", "output_angle"')
     (tmp_path / "rig.toml").write_text(text)
-    robot = robot_file.read(tmp_path / "rig.toml")
-    assert len(settled(tmp_path, robot, rolling=rolling(robot)).kept) == 4
+    robot = robot_file.read_robot(tmp_path / "rig.toml")
+    assert len(settled(tmp_path, robot, rolling=rolling_readings(robot)).kept) == 4
 
 
 def test_a_duty_beyond_one_is_refused_with_its_row(tmp_path):
@@ -382,7 +382,7 @@ def test_missing_samples_divide_a_level_and_are_said(tmp_path):
     robot = bench(tmp_path, cut(columns, np.r_[0:300, 400:600]))
     found = settled(tmp_path, robot)
     assert found.gaps == (299,) and len(found.kept) == 2
-    assert words.remarks(found)[0].startswith("samples are missing after row 300; no stretch goes across")
+    assert words.settle_remarks(found)[0].startswith("samples are missing after row 300; no stretch goes across")
 
 
 def test_days_between_rows_are_a_gap(tmp_path):
@@ -424,7 +424,7 @@ def test_glitches_leave_means_where_they_are_or_a_level_out(tmp_path, case):
     kept = np.setdiff1d(middle.rows, off) - 200
     assert middle.mean["motor_speed"] == pytest.approx(clean[kept].mean(), rel=1e-9)
     assert middle.sd["motor_speed"] < 3 * 0.5 / np.sqrt(len(kept)) + 1.0  # the start's lag included
-    said = [x for x in words.remarks(found) if "far from the readings next to them" in x]
+    said = [x for x in words.settle_remarks(found) if "far from the readings next to them" in x]
     assert len(said) == (count > 0)
 
 
@@ -433,7 +433,7 @@ def test_the_readings_of_a_start_are_no_glitches():
     rng, k = np.random.default_rng(0), np.arange(200)
     shown = np.where(k < 4, 2.0, 1.0 + 8.0 * np.exp(-(k - 4) / 4)) + 0.01 * rng.standard_normal(200)
     shown[150] = 5.0
-    assert np.flatnonzero(settling.glitches(shown, [k], 31, 0.0, 0.02)).tolist() == [150]
+    assert np.flatnonzero(settling.find_glitches(shown, [k], 31, 0.0, 0.02)).tolist() == [150]
 
 
 def test_a_current_in_pulses_keeps_its_mean(tmp_path):
@@ -451,13 +451,13 @@ def test_what_does_not_move_and_what_nothing_drives_is_left_out(tmp_path):
 
 
 def test_an_acceleration_that_takes_current_is_no_settled_run(tmp_path):
-    from sweeps.commands.settle import inertia
+    from sweeps.commands.settle import acceleration_currents
 
     columns = stairs(levels=(12.0,), hold=600)
     columns["motor_speed_rpm"] = 2000 + 2.0 * columns["time_s"]  # 0.6 % over the log
     robot = bench(tmp_path, columns)
     assert not settled(tmp_path, robot).stretches[0].why
-    heavy = inertia(robot)
+    heavy = acceleration_currents(robot)
     rate = 0.002 / 100 / 0.05 * np.pi / 30  # load's inertia at the motor over the torque constant, of an rpm a second
     assert heavy["bench"].per_rate == pytest.approx(rate + float(robot.motor.inertia) / 0.05 * np.pi / 30)
     slow = {"bench": settling.Inertia("motor_speed", "total_current", 0.02, 1e-3)}
@@ -499,12 +499,12 @@ def test_an_angle_shows_the_speed_of_its_shaft(tmp_path):
     found = settled(tmp_path, whole)
     speeds = [s.mean["output_speed"] for s in found.kept]
     assert speeds == pytest.approx([108.0, 216.0, 324.0], rel=0.01)
-    said = words.remarks(found)
+    said = words.settle_remarks(found)
     assert (
         "output_speed_rpm is the rate of output_angle_deg; add output_speed to channels in the rig's file" in said[0]
     )
     named = bench(tmp_path, columns | {"output_angle_deg": angle}, '"total_current", "output_speed", "output_angle"')
-    assert words.remarks(settled(tmp_path, named)) == []
+    assert words.settle_remarks(settled(tmp_path, named)) == []
 
 
 def test_the_command_leaves_a_table_that_is_read_as_settled_runs(tmp_path, mmrjax):
@@ -512,7 +512,7 @@ def test_the_command_leaves_a_table_that_is_read_as_settled_runs(tmp_path, mmrja
     code, out, err = mmrjax("settle", "log.csv", "--robot", "rig.toml", "--out", "found")
     assert code == 0, err
     assert f"{len(world.conditions)} settled runs, " in " ".join(out.split())
-    runs = records.read(tmp_path / "found" / "settled.csv", robot=robot)
+    runs = records.read_runs(tmp_path / "found" / "settled.csv", robot=robot)
     assert not runs.sampled and len(runs) == len(world.conditions)
     assert np.isfinite(runs.deviations()).all() and not runs.unknown
     with (tmp_path / "found" / "stretches.csv").open(encoding="utf-8") as file:
@@ -574,7 +574,9 @@ def turning(tmp_path):
         "yaw_rate_rad_s": (right - left) / 0.8 + 0.01 * noise[2],
     }
     write_table({n: [f"{x:.6g}" for x in column] for n, column in table.items()}, tmp_path / "log.csv")
-    return pairs, robot_file.read(Path(__file__).resolve().parents[1] / "docs" / "rigs" / "husky" / "husky.toml")
+    return pairs, robot_file.read_robot(
+        Path(__file__).resolve().parents[1] / "docs" / "rigs" / "husky" / "husky.toml"
+    )
 
 
 def test_levels_of_a_turn_are_those_of_both_sides_and_a_yaw_rate_has_its_own_sign(tmp_path):
@@ -585,7 +587,7 @@ def test_levels_of_a_turn_are_those_of_both_sides_and_a_yaw_rate_has_its_own_sig
     assert yaw == pytest.approx(np.diff(pairs, axis=1)[:, 0] / 0.8, abs=0.02)
     assert found.scatter["yaw_rate"] == 0  # the first and the last pair of equal speeds are one level, others are not
     write_table(found.table(), tmp_path / "settled.csv")
-    runs = records.read(tmp_path / "settled.csv", robot=robot)
+    runs = records.read_runs(tmp_path / "settled.csv", robot=robot)
     assert runs.of_sides[1] == pytest.approx(4555.3 * pairs[:, 1], rel=1e-4)
 
 
@@ -623,7 +625,7 @@ def test_gaps_and_a_clock_that_jitters_are_said_with_rows_and_remedy(tmp_path, c
     }[case]
     columns["time_s"] = columns["time_s"] + off - off[0]
     robot = bench(tmp_path, columns)
-    (found,) = rig_facts.doubts(records.read(tmp_path / "log.csv", robot=robot), robot) or ("",)
+    (found,) = rig_facts.log_doubts(records.read_runs(tmp_path / "log.csv", robot=robot), robot) or ("",)
     assert re.search(said, found) and bool(found) == bool(said)
 
 
@@ -639,7 +641,7 @@ def test_a_log_in_which_nothing_moves_is_refused_unless_a_shaft_is_locked(tmp_pa
         3 * np.random.default_rng(13).standard_normal(600) + (volts == 12) * columns["motor_speed_rpm"]
     )
     robot = bench(tmp_path, columns)
-    runs = records.read(tmp_path / "log.csv", robot=robot)
+    runs = records.read_runs(tmp_path / "log.csv", robot=robot)
     refused = pytest.raises(BadData, match=said) if said else contextlib.nullcontext()
     with refused:
         checks._check_motion(runs, noises.noise_from_table(runs, observers.observer_kind(runs).sizes(runs), noise))
@@ -654,7 +656,7 @@ def test_a_log_in_which_nothing_moves_is_refused_unless_a_shaft_is_locked(tmp_pa
 ])  # fmt: skip
 def test_a_log_of_one_level_is_said_with_what_it_lacks(tmp_path, levels, said):
     robot = bench(tmp_path, stairs(levels))
-    (found,) = rig_facts.doubts(records.read(tmp_path / "log.csv", robot=robot), robot) or ("",)
+    (found,) = rig_facts.log_doubts(records.read_runs(tmp_path / "log.csv", robot=robot), robot) or ("",)
     assert re.search(said, found) and bool(found) == bool(said)
 
 
@@ -674,7 +676,7 @@ def test_a_command_beyond_what_the_driver_gives_is_said_with_its_limit(tmp_path,
         "motor_speed_rpm": speed * 30 / np.pi + 3 * rng.standard_normal(1200),
     }
     robot = bench(tmp_path, columns, f'"{ammeter}", "motor_speed"')
-    found = rig_facts.saturated(records.read(tmp_path / "log.csv", robot=robot))
+    found = rig_facts.saturation_sentence(records.read_runs(tmp_path / "log.csv", robot=robot))
     if limit > 36:
         assert found == ""
         return

@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 
 from calibration.data import requirements_file, robot_file
-from calibration.data.parts import gearboxes, motors
+from calibration.data.parts import packaged_gearboxes, packaged_motors
 from calibration.sizing import chart, design_search, sheet
 from calibration.sizing.design import OBJECTIVES, build_robot, evaluate_design, sizing_task
 from calibration.sizing.part_options import BELT_STAGE, MOTOR, drive_options, options_for_robot
 from mmrjax.derived.requirements import QUANTITIES
 from mmrjax.model import params
-from sweeps.results.size_results import verdict
+from sweeps.results.size_results import design_verdict
 from tests.commands import command
 from tests.pages import Tables, drawn, outside
 
@@ -50,7 +50,7 @@ def text(request):
 
 @pytest.fixture(scope="module")
 def asked(text):
-    return requirements_file.read(text, "r.toml")
+    return requirements_file.parse_requirements(text, "r.toml")
 
 
 @pytest.fixture(scope="module")
@@ -97,11 +97,15 @@ def test_alternatives_meet_every_requirement(asked, found):
 def test_best_is_of_the_sheets(found):
     """A ratio that is made, with a gearbox that its source combines with the motor; whole cells."""
     for f in (found.best, *found.alternatives):
-        made = [g.ratio * BELT_STAGE for g in gearboxes() if (g.family, g.stages) == (f.drive.family, f.drive.stages)]
+        made = [
+            g.ratio * BELT_STAGE
+            for g in packaged_gearboxes()
+            if (g.family, g.stages) == (f.drive.family, f.drive.stages)
+        ]
         assert f.ratio == pytest.approx(min(made, key=lambda r: abs(r - f.ratio)), rel=1e-12)
         assert f.drive.family in f.drive.motor.gearboxes
         assert f.parallel == pytest.approx(round(f.parallel), abs=1e-9)
-    assert {m.name for m in motors() if m.gearboxes} == set(found.motors)
+    assert {m.name for m in packaged_motors() if m.gearboxes} == set(found.motors)
 
 
 @pytest.mark.slow
@@ -188,7 +192,7 @@ def test_command_leaves_what_its_schema_says(folder):
     assert len(front) > 1 and front == sorted(front) and all(a[1] > b[1] for a, b in itertools.pairwise(front))
     assert result["best"]["objectives"]["mass"] == pytest.approx(front[0][0])
     assert all(r["met"] for r in result["requirements"]) and result["starts"] == 256
-    sized = robot_file.load(str(folder / "robot.toml"))
+    sized = robot_file.load_robot(str(folder / "robot.toml"))
     assert float(sized.gearbox.ratio) == pytest.approx(result["best"]["ratio"])
     assert sized.battery.cells == result["best"]["cells"]
     assert (
@@ -221,7 +225,7 @@ def test_report_shows_designs_and_what_binds_where(folder):
 @pytest.mark.slow
 def test_chart_has_the_limits_of_the_robot(robot, asked):
     """On the bench's surface adhesion ends at 14.6°; the required speed counts within its envelope alone."""
-    of = chart.margin_chart(robot, requirements_file.read("speed_m_s = 0.1", "r.toml"), (8.0, 30.0))
+    of = chart.margin_chart(robot, requirements_file.parse_requirements("speed_m_s = 0.1", "r.toml"), (8.0, 30.0))
     steep = of.slope > 14.6
     assert np.all(of.margin[steep] < 0) and chart.LIMITS[of.nearest[-1, 0]] in ("adhesion", "gearbox input speed")
     assert of.margin.shape == (chart.POINTS, chart.POINTS) and np.isfinite(of.margin).all()
@@ -231,13 +235,15 @@ def test_chart_has_the_limits_of_the_robot(robot, asked):
 
 @pytest.mark.slow
 def test_what_no_parts_meet_is_left_out_and_said(robot):
-    asked = requirements_file.read(
+    asked = requirements_file.parse_requirements(
         "speed_m_s = 0.5\nslope_deg = 20\n[envelope]\nstate_of_charge = [0.1, 1]", "r.toml"
     )
     found = design_search.size_robot(robot, asked, ("mass",), starts=32, motors=(MOTOR,))
     assert found.unmeetable == ("steepest slope held",) and found.best is not None
-    assert [verdict(f, found.unmeetable) for f in (found.best, *found.motors.values())] == ["meets the others"] * 2
-    assert verdict(found.best, ()) == "meets"
+    assert [design_verdict(f, found.unmeetable) for f in (found.best, *found.motors.values())] == [
+        "meets the others"
+    ] * 2
+    assert design_verdict(found.best, ()) == "meets"
     assert set(found.motors) == {MOTOR} and len(drive_options((MOTOR,))) == 3
 
 
@@ -245,7 +251,7 @@ def test_what_no_parts_meet_is_left_out_and_said(robot):
 def test_step_that_is_asked_for_decides_the_design(robot):
     """Smaller pulleys stand on higher steps: 290 mm without payload takes 3/4 of the robot's, with which it does 270."""
     text = "speed_m_s = 0.5\nstep_mm = { least = 290, payload_kg = 0 }\n[envelope]\nstate_of_charge = [0.1, 1]"
-    asked = requirements_file.read(text, "r.toml")
+    asked = requirements_file.parse_requirements(text, "r.toml")
     best = design_search.size_robot(robot, asked, ("mass",), starts=32, motors=(MOTOR,)).best
     meets(best, asked)
     assert 0.6 <= best.radius / float(robot.radius_pulley) < 0.75
@@ -257,7 +263,9 @@ def test_ratings_of_parts_are_asked_somewhere_whatever_else_is(robot, name):
     """Of a robot that only has to turn, climb or be light too."""
     limit = {"endurance_min": '{ least = 9, duty = "driving" }', "stairs_rise_mm": "{ least = 9, tread_mm = 290 }"}
     of = sizing_task(
-        robot, requirements_file.read(f"{name} = {limit.get(name, 9)}", "r.toml"), options_for_robot(robot)
+        robot,
+        requirements_file.parse_requirements(f"{name} = {limit.get(name, 9)}", "r.toml"),
+        options_for_robot(robot),
     )
     assert all(d.rows for d in of.demands) and {d.requirement is None for d in of.demands} == {True, False}
 

@@ -18,7 +18,7 @@ from calibration.data import contents, delimited, profiles, robot_file, terrains
 from calibration.data import runs as records
 from calibration.data.input_errors import BadData
 from calibration.data.sources import one_clock, opening
-from calibration.data.sources.recorded_signals import Clock, Signal, one
+from calibration.data.sources.recorded_signals import Clock, Signal, find_signal
 from sweeps.commands import inspect as command
 
 RIG = """
@@ -64,11 +64,11 @@ FORMS = {
 def robot(tmp_path_factory):
     path = tmp_path_factory.mktemp("rig") / "rig.toml"
     path.write_text(RIG, encoding="utf-8")
-    return robot_file.read(path)
+    return robot_file.read_robot(path)
 
 
 def opened(path, within=""):
-    return opening.opened(path, within, path.name, opening.format_of(path, path.name))
+    return opening.open_signals(path, within, path.name, opening.format_of(path, path.name))
 
 
 def same(runs, table):
@@ -80,7 +80,7 @@ def same(runs, table):
 def test_a_table_is_read_equal_to_its_arrays(tmp_path, robot, file):
     table = samples.table()
     TABLES[file](tmp_path / file, table)
-    same(records.read(tmp_path / file, robot, columns=COLUMNS), table)
+    same(records.read_runs(tmp_path / file, robot, columns=COLUMNS), table)
 
 
 @pytest.mark.parametrize("orient", ["records", "columns", "split", "list", "lines"])
@@ -90,7 +90,7 @@ def test_json_of_every_form_is_read_equal_to_its_arrays(tmp_path, robot, orient)
     stated = {"orient": "records", "lines": True} if orient == "lines" else {"orient": orient}
     text = text or frame.to_json(double_precision=15, **stated)
     (tmp_path / "log.json").write_text(text)
-    runs = records.read(tmp_path / "log.json", robot, columns=COLUMNS)
+    runs = records.read_runs(tmp_path / "log.json", robot, columns=COLUMNS)
     for column, name in COLUMNS.items():
         np.testing.assert_allclose(runs[column], table[name], rtol=1e-13, atol=1e-15)
 
@@ -98,7 +98,7 @@ def test_json_of_every_form_is_read_equal_to_its_arrays(tmp_path, robot, orient)
 @pytest.mark.parametrize("form", FORMS)
 def test_a_table_in_memory_is_read_equal_to_its_arrays(robot, form):
     table = samples.table()
-    same(records.read(FORMS[form](table), robot, columns=COLUMNS), table)
+    same(records.read_runs(FORMS[form](table), robot, columns=COLUMNS), table)
 
 
 @pytest.mark.parametrize("file", LOGS)
@@ -112,13 +112,13 @@ def test_a_log_of_two_rates_is_read_equal_to_its_arrays(tmp_path, robot, file):
         (amps, fast["amps"], fast["t"]),
         (rpm, slow["rpm"], slow["t"]),
     ):
-        signal = one(signals, path, file)
+        signal = find_signal(signals, path, file)
         np.testing.assert_allclose(signal.load(), values, rtol=0, atol=off)
-        elapsed = one_clock.seconds(signal.clock).time
+        elapsed = one_clock.clock_seconds(signal.clock).time
         np.testing.assert_allclose(elapsed, time - time[0], rtol=0, atol=1e-9)
     speed = "motor_speed_rad_s" if "velocity" in rpm else "motor_speed_rpm"
     one_rpm = 30 / np.pi if "velocity" in rpm else 1.0
-    runs = records.read(
+    runs = records.read_runs(
         tmp_path / file, robot, columns={"supply_voltage_V": volts, "total_current_A": amps, speed: rpm}
     )
     read = np.isfinite(runs["motor_speed_rpm"])
@@ -181,7 +181,7 @@ def test_a_clock_of_its_own_may_wrap_and_start_at_boot(tmp_path, robot):
     fast, slow = samples.fast(), samples.slow()
     ticks = np.round((fast["t"] + 4294.0) * 1e6).astype(np.int64) % 2**32
     samples.hdf5(tmp_path / "log.h5", {**fast, "t": ticks}, {**slow, "t": slow["t"] + 4294.0})
-    runs = records.read(tmp_path / "log.h5", robot, columns=COLUMNS)
+    runs = records.read_runs(tmp_path / "log.h5", robot, columns=COLUMNS)
     np.testing.assert_allclose(runs["time_s"], fast["t"], rtol=0, atol=1e-6)
     assert any("/drive/t wraps at 4294967296" in note for note in runs.notes)
     assert any("/drive/t states no unit; its numbers are read as us (100 Hz)" in note for note in runs.notes)
@@ -198,7 +198,7 @@ def test_a_missing_topic_is_named_with_the_nearest(tmp_path, robot):
         "total_current_A": "/drive/amps.data",
         "motor_speed_rpm": "/joint_state.velocity[2]",
     }
-    runs = records.read(tmp_path / "bag", robot, columns=columns)
+    runs = records.read_runs(tmp_path / "bag", robot, columns=columns)
     assert any(
         "no signal /joint_state.velocity[2], which motor_speed_rpm is read from; did you mean /joint_states.velocity[2]"
         in note
@@ -210,44 +210,44 @@ def test_a_unit_that_a_source_states_is_not_read_as_another(tmp_path, robot):
     samples.ros2(tmp_path / "bag", samples.fast(), samples.slow())
     columns = {"supply_voltage_V": "/volts.data", "motor_speed_rpm": "/joint_states.velocity[2]"}
     with pytest.raises(BadData, match=r"states rad_s in the source, and is read in rpm"):
-        records.read(tmp_path / "bag", robot, columns=columns)
+        records.read_runs(tmp_path / "bag", robot, columns=columns)
 
 
 def test_signals_are_named_by_the_end_of_their_path_and_by_their_place(tmp_path, robot):
     samples.hdf5(tmp_path / "log.h5", samples.fast(), samples.slow())
-    assert one(opened(tmp_path / "log.h5").signals, "volts", "log.h5").path == "/drive/volts"
+    assert find_signal(opened(tmp_path / "log.h5").signals, "volts", "log.h5").path == "/drive/volts"
     with pytest.raises(BadData, match=r"log.h5, t: got a name of 2 signals, /drive/t, /encoder/t"):
-        one(opened(tmp_path / "log.h5").signals, "t", "log.h5")
-    below = records.read(f"{tmp_path / 'log.h5'}::/drive", robot, columns=COLUMNS)
+        find_signal(opened(tmp_path / "log.h5").signals, "t", "log.h5")
+    below = records.read_runs(f"{tmp_path / 'log.h5'}::/drive", robot, columns=COLUMNS)
     assert len(below) == 200 and not below.has("motor_speed_rpm")
 
 
 def test_profiles_and_terrains_are_read_from_tables_of_every_format(tmp_path):
     pd.DataFrame({"time_s": [0.0, 2.0], "duty": [0.5, 0.0]}).to_parquet(tmp_path / "profile.parquet")
     np.savez(tmp_path / "ground.npz", x_m=[0.0, 1.0, 2.0], z_m=[0.0, 0.1, 0.1])
-    assert profiles.read(tmp_path / "profile.parquet").duration == 2.0
+    assert profiles.read_profile(tmp_path / "profile.parquet").duration == 2.0
     assert terrains.read_terrain(tmp_path / "ground.npz") is not None
 
 
 def test_a_long_csv_file_is_read_as_a_short_one(tmp_path, monkeypatch):
     text = "run_id,time_s,a,b,c\n1,0.5, 7,1e-3,x\n2,-3.25,,2,\n1,1e5,nan,3,z\n"
     (tmp_path / "log.csv").write_text(text)
-    short = delimited.arrays(tmp_path / "log.csv", "log.csv")
+    short = delimited.read_csv_columns(tmp_path / "log.csv", "log.csv")
     monkeypatch.setattr(delimited, "LONG", 0)
-    long = delimited.arrays(tmp_path / "log.csv", "log.csv")
+    long = delimited.read_csv_columns(tmp_path / "log.csv", "log.csv")
     assert isinstance(long.values[1], np.ndarray) and long.header == short.header and long.digest == short.digest
     for mine, theirs in zip(long.values, short.values, strict=True):
         np.testing.assert_array_equal(delimited_numbers(mine), delimited_numbers(theirs))
     assert list(long.values[4]) == short.values[4]
     (tmp_path / "log.csv").write_text(text + "1,2\n")
     with pytest.raises(BadData, match="row 4: got 2 cells; the header has 5 columns"):
-        delimited.arrays(tmp_path / "log.csv", "log.csv")
+        delimited.read_csv_columns(tmp_path / "log.csv", "log.csv")
 
 
 def delimited_numbers(raw):
-    from calibration.data.named_arrays import numbers
+    from calibration.data.named_arrays import column_numbers
 
-    return numbers(raw)
+    return column_numbers(raw)
 
 
 # --- bad input --------------------------------------------------------------------------------------
@@ -262,7 +262,7 @@ def test_a_cut_table_is_refused_in_one_sentence(tmp_path, robot, file):
     TABLES[file](tmp_path / file, samples.table())
     _cut(tmp_path / file)
     with pytest.raises(BadData, match=rf"^{file}.*cannot be read as .*; it may be cut off") as refusal:
-        records.read(tmp_path / file, robot, columns=COLUMNS)
+        records.read_runs(tmp_path / file, robot, columns=COLUMNS)
     assert "\n" not in str(refusal.value) and len(str(refusal.value)) < 450
 
 
@@ -276,7 +276,7 @@ def test_a_cut_log_is_refused_in_one_sentence(tmp_path, robot, file):
     _cut(tmp_path / file, 0.3 if file == "log.bag" else 0.61)
     before = set(os.listdir(tmp_path))
     with pytest.raises(BadData, match=rf"^{file}") as refusal:
-        records.read(
+        records.read_runs(
             tmp_path / file,
             robot,
             columns={"supply_voltage_V": volts, "total_current_A": amps, "motor_speed_rpm": rpm},
@@ -312,7 +312,7 @@ def test_an_array_that_cannot_be_is_refused_by_its_name(tmp_path, robot, case):
     write, says = BAD_ARCHIVES[case]
     write(tmp_path / "log.npz")
     with pytest.raises(BadData, match=says):
-        records.read(tmp_path / "log.npz", robot, columns=COLUMNS)
+        records.read_runs(tmp_path / "log.npz", robot, columns=COLUMNS)
 
 
 def test_values_that_a_library_cannot_read_are_refused_by_their_signal(tmp_path, robot):
@@ -321,7 +321,7 @@ def test_values_that_a_library_cannot_read_are_refused_by_their_signal(tmp_path,
     content[40:400] = bytes(360)  # within the first column's pages; the list of columns at the end is sound
     (tmp_path / "log.parquet").write_bytes(content)
     with pytest.raises(BadData, match=r"log.parquet, t: cannot be read as a Parquet file .* damaged"):
-        records.read(tmp_path / "log.parquet", robot, columns=COLUMNS)
+        records.read_runs(tmp_path / "log.parquet", robot, columns=COLUMNS)
 
 
 def test_a_link_to_another_file_is_not_followed(tmp_path, robot):
@@ -330,11 +330,11 @@ def test_a_link_to_another_file_is_not_followed(tmp_path, robot):
     with h5py.File(tmp_path / "log.h5", "w") as file:
         file["volts"] = h5py.ExternalLink("/etc/passwd", "/")
     with pytest.raises(BadData, match=r"volts: is a link to another file, /etc/passwd"):
-        records.read(tmp_path / "log.h5", robot)
+        records.read_runs(tmp_path / "log.h5", robot)
     samples.ros2(tmp_path / "bag", samples.fast(0.1), samples.slow(0.1))
     (tmp_path / "bag" / "more.db3").symlink_to("/etc/passwd")
     with pytest.raises(BadData, match=r"bag, more.db3: is a link that leads out of the bag"):
-        records.read(tmp_path / "bag", robot)
+        records.read_runs(tmp_path / "bag", robot)
 
 
 def test_a_topic_of_two_types_or_without_definition_is_refused_where_it_is_read(tmp_path, robot):
@@ -358,13 +358,13 @@ def test_a_topic_of_two_types_or_without_definition_is_refused_where_it_is_read(
     assert "messages of type mine/msg/Own, which the bag does not define; record it as MCAP" in kinds["/own"]
     assert "types std_msgs/msg/Float32 and std_msgs/msg/Float64; expected one type" in kinds["/volts"]
     with pytest.raises(BadData, match=r"bag, /volts: has messages of types"):
-        records.read(tmp_path / "bag", robot, columns={"supply_voltage_V": "/volts"})
+        records.read_runs(tmp_path / "bag", robot, columns={"supply_voltage_V": "/volts"})
 
 
 def test_an_array_that_changes_its_length_is_refused_with_its_message(tmp_path):
     fast, slow = samples.fast(0.2), samples.slow(0.2)
     samples.ros2(tmp_path / "bag", fast, slow, lose=True)
-    signal = one(opened(tmp_path / "bag").signals, "/joint_states.velocity[0]", "bag")
+    signal = find_signal(opened(tmp_path / "bag").signals, "/joint_states.velocity[0]", "bag")
     with pytest.raises(BadData, match=r"/joint_states.*: message \d has fewer elements than the first"):
         signal.load()
 
@@ -375,22 +375,22 @@ def test_a_library_that_is_missing_is_named_with_the_extra(tmp_path, robot, monk
     with pytest.raises(
         BadData, match=r"h5py reads, and it is not installed; install it with pip install mmrjax\[logs\]"
     ):
-        records.read(tmp_path / "log.h5", robot)
+        records.read_runs(tmp_path / "log.h5", robot)
 
 
 def test_a_recording_larger_than_memory_is_refused_before_it_is_read(tmp_path, robot, monkeypatch):
     samples.parquet(tmp_path / "log.parquet", samples.table())
-    monkeypatch.setattr(opening, "available", lambda: 1e4)
+    monkeypatch.setattr(opening, "available_memory", lambda: 1e4)
     with pytest.raises(BadData, match="GB of memory are free"):
-        records.read(tmp_path / "log.parquet", robot, columns=COLUMNS)
-    monkeypatch.setattr(opening, "available", lambda: 1e3)
-    assert "more values than the free memory" in contents.inspect(tmp_path / "log.parquet").signals[0].refused
+        records.read_runs(tmp_path / "log.parquet", robot, columns=COLUMNS)
+    monkeypatch.setattr(opening, "available_memory", lambda: 1e3)
+    assert "more values than the free memory" in contents.inspect_source(tmp_path / "log.parquet").signals[0].refused
 
 
 @pytest.mark.parametrize("source", [3, None, [1, 2], {}, pd.Series([1.0]), pd.DataFrame()])
 def test_what_is_no_table_in_memory_is_refused(robot, source):
     with pytest.raises(BadData):
-        records.read(source, robot)
+        records.read_runs(source, robot)
 
 
 # --- contents ---------------------------------------------------------------------------------------
@@ -398,7 +398,7 @@ def test_what_is_no_table_in_memory_is_refused(robot, source):
 
 def test_contents_lists_signals_and_proposes_columns(tmp_path):
     samples.hdf5(tmp_path / "log.h5", samples.fast(), samples.slow())
-    found = contents.inspect(tmp_path / "log.h5")
+    found = contents.inspect_source(tmp_path / "log.h5")
     speed = next(s for s in found.signals if s.path == "/encoder/rpm")
     assert speed.unit == "rpm" and speed.samples == 80 and round(speed.rate) == samples.SLOW and speed.gaps == 0
     assert speed.least == samples.slow()["rpm"].min() and "2 clocks" in found.notes[0]
@@ -408,34 +408,34 @@ def test_contents_lists_signals_and_proposes_columns(tmp_path):
 
 def test_inspect_prints_what_contents_finds(tmp_path, capsys):
     samples.hdf5(tmp_path / "log.h5", samples.fast(), samples.slow())
-    assert command.inspect(f"{tmp_path / 'log.h5'}::/encoder", True) == 0
+    assert command.inspect_file(f"{tmp_path / 'log.h5'}::/encoder", True) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["schema"] == "mmrjax.inspect/1" and [s["path"] for s in found["signals"]] == [
         "/encoder/rpm",
         "/encoder/t",
     ]
-    assert command.inspect(str(tmp_path / "log.h5"), False) == 0
+    assert command.inspect_file(str(tmp_path / "log.h5"), False) == 0
     said = capsys.readouterr().out
     assert 'motor_speed_rpm = "/encoder/rpm"' in said and "log.h5: an HDF5 file, 5 signals" in said
 
 
 def test_contents_of_an_empty_file_are_an_error_and_empty_cells_are_missing(tmp_path):
     (tmp_path / "log.csv").write_text("t,amps\n0,\n1,\n")
-    assert [s.missing for s in contents.inspect(tmp_path / "log.csv").signals] == [0, 2]
+    assert [s.missing for s in contents.inspect_source(tmp_path / "log.csv").signals] == [0, 2]
     (tmp_path / "log.csv").write_text("")
     with pytest.raises(BadData, match="the file is empty"):
-        contents.inspect(tmp_path / "log.csv")
+        contents.inspect_source(tmp_path / "log.csv")
 
 
 def test_a_bags_folder_without_its_metadata_is_named(tmp_path):
     (tmp_path / "bag").mkdir()
     (tmp_path / "bag" / "bag_0.mcap").touch()
     with pytest.raises(BadData, match=r"without metadata\.yaml; .* as .*bag_0\.mcap"):
-        contents.inspect(tmp_path / "bag")
+        contents.inspect_source(tmp_path / "bag")
 
 
 def test_contents_of_a_presets_log_name_the_preset(tmp_path):
     pd.DataFrame({"ms_today": [1, 2, 3], "input_voltage": 24.0, "duty_cycle": 0.5, "erpm": 100.0}).to_csv(
         tmp_path / "log.csv", index=False
     )
-    assert contents.inspect(tmp_path / "log.csv").preset == "vesc"
+    assert contents.inspect_source(tmp_path / "log.csv").preset == "vesc"

@@ -40,8 +40,8 @@ class Mine(Effect):
 
 
 def again(tmp_path, value):
-    stage_files.write(tmp_path / "x.stage", value)
-    return stage_files.read(tmp_path / "x.stage")
+    stage_files.write_stage(tmp_path / "x.stage", value)
+    return stage_files.read_stage(tmp_path / "x.stage")
 
 
 def test_values_are_read_as_they_were_written(tmp_path):
@@ -78,27 +78,29 @@ def test_our_own_classes_come_back_by_name(tmp_path):
     robot = paper_robots.nominal()
     strong = scaled_effect(effects.BY_NAME["iron_loss"], (2.0, 1.0, 3.0))
     robot = dataclasses.replace(robot, effects=(strong(), next(iter(curve.CURVES.values()))()))
-    now = again(tmp_path, (robot, Noise, channels.find_channel("speed"), setups.blocked, records.read("measured")))
+    now = again(
+        tmp_path, (robot, Noise, channels.find_channel("speed"), setups.blocked, records.read_runs("measured"))
+    )
     assert jax.tree.structure(now[0]) == jax.tree.structure(robot)
     assert all(map(np.array_equal, jax.tree.leaves(now[0]), jax.tree.leaves(robot)))
     assert type(now[0].effects[0]) is strong
     assert now[1] is Noise and now[2] is channels.find_channel("speed") and now[3] is setups.blocked
-    assert list(now[4].columns) == list(records.read("measured").columns)
+    assert list(now[4].columns) == list(records.read_runs("measured").columns)
 
 
 def test_an_effect_of_the_users_own_comes_back_only_once_it_is_loaded(tmp_path, monkeypatch):
     (tmp_path / "own.py").write_text(OWN)
-    (mine,) = effect_file.read(tmp_path / "own.py")
+    (mine,) = effect_file.read_effect_file(tmp_path / "own.py")
     assert type(again(tmp_path, mine())) is mine
     monkeypatch.delitem(sys.modules, mine.__module__)
     with pytest.raises(stage_files.Unreadable, match="a class of mmrjax_user_effects_"):
-        stage_files.read(tmp_path / "x.stage")
+        stage_files.read_stage(tmp_path / "x.stage")
 
 
 @pytest.mark.parametrize("value", [lambda: 1, object(), os.system, np.datetime64("2026-01-01"), subprocess.Popen])
 def test_what_has_no_place_in_a_file_is_refused(tmp_path, value):
     with pytest.raises((stage_files.Unwritable, stage_files.Unreadable)):
-        stage_files.write(tmp_path / "x", value)
+        stage_files.write_stage(tmp_path / "x", value)
 
 
 class Harm:
@@ -178,7 +180,7 @@ def test_effects_are_those_of_the_file_that_is_read_and_not_of_bytes_beside_it(t
     before = os.getcwd()
     os.chdir(tmp_path)
     try:
-        (mine,) = effect_file.read(file)
+        (mine,) = effect_file.read_effect_file(file)
     finally:
         os.chdir(before)
     assert mine.name == "mine" and not (tmp_path / "harmed").exists()

@@ -57,7 +57,7 @@ def test_names_taken_from_the_project_exist():
 
 
 def test_a_name_that_is_gone_is_seen():
-    text = "import loop\nfrom calibration.data import runs, no_such_room\nfrom mmrjax.model import paper_robots as r\nloop.one(1)\nr.gone, runs.read, r.nominal\n"
+    text = "import loop\nfrom calibration.data import runs, no_such_room\nfrom mmrjax.model import paper_robots as r\nloop.one(1)\nr.gone, runs.read_runs, r.nominal\n"
     assert [x for _, x in stale(ast.parse(text))] == [
         "calibration.data.no_such_room",
         "loop.one",

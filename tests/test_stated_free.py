@@ -35,7 +35,7 @@ loss_coulomb = 0.1
 
 def bench(tmp_path, change=lambda text: text):
     (tmp_path / "rig.toml").write_text(change(RIG), encoding="utf-8")
-    return robot_file.read(tmp_path / "rig.toml")
+    return robot_file.read_robot(tmp_path / "rig.toml")
 
 
 def test_everything_stated_with_a_width_is_freed_that_the_data_show(tmp_path):
@@ -61,8 +61,8 @@ def test_everything_stated_with_a_width_is_freed_that_the_data_show(tmp_path):
 def test_a_calibration_frees_what_its_rig_states(tmp_path, monkeypatch):
     world = rigs.world(np.random.default_rng(4), "bench", "voltage", rows=(16, 24))
     rigs.case(world).write(tmp_path)
-    robot = robot_file.read(tmp_path / "rig.toml")
-    runs = records.read(tmp_path / "table.csv", robot=robot)
+    robot = robot_file.read_robot(tmp_path / "rig.toml")
+    runs = records.read_runs(tmp_path / "table.csv", robot=robot)
     asked = []
 
     def chosen(robot, names, *others, **further):
@@ -85,7 +85,7 @@ def test_a_prior_is_shown_as_it_is_stated(tmp_path):
     (tmp_path / "runs.csv").write_text(
         "supply_voltage_V,total_current_A,motor_speed_rpm\n12,2.0,1600\n24,2.1,3900\n", encoding="utf-8"
     )
-    seen = foresight.predict_identifiability(records.read(tmp_path / "runs.csv", robot=robot), robot)
+    seen = foresight.predict_identifiability(records.read_runs(tmp_path / "runs.csv", robot=robot), robot)
     assert {p.name: p.prior_sd for p in seen.parameters}[names[0]] == pytest.approx(0.002)
 
 

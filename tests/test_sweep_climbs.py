@@ -17,7 +17,7 @@ from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.paper_robots import nominal
 from sweeps.config_campaign import Campaign, Obstacle
-from sweeps.pages.campaign_figures import Varied, endings
+from sweeps.pages.campaign_figures import Varied, draw_grid_statuses
 from sweeps.points import axes, climbs
 
 ROBOT = nominal()
@@ -62,7 +62,7 @@ REFUSED = {
 def test_sweeps_that_cannot_be_climbed_are_refused_in_one_sentence(case):
     of, varied, message = REFUSED[case]
     with pytest.raises(BadConfiguration, match=message) as error:
-        axes.plan(Campaign(obstacle=Obstacle(**of), axes=varied), ROBOT, "map.toml")
+        axes.plan_design(Campaign(obstacle=Obstacle(**of), axes=varied), ROBOT, "map.toml")
     assert "\n" not in str(error.value)
 
 
@@ -79,7 +79,7 @@ def test_keys_of_another_obstacle_are_refused(key, value, kind, kinds):
 
 def test_size_is_an_obstacles_alone():
     with pytest.raises(BadConfiguration, match="obstacle_mm: neither a parameter of the robot nor a condition"):
-        axes.plan(Campaign(axes={"obstacle_mm": [50]}), ROBOT, "map.toml")
+        axes.plan_design(Campaign(axes={"obstacle_mm": [50]}), ROBOT, "map.toml")
 
 
 def test_each_point_has_its_own_robot_levers_and_obstacle(monkeypatch):
@@ -93,7 +93,7 @@ def test_each_point_has_its_own_robot_levers_and_obstacle(monkeypatch):
     variation = Variation(ROBOT, ("levers_front_deg", "motor.resistance"))
     conditions = Conditions(np.zeros(2, int), voltage=np.full(2, 24.0)).resolved(ROBOT)
     with pytest.raises(StopIteration):
-        climbs.computed(
+        climbs.compute_climbs(
             Obstacle(kind="stairs", tread_mm=300, count=2, levers_voltage_V=8.0), variation, conditions,
             np.array([[30.0, 0.6], [50.0, 1.5]]), np.array([60.0, 90.0]), lambda share: None,
         )  # fmt: skip
@@ -112,7 +112,7 @@ def test_points_of_which_the_robot_varies_are_single_climbs():
     variation = Variation(ROBOT, ("levers_front_deg", "motor.resistance", "payload"))
     values = np.array([[30.0, 0.6, 0.0], [50.0, 1.5, 4.0], [50.0, 0.6, 0.0]])
     conditions = Conditions(np.zeros(3, int), voltage=np.full(3, 24.0)).resolved(ROBOT)
-    found = climbs.computed(of, variation, conditions, values, np.array([60.0, 90.0, 90.0]), lambda share: None)
+    found = climbs.compute_climbs(of, variation, conditions, values, np.array([60.0, 90.0, 90.0]), lambda share: None)
     robot = params.replace(ROBOT, {"motor.resistance": 1.5})
     one = climb_batch(
         robot, Conditions(np.zeros(1, int), voltage=24.0, payload=4.0).resolved(robot),
@@ -130,7 +130,9 @@ def test_points_of_which_the_robot_varies_are_single_climbs():
 def test_map_of_verdicts_has_each_point_in_its_colour():
     angles, sizes = np.meshgrid([0.0, 30.0, 60.0], [50.0, 100.0], indexing="ij")
     codes = np.array([OVER, SLIDES, OVER, TIPS, OVER, OVER])
-    figure = endings(codes, NAMES, Varied(angles.ravel(), "angle [deg]"), Varied(sizes.ravel(), "obstacle_mm [mm]"))
+    figure = draw_grid_statuses(
+        codes, NAMES, Varied(angles.ravel(), "angle [deg]"), Varied(sizes.ravel(), "obstacle_mm [mm]")
+    )
     (axes,) = figure.axes
     shown = axes.collections[0].get_array().reshape(2, 3)
     assert shown.tolist() == [[OVER, OVER, OVER], [SLIDES, TIPS, OVER]]
@@ -157,10 +159,10 @@ def test_interrupted_map_goes_on_after_its_last_chunk(mmrjax, tmp_path, monkeypa
         if next(ends):
             raise KeyboardInterrupt
         climbed.append(np.asarray(values)[:, 0].tolist())
-        found = {name: np.asarray(values)[:, 0] + sizes for name in climbs.attributes(of)}
+        found = {name: np.asarray(values)[:, 0] + sizes for name in climbs.climb_attributes(of)}
         return {**found, climbs.VERDICT: np.zeros(2, np.uint8), STATUS: np.zeros(2, np.uint8)}
 
-    monkeypatch.setattr(climbs, "computed", closed)
+    monkeypatch.setattr(climbs, "compute_climbs", closed)
     (tmp_path / "map.toml").write_text(MAP)
     assert mmrjax("sweep", "map.toml", "--out", "map")[0] == 130
     assert climbed == [[0.0, 0.0]] and (tmp_path / "map.partial").is_dir()
@@ -178,11 +180,11 @@ def test_page_says_the_largest_obstacle_and_where_it_is_got_over(mmrjax, tmp_pat
     def closed(of, variation, conditions, values, sizes, told):
         most = np.array([70, 250, 40])[(np.asarray(values)[:, 0] / 30).astype(int)]
         own = {climbs.LARGEST: most * 1.0} if of.find else {climbs.VERDICT: np.where(sizes <= most, OVER, TIPS)}
-        found = {name: np.full(len(most), 1.0) for name in climbs.attributes(of)} | own
+        found = {name: np.full(len(most), 1.0) for name in climbs.climb_attributes(of)} | own
         found[climbs.VERDICT] = found[climbs.VERDICT].astype(np.uint8)
         return {**found, STATUS: np.zeros(len(most), np.uint8)}
 
-    monkeypatch.setattr(climbs, "computed", closed)
+    monkeypatch.setattr(climbs, "compute_climbs", closed)
     text = MAP.replace("report = false", "")
     (tmp_path / "map.toml").write_text(text)
     (tmp_path / "find.toml").write_text(

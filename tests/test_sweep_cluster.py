@@ -21,7 +21,7 @@ from calibration.data.input_errors import BadConfiguration
 from mmrjax.model import paper_robots
 from sweeps.config_campaign import Campaign
 from sweeps.points import axes, cluster, identity, scale
-from sweeps.points.job import prepare
+from sweeps.points.job import prepare_job
 
 pytest.importorskip("distributed")
 
@@ -133,7 +133,7 @@ def test_scheduler_that_does_not_answer_is_refused_in_ten_seconds(tmp_path):
 def test_scheduler_without_dask_says_what_to_install(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
     with pytest.raises(BadConfiguration, match=r"--scheduler: needs dask; install mmrjax\[cluster\]"):
-        cluster.connect("tcp://127.0.0.1:1")
+        cluster.connect_workers("tcp://127.0.0.1:1")
 
 
 def test_scheduler_without_workers_is_refused(tmp_path, monkeypatch):
@@ -155,7 +155,7 @@ def test_worker_with_another_program_is_refused(two_workers, monkeypatch):
     with pytest.raises(BadConfiguration, match=r"has another program; it differs in code \(mmrjax/motor\.py\)"):
         connect_when_up(two_workers.address)
     monkeypatch.undo()
-    pool = cluster.connect(two_workers.address)
+    pool = cluster.connect_workers(two_workers.address)
     assert pool.device.startswith("cpu")
     pool.close()
 
@@ -164,7 +164,7 @@ def connect_when_up(address):
     """The scheduler of a test takes a moment to start."""
     for _ in range(20):
         try:
-            pool = cluster.connect(address)
+            pool = cluster.connect_workers(address)
         except BadConfiguration as error:
             if "no scheduler answers" not in str(error):
                 raise
@@ -191,7 +191,7 @@ def job():
     """Ten chunks of one point each."""
     config = Campaign(axes={"voltage": [*range(15, 25)]}, chunk=1, outputs=("speed",))
     robot = paper_robots.nominal()
-    return prepare(config, robot, axes.plan(config, robot, "x"), "x")
+    return prepare_job(config, robot, axes.plan_design(config, robot, "x"), "x")
 
 
 @pytest.mark.slow
@@ -201,7 +201,7 @@ def job():
 )
 def test_workers_or_scheduler_lost_for_good_end_the_sweep(two_workers, job, monkeypatch, victim, message):
     monkeypatch.setattr(cluster, "WORKER", 1.0)
-    pool = cluster.connect(two_workers.address)
+    pool = cluster.connect_workers(two_workers.address)
     try:
         pieces = pool.produce(job, range(10))
         next(pieces)
@@ -219,9 +219,9 @@ def test_chunk_that_kills_its_workers_ends_the_sweep(tmp_path, job, monkeypatch)
     (tmp_path / "cluster").mkdir()
     restarting = Cluster(tmp_path / "cluster", 1, "--nanny")
     deadly = eval("lambda *_: __import__('os')._exit(1)", {})  # of no module, so that it travels whole
-    monkeypatch.setattr(cluster, "compute", deadly)
+    monkeypatch.setattr(cluster, "compute_on_worker", deadly)
     monkeypatch.setattr(cluster, "RETRIES", 0)
-    pool = cluster.connect(restarting.address)
+    pool = cluster.connect_workers(restarting.address)
     try:
         with pytest.raises(cluster.LostWorkers, match=r"chunk 3 lost its worker 1 times, perhaps short of memory"):
             list(pool.produce(job, [3]))
@@ -255,7 +255,7 @@ def test_chunks_that_workers_compute_are_those_of_this_process(job, monkeypatch)
     monkeypatch.setattr(cluster.Pool, "_workers", lambda _: 1)
     monkeypatch.setattr(cluster.Pool, "_next", lambda _, under_way: under_way.pop(0))
     compiled, found = scale.Compiled(job), {}
-    for piece in cluster.Pool(Client(), cluster.introduce()[1]).produce(job, range(3)):
+    for piece in cluster.Pool(Client(), cluster.introduce_worker()[1]).produce(job, range(3)):
         found[piece.chunk] = piece.arrays
     assert set(found) == {0, 1, 2}
     for chunk, arrays_there in found.items():
@@ -294,9 +294,9 @@ def test_workers_that_come_later_get_chunks(job, monkeypatch):
 
 
 def test_worker_that_comes_later_and_differs_is_refused():
-    expected = {**cluster.program(), "device": {"device": "gpu: another"}}
+    expected = {**cluster.program_identity(), "device": {"device": "gpu: another"}}
     with pytest.raises(BadConfiguration, match=r"a worker that came later has another program or device: device \("):
-        cluster.compute(b"", "x", 0, expected)
+        cluster.compute_on_worker(b"", "x", 0, expected)
 
 
 def test_workers_of_several_kinds_are_refused(monkeypatch):
@@ -307,7 +307,10 @@ def test_workers_of_several_kinds_are_refused(monkeypatch):
             pass
 
         def run(self, _):
-            return {"tcp://a": (cluster.program(), "cpu: cpu"), "tcp://b": (cluster.program(), "gpu: H200")}
+            return {
+                "tcp://a": (cluster.program_identity(), "cpu: cpu"),
+                "tcp://b": (cluster.program_identity(), "gpu: H200"),
+            }
 
         def close(self):
             self.closed = True
@@ -317,7 +320,7 @@ def test_workers_of_several_kinds_are_refused(monkeypatch):
     with pytest.raises(
         BadConfiguration, match=r"workers have different devices, cpu: cpu, gpu: H200; expected one kind"
     ):
-        cluster.connect("tcp://x:1")
+        cluster.connect_workers("tcp://x:1")
     assert client.closed
 
 

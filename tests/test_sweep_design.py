@@ -29,7 +29,7 @@ def nominal():
 
 
 def planned(robot, **tables):
-    return axes.plan(Campaign(**tables), robot, "plan.toml")
+    return axes.plan_design(Campaign(**tables), robot, "plan.toml")
 
 
 def sampled(robot, kind="latin_hypercube", number=1000, seed=5, **over):
@@ -60,17 +60,17 @@ def test_seed_is_another_design_and_the_same_again(kind, nominal):
 
 @pytest.mark.parametrize("number", [1, 2, 3, 10, 97, 1024, 5041])
 def test_permutation_has_each_number_once(number):
-    found = design.permutation(17, number, np.arange(number, dtype=np.uint64))
+    found = design.keyed_permutation(17, number, np.arange(number, dtype=np.uint64))
     assert sorted(found.tolist()) == list(range(number))
 
 
 def test_permutation_of_many_points_is_spread_and_not_the_identity():
     number = 10**12
     points = np.arange(0, 10_000, dtype=np.uint64)
-    found = design.permutation(17, number, points).astype(float) / number
+    found = design.keyed_permutation(17, number, points).astype(float) / number
     assert stats.kstest(found, "uniform").pvalue > 1e-4
     assert abs(np.corrcoef(found[:-1], found[1:])[0, 1]) < 0.05
-    assert not np.array_equal(found, design.permutation(18, number, points) / number)
+    assert not np.array_equal(found, design.keyed_permutation(18, number, points) / number)
 
 
 def test_latin_hypercube_has_one_point_in_each_slice():

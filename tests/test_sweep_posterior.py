@@ -23,13 +23,13 @@ def folder(tmp_path):
         coordinates=NAMES, units=("Ω", "N·m"), mean=none, covariance=np.array([[1.0, 0.8], [0.8, 1.0]]), location=centre,
         spread=0.05 * centre, low=0.1 * centre, high=10 * centre, softness=none, kinds=(posteriors.NORMAL,) * 2,
     )  # fmt: skip
-    posteriors.write(found, tmp_path / posteriors.FILE)
+    posteriors.write_posterior(found, tmp_path / posteriors.FILE)
     return tmp_path
 
 
 def plan(folder, robot=None, **samples):
     stated = {"design": "sobol", "number": 8192, "seed": 2, "posterior": str(folder), **samples}
-    return axes.plan(Campaign(samples=stated), paper_robots.nominal() if robot is None else robot, "plan.toml")
+    return axes.plan_design(Campaign(samples=stated), paper_robots.nominal() if robot is None else robot, "plan.toml")
 
 
 def test_posterior_is_sampled_with_its_correlation_whatever_the_chunk(folder):

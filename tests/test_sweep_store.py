@@ -28,7 +28,7 @@ from sweeps import cli
 from sweeps.commands import sweep as command
 from sweeps.config_campaign import Campaign
 from sweeps.points import axes, identity, scale, zarr_store
-from sweeps.points.job import laid_out, prepare
+from sweeps.points.job import laid_out, prepare_job
 from sweeps.store import LOCK, MANIFEST, RunFolder
 
 CONFIG = """report = false
@@ -462,11 +462,11 @@ def test_sweep_of_other_data_code_or_versions_is_refused_saying_which(begun, mon
     code, _, err = begun()
     assert code == 2 and "differs in code (mmrjax/model/motor.py);" in err
     monkeypatch.setattr(identity, "_code", lambda: honest)
-    real = identity.versions
-    monkeypatch.setattr(identity, "versions", lambda packages: {**real(packages), "jax": "0.9.9"})
+    real = identity.installed_versions
+    monkeypatch.setattr(identity, "installed_versions", lambda packages: {**real(packages), "jax": "0.9.9"})
     code, _, err = begun()
     assert code == 2 and "differs in versions (jax was " in err and ", is 0.9.9);" in err
-    monkeypatch.setattr(identity, "versions", real)
+    monkeypatch.setattr(identity, "installed_versions", real)
     monkeypatch.setattr(scale, "device_kind", lambda: "cpu: another")
     code, _, err = begun()
     assert code == 2 and "differs in device (device was 'cpu: cpu'" not in err and "differs in device" in err
@@ -483,9 +483,9 @@ def test_force_begins_anew(begun, tmp_path):
 def test_identity_differences_are_few_words():
     old = {"configuration": {"a": "1", "b": "2", "c": "3", "d": "4"}, "code": {"x.py": "0"}}
     new = {"configuration": {"a": "2", "b": "3", "c": "4", "e": "5"}, "code": {"x.py": "1"}}
-    said = identity.differences(old, new)
+    said = identity.identity_differences(old, new)
     assert said == "configuration (a was 1, is 2, b was 2, is 3, c was 3, is 4 and 2 more); code (x.py)"
-    assert identity.differences(old, old) == ""
+    assert identity.identity_differences(old, old) == ""
 
 
 @pytest.mark.nightly
@@ -530,7 +530,7 @@ def test_interrupt_is_not_replaced_where_the_writer_empties_the_queue(monkeypatc
 
     monkeypatch.setattr(scale.queue, "Queue", Raced)
     with pytest.raises(KeyboardInterrupt):
-        scale.run(print, None, interrupted(), print, scale.Times())
+        scale.write_chunks(print, None, interrupted(), print, scale.Times())
 
 
 # --- shares -------------------------------------------------------------------------------------------------------
@@ -572,7 +572,7 @@ def test_rest_of_lost_shares_is_done_by_the_command_without(sweep, whole):
 
 def test_shares_hold_every_chunk_once():
     for chunks, n in ((12, 5), (3, 8), (7, 7), (1000, 3)):
-        held = [c for k in range(1, n + 1) for c in command.share((k, n), chunks)]
+        held = [c for k in range(1, n + 1) for c in command.chunks_of_shard((k, n), chunks)]
         assert held == list(range(chunks))
 
 
@@ -592,7 +592,7 @@ def layout():
     """Three chunks of one point each."""
     config = Campaign(axes={"voltage": [15, 24, 33]}, chunk=1, outputs=("speed",))
     robot = paper_robots.nominal()
-    return laid_out(config, prepare(config, robot, axes.plan(config, robot, "x"), "x"))
+    return laid_out(config, prepare_job(config, robot, axes.plan_design(config, robot, "x"), "x"))
 
 
 @pytest.fixture
@@ -852,7 +852,7 @@ def test_chunk_is_split_along_the_points_among_all_devices(tmp_path):
         "from sweeps.points.sampled_design import Blocks\n"
         "from sweeps.points.tasks import of_fidelity\n"
         "robot = mmrjax.nominal()\n"
-        "plan = axes.plan(Campaign(axes={'voltage': [15, 20, 24, 28, 33]}), robot, 'x')\n"
+        "plan = axes.plan_design(Campaign(axes={'voltage': [15, 20, 24, 28, 33]}), robot, 'x')\n"
         "job = scale.Job(robot, of_fidelity('steady', {}, robot), plan, ('speed',), 'float64', Blocks.of((5,), 5))\n"
         "compiled = scale.Compiled(job)\n"
         "found = compiled(compiled.points(0))['speed']\n"
@@ -941,7 +941,7 @@ def test_somebody_elses_folder_is_left_alone(sweep, tmp_path):
 def test_layout_counts_its_bytes_without_writing(whole):
     config = Campaign(axes={"voltage": [15, 24, 33]}, chunk=2, outputs=("speed",))
     robot = paper_robots.nominal()
-    job = prepare(config, robot, axes.plan(config, robot, "x"), "x")
+    job = prepare_job(config, robot, axes.plan_design(config, robot, "x"), "x")
     layout = laid_out(config, job)
     assert layout.size == 2 * 2 * 9 + 3 * 8  # chunks are filled up
     assert dataclasses.replace(layout, variables=()).size == 3 * 8

@@ -69,8 +69,8 @@ def test_points_of_a_table_are_its_runs_each_with_every_draw(robot, runs, poster
 @pytest.mark.slow
 @pytest.mark.parametrize("chunk", [None, 3])
 def test_table_has_each_run_as_it_is_by_itself(robot, runs, chunk):
-    found = run.evaluate(robot, runs, chunked(chunk), None)
-    alone = run.ended(robot, run.Run(steady_batch(robot, runs.conditions(robot))))
+    found = run.evaluate_runs(robot, runs, chunked(chunk), None)
+    alone = run.ending_columns(robot, run.Run(steady_batch(robot, runs.conditions(robot))))
     same({name: found[name] for name in alone}, alone, rtol=1e-12)
     assert found["status"].tolist() == ["converged"] * 3 + ["slides"]
     assert found["total_mass_kg"][1] == float(robot.configurations.members[1].mass) + 3
@@ -78,9 +78,9 @@ def test_table_has_each_run_as_it_is_by_itself(robot, runs, chunk):
 
 @pytest.mark.slow
 def test_draws_have_the_intervals_of_robots_simulated_one_by_one(robot, runs, posterior):
-    found = uncertainty.intervals(robot, posterior, runs, chunked(None), DRAWS)
+    found = uncertainty.simulate_draws(robot, posterior, runs, chunked(None), DRAWS)
     each = [
-        run.evaluate(params.replace(robot, dict(zip(NAMES, theta, strict=True))), runs, chunked(None), None)
+        run.evaluate_runs(params.replace(robot, dict(zip(NAMES, theta, strict=True))), runs, chunked(None), None)
         for theta in posterior.draw(DRAWS, uncertainty.SEED)
     ]
     speeds = np.array([table["speed_mm_s"] for table in each])
@@ -93,14 +93,14 @@ def test_draws_have_the_intervals_of_robots_simulated_one_by_one(robot, runs, po
 @pytest.mark.slow
 def test_chunks_of_draws_change_no_interval(robot, runs, posterior):
     """Of a run all draws in one chunk, some runs in each; and a run's draws in three."""
-    whole = uncertainty.intervals(robot, posterior, runs, chunked(2 * DRAWS), DRAWS)
-    parted = uncertainty.intervals(robot, posterior, runs, chunked(4), DRAWS)
+    whole = uncertainty.simulate_draws(robot, posterior, runs, chunked(2 * DRAWS), DRAWS)
+    parted = uncertainty.simulate_draws(robot, posterior, runs, chunked(4), DRAWS)
     same(whole.columns, parted.columns, rtol=1e-9)
 
 
 @pytest.mark.slow
 def test_interrupted_draws_are_taken_up(robot, runs, posterior, tmp_path, monkeypatch):
-    whole = uncertainty.intervals(robot, posterior, runs, chunked(DRAWS), DRAWS)
+    whole = uncertainty.simulate_draws(robot, posterior, runs, chunked(DRAWS), DRAWS)
     folder, computed, honest = RunFolder(tmp_path / "r", {}), [], scale.Compiled.__call__
 
     def interrupted(compiled, values, *told):
@@ -111,14 +111,14 @@ def test_interrupted_draws_are_taken_up(robot, runs, posterior, tmp_path, monkey
 
     monkeypatch.setattr(scale.Compiled, "__call__", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        uncertainty.intervals(robot, posterior, runs, chunked(DRAWS), DRAWS, folder)
+        uncertainty.simulate_draws(robot, posterior, runs, chunked(DRAWS), DRAWS, folder)
     kept = len(list((tmp_path / "r.partial" / "chunks").glob("draws-*.npz")))
     assert kept <= 2
     computed.clear()
     monkeypatch.setattr(scale.Compiled, "__call__", lambda *a: (computed.append(1), honest(*a))[1])
-    same(uncertainty.intervals(robot, posterior, runs, chunked(DRAWS), DRAWS, folder).columns, whole.columns)
+    same(uncertainty.simulate_draws(robot, posterior, runs, chunked(DRAWS), DRAWS, folder).columns, whole.columns)
     assert len(computed) == 4 - kept
-    again = uncertainty.intervals(robot, posterior, runs, chunked(DRAWS), DRAWS, folder)
+    again = uncertainty.simulate_draws(robot, posterior, runs, chunked(DRAWS), DRAWS, folder)
     assert len(computed) == 4 - kept  # nothing is left to do
     same(again.columns, whole.columns)
     folder.close()
@@ -134,12 +134,12 @@ def test_what_takes_long_runs_in_parts_and_says_how_far_it_is(robot, runs, monke
         progress(0.5)
         return honest.run(robot, conditions, options)
 
-    plain, said = run.evaluate(robot, runs, chunked(2), None), []
+    plain, said = run.evaluate_runs(robot, runs, chunked(2), None), []
     monkeypatch.setitem(
         fidelities.TABLE, "steady", dataclasses.replace(fidelities.fidelity_facts("steady"), slow=True)
     )
     monkeypatch.setattr(steady, "FIDELITY", dataclasses.replace(honest, run=in_two))
-    found = run.evaluate(robot, runs, chunked(2), None, said.append)
+    found = run.evaluate_runs(robot, runs, chunked(2), None, said.append)
     same(found, plain, rtol=1e-12)
     assert said.count(1.0) == 4 and sum(said) == 4  # two chunks, two parts each
 

@@ -41,7 +41,7 @@ def test_the_run_with_the_largest_residuals_comes_first():
 
 
 def test_static_figure_shows_simulated_less_measured():
-    with figure_style.style():
+    with figure_style.figure_settings():
         above, below = overlay().draw().axes
     np.testing.assert_allclose(below.lines[-1].get_ydata(), 5.0)
     assert above.get_title(loc="left") == "run b" and above.get_ylabel() == figure_style.axis_label(SPEED)
@@ -69,7 +69,7 @@ def test_panels_are_stacked_for_phones(tmp_path, monkeypatch, stated):
     drawn = []
 
     def draw():
-        fig, grid = figure_style.figure(1, 2, 3.0, sharey="row")
+        fig, grid = figure_style.new_figure(1, 2, 3.0, sharey="row")
         grid[0, 0].set(ylabel="current", xlabel="runs by slope, then payload, then voltage; band: ±2σ")
         drawn.append((fig, grid))
         return fig
@@ -88,7 +88,7 @@ def test_a_colour_scale_is_not_inverted_in_the_dark(tmp_path):
     album = page.Album(tmp_path)
 
     def draw(scale):
-        fig, grid = figure_style.figure(1, 1, 2.0)
+        fig, grid = figure_style.new_figure(1, 1, 2.0)
         grid[0, 0].imshow(np.eye(2)) if scale else grid[0, 0].plot([0, 1])
         return fig
 

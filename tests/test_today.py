@@ -12,7 +12,7 @@ from calibration.data import robot_file, runs
 from calibration.data.input_errors import BadConfiguration, BadData
 from mmrjax.fidelities.drive import drive_batch
 from mmrjax.model import paper_robots, signals
-from sweeps.commands.simulate import PEAK, remarks
+from sweeps.commands.simulate import PEAK, run_remarks
 from sweeps.pages import figure_style, history_figures, words
 from sweeps.pages import runs_page as runs_page
 from tests.commands import rows as table
@@ -98,7 +98,7 @@ def test_a_robot_held_on_a_slope_stands_for_an_hour():
 def test_the_words_name_the_same_statuses_as_the_codes():
     assert tuple(signals.STATUSES[k] for k in signals.DONE) == words.SETTLED
     assert tuple(words.STATUSES) == signals.STATUSES and tuple(words.FLAGS) == signals.FLAGS
-    assert words.solved({"converged": 2, "slides": 4, "failed": 0}) and not words.solved(
+    assert words.every_run_solved({"converged": 2, "slides": 4, "failed": 0}) and not words.every_run_solved(
         {"converged": 9, "failed": 1}
     )
 
@@ -243,7 +243,7 @@ COLUMNS = "configuration,supply_voltage_V,total_mass_kg,payload_kg,slope_deg,tot
 def test_readings_without_a_sign_are_refused_backward(tmp_path, row, sentence):
     (tmp_path / "mine.csv").write_text(f"{COLUMNS}\n6T2A,15,13.1,0,0,2.1,5292\n{row}\n")
     with pytest.raises(BadData, match=f"mine.csv row 2, {sentence}"):
-        runs.read(tmp_path / "mine.csv")
+        runs.read_runs(tmp_path / "mine.csv")
 
 
 @pytest.mark.slow
@@ -280,9 +280,11 @@ def test_a_history_has_the_peak_of_the_inrush(climb, mmrjax, tmp_path):
 @pytest.mark.slow
 def test_a_start_is_drawn_of_the_run_that_was_asked_for(climb):
     robot, found = climb
-    heading = runs_page.labels(found.to_dict())
+    heading = runs_page.run_headings(found.to_dict())
     assert heading == ["6T2A, 33 V, 0 kg, 10°", "6T2A, -33 V, 0 kg, -10°"]
-    up, back = history_figures.starts(robot, found.history, np.asarray(found.status), [0, 0], heading)
+    up, back = history_figures.members_from_standstill(
+        robot, found.history, np.asarray(found.status), [0, 0], heading
+    )
     for k, start in enumerate((up, back)):
         assert start.ended[0] == pytest.approx(abs(float(found.total_current[k])), rel=1e-6)
         assert start.ended[1] == pytest.approx(1e3 * abs(float(found.speed[k])), rel=1e-6)
@@ -328,7 +330,7 @@ def test_a_run_may_last_a_day(mmrjax):
 
 def test_remarks_name_the_run_they_are_of():
     found = api.simulate(paper_robots.nominal(), api.Conditions("4W2T", 33.0, [0.0, 20.0], 200.0, adhesion=3.0))
-    shown = remarks(paper_robots.nominal(), found.to_dict())
+    shown = run_remarks(paper_robots.nominal(), found.to_dict())
     assert len(shown) == 2 and shown[0].startswith("run 2: winding_hot: 125 °C are reached after ")
     assert shown[1].startswith("run 2: winding, long running: none settles")
 
@@ -343,15 +345,15 @@ def test_rated_limits_and_switches_are_read_and_written(tmp_path):
     nominal = paper_robots.nominal()
     assert nominal.gearbox.torque_limit == pytest.approx(3.0 * 25 / 12)
     (tmp_path / "mine.toml").write_text(RATED)
-    robot = robot_file.read(tmp_path / "mine.toml")
+    robot = robot_file.read_robot(tmp_path / "mine.toml")
     assert (robot.gearbox.torque_limit, robot.gearbox.mesh_theory, robot.driver.returns_current) == (4.5, True, False)
     assert robot.driver.decay == "fast"
     battery = robot.battery
     assert (battery.voltage_charge, battery.voltage_cutoff, battery.delay_cutoff) == (4.25, 3.2, 2.0)
     assert (battery.current_limit, battery.current_charge) == (30.0, 2.0)
     for k, given in enumerate((robot, nominal)):
-        robot_file.write(given, tmp_path / f"{k}.toml")
-        again = robot_file.read(tmp_path / f"{k}.toml")
+        robot_file.write_robot(given, tmp_path / f"{k}.toml")
+        again = robot_file.read_robot(tmp_path / f"{k}.toml")
         assert (again.gearbox, again.driver, again.battery) == (given.gearbox, given.driver, given.battery)
     assert "current_limit = None" not in (tmp_path / "1.toml").read_text()
 
@@ -373,7 +375,7 @@ def test_rated_limits_and_switches_are_read_and_written(tmp_path):
 )
 def test_bad_limits_and_switches_are_refused(values, sentence):
     with pytest.raises(BadConfiguration, match=sentence):
-        robot_file.change(paper_robots.nominal(), values, where="mine.toml")
+        robot_file.change_robot(paper_robots.nominal(), values, where="mine.toml")
 
 
 @pytest.mark.slow
@@ -389,7 +391,7 @@ def test_rated_limits_stand_in_the_report():
     robot = paper_robots.nominal()
     found = api.simulate(robot, api.Conditions("6T2A", 33.0, 10.0, 8.0, battery=1.0))
     run = {name: np.atleast_1d(values)[0] for name, values in found.to_dict().items()}
-    shown = {line["words"]: line for line in runs_page.limits(robot, run)}
+    shown = {line["words"]: line for line in runs_page.limits_used(robot, run)}
     torque = shown["gearbox torque at the driving wheel"]
     wheel = float(found.theoretical_speed) / float(robot.configurations["6T2A"].radius)
     assert torque["limit"] == "6.25 N·m"
@@ -414,4 +416,4 @@ def test_a_run_without_current_is_drawn():
     """Nothing drives its motors: no scale of nothing."""
     time = np.linspace(0.0, 1.0, 30)
     still = history_figures.Start("run 1", "6T2A", "stalled", time, *3 * [0 * time], stages=None)
-    figure_style.svg(history_figures.from_standstill([still]))
+    figure_style.figure_as_svg(history_figures.from_standstill([still]))

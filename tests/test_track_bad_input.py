@@ -17,7 +17,7 @@ from mmrjax.undercarriage.half_robot import half_robot_system, stand, tipping_ma
 from mmrjax.undercarriage.stability import _whole, largest_step
 from sweeps import config as configuration
 from sweeps.points import run
-from sweeps.points.grid import grid
+from sweeps.points.grid import grid_conditions
 
 TWO = Conditions(
     voltage=jnp.asarray([33.0, 33.0]), payload=jnp.asarray([0.0, 8.0]), configuration=jnp.asarray([0.0, 1.0])
@@ -159,14 +159,14 @@ def test_member_that_blows_up_fails_alone(robot):
 @pytest.mark.slow
 def test_step_that_a_later_chunk_cannot_bear_is_refused_before_the_first(robot):
     options = {"model": "track", "step_s": 5e-4, "chunk": 2, "slopes_deg": (0.0,), "configurations": ("4W2T", "6T2A")}
-    config = configuration.resolve(configuration.Sweep, None, options)
+    config = configuration.resolve_configuration(configuration.Sweep, None, options)
     robot = params.replace(robot, {"running_gear.contact_stiffness": jnp.asarray(5e9)})
-    runs, told = grid(config, robot), []
-    limits = largest_step(robot, run.commanded(robot, runs, config))
+    runs, told = grid_conditions(config, robot), []
+    limits = largest_step(robot, run.conditions_of_runs(robot, runs, config))
     worst = int(np.argmin(limits))
     assert limits[:2].min() > config.step_s > limits[worst]  # the first chunk could bear it
     with pytest.raises(BadConfiguration, match=rf"run {worst + 1} of {len(runs)}"):
-        run.evaluate(robot, runs, config, None, told.append)
+        run.evaluate_runs(robot, runs, config, None, told.append)
     assert told == []
 
 

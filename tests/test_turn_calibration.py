@@ -70,7 +70,7 @@ def of_world(robot, tmp_path_factory):
     path = written(
         tmp_path_factory.mktemp("world") / "turns.csv", "6T2A", other.mass, dict(zip(SHOWN, seen, strict=True))
     )
-    return records.read(path, robot=robot)
+    return records.read_runs(path, robot=robot)
 
 
 TRUE = {LATERAL: 1.45, WIDTH: 0.236}
@@ -153,7 +153,7 @@ def test_histories_of_turns_are_refused(robot, of_world, tmp_path):
     with pytest.raises(
         BadConfiguration, match=r"history.csv: time histories of a robot .* mmrjax settle history.csv"
     ):
-        calibrate(records.read(path, robot=robot), robot, model="drive", free=[f"6T2A.{LATERAL}"], noise=NOISE)
+        calibrate(records.read_runs(path, robot=robot), robot, model="drive", free=[f"6T2A.{LATERAL}"], noise=NOISE)
 
 
 @pytest.mark.nightly
@@ -201,7 +201,7 @@ def test_wheels_that_creep_tell_the_effective_width_alone(tmp_path):
     seen = mm.simulate(robot, mm.Conditions(["4W2T"] * len(DUTIES), voltage=33.0, **duties)).reading
     mass = float(robot.configurations["4W2T"].mass)
     table = written(tmp_path / "turns.csv", "4W2T", mass, {name: seen[name] for name in MOTION})
-    runs = records.read(table, robot=robot)
+    runs = records.read_runs(table, robot=robot)
     names = tuple(f"4W2T.{n}" for n in (LATERAL, WIDTH))
     sd = np.broadcast_to([channels.find_channel(n).factor * SDS[n] for n in MOTION], runs.measured().shape)
     about = identifiability.analyse_identifiability(

@@ -21,7 +21,7 @@ from sweeps import config, inputs
 from sweeps.commands import simulate
 from sweeps.commands import turn as turn_room
 from sweeps.pages import mission_figures, turn_page, turn_words
-from sweeps.pages.figure_style import svg
+from sweeps.pages.figure_style import figure_as_svg
 from sweeps.points.imposed import UNLIMITED
 from sweeps.points.job import showing_turns
 from sweeps.results import check_results
@@ -136,23 +136,27 @@ def test_a_turn_beyond_the_supply_is_refused_with_what_it_reaches(monkeypatch, s
 
     monkeypatch.setattr(turn_room, "_with_others", rolling)
     robot, demand = paper_robots.nominal(), config.Simulate(speed_m_s=speed, yaw_rate_rad_s=rate)
-    runs = inputs.one_run(robot, {"supply_voltage_V": 24.0, **turn_room.cells(demand, {})})
+    runs = inputs.one_run(robot, {"supply_voltage_V": 24.0, **turn_room.turn_columns(demand, {})})
     with pytest.raises(BadConfiguration, match=f"{speed:g} m/s and {rate:g} rad/s .*{says}"):
         turn_room._demanded(robot, runs.conditions(robot), runs, demand)
 
 
 def test_a_required_turn_without_a_steady_state_is_not_told_of_options_of_runs():
     asked = types.SimpleNamespace(quantity=requirements.QUANTITIES["turning_radius_mm"])
-    said = check_results.reached(types.SimpleNamespace(requirement=asked, value=None, status="not_settled"))
+    said = check_results.reached_value_text(
+        types.SimpleNamespace(requirement=asked, value=None, status="not_settled")
+    )
     assert "no settled turn" in said and "--duration" not in said
-    assert said != check_results.reached(types.SimpleNamespace(requirement=asked, value=None, status="stalled"))
+    assert said != check_results.reached_value_text(
+        types.SimpleNamespace(requirement=asked, value=None, status="stalled")
+    )
 
 
 def test_a_turn_that_is_not_found_though_it_is_within_reach_is_friction_s():
     speeds, rates = np.array([0.7, np.nan, 0.0]), np.array([0.0, np.nan, 3.0])
-    assert "friction that falls with sliding" in turn_words.reach(0.3, 1.0, speeds, rates)
-    assert "reaches" in turn_words.reach(0.3, 2.0, speeds, rates)
-    assert "no turn settles" in turn_words.reach(0.3, 2.0, np.full(3, np.nan), rates)
+    assert "friction that falls with sliding" in turn_words.turn_not_found_reason(0.3, 1.0, speeds, rates)
+    assert "reaches" in turn_words.turn_not_found_reason(0.3, 2.0, speeds, rates)
+    assert "no turn settles" in turn_words.turn_not_found_reason(0.3, 2.0, np.full(3, np.nan), rates)
 
 
 REFUSED = {
@@ -196,15 +200,15 @@ HEADER, SIDED = "configuration,supply_voltage_V,payload_kg,slope_deg,", "duty_le
 def test_tables_take_the_duty_of_either_side(tmp_path):
     path = tmp_path / "turns.csv"
     path.write_text(f"{HEADER}duty_left,duty_right\n6T2A,33,0,0,1,-0.5\n")
-    runs = records.read(path, measured=False)
+    runs = records.read_runs(path, measured=False)
     assert runs.turns
     assert runs.axes[-2:] == ("duty_left", "duty_right")
     path.write_text(f"{HEADER}duty_left\n6T2A,33,0,0,1\n")
     with pytest.raises(BadData, match="column duty_right is missing, duty_left is stated"):
-        records.read(path, measured=False)
+        records.read_runs(path, measured=False)
     path.write_text(f"{HEADER}duty_left,duty_right,duty\n6T2A,33,0,0,1,1,1\n")
     with pytest.raises(BadData, match="column duty in addition to duty_left"):
-        records.read(path, measured=False)
+        records.read_runs(path, measured=False)
 
 
 def row(**changes):
@@ -243,7 +247,7 @@ def test_runs_of_a_table_whose_sides_are_driven_apart_show_both_sides(tmp_path, 
         assert mmrjax("simulate", "--runs", path)[0] == 4
         assert ({"yaw_rate", "motor_current_left", "motor_current_right"} <= set(shown)) == turns
     table = {"total_current_A": [1.8], "motor_current_left_A": [-1.8], "motor_current_right_A": [0.1]}
-    assert simulate.amperes(paper_robots.nominal(), table) == pytest.approx([1.8])
+    assert simulate.motor_currents(paper_robots.nominal(), table) == pytest.approx([1.8])
 
 
 def test_options_of_one_run_are_refused_beside_a_table(tmp_path, mmrjax):
@@ -308,7 +312,7 @@ def test_turns_are_told_in_plain_words():
     robot = paper_robots.nominal()
 
     def said(ended=None, **changes):
-        found = turn_words.turn(robot, row(**changes), ended)
+        found = turn_words.turn_in_words(robot, row(**changes), ended)
         return " ".join((found.answer, *found.notes))
 
     assert "to the left: a circle of 400 mm radius" in said()
@@ -321,12 +325,14 @@ def test_turns_are_told_in_plain_words():
     assert "stalled" in said(status="stalled")
     assert "track width" not in said(status="not_settled")
     assert "winding_hot: winding hotter than permitted" in said(flags="gearbox_overspeed;winding_hot")
-    hot = turn_words.turn(robot, row(winding_left_C=float("inf"), power_right_W=-0.01), None)
+    hot = turn_words.turn_in_words(robot, row(winding_left_C=float("inf"), power_right_W=-0.01), None)
     assert hot.sides[-2:] == [("electrical power [W]", "5.0", "0.0"), (hot.sides[-1][0], "none settles", "40")]
     unknown = dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, unknown=HEAT[-1:]))
-    assert [side[0] for side in turn_words.turn(unknown, row(), None).sides] == [side[0] for side in hot.sides[:-1]]
+    assert [side[0] for side in turn_words.turn_in_words(unknown, row(), None).sides] == [
+        side[0] for side in hot.sides[:-1]
+    ]
     nothing = {name: float("nan") for name, value in row().items() if isinstance(value, float)}
-    none = turn_words.turn(robot, row(status="not_settled", **nothing), None)
+    none = turn_words.turn_in_words(robot, row(status="not_settled", **nothing), None)
     assert (
         none.answer.startswith("not_settled: ")
         and "no settled turn" in none.answer
@@ -431,7 +437,7 @@ def test_tables_have_no_negative_zero(monkeypatch):
     straight = mm.simulate(mm.nominal(), mm.Conditions("6T2A", voltage=24, slope_deg=-1e-6))
     assert "-0" not in straight.table() and "0.00" in straight.table()
     said = []
-    monkeypatch.setattr(simulate, "say", said.append)
+    monkeypatch.setattr(simulate, "print_output", said.append)
     table = {"slope_deg": [-0.0], "speed_mm_s": [-0.01], "status": ["converged"]}
     simulate.print_runs({name: np.array(values) for name, values in table.items()}, paper_robots.nominal().channels)
     assert [list(c.cells) for c in said[0].columns][1] == ["0", "0.0", "converged"]
@@ -440,7 +446,7 @@ def test_tables_have_no_negative_zero(monkeypatch):
 def test_a_path_between_places_that_turn_is_an_arc():
     """A quarter of a circle of 2 m, and a metre straight on, from three rows."""
     x, y, yaw = np.array([0.0, 2.0, 2.0]), np.array([0.0, 2.0, 3.0]), np.array([0.0, np.pi / 2, np.pi / 2])
-    ahead, aside = turn_page.arcs(x, y, yaw)
+    ahead, aside = turn_page.path_arcs(x, y, yaw)
     np.testing.assert_allclose(np.hypot(ahead[:-1], aside[:-1] - 2.0), 2.0, rtol=1e-12)
     assert np.max(np.diff(aside[:-1])) < 0.11 and (ahead[-1], aside[-1], len(ahead)) == (2.0, 3.0, 34)
 
@@ -451,8 +457,8 @@ def test_a_mission_of_which_no_heat_is_known_is_laid_out():
     names = ("theoretical_speed_mm_s", "demanded_speed_mm_s", "slope_deg", "source_voltage_V", "motor_current_left_A")
     rows = {name: time for name in (*names, "motor_current_right_A", "duty_left", "duty_right")}
     rows |= {"time_s": time, "slope_deg": 0 * time, "state_of_charge": np.nan * time}
-    fig = mission_figures.course(rows, 12.0, UNLIMITED, False, 2.0)
-    svg(fig)
+    fig = mission_figures.draw_mission_course(rows, 12.0, UNLIMITED, False, 2.0)
+    figure_as_svg(fig)
     assert all(axes.get_position().width > 0.2 for axes in fig.axes)
     first, second = (axes.title.get_window_extent() for axes in fig.axes[2:4])
     assert not first.overlaps(second)

@@ -145,7 +145,7 @@ def test_straight_travel_shows_none_of_them():
 def test_robot_files_know_them_and_the_library_of_straight_travel_does_not(tmp_path):
     path = tmp_path / "robot.toml"
     path.write_text('base = "nominal"\n[effects.side_torque]\namplitude = 0.1\n')
-    robot = robot_file.read(path)
+    robot = robot_file.read_robot(path)
     assert [e.name for e in robot.effects] == ["side_torque"] and float(robot.effects[0].amplitude) == 0.1
     assert not set(effects.OF_TURNS) & set(effects.BY_NAME)
     for kind in effects.OF_TURNS.values():
@@ -166,7 +166,7 @@ def test_sides_that_are_not_alike_are_found(tmp_path):
     mass = float(robot.configurations["6T2A"].mass)
     table = written(tmp_path / "turns.csv", "6T2A", mass, {name: seen[name] for name in SHOWN})
     free = [f"effects.{name}.amplitude" for name in ("side_friction", "side_torque")] + ["6T2A.turning.lateral"]
-    found = calibrate(records.read(table, robot=robot), robot, free=free, noise=NOISE, starts=1, blocks=())
+    found = calibrate(records.read_runs(table, robot=robot), robot, free=free, noise=NOISE, starts=1, blocks=())
     friction, torque = (found.parameters[name] for name in free[:2])
     assert abs(friction.value - 0.0025) < 3 * friction.sd < 0.001
     assert abs(torque.value) < 3 * torque.sd

@@ -32,7 +32,7 @@ def posed(tmp_path_factory):
     table, file = planted.write(tmp_path_factory.mktemp("turns"), "friction", COUNT)
     robot = mm.read_robot(str(file))
     library = {name: kind for name, kind in effects.BY_NAME.items() if name in SOME}
-    ready = prepare_loop(records.read(table, robot=robot), robot, noise=planted.NOISE, library=library)
+    ready = prepare_loop(records.read_runs(table, robot=robot), robot, noise=planted.NOISE, library=library)
     space = pose_candidates(ready.runs, ready.robot, ready.noise.sd, ready.settings, ready.stated, ready.library)
     return space.bare, space
 
@@ -162,5 +162,5 @@ def test_what_a_second_implementation_planted_is_found(tmp_path, case):
     """In the whole library, for which the command above has compiled."""
     table, file = planted.write(tmp_path, case)
     robot = mm.read_robot(str(file))
-    found = discover(records.read(table, robot=robot), robot, noise=planted.NOISE, replicates=250)
+    found = discover(records.read_runs(table, robot=robot), robot, noise=planted.NOISE, replicates=250)
     assert found.verdict in ("named", "class") and FOUND[case] in {n for e in found.effects for n in e.members}

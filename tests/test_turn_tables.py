@@ -71,7 +71,7 @@ def table(tmp_path):
     def written(header, *rows, robot):
         path = tmp_path / "turns.csv"
         path.write_text("\n".join([header, *(",".join(map(str, row)) for row in rows)]) + "\n")
-        return records.read(path, robot=robot)
+        return records.read_runs(path, robot=robot)
 
     return written
 
@@ -100,16 +100,16 @@ def test_a_table_of_turns_with_channels_of_turns_alone_is_answered_by_the_line_t
         + "6T2A,33,13.1,0,0,1,0.4,-1.1\n" * 3
     )
     with pytest.raises(BadData, match=r"yaw_rate_rad_s: state in the robot's file channels = ") as said:
-        records.read(path, robot=rig('base = "nominal"'))
+        records.read_runs(path, robot=rig('base = "nominal"'))
     line = said.value.args[0].rpartition("file ")[2]
     robot = rig(f'base = "nominal"\n{line}')
-    assert [c.name for c in records.read(path, robot=robot).channels] == ["yaw_rate"]
+    assert [c.name for c in records.read_runs(path, robot=robot).channels] == ["yaw_rate"]
 
 
 def test_a_table_of_turns_is_read_once_with_the_channels_of_turns_that_it_has(tmp_path, capsys, monkeypatch):
     path, reads = tmp_path / "turns.csv", []
-    read = records.read
-    monkeypatch.setattr(records, "read", lambda *told, **how: reads.append(told) or read(*told, **how))
+    read = records.read_runs
+    monkeypatch.setattr(records, "read_runs", lambda *told, **how: reads.append(told) or read(*told, **how))
     header = "configuration,voltage_left_V,voltage_right_V,total_mass_kg,payload_kg,slope_deg"
     path.write_text(f"{header},yaw_rate_rad_s,motor_current_left_A\n" + "6T2A,24,12,13.1,0,0,-1.1,2\n" * 2)
     runs = read_runs(str(path), mm.nominal(), measured=True, of_turns=True)
@@ -189,12 +189,12 @@ def test_the_packaged_robot_turns_by_voltages_of_its_sides_without_a_supply(tmp_
     path = tmp_path / "turns.csv"
     header = "configuration,total_mass_kg,payload_kg,slope_deg,voltage_left_mV,voltage_right_mV"
     path.write_text(f"{header}\n6T2A,13.1,0,0,6000,24000\n6T2A,13.1,0,0,-12000,12000\n")
-    runs = records.read(path, measured=False)
+    runs = records.read_runs(path, measured=False)
     conditions = runs.conditions(mm.nominal())
     np.testing.assert_allclose(conditions.voltage, [24.0, 12.0])
     np.testing.assert_allclose(conditions.duty_left, [0.25, -1.0])
     with pytest.raises(BadData, match=r"voltage_left_V together with --battery, .* state duty_left and duty_right"):
-        records.read(path, measured=False, battery=True)
+        records.read_runs(path, measured=False, battery=True)
 
 
 @pytest.mark.parametrize(
@@ -237,7 +237,7 @@ def test_readings_of_turns_on_a_slope_are_refused_with_what_follows_them(tmp_pat
     assert len(table(header, rows[0], robot=robot)) == 1
     path = tmp_path / "asked.csv"  # which are followed over time
     path.write_text(f"supply_voltage_V,slope_deg,{of_turns}\n24,5,{','.join(map(str, each))}\n")
-    assert records.read(path, measured=False, robot=robot).turns
+    assert records.read_runs(path, measured=False, robot=robot).turns
 
 
 def test_yaw_rate_in_degrees_is_converted(rig, table):

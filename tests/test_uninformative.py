@@ -38,7 +38,7 @@ OUTPUT = SPEED / 20 + 0.2 * RNG.standard_normal(12)
 def robot(tmp_path_factory):
     path = tmp_path_factory.mktemp("rig") / "rig.toml"
     path.write_text(RIG, encoding="utf-8")
-    return robot_file.read(path)
+    return robot_file.read_robot(path)
 
 
 @pytest.fixture
@@ -58,7 +58,7 @@ def table(tmp_path, robot, current=CURRENT, torque=TORQUE, output=OUTPUT, speed=
     lines = [",".join(columns), *(",".join(f"{x:.6g}" for x in row) for row in zip(*columns.values(), strict=True))]
     path = tmp_path / "t.csv"
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    return records.read(path, robot=robot)
+    return records.read_runs(path, robot=robot)
 
 
 def shown(runs):
@@ -106,7 +106,7 @@ def test_readings_that_a_rigid_gear_ties_are_said_and_not_refused(tmp_path, robo
     path = tmp_path / "t.csv"
     rows = (",".join(f"{x:.6g}" for x in row) for row in zip(*columns.values(), strict=True))
     path.write_text("\n".join([",".join(columns), *rows]) + "\n", encoding="utf-8")
-    (found,) = uninformative.copied_channels(records.read(path, robot=driven), driven)
+    (found,) = uninformative.copied_channels(records.read_runs(path, robot=driven), driven)
     assert found.tied and found.slope == pytest.approx(0.05) and "counts twice" in describe(found)
 
 

@@ -73,14 +73,14 @@ def two_rows_more(monkeypatch):
 def test_a_quantity_is_read_written_and_explained_by_its_row(two_rows_more, tmp_path):
     path = tmp_path / "runs.csv"
     path.write_text(TABLE.format("air_pressure_Pa,terminal_voltage_mV", 98000))
-    runs = records.read(path)
+    runs = records.read_runs(path)
     assert runs.unknown == () and runs.channels[-1] is CHANNEL
     assert runs["air_pressure_kPa"].tolist() == [98.0, 101.3] and runs["terminal_voltage_V"].tolist() == [2.0, 4.0]
     path.write_text(TABLE.format("air_pressure_kPa,terminal_voltage_V", 40))
     with pytest.raises(BadData, match=r"row 1, air_pressure_kPa: got 40; expected 50 to 120; also row 1, terminal_"):
-        records.read(path)
+        records.read_runs(path)
     path.write_text(TABLE.format("Air_Pressure_Pa,terminal_voltage_mV", 98000))
-    assert "Air_Pressure_Pa is read as air_pressure_Pa" in records.read(path).notes[0]
+    assert "Air_Pressure_Pa is read as air_pressure_Pa" in records.read_runs(path).notes[0]
     (output,) = (o for o in outputs.output_table(runs.channels) if o.name == CHANNEL.name)
     assert (output.column, output.unit, output.label) == ("terminal_voltage_V", "V", "terminal voltage")
     for kind, name in (("channel", "terminal_voltage"), ("condition", "air_pressure_kPa")):
@@ -90,8 +90,8 @@ def test_a_quantity_is_read_written_and_explained_by_its_row(two_rows_more, tmp_
 def test_a_rig_states_a_channel_by_its_row(two_rows_more, tmp_path):
     path = tmp_path / "rig.toml"
     path.write_text('channels = ["terminal_voltage"]\n[columns]\nair_pressure_Pa = "p"\nterminal_voltage_mV = "Ut"\n')
-    robot = robot_file.read(path)
+    robot = robot_file.read_robot(path)
     (tmp_path / "runs.csv").write_text(TABLE.format("p,Ut", 98000))
-    runs = records.read(tmp_path / "runs.csv", robot=robot)
+    runs = records.read_runs(tmp_path / "runs.csv", robot=robot)
     assert runs["air_pressure_kPa"].tolist() == [98.0, 101.3] and runs.measured().tolist() == [[2.0], [4.0]]
     assert robot.channels == (CHANNEL,) and runs.headings["terminal_voltage_V"] == "Ut"

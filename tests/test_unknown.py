@@ -20,7 +20,7 @@ from sweeps.config import Simulate
 from sweeps.config_campaign import Campaign
 from sweeps.inputs import load_robot
 from sweeps.points import axes
-from sweeps.points.job import prepare
+from sweeps.points.job import prepare_job
 
 MOTOR = "[motor]\ntorque_constant = 0.03\n{more}[gearbox]\nratio = 20\nefficiency_load = 0.8\n"
 BENCH = (
@@ -58,7 +58,7 @@ wheelbase = 0.4
 def read(tmp_path, text, imposed, more=""):
     path = tmp_path / "rig.toml"
     path.write_text(text.format(imposed=imposed, more=more), encoding="utf-8")
-    return robot_file.read(path)
+    return robot_file.read_robot(path)
 
 
 def elsewhere(robot):
@@ -119,8 +119,8 @@ def test_what_is_stated_is_known_with_the_packaged_robots_number_too(tmp_path):
     stated = "resistance = 0.611\nresistance_thermal_winding = 1.7\nresistance_thermal_housing = 6.0\n"
     robot = read(tmp_path, BENCH, "motor_speed", stated)
     assert robot.knows(HEAT) and not read(tmp_path, BENCH, "motor_speed").knows(HEAT)
-    robot_file.write(robot, tmp_path / "again.toml")
-    assert robot_file.read(tmp_path / "again.toml").rig.unknown == robot.rig.unknown
+    robot_file.write_robot(robot, tmp_path / "again.toml")
+    assert robot_file.read_robot(tmp_path / "again.toml").rig.unknown == robot.rig.unknown
     seen = mm.simulate(robot, mm.Conditions(motor_speed=300.0))
     assert float(seen.power_supply) > float(seen.power_motor) and float(seen.winding_settled) > 25.0
 
@@ -128,7 +128,7 @@ def test_what_is_stated_is_known_with_the_packaged_robots_number_too(tmp_path):
 def test_rig_check_says_what_of_a_battery_is_an_examples(tmp_path):
     def left_open(more):
         read(tmp_path, ROVER + more, "voltage", DRIVEN)
-        found = rig_facts.origins(robot_file.parse(tmp_path / "rig.toml"))
+        found = rig_facts.number_origins(robot_file.parse_robot_file(tmp_path / "rig.toml"))
         return {o.name.partition(".")[2] for o in found if o.name.startswith("battery.") and "an example's" in o.why}
 
     assert left_open("") == set()
@@ -174,9 +174,9 @@ def test_commands_leave_out_what_is_unknown_and_say_so(mmrjax, tmp_path):
 def test_a_store_of_what_is_unknown_is_refused_unless_it_varies(tmp_path, varied, refused):
     robot = read(tmp_path, BENCH, "motor_speed")
     config = Campaign(axes={"motor_speed": [100.0, 200.0], **varied}, outputs=("power_supply",), chunk=4)
-    plan = axes.plan(config, robot, "map.toml")
+    plan = axes.plan_design(config, robot, "map.toml")
     if refused:
         with pytest.raises(BadConfiguration, match=r"power_supply is not known, as .* state motor\.resistance$"):
-            prepare(config, robot, plan, "map.toml")
+            prepare_job(config, robot, plan, "map.toml")
     else:
-        assert prepare(config, robot, plan, "map.toml").outputs == ("power_supply",)
+        assert prepare_job(config, robot, plan, "map.toml").outputs == ("power_supply",)

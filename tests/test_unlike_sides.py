@@ -72,7 +72,7 @@ def test_a_file_of_unlike_sides_is_said_to_turn_and_by_how_much(tmp_path, capsys
     assert remark in capsys.readouterr().err.replace("\n", " ")
     assert "33 V on level ground, it turns: 4W2T by 0.0175 rad/s to the right at 1.31 m/s ahead (--left" in remark
     assert "6T2A" not in remark  # whose sides are alike
-    assert page.named(file)["remarks"] == file.remarks
+    assert page.robot_section(file)["remarks"] == file.remarks
     assert inputs.load_robot(config.Simulate(robot=file.source, left_V=9.0, right_V=9.0)).remarks == ()
     assert of_file(tmp_path, SIDE_RADIUS.replace("0.01", "0.0")).remarks == ()
     (narrow,) = of_file(tmp_path, SIDE_RADIUS, set={"4W2T.turning.width": 0.0}).remarks
@@ -102,7 +102,7 @@ def test_effects_of_a_file_say_that_they_are_of_one_side(tmp_path):
 
     def read(balance, term, more=""):
         path.write_text(OWN.format(balance=balance, term=term, more=more))
-        return effect_file.read(path)
+        return effect_file.read_effect_file(path)
 
     of_side = 'driver = "the side"'
     for balance, term in (("ground", "signals.side"), ("yaw", "signals.normal"), ("lateral", "signals.normal")):

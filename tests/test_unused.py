@@ -24,11 +24,11 @@ SPEED = (24 - 0.5 * CURRENT) / 0.05 * 30 / np.pi
 def table(tmp_path, head, **columns):
     """A table of six rows read for the rig with a line `head` in its file."""
     (tmp_path / "rig.toml").write_text(RIG.format(head=head))
-    robot = robot_file.read(tmp_path / "rig.toml")
+    robot = robot_file.read_robot(tmp_path / "rig.toml")
     every = {"supply_voltage_V": np.full(6, 24.0), "motor_speed_rpm": SPEED, "motor_current_A": CURRENT, **columns}
     lines = [",".join(every), *(",".join(map(str, row)) for row in zip(*every.values(), strict=True))]
     (tmp_path / "runs.csv").write_text("\n".join(lines) + "\n")
-    return records.read(tmp_path / "runs.csv", robot=robot)
+    return records.read_runs(tmp_path / "runs.csv", robot=robot)
 
 
 CHANNELS = 'channels = ["motor_current", "motor_speed"]'

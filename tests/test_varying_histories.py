@@ -11,7 +11,7 @@ from synthetic import Analyst
 
 from calibration.data import runs as records
 from calibration.data.columns import DRIVEN
-from calibration.data.courses import applied, courses, stretches, varies
+from calibration.data.courses import applied_drive, course_of_each_row, course_stretches, rows_of_varying_runs
 from calibration.data.input_errors import BadData
 from calibration.data.runs import Runs
 from calibration.discovery.reach import reach_of_table
@@ -283,13 +283,13 @@ def test_one_supply_voltage_is_said_only_where_the_duty_is_one_too(runs):
 
 
 def test_stretches_are_the_segments(runs, observer):
-    for found in (stretches(runs), observer.stretches()):
+    for found in (course_stretches(runs), observer.stretches()):
         assert [len(run) for run in found] == [4, 4, 4]
         for run in found:
             np.testing.assert_allclose([s.begin for s in run], SEGMENTS[:4], atol=1e-12)
             assert [len(s.rows) for s in run] == [20, 21, 21, 17] and not any(s.whole for s in run)
         assert [s.driven for s in found[1]] == [True, False, False, True]
-    assert applied(runs)[runs["mode"] == "brake"].tolist() == [0.0] * 21
+    assert applied_drive(runs)[runs["mode"] == "brake"].tolist() == [0.0] * 21
 
 
 def test_blocks_of_runs_that_vary_are_whole_runs(runs):
@@ -302,7 +302,11 @@ def test_blocks_of_runs_that_vary_are_whole_runs(runs):
         assert len(np.unique(more["run_id"][mask])) == 1
     assert blocks_of_kind(runs, "voltage") == {} and set(blocks_of_kind(runs, "slope")) == {"0.0", "4.0", "-3.0"}
     assert "voltage" not in distinct_blocks(runs, Histories.blocks)
-    assert varies(more).sum() == len(runs) and len(set(courses(more))) == 4 and courses(more)[-1] == ""
+    assert (
+        rows_of_varying_runs(more).sum() == len(runs)
+        and len(set(course_of_each_row(more))) == 4
+        and course_of_each_row(more)[-1] == ""
+    )
 
 
 def test_ends_are_those_of_stretches_driven_forwards(runs):
@@ -373,10 +377,10 @@ def written(tmp_path, header, *rows):
 def test_columns_of_the_driver_are_read(tmp_path):
     rows = ("a,0,6T2A,24,0,0,0,11,0.5,voltage", "a,1,6T2A,-12,0,0,5,11,-1,voltage", "a,2,6T2A,0,0,0,5,11,,brake",
             "a,3,6T2A,24,0,0,5,11,,coast")  # fmt: skip
-    read = records.read(written(tmp_path, f"{HEADER},duty,mode", *rows))
+    read = records.read_runs(written(tmp_path, f"{HEADER},duty,mode", *rows))
     found = read.conditions(paper_robots.nominal())
     assert found.duty.tolist() == [0.5, -1.0, 0.0, 0.0] and found.open.tolist() == [0, 0, -1, 1]
-    assert found.voltage.tolist() == [24, -12, 0, 24] and applied(read).tolist() == [12, 12, 0, 0]
+    assert found.voltage.tolist() == [24, -12, 0, 24] and applied_drive(read).tolist() == [12, 12, 0, 0]
     assert set(DRIVEN) <= set(MODES)
 
 
@@ -396,7 +400,7 @@ def test_columns_of_the_driver_are_read(tmp_path):
 )  # fmt: skip
 def test_what_is_wrong_is_said_in_one_sentence(tmp_path, header, row, says):
     with pytest.raises(BadData, match=says):
-        records.read(written(tmp_path, header, row))
+        records.read_runs(written(tmp_path, header, row))
 
 
 def test_what_cannot_change_within_a_run_is_refused(runs):

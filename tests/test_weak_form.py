@@ -79,7 +79,7 @@ def space(tmp_path_factory):
     """What can be fitted to the log of a motor that churns."""
     file = tmp_path_factory.mktemp("motor") / "rig.toml"
     file.write_text(RIG, encoding="utf-8")
-    return posed(Runs("synthetic", motor()).of(robot_file.read(file)), robot_file.read(file))
+    return posed(Runs("synthetic", motor()).of(robot_file.read_robot(file)), robot_file.read_robot(file))
 
 
 def posed(runs, robot, sd=SD):
@@ -174,13 +174,15 @@ def test_a_current_or_a_speed_may_be_imposed(tmp_path, imposed, channel):
     turns between them; lines between rows of an imposed one differ from it by more than the effect."""
     text = RIG.replace('imposed = "voltage"', f'imposed = "{imposed}"')
     (tmp_path / "rig.toml").write_text(text.replace('"motor_current", "motor_speed"', f'"{channel}"'), "utf-8")
-    robot = robot_file.read(tmp_path / "rig.toml")
+    robot = robot_file.read_robot(tmp_path / "rig.toml")
     columns = motor(noise=(0.0, 1.0) if imposed == "motor_speed" else (1.0, 0.0))
     del columns["supply_voltage_V"]
     lines = [",".join(columns), *(",".join(map(str, row)) for row in zip(*columns.values(), strict=True))]
     (tmp_path / "log.csv").write_text("\n".join(lines) + "\n", "utf-8")
     mine = posed(
-        records.read(str(tmp_path / "log.csv"), robot=robot).of(robot), robot, SD[int(channel == "motor_current")]
+        records.read_runs(str(tmp_path / "log.csv"), robot=robot).of(robot),
+        robot,
+        SD[int(channel == "motor_current")],
     )
     found = screening.screen_by_weak_form(mine, SETTINGS)
     names, value = mine.coordinates.base.names, mine.coordinates.base.value(found.base.z[: mine.free])
@@ -194,7 +196,7 @@ def test_a_current_or_a_speed_may_be_imposed(tmp_path, imposed, channel):
 def test_logs_of_an_angle_alone_are_twice_integrated(tmp_path, kind, made):
     made = made(np.random.default_rng(1), levels=(0.8, 1.0, -0.9) if kind == "servo" else (1.2, 2.0, -1.6))
     robot = written(tmp_path, kind, made)
-    runs = records.read(str(tmp_path / "log.csv"), robot=robot).of(robot)
+    runs = records.read_runs(str(tmp_path / "log.csv"), robot=robot).of(robot)
     found = weak_form.weak_form(posed(runs, robot, np.maximum(0.003 * Histories.sizes(runs), 1e-9)).bare)
     assert found is not None and np.all(np.abs(found.z) < 4)
 

@@ -221,7 +221,7 @@ def test_every_reason_and_every_doubt_has_its_words():
 @pytest.mark.parametrize(("unit", "said"), [("-", "-0.0154 ± 0.00014"), ("ohm", "-0.0154 ± 0.00014 ohm")])
 def test_a_size_has_a_unit_where_there_is_one(unit, said):
     amplitude = SimpleNamespace(value=-0.01541, sd=0.000141, unit=unit)
-    assert loop_words.size(SimpleNamespace(parameters={"amplitude": amplitude})) == said
+    assert loop_words.effect_amplitude(SimpleNamespace(parameters={"amplitude": amplitude})) == said
 
 
 # --- verdicts -------------------------------------------------------------------------------------------
@@ -275,22 +275,22 @@ OVER = CurveOver("slip", ("slope",))
     ],
 )
 def test_why_names_stand_or_not(support, said):
-    assert loop_words.reason(support) == said
+    assert loop_words.support_reasons(support) == said
 
 
 def test_verdict_of_a_complete_model():
     off = of_fit.NoiseOff("", 2.0, "stated")
     said = "Nothing is missing: the residuals are consistent with noise (family-wise p = 0.4)."
-    assert loop_words.statement(Summary("none", 0.4, None)) == said
-    assert loop_words.statement(Summary("none", 0.4, None, noise=(off,))) == f"{said} But {describe(off)}"
-    aside = loop_words.statement(Summary("none", 0.4, None, aside=10, of=100))
+    assert loop_words.verdict_sentences(Summary("none", 0.4, None)) == said
+    assert loop_words.verdict_sentences(Summary("none", 0.4, None, noise=(off,))) == f"{said} But {describe(off)}"
+    aside = loop_words.verdict_sentences(Summary("none", 0.4, None, aside=10, of=100))
     assert aside == f"10 of 100 rows (10 %) are outliers and are set aside. {said}"
 
 
 def test_verdict_tells_what_is_tentative():
     test = NameTest("b", 5.0, 3.4, (), 9.0, 10, 2.0)
     sure, tentative = Missing(("a",), (), ("drop",)), Missing(("b",), (), ("slip",), False, test)
-    assert loop_words.statement(Summary("named", 0.001, None, (sure, tentative))) == (
+    assert loop_words.verdict_sentences(Summary("named", 0.001, None, (sure, tentative))) == (
         "Missing: a (family-wise p ≤ 0.001). Tentative, in the model since it predicts better: b, which rests on row 10."
     )
     # where no name stands and it was not tested by itself, what speaks against all of them
@@ -299,7 +299,7 @@ def test_verdict_tells_what_is_tentative():
         place="slip", variable="slope", alike=("slip",), variables_alike=(), family="slip", by_duty=False
     )
     only = Missing(("b",), (), ("slip",), False)
-    said = loop_words.statement(Summary("place", 0.001, place, (only,), support=curve))
+    said = loop_words.verdict_sentences(Summary("place", 0.001, place, (only,), support=curve))
     assert "no effect of the library is established" in said
     assert said.endswith("predicts better: b (one smooth curve in the slip balance over slope leaves nothing).")
 
@@ -309,18 +309,18 @@ def test_a_mechanism_is_stated_with_what_it_explains_and_predicts():
     place = SimpleNamespace(
         place="track", variable="speed_motor", alike=("track",), variables_alike=(), family="x", by_duty=False
     )
-    said = loop_words.statement(Summary("mechanism", 0.001, place, mechanism=found))
+    said = loop_words.verdict_sentences(Summary("mechanism", 0.001, place, mechanism=found))
     assert said.startswith(
         "Missing: a loss torque that changes with speed or a slip, established as a mechanism: it "
     )
     assert "explains 99 % of the excess misfit, gains 0.8 nat" in said and "8.0 standard errors" in said
     weak = dataclasses.replace(found, families=("slip",), share=0.3, gain=0.1)
-    said = loop_words.statement(Summary("place", 0.001, place, mechanism=weak))
+    said = loop_words.verdict_sentences(Summary("place", 0.001, place, mechanism=weak))
     assert (
         "No mechanism is established: the best one is a slip, but it explains only 30 % of the excess misfit and"
         in said
     )
-    assert loop_words.brief(Summary("mechanism", 0.001, place, mechanism=weak)) == "mechanism: slip"
+    assert loop_words.brief_verdict(Summary("mechanism", 0.001, place, mechanism=weak)) == "mechanism: slip"
 
 
 def test_a_mechanism_is_stated_with_its_window_and_why_no_name_stands():
@@ -332,25 +332,25 @@ def test_a_mechanism_is_stated_with_its_window_and_why_no_name_stands():
     mechanism = Mechanism((here.family,), (), 0.99, 0.8, 0.1, 1.0)
     summary = Summary("mechanism", 0.001, here, mechanism=mechanism)
     within = "order, in runs 30 to 44 (as well in runs 31 to 44)"
-    assert loop_words.statement(summary).startswith(
+    assert loop_words.verdict_sentences(summary).startswith(
         f"Missing: a slip that changes with {within}, established as a mechanism"
     )
     other = dataclasses.replace(mechanism, families=("slip that changes with load",))
-    assert "in runs" not in loop_words.statement(dataclasses.replace(summary, mechanism=other))
+    assert "in runs" not in loop_words.verdict_sentences(dataclasses.replace(summary, mechanism=other))
     support = NameSupport(False, "none by itself", tests=(NameTest("a", 1.2, 3.41, (), 0.0),))
     found = SimpleNamespace(
         verdict="mechanism", summary=summary, effects=(), unnamed=here, support=support, after=SimpleNamespace(adequate=True)
     )  # fmt: skip
     assert (
-        loop_words.answer(found)
+        loop_words.completeness_answer(found)
         == f"No: missing is a slip that changes with {within}. Its exact law is not established."
     )
     said = (
         "one constant in the slip balance in runs 30 to 44 leaves nothing; a explains 1.2 σ; chance alone reaches 3.4"
     )
-    assert loop_words.why(found) == said
+    assert loop_words.naming_reasons(found) == said
     found.after.adequate = False
-    assert loop_words.why(found) == loop_words.reason(support)
+    assert loop_words.naming_reasons(found) == loop_words.support_reasons(support)
 
 
 def test_every_doubt_about_a_mechanism_has_words():
@@ -368,8 +368,8 @@ def test_every_doubt_about_a_mechanism_has_words():
 def test_the_course_of_a_curve_is_told_by_its_ends(value, said):
     at = np.array([10.0, 20.0, 100.0])
     curve = SimpleNamespace(window=None, variable="speed_motor", at=at, value=np.array(value), unit="N·m")
-    assert loop_words.course(curve) == said
-    assert loop_words.course(SimpleNamespace(**vars(curve) | {"window": {}})) == ""
+    assert loop_words.curve_course(curve) == said
+    assert loop_words.curve_course(SimpleNamespace(**vars(curve) | {"window": {}})) == ""
 
 
 def test_verdicts_at_other_noise_are_one_sentence():
@@ -390,11 +390,11 @@ def test_verdict_lists_what_cannot_be_told_apart():
     value = FreedValue("motor.resistance", 1.9377, "ohm")
     one = Missing(("a",), (value,), ("losses",))
     two = Missing(("b", "c"), (), ("leads", "supply"))
-    assert loop_words.statement(Summary("class", 0.0004, None, (one, two))) == (
+    assert loop_words.verdict_sentences(Summary("class", 0.0004, None, (one, two))) == (
         "Missing: losses, a, or motor.resistance is 1.94 ohm (these data cannot tell which); one of b, c (these data "
         "cannot tell which) (family-wise p ≤ 0.0004)."
     )
-    assert loop_words.statement(Summary("named", 0.002, None, (Missing(("a",), (), ("x",)),))) == (
+    assert loop_words.verdict_sentences(Summary("named", 0.002, None, (Missing(("a",), (), ("x",)),))) == (
         "Missing: a (family-wise p ≤ 0.002)."
     )
 
@@ -406,7 +406,9 @@ def test_verdict_lists_what_cannot_be_told_apart():
 def test_what_settled_runs_cannot_tell_from_an_effect_is_said_of_them_alone(sampled, said):
     members = {"directional_friction": SimpleNamespace(size=0.1), "angle_friction": SimpleNamespace(size=1.5)}
     effect = SimpleNamespace(members=members, stated={})
-    assert loop_words.alike(SimpleNamespace(runs=SimpleNamespace(sampled=sampled)), effect) == said
+    assert (
+        loop_words.indistinguishable_effects(SimpleNamespace(runs=SimpleNamespace(sampled=sampled)), effect) == said
+    )
 
 
 def test_a_formula_without_terms_says_so():
@@ -452,7 +454,7 @@ def test_names_say_what_would_explain_more_than_they():
 def test_what_is_predicted_worse_is_said_with_its_rows(found, predicted, said):
     worse = () if found is None else (Worse("voltage", "motor_speed", *found),)
     whole = f"Predicts worse on held-out rows: by voltage {said}."
-    assert loop_words.worse(worse, {"voltage": predicted}) == (whole if said else "")
+    assert loop_words.rising_errors_sentence(worse, {"voltage": predicted}) == (whole if said else "")
 
 
 @pytest.mark.parametrize(
@@ -464,7 +466,7 @@ def test_what_is_predicted_worse_is_said_with_its_rows(found, predicted, said):
     ],
 )
 def test_what_the_track_model_is_asked_about(about, said):
-    assert loop_words.asked(of_loop.Asked(*about)) == said
+    assert loop_words.track_model_question(of_loop.Asked(*about)) == said
 
 
 # --- whether a fit is adequate --------------------------------------------------------------------------
@@ -561,10 +563,10 @@ def test_what_would_measure_is_found_by_either_end_of_a_name():
 
 def test_lines_of_a_terminal_have_80_columns_and_those_of_a_file_are_whole(monkeypatch, capsys):
     text = "- " + "a sentence that goes on " * 8 + "\n" + "x" * 100
-    lines = console.wrapped(text).split("\n")
+    lines = console.wrap_for_terminal(text).split("\n")
     assert all(len(line) <= 80 for line in lines[:-1]) and lines[-1] == "x" * 100 and lines[1].startswith("  ")
-    assert " ".join(console.wrapped(text).split()) == " ".join(text.split())
-    console.say(text)
+    assert " ".join(console.wrap_for_terminal(text).split()) == " ".join(text.split())
+    console.print_output(text)
     assert capsys.readouterr().out.rstrip("\n") == text
 
 

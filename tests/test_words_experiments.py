@@ -29,7 +29,7 @@ HELD = dataclasses.replace(DRIVEN, torques=(0.0, 0.0412))
 
 
 def on(reach):
-    return {e.name: words.experiment(e) for e in menu.experiment_menu(reach)}
+    return {e.name: words.experiment_sentences(e) for e in menu.experiment_menu(reach)}
 
 
 def test_acts_say_what_to_set_and_to_read():
@@ -132,22 +132,27 @@ def test_runs_of_a_shaft_are_at_what_is_imposed():
     ],
 )
 def test_what_can_do_damage_is_said(about, said):
-    assert words.watch(about) == said
+    assert words.part_to_watch(about) == said
     run = dataclasses.replace(next(e for e in menu.experiment_menu(ONE) if e.name == "crawl, rover"), watch=(about,))
-    assert words.experiment(run).endswith(f"; read speed. Watch {said}")
+    assert words.experiment_sentences(run).endswith(f"; read speed. Watch {said}")
 
 
 def test_instructions_are_said():
     crawl, reverse = (
         next(e for e in menu.experiment_menu(ONE) if e.name == f"{n}, rover") for n in ("crawl", "reverse")
     )
-    both = f"{words.experiment(crawl)}. And: {words.experiment(reverse)}"
-    assert words.instruction(CarryOut((crawl, reverse))) == both
-    assert words.instruction(NothingPossible()) == "Every experiment of the menu is forbidden or beyond reach"
-    assert words.instruction(NothingTells(("a", "b"), 2.0)) == (
+    both = f"{words.experiment_sentences(crawl)}. And: {words.experiment_sentences(reverse)}"
+    assert words.experiment_instruction(CarryOut((crawl, reverse))) == both
+    assert (
+        words.experiment_instruction(NothingPossible()) == "Every experiment of the menu is forbidden or beyond reach"
+    )
+    assert words.experiment_instruction(NothingTells(("a", "b"), 2.0)) == (
         "No experiment of the menu tells a and b apart by 2 sigma"
     )
-    assert words.instruction(TooWeak("slope", 1.23)) == "A series in slope would show what is missing by 1.2 sigma"
+    assert (
+        words.experiment_instruction(TooWeak("slope", 1.23))
+        == "A series in slope would show what is missing by 1.2 sigma"
+    )
 
 
 #: Reach, variable, and what is said of more runs along it.
@@ -213,7 +218,7 @@ MORE = [
 
 @pytest.mark.parametrize(("reach", "variable", "said"), MORE, ids=[v for _, v, _ in MORE])
 def test_more_runs_are_said_within_reach(reach, variable, said):
-    assert words.instruction(denser_runs_instruction("slip", variable, reach)) == (
+    assert words.experiment_instruction(denser_runs_instruction("slip", variable, reach)) == (
         f"{said}; read every channel. What the slip balance lacks then shows its shape"
     )
 
@@ -233,7 +238,9 @@ def test_more_runs_are_said_within_reach(reach, variable, said):
 )
 def test_runs_that_a_duty_drives_are_repeated_over_the_duty(reach, variable, said):
     reach = dataclasses.replace(reach, duties=(0.3, 0.9))
-    assert words.instruction(denser_runs_instruction("slip", variable, reach, by_duty=True)).startswith(f"{said}; ")
+    assert words.experiment_instruction(denser_runs_instruction("slip", variable, reach, by_duty=True)).startswith(
+        f"{said}; "
+    )
 
 
 def test_every_kind_of_runs_has_words():
@@ -256,8 +263,8 @@ def test_steps_are_those_that_a_person_sets(span, count, step):
 
 def test_a_temperature_that_nobody_stated_is_not_watched():
     stated, unknown = (denser_runs_instruction("slip", "time", dataclasses.replace(ONE, hot=t)) for t in (125.0, 1e9))
-    assert "(125 °C is allowed)" in words.instruction(stated)
-    assert words.instruction(unknown).count("watch the winding's temperature;") == 1
+    assert "(125 °C is allowed)" in words.experiment_instruction(stated)
+    assert words.experiment_instruction(unknown).count("watch the winding's temperature;") == 1
 
 
 @pytest.mark.parametrize("reach", [ONE, BENCH, DRIVEN, BRAKED, HELD])
@@ -267,6 +274,6 @@ def test_a_temperature_that_nobody_stated_is_not_watched():
 def test_more_runs_are_said_of_a_table_that_varied_nothing(reach, variable):
     """Where a speed is imposed the table has no voltage at all."""
     used = tuple(dataclasses.replace(u, voltages=(0.0,), slopes=(0.0,), payloads=(0.0,)) for u in reach.used)
-    assert words.instruction(
+    assert words.experiment_instruction(
         denser_runs_instruction("track", variable, dataclasses.replace(reach, used=used))
     ).startswith("Re")

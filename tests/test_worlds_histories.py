@@ -154,7 +154,7 @@ def test_runs_of_another_robot_end_where_settled_travel_is():
 def test_histories_of_another_robot_agree_with_drive(tmp_path, variety):
     w = brief(world("robots", variety, seed=3), 0.6)
     (tmp_path / "robot.toml").write_text(w.machine.toml)
-    robot = robot_file.read(tmp_path / "robot.toml")
+    robot = robot_file.read_robot(tmp_path / "robot.toml")
     lost = {"battery", *machines.ROLES} - set(w.machine.names)
     kept = {w.machine.public(n): v for n, v in w.constants.items() if n.split(".")[0] not in lost}
     robot = params.replace(robot, {n: jnp.asarray(v, float) for n, v in kept.items()})
@@ -205,7 +205,7 @@ def test_starts_of_the_papers_robot_pass_the_input_checks_and_are_reproducible(t
     (effect,) = one.label["effects"]
     assert effect["class"] == "rotating_inertia" and effect["sigmas"] == pytest.approx(6.0)
     one.write(tmp_path)
-    runs = records.read(tmp_path / "table.csv")
+    runs = records.read_runs(tmp_path / "table.csv")
     assert len(runs) == 6 * 11 and runs.has("time_s") and "rotating" not in (tmp_path / "table.csv").read_text()
 
 
@@ -215,7 +215,7 @@ def test_table_of_histories_passes_the_input_checks(quick, tmp_path):
         w = brief(world(stratum, variety, seed=4))
         made = histories.case(w, seed=1)
         made.write(tmp_path)
-        runs = records.read(tmp_path / "table.csv")
+        runs = records.read_runs(tmp_path / "table.csv")
         kind = observers.observer_kind(runs)
         known = noise.noise_from_table(runs, kind.sizes(runs))
         assert runs.has("time_s") and len(runs) == made.label["rows"]

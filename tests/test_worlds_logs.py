@@ -25,8 +25,8 @@ def shown(tmp_path, case, terms=()):
     """Readings of the simulator with the truth of a case, in sds as the generator's: without effects, then with each of
     `terms` alone; each of shape (runs, readings)."""
     case.write(tmp_path)
-    robot = robot_file.read(tmp_path / "rig.toml")
-    runs = records.read(tmp_path / "table.csv", robot=robot)
+    robot = robot_file.read_robot(tmp_path / "rig.toml")
+    runs = records.read_runs(tmp_path / "table.csv", robot=robot)
     robot = dataclasses.replace(robot, effects=tuple(BY_NAME[t.name]() for t in terms))
     truth = {logs.PUBLIC[n]: x for n, x in case.rig.p.items() if n in case.rig.names} | {"rig.delay": case.rig.delay}
     sizes = {f"effects.{t.name}.amplitude": t.amplitude for t in terms}
@@ -88,8 +88,8 @@ def test_a_speed_that_still_rises_is_no_matter_of_units(tmp_path, monkeypatch):
     # Levels of an imposed current that end long before steady travel; refused before as "are they in turns/s?".
     case = rig_logs.attempt("clean", 4)
     case.write(tmp_path)
-    robot = robot_file.read(tmp_path / "rig.toml")
-    runs = records.read(tmp_path / "table.csv", robot=robot)
+    robot = robot_file.read_robot(tmp_path / "rig.toml")
+    runs = records.read_runs(tmp_path / "table.csv", robot=robot)
     # None of its rows has settled, so nothing is compared.
     monkeypatch.setattr(ranges, "_check_masses", lambda *_: pytest.fail("rows that still rise are compared"))
     assert check_ranges(runs, robot) == []

@@ -241,7 +241,7 @@ def test_table_and_label_are_separate_files_and_the_table_passes_the_input_check
     narrow(["windage"], seed=9).write(tmp_path)
     assert "windage" not in (tmp_path / "table.csv").read_text()
     assert json.loads((tmp_path / "label.json").read_text())["effects"][0]["name"] == "windage"
-    runs = records.read(tmp_path / "table.csv")
+    runs = records.read_runs(tmp_path / "table.csv")
     assert len(runs) == 90 and runs.has("total_current_sd_A")
 
 
@@ -291,7 +291,7 @@ def test_missing_cells_are_empty_in_the_file(tmp_path):
     (w,) = worlds("missing", 1)
     made = tables.case(w, seed=1)
     made.write(tmp_path)
-    runs = records.read(tmp_path / "table.csv")
+    runs = records.read_runs(tmp_path / "table.csv")
     lost = np.isnan(runs.measured())
     assert lost.sum() == made.label["missing"] and 0.05 < lost.mean() < 0.16
     assert (np.isnan(runs.deviations()) == lost).all()
@@ -406,9 +406,9 @@ def test_robot_file_is_read_and_runs_agree_with_steady(tmp_path, roles):
     )
     w = dataclasses.replace(w, machine=m, constants=dict(m.constants), conditions=machines.grid(m, m.constants))
     tables.case(w).write(tmp_path)
-    robot = robot_file.read(tmp_path / "rig.toml")
+    robot = robot_file.read_robot(tmp_path / "rig.toml")
     assert robot.configurations.names == tuple(m.names.values())
-    r = steady_batch(robot, records.read(tmp_path / "table.csv").conditions(robot)).reading
+    r = steady_batch(robot, records.read_runs(tmp_path / "table.csv").conditions(robot)).reading
     ours = np.stack([r["total_current"], r["motor_speed"], r["speed"]])
     theirs, sound = readings(w.conditions, w.constants)
     assert sound.all()
@@ -442,7 +442,7 @@ def test_laws_follow_the_size_of_the_robot():
 
 
 def test_priors_are_those_of_the_fields_and_truths_are_where_the_package_has_them():
-    robot = robot_file.load("nominal")
+    robot = robot_file.load_robot("nominal")
     c = priors.parameter_coordinates(robot, priors.free_names(robot, ("6T2A", "4W2T")))
     assert set(c.names) == set(PAPER.free)
     known = {p.name: p for p in params.walk_parameters(robot)}

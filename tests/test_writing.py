@@ -47,9 +47,9 @@ def test_results_are_frames_of_every_library():
     for frame in (frames.to_pandas(table), frames.to_polars(table)):
         assert list(frame.columns) == ["a", "word"] and frame["a"].to_numpy().tolist() == [0.5, 2.0]
     assert frames.to_xarray(table)["a"].values.tolist() == [0.5, 2.0]
-    runs = records.read("measured")
+    runs = records.read_runs("measured")
     assert frames.to_pandas(runs)["supply_voltage_V"].tolist() == runs["supply_voltage_V"].tolist()
-    again = records.read(frames.to_polars(runs))
+    again = records.read_runs(frames.to_polars(runs))
     np.testing.assert_array_equal(again.measured(), runs.measured())
     with pytest.raises(TypeError, match="expected a result with a table, got int"):
         frames.to_pandas(3)

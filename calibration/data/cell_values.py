@@ -9,8 +9,8 @@ import numpy as np
 
 from calibration.data import surfaces
 from calibration.data.columns import DRIVEN, DUTY, WORDS, Column, Layout
-from calibration.data.input_errors import allowed_words, number, parsed
-from calibration.data.named_arrays import Raw, missing, numbers, texts
+from calibration.data.input_errors import allowed_words, bound_text, parse_number
+from calibration.data.named_arrays import Raw, column_numbers, column_texts, missing_readings
 from mmrjax.model import quantities
 
 #: Ratio to the largest allowed value from which another unit is probable.
@@ -23,21 +23,22 @@ NOTHING = ("n.a.", "-", "--", "?", "x", "inf", "-inf")
 _WITH_UNIT = re.compile(r"([+-]?\d*\.?\d+(?:[eE][+-]?\d+)?)\s*([^\d\s.,].*)")
 
 
-def values(meaning: Column, raw: Raw, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
+def convert_column(meaning: Column, raw: Raw, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
     """Returns a column's values in its unit, NaN where there is no reading, and True for each cell to be refused.
 
-    All cells are read at once, since a log may have a million rows; `refusal` makes the sentence about one of them.
+    All cells are read at once, since a log may have a million rows; `refused_cell_sentence` makes the sentence about
+    one of them.
     """
     if meaning.column in WORDS:
-        words = texts(raw)
+        words = column_texts(raw)
         wrong = [word for word in dict.fromkeys(words) if _allowed_words(meaning.column, word, layout)]
         return np.array(words), np.isin(words, wrong)
-    found, (low, high) = numbers(raw), meaning.limits()
+    found, (low, high) = column_numbers(raw), meaning.limits()
     beyond = ROUNDED_FACTOR if meaning.factor != 1.0 else ROUNDED
     above = found > low if meaning.column in layout.deviation_columns else found >= low - beyond * abs(low)
     refused = ~(above & (found <= high + beyond * abs(high)))
     if _may_be_empty(meaning.column, layout):
-        refused[refused] = ~missing(raw, np.flatnonzero(refused))
+        refused[refused] = ~missing_readings(raw, np.flatnonzero(refused))
     np.clip(found, low, high, out=found)
     return found if meaning.as_named else _in_its_unit(meaning, found), refused
 
@@ -59,7 +60,7 @@ def _may_be_empty(column: str, layout: Layout) -> bool:
 def _allowed_words(column: str, word: str, layout: Layout) -> str:
     """Allowed words for the message about a word; empty if the word is allowed itself."""
     if column == "surface":
-        return surfaces.refused(word, layout)
+        return surfaces.allowed_labels(word, layout)
     if column == "mode" and word not in DRIVEN:
         return f"one of these; {allowed_words(word, DRIVEN)}"
     if column == "configuration" and not word:
@@ -67,8 +68,8 @@ def _allowed_words(column: str, word: str, layout: Layout) -> str:
     return ""
 
 
-def refusal(where: str, meaning: Column, cell: str, layout: Layout, *, hints: bool = True) -> str:
-    """Returns the sentence about a cell that `values` refuses.
+def refused_cell_sentence(where: str, meaning: Column, cell: str, layout: Layout, *, hints: bool = True) -> str:
+    """Returns the sentence about a cell that `convert_column` refuses.
 
     Args:
         where: opens it; hints: True to guess the unit that was meant.
@@ -80,9 +81,9 @@ def refusal(where: str, meaning: Column, cell: str, layout: Layout, *, hints: bo
         low, high = meaning.limits()
         hint = _hint(meaning, cell, hints, (*layout.measured_columns, *layout.deviation_columns, *DUTY))
         more = "more than " if column in layout.deviation_columns else ""
-        allowed = f"{more}{number(low)} to {number(high)}"
+        allowed = f"{more}{bound_text(low)} to {bound_text(high)}"
         try:
-            parsed(cell)
+            parse_number(cell)
         except ValueError:
             allowed = f"a number, {allowed}"
     return f"{where}, {meaning.shown}: got {cell or 'an empty cell'}; {hint}expected {allowed}"
@@ -97,7 +98,7 @@ def _hint(meaning: Column, cell: str, units: bool, readings: tuple[str, ...]) ->
         return ""
     named = {unit: column for column, unit in quantity.columns().items()}
     try:
-        value = parsed(cell)
+        value = parse_number(cell)
     except ValueError:
         found = _WITH_UNIT.fullmatch(cell)
         return "" if found is None else _unit_hint(found[1], found[2], mine, named)

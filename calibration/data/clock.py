@@ -11,8 +11,8 @@ import numpy as np
 
 from calibration.data import counters
 from calibration.data.columns import Column
-from calibration.data.input_errors import number
-from calibration.data.named_arrays import Raw, numbers
+from calibration.data.input_errors import bound_text
+from calibration.data.named_arrays import Raw, column_numbers
 
 #: Day of a cell with a time alone, and length of a day [s].
 _SOME_DAY, _DAY = "1970-01-01T", 86400.0
@@ -44,7 +44,7 @@ def from_the_first(name: str, meaning: Column, raw: Raw, runs: Sequence[str] | N
     notes: tuple[str, ...] = ()
     if not of_day:
         low, high = (limit * factor for limit in meaning.limits())
-        count, notes = _counted(name, meaning, numbers(raw), run)
+        count, notes = _counted(name, meaning, column_numbers(raw), run)
         clock = count * factor
         of_day = bool((clock > high).all())
         if of_day and clock[0] > EPOCH[1]:
@@ -69,7 +69,7 @@ def from_the_first(name: str, meaning: Column, raw: Raw, runs: Sequence[str] | N
     if of_day:
         return passed, (*notes, f"{name}: {meaning.shown} is a time of day; counted from the first of each run")
     which = run[np.flatnonzero(first[run])[0]]
-    where = f"{number(first[which] / factor)}{f' in run {names[which]}' if names[which] else ''}"
+    where = f"{bound_text(first[which] / factor)}{f' in run {names[which]}' if names[which] else ''}"
     return passed, (
         *notes,
         f"{name}: {meaning.shown} begins at {where}; a run begins at its first row, and its time counts from there; "
@@ -86,10 +86,10 @@ def _counted(
         return count, ()
     notes = []
     recording = np.zeros(len(count), int) if run is None else run
-    count, period = counters.unwrapped(count, recording)
+    count, period = counters.unwrap_counter(count, recording)
     if period:
         notes.append(f"{name}: {meaning.shown} wraps at {period:.10g}; counted on from there")
-    count, rows = counters.spread(count, recording)
+    count, rows = counters.spread_shared_stamps(count, recording)
     if rows:
         notes.append(f"{name}: {meaning.shown} repeats, {rows:.3g} rows a stamp; rows are set evenly between stamps")
     return count, tuple(notes)

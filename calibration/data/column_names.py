@@ -19,7 +19,7 @@ NAMED = 8
 _SIDE = {"l": "left", "lh": "left", "lft": "left", "port": "left", "r": "right", "rh": "right", "starboard": "right"}
 
 
-def understood(
+def match_column_names(
     name: str, header: Sequence[str], layout: Layout, *, inferred: bool, of_turns: bool
 ) -> tuple[list[str], Layout, tuple[str, ...]]:
     """Returns the names of columns in this program's spelling, the layout with their channels, and notes.

@@ -46,7 +46,7 @@ class Loads:
     missing: tuple[str, ...]
 
 
-def loads(base: Robot | None, content: dict[str, Any], sds: dict[str, float], where: str) -> Loads:
+def loads_from_tables(base: Robot | None, content: dict[str, Any], sds: dict[str, float], where: str) -> Loads:
     """Returns the loads that the file's content states, in its order.
 
     Takes `configurations` and every configuration's `load`, `like` and `movers` out of `content`, and replaces linear
@@ -85,7 +85,7 @@ def loads(base: Robot | None, content: dict[str, Any], sds: dict[str, float], wh
             raise BadConfiguration(f"{here}: got {table!r}; expected a table [{name}]")
         kind = _kind(table, here)
         if kind == "linear":
-            rig_file.linear(table, name, here, sds, _sides(content, base))
+            rig_file.linear_to_shaft(table, name, here, sds, _sides(content, base))
             linear.add(name)
         if kind in ("linear", "shaft"):
             by_name[name], lacking = _shaft(table)

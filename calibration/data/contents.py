@@ -13,9 +13,9 @@ import numpy as np
 from calibration.data import delimited, presets_file
 from calibration.data.columns import Layout
 from calibration.data.input_errors import BadData
-from calibration.data.named_arrays import NamedArrays, numbers
+from calibration.data.named_arrays import NamedArrays, column_numbers
 from calibration.data.sources import in_memory, one_clock, opening
-from calibration.data.sources.recorded_signals import Clock, Signal, Source, known, unit_of_clock
+from calibration.data.sources.recorded_signals import Clock, Signal, Source, unit_of_clock, values_in_memory
 from mmrjax.model import channels, quantities
 
 #: Least gap between samples, in usual steps.
@@ -85,7 +85,7 @@ class Contents:
         return {"schema": "mmrjax.inspect/1", **dataclasses.asdict(self)}
 
 
-def inspect(source: str | Path | Any) -> Contents:
+def inspect_source(source: str | Path | Any) -> Contents:
     """Returns the contents of a file or of a table in memory.
 
     Raises:
@@ -104,7 +104,7 @@ def inspect(source: str | Path | Any) -> Contents:
         time = times.get(id(signal.clock)) if signal.clock is not None else None
         if isinstance(time, str) and f"{found.name}: {time}" not in notes:
             notes.append(f"{found.name}: {time}")
-    preset = presets_file.recognised([s.path for s in found.signals])
+    preset = presets_file.recognise_preset([s.path for s in found.signals])
     if len(clocks) > 1:
         notes.append(f"{found.name}: signals have {len(clocks)} clocks; rows become those of the densest channel")
     still = {fact.path for fact in facts if fact.least == fact.greatest}
@@ -118,14 +118,14 @@ def _source(source: Any) -> Source:
     if not isinstance(source, str | Path):
         kind, signals = in_memory.of_object(source)
         return Source(kind, kind, signals)
-    path, within = opening.split(str(source))
+    path, within = opening.split_source(str(source))
     name = path.name or str(source)
     if not path.exists():
         raise BadData(f"{source}: no such file; expected a file of data, or the folder of a ROS 2 bag")
     form = opening.format_of(path, name)
     if form is not None:
-        return opening.opened(path, within, name, form)
-    found = _of_text(delimited.arrays(path, name))
+        return opening.open_signals(path, within, name, form)
+    found = _of_text(delimited.read_csv_columns(path, name))
     if not found.signals:
         raise BadData(f"{name}: the file is empty; expected a header and rows")
     return found.below(within) if within else found
@@ -135,11 +135,11 @@ def _of_text(arrays: NamedArrays) -> Source:
     """A table of texts as signals: numbers where most cells are."""
     signals = []
     for k, (name, raw) in enumerate(zip(arrays.header, arrays.values, strict=True)):
-        values = numbers(raw)
+        values = column_numbers(raw)
         words = not np.isfinite(values).any() and any(str(cell).strip() for cell in raw)
         loaded = np.array(raw) if words else values
         unit = arrays.units[k] if arrays.units else ""
-        signals.append(Signal(name, len(values), known(loaded), unit, words=words))
+        signals.append(Signal(name, len(values), values_in_memory(loaded), unit, words=words))
     return Source(arrays.name, "a text file", tuple(signals), arrays.digest, arrays.notes)
 
 
@@ -167,7 +167,7 @@ def _facts(signal: Signal, clock: Clock | None, times: dict[int, tuple[np.ndarra
     )
     if signal.refused or not signal.length:
         return found
-    if opening.VALUE * signal.length > opening.SHARE * opening.available():
+    if opening.VALUE * signal.length > opening.SHARE * opening.available_memory():
         return dataclasses.replace(found, refused="has more values than the free memory holds")
     try:
         values = signal.load()
@@ -194,7 +194,7 @@ def _facts(signal: Signal, clock: Clock | None, times: dict[int, tuple[np.ndarra
 
 
 def _seconds(clock: Clock) -> tuple[np.ndarray, str] | str:
-    found = one_clock.seconds(clock)
+    found = one_clock.clock_seconds(clock)
     back = np.flatnonzero(np.diff(found.time) < 0)
     if back.size:
         return f"{clock.name} goes back at sample {back[0] + 2}"

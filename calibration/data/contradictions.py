@@ -7,7 +7,7 @@ import numpy as np
 
 from calibration.data import sides
 from calibration.data.columns import HEADING, LEVERS, SPEED, SUPPLY
-from calibration.data.input_errors import BadData, number
+from calibration.data.input_errors import BadData, bound_text
 from calibration.data.table import Runs
 from mmrjax.model import params
 from mmrjax.model.channels import CURRENT, VOLTAGE
@@ -32,7 +32,7 @@ SELDOM = 0.02
 RADIAN, ALIKE = 180 / np.pi, 0.03
 
 
-def check(runs: Runs, robot: Robot) -> None:
+def check_contradictions(runs: Runs, robot: Robot) -> None:
     """Refuse a table that contradicts itself or its robot.
 
     Raises:
@@ -43,8 +43,8 @@ def check(runs: Runs, robot: Robot) -> None:
     if runs.turns and (why := turn_error(robot, sorted({str(n) for n in runs.configurations_named(robot)}))):
         raise BadData(f"{runs.source}, {', '.join((*runs.layout.sides, *HEADING))}: {why}")
     if runs.turns:
-        sides.check(runs)
-    if found := misplaced(runs, robot):
+        sides.check_turns(runs)
+    if found := misplaced_levers(runs, robot):
         row, column, why = found
         raise BadData(f"{runs.source} row {row + 1}, {column}: {why}")
     if robot.rig.imposed == "motor_speed" and not runs.sampled and not runs.turns:
@@ -72,7 +72,7 @@ def without_levers(robot: Robot, configuration: str) -> str:
     return "" if configuration in have else f"{configuration} has no levers; {others}"
 
 
-def misplaced(runs: Runs, robot: Robot) -> tuple[int, str, str] | None:
+def misplaced_levers(runs: Runs, robot: Robot) -> tuple[int, str, str] | None:
     """Row and column of an impossible lever angle, and the reason; None if there is no such row.
 
     The reason is a configuration without levers, or an angle beyond their range.
@@ -138,8 +138,9 @@ def _voltage(runs: Runs, robot: Robot, column: str) -> None:
         row = int(wrong[0])
         why = "of the other sign" if along[row] < 0 else "too small"
         raise BadData(
-            f"{runs.source} row {row + 1}, {column}: got {number(voltage[row])} at an imposed {SPEED} of "
-            f"{number(runs[SPEED][row])}, {why} for the motors' back-EMF of {number(float(f'{back[row]:.3g}'))} V; "
+            f"{runs.source} row {row + 1}, {column}: got {bound_text(voltage[row])} at an imposed {SPEED} of "
+            f"{bound_text(runs[SPEED][row])}, {why} for the motors' back-EMF of "
+            f"{bound_text(float(f'{back[row]:.3g}'))} V; "
             "check both columns and motor.torque_constant in the robot's file"
         )
 
@@ -153,7 +154,7 @@ def _time(runs: Runs) -> None:
         if 0 < back.size <= max(SELDOM * len(mine), 1):
             row, was, now = mine[back[0] + 1] + 1, time[mine[back[0]]], time[mine[back[0] + 1]]
             raise BadData(
-                f"{runs.source} row {row}, time_s: goes back from {number(was)} to {number(now)} s; "
+                f"{runs.source} row {row}, time_s: goes back from {bound_text(was)} to {bound_text(now)} s; "
                 "give each recording its own run_id, or sort the rows"
             )
 
@@ -181,9 +182,10 @@ def _angle(runs: Runs) -> None:
             gap = passed[jumps[0]]
             why = "as an angle that wraps; expected an angle that continues beyond a turn"
             if gap > GAP * np.median(passed):
-                why = f"{number(float(f'{gap:.3g}'))} s earlier; give each recording its own run_id"
+                why = f"{bound_text(float(f'{gap:.3g}'))} s earlier; give each recording its own run_id"
             raise BadData(
-                f"{runs.source} row {row + 1}, output_angle_deg: jumps by {number(float(f'{step[jumps[0]]:.4g}'))} "
+                f"{runs.source} row {row + 1}, output_angle_deg: jumps by "
+                f"{bound_text(float(f'{step[jumps[0]]:.4g}'))} "
                 f"deg from the sample before, {why}"
             )
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -192,7 +194,7 @@ def _angle(runs: Runs) -> None:
         mixed = np.flatnonzero(other & (np.abs(step) > UNUSUAL * np.maximum(usual, 1.0)))
         if mixed.size:
             row, k = int(mine[mixed[0] + 1]), mixed[0]
-            was, now = (number(float(f"{x:.4g}")) for x in angle[mine][k : k + 2])
+            was, now = (bound_text(float(f"{x:.4g}")) for x in angle[mine][k : k + 2])
             raise BadData(
                 f"{runs.source} row {row + 1}, output_angle_deg: goes from {was} to {now} between two samples, as "
                 "if degrees and radians are mixed; write all rows in one unit"

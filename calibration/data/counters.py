@@ -14,7 +14,7 @@ LACKING = 5.0
 SHARED, ODD = 0.1, 0.1
 
 
-def unwrapped(count: np.ndarray, run: np.ndarray) -> tuple[np.ndarray, float]:
+def unwrap_counter(count: np.ndarray, run: np.ndarray) -> tuple[np.ndarray, float]:
     """Returns a counter that goes on past its end, and its period; 0 where it does not.
 
     A counter wraps where it falls from its last numbers to its first ones, within `LACKING` usual steps, and never
@@ -49,7 +49,7 @@ def unwrapped(count: np.ndarray, run: np.ndarray) -> tuple[np.ndarray, float]:
     return count, 0.0
 
 
-def spread(time: np.ndarray, run: np.ndarray) -> tuple[np.ndarray, float]:
+def spread_shared_stamps(time: np.ndarray, run: np.ndarray) -> tuple[np.ndarray, float]:
     """Returns times with rows that share a stamp set evenly between it and the next, and the rows of a stamp.
 
     The number of rows is 0 where nothing is changed.

@@ -41,12 +41,12 @@ class Stretch:
         return self.rows[time[self.rows] >= self.begin + share * (self.end - self.begin)]
 
 
-def changing(runs: Runs) -> tuple[str, ...]:
+def changing_columns(runs: Runs) -> tuple[str, ...]:
     """Columns of a table that are among `CHANGING` or are imposed."""
     return tuple(c for c in dict.fromkeys((runs.layout.imposed_column, *CHANGING)) if runs.has(c))
 
 
-def applied(runs: Runs) -> np.ndarray:
+def applied_drive(runs: Runs) -> np.ndarray:
     """Voltage of the motors in every row, or the imposed speed or current; shape (rows,) [V], [rpm] or [A].
 
     The voltage is 0 where the driver brakes or coasts. In turns it is the magnitude of the larger of both sides'.
@@ -59,9 +59,9 @@ def applied(runs: Runs) -> np.ndarray:
     return np.where(runs["mode"] == "voltage", voltage, 0.0) if runs.has("mode") else voltage
 
 
-def varies(runs: Runs, columns: tuple[str, ...] | None = None) -> np.ndarray:
+def rows_of_varying_runs(runs: Runs, columns: tuple[str, ...] | None = None) -> np.ndarray:
     """True for rows in whose run one of these columns changes, shape (rows,); by default the columns that may."""
-    columns = changing(runs) if columns is None else columns
+    columns = changing_columns(runs) if columns is None else columns
     found = np.zeros(len(runs), bool)
     if not runs.sampled:
         return found
@@ -73,7 +73,7 @@ def varies(runs: Runs, columns: tuple[str, ...] | None = None) -> np.ndarray:
     return found
 
 
-def differs(rows: np.ndarray, conditions: Iterable[np.ndarray]) -> np.ndarray:
+def differs_from_row_before(rows: np.ndarray, conditions: Iterable[np.ndarray]) -> np.ndarray:
     """True for rows with a condition that differs from the row before, shape (rows,)."""
     found = np.zeros(len(rows), bool)
     for condition in conditions:
@@ -81,7 +81,7 @@ def differs(rows: np.ndarray, conditions: Iterable[np.ndarray]) -> np.ndarray:
     return found
 
 
-def divided(
+def divide_run(
     rows: np.ndarray, time: np.ndarray, conditions: Sequence[np.ndarray], applied: np.ndarray
 ) -> list[Stretch]:
     """The stretches of one run.
@@ -89,7 +89,7 @@ def divided(
     Args:
         rows: of the run, in the order of time; time [s], conditions, applied [V]: of every row of the table.
     """
-    cuts = [0, *np.flatnonzero(differs(rows, conditions)).tolist(), len(rows)]
+    cuts = [0, *np.flatnonzero(differs_from_row_before(rows, conditions)).tolist(), len(rows)]
     begins = [0.0, *(float(time[rows[k]]) for k in cuts[1:-1]), float(time[rows[-1]])]
     return [
         Stretch(rows[low:high], begin, end, bool(applied[rows[low]] > 0), len(cuts) == 2)
@@ -97,22 +97,22 @@ def divided(
     ]
 
 
-def stretches(runs: Runs) -> list[list[Stretch]]:
+def course_stretches(runs: Runs) -> list[list[Stretch]]:
     """The stretches of every run, runs in the order of their names."""
     found = []
-    time, volts = runs["time_s"], applied(runs)
-    columns = [runs[c] for c in changing(runs)]
+    time, volts = runs["time_s"], applied_drive(runs)
+    columns = [runs[c] for c in changing_columns(runs)]
     for name in np.unique(runs.run_names):
-        found.append(divided(runs.in_order(name), time, columns, volts))
+        found.append(divide_run(runs.in_order(name), time, columns, volts))
     return found
 
 
-def courses(runs: Runs) -> np.ndarray:
+def course_of_each_row(runs: Runs) -> np.ndarray:
     """For every row the course of its run's conditions, empty where they do not change; shape (rows,)."""
     found = np.full(len(runs), "", dtype=object)
-    if varies(runs).any():
-        columns = changing(runs)
-        for run in (r for r in stretches(runs) if len(r) > 1):
+    if rows_of_varying_runs(runs).any():
+        columns = changing_columns(runs)
+        for run in (r for r in course_stretches(runs) if len(r) > 1):
             said = [f"{s.begin:g}: {', '.join(str(runs[c][s.rows[0]]) for c in columns)}" for s in run]
             found[np.concatenate([s.rows for s in run])] = "; ".join(said)
     return found.astype(str)

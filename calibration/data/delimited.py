@@ -15,7 +15,7 @@ import numpy as np
 from calibration.data import input_files
 from calibration.data.columns import WORDS
 from calibration.data.input_errors import BadData
-from calibration.data.named_arrays import NamedArrays, Raw, number
+from calibration.data.named_arrays import NamedArrays, Raw, cell_number
 from mmrjax.errors import count_noun
 from mmrjax.model import channels, quantities
 
@@ -30,20 +30,21 @@ _COMMA, _POINT = (re.compile(rf"[+-]?\d*{mark}\d+(?:[eE][+-]?\d+)?") for mark in
 _THOUSANDS, _BELOW = re.compile(r"[+-]?[1-9]\d{0,2}[,.]\d{3}"), re.compile(r"[+-]?[1-9]\d{0,2}")
 
 
-def arrays(path: Path, name: str) -> NamedArrays:
+def read_csv_columns(path: Path, name: str) -> NamedArrays:
     """Returns the columns of a CSV file as texts.
 
     Args:
         name: of the file, for messages.
 
     Raises:
-        BadData: as `input_files.table`, `text` and `cells`, or a row of another length than the header.
+        BadData: as `input_files.csv_bytes`, `decode_text` and `split_cells`, or a row of another length than the
+            header.
     """
-    content = input_files.table(path, name)
+    content = input_files.csv_bytes(path, name)
     if len(content) >= LONG and (plain := _plain(name, content)) is not None:
         return plain
-    decoded, encoded = text(name, content)
-    rows, notes = cells(name, below_comments([line for line in decoded.splitlines() if line.strip()]))
+    decoded, encoded = decode_text(name, content)
+    rows, notes = split_cells(name, below_comments([line for line in decoded.splitlines() if line.strip()]))
     header, body = (rows[0], rows[1:]) if rows else ([], [])
     units = row_of_units(header, body[0]) if body else ()
     if units:
@@ -66,7 +67,7 @@ def arrays(path: Path, name: str) -> NamedArrays:
 
 
 def _plain(name: str, content: bytes) -> NamedArrays | None:
-    """Columns of a plain table, numbers as arrays; None for any other table, which `cells` reads with all checks.
+    """Columns of a plain table, numbers as arrays; None for any other table, which `split_cells` reads and checks.
 
     A plain table is in UTF-8 with commas, without comments, quotes and units.
     """
@@ -113,7 +114,7 @@ def _plain(name: str, content: bytes) -> NamedArrays | None:
 def row_of_units(header: Sequence[str], first: Sequence[str]) -> tuple[str, ...]:
     """Returns the units that the first row below a header states, empty where it states none; () if it is a run: a
     cell of it is a number, or no cell of a column of numbers is a unit."""
-    if len(first) != len(header) or any(math.isfinite(number(cell)) for cell in first):
+    if len(first) != len(header) or any(math.isfinite(cell_number(cell)) for cell in first):
         return ()
     units = tuple(quantities.unit_in_column(cell.strip("[]()")).strip("-") for cell in first)
     known = {unit for quantity in (*quantities.SET, *channels.EVERY) for unit in quantity.columns().values()} - {""}
@@ -121,7 +122,7 @@ def row_of_units(header: Sequence[str], first: Sequence[str]) -> tuple[str, ...]
     return units if stated else ()
 
 
-def text(name: str, content: bytes) -> tuple[str, tuple[str, ...]]:
+def decode_text(name: str, content: bytes) -> tuple[str, tuple[str, ...]]:
     """Returns the text of a file in UTF-8, in UTF-16 that begins with its mark, or in Windows-1252; and a note if it
     is not in UTF-8.
 
@@ -147,12 +148,12 @@ def below_comments(lines: Sequence[str]) -> list[str]:
     numbers follow it."""
     first = next((k for k, line in enumerate(lines) if not line.startswith("#")), len(lines))
     below = list(lines[first:])
-    if first and below and any(map(math.isfinite, map(number, re.split(r"[,;\t]", below[0])))):
+    if first and below and any(map(math.isfinite, map(cell_number, re.split(r"[,;\t]", below[0])))):
         return [lines[first - 1].lstrip("# "), *below]
     return below
 
 
-def cells(name: str, lines: Sequence[str]) -> tuple[list[list[str]], tuple[str, ...]]:
+def split_cells(name: str, lines: Sequence[str]) -> tuple[list[list[str]], tuple[str, ...]]:
     """Returns rows of cells without blanks around them, numbers with points; and notes on separators and marks.
 
     Semicolons or tabs separate cells where the header has no comma; numbers may have decimal commas then.

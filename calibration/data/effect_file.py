@@ -63,14 +63,14 @@ TURN: dict[str, Any] = {
 }
 
 
-def library(paths: Sequence[Path | str] = ()) -> Library:
+def effect_library(paths: Sequence[Path | str] = ()) -> Library:
     """Returns the packaged effects and the effects of the files, by name.
 
     Raises:
-        BadConfiguration: as `read`; a repeated name; an effect that settles to an unknown effect.
+        BadConfiguration: as `read_effect_file`; a repeated name; an effect that settles to an unknown effect.
     """
     known = dict(effects.BY_NAME)
-    own = [(path, effect) for path in map(Path, paths) for effect in read(path)]
+    own = [(path, effect) for path in map(Path, paths) for effect in read_effect_file(path)]
     for path, effect in own:
         if effect.name in {**effects.BESIDE, **known}:
             raise BadConfiguration(f"{_where(path, effect)}, name: {effect.name} is taken; choose another")
@@ -92,7 +92,7 @@ class _FromSource(importlib.machinery.SourceFileLoader):
         return self.source_to_code(self.get_data(self.path), self.path)
 
 
-def read(path: Path) -> tuple[type[Effect], ...]:
+def read_effect_file(path: Path) -> tuple[type[Effect], ...]:
     """Returns the effect classes that a Python file defines, in its order. The file's code is run.
 
     Raises:

@@ -31,7 +31,7 @@ class BadData(InputError):
     exit_code = 4
 
 
-def parsed(text: str) -> float:
+def parse_number(text: str) -> float:
     """Returns the number that a text states in digits, without the underscores that Python allows.
 
     Raises:
@@ -42,12 +42,12 @@ def parsed(text: str) -> float:
     return float(text)
 
 
-def number(value: float) -> str:
+def bound_text(value: float) -> str:
     """A bound as a person writes it."""
     return f"{value:g}"
 
 
-def rounded(value: float) -> str:
+def three_digits(value: float) -> str:
     """A value as a sheet shows it, to three digits."""
     return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
 
@@ -72,6 +72,6 @@ def stated_number(
         kind = "a number" if unit is None else f"a number [{unit or '-'}]"
         raise BadConfiguration(f"{where}: got {value!r}; expected {kind}")
     if not math.isfinite(value) or not low <= value <= high:
-        allowed = f"{number(low)} to {number(high)} {unit or ''}".rstrip()
+        allowed = f"{bound_text(low)} to {bound_text(high)} {unit or ''}".rstrip()
         raise BadConfiguration(f"{where}: got {value}; expected {allowed}")
     return float(value)

@@ -32,7 +32,7 @@ WHOLE = 2**63
 _KINDS = {stat.S_ISDIR: "a folder", stat.S_ISFIFO: "a pipe", stat.S_ISSOCK: "a socket"}
 
 
-def content(path: Path, where: str | Path, kind: type[InputError] = BadData, largest: int = LARGEST) -> bytes:
+def file_bytes(path: Path, where: str | Path, kind: type[InputError] = BadData, largest: int = LARGEST) -> bytes:
     """Returns the bytes of a regular file.
 
     Args:
@@ -45,14 +45,14 @@ def content(path: Path, where: str | Path, kind: type[InputError] = BadData, lar
         return stream.read()
 
 
-def beginning(path: Path, where: str | Path, kind: type[InputError] = BadData, length: int = 4096) -> bytes:
+def first_bytes(path: Path, where: str | Path, kind: type[InputError] = BadData, length: int = 4096) -> bytes:
     """Returns the first bytes of a regular file of any size.
 
     Args:
         where: opens the message of an error; kind: of the error.
 
     Raises:
-        InputError: as `content`.
+        InputError: as `file_bytes`.
     """
     with _opened(path, where, kind) as stream:
         return stream.read(length)
@@ -73,13 +73,13 @@ def _opened(path: Path, where: str | Path, kind: type[InputError], largest: floa
         raise kind(f"{where}: cannot be read ({getattr(error, 'strerror', None) or error})") from error
 
 
-def table(path: Path, where: str | Path) -> bytes:
+def csv_bytes(path: Path, where: str | Path) -> bytes:
     """Returns the bytes of a file that should be CSV.
 
     Raises:
-        BadData: as `content`, or another format, which the message names.
+        BadData: as `file_bytes`, or another format, which the message names.
     """
-    found = content(path, where)
+    found = file_bytes(path, where)
     what = next((word for begin, word in BINARY.items() if found.startswith(begin)), None)
     what = what or next((word for begin, word in TEXTS.items() if begin.match(found)), None)
     if what is not None:
@@ -98,10 +98,10 @@ def toml_text(path: Path, where: str | Path) -> str:
         where: opens the message of an error.
 
     Raises:
-        BadConfiguration: as `content`, or text that is not UTF-8.
+        BadConfiguration: as `file_bytes`, or text that is not UTF-8.
     """
     try:
-        return content(path, where, BadConfiguration, LARGEST_TOML).decode("utf-8-sig")
+        return file_bytes(path, where, BadConfiguration, LARGEST_TOML).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise BadConfiguration(f"{where}: not a readable TOML file ({error}); save it in UTF-8") from error
 

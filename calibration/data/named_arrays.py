@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from calibration.data.input_errors import parsed
+from calibration.data.input_errors import parse_number
 
 #: Raw values of a column: a list of texts as written, or an array of numbers with NaN for a missing reading.
 Raw = list[str] | np.ndarray
@@ -47,22 +47,22 @@ class NamedArrays:
         return f"{self.name} row {index + 1}"
 
 
-def texts(raw: Raw) -> list[str]:
+def column_texts(raw: Raw) -> list[str]:
     """Returns the values of a column as texts, whole numbers without a point."""
     if isinstance(raw, list):
         return raw
     return [f"{x:.15g}" if isinstance(x, float) else str(x) for x in raw.tolist()]
 
 
-def number(cell: str) -> float:
+def cell_number(cell: str) -> float:
     """Returns a cell's number, NaN where it states none."""
     try:
-        return parsed(cell)
+        return parse_number(cell)
     except ValueError:
         return math.nan
 
 
-def numbers(raw: Raw) -> np.ndarray:
+def column_numbers(raw: Raw) -> np.ndarray:
     """Returns the numbers of a column's cells, NaN where a cell states none."""
     if isinstance(raw, np.ndarray):
         return raw.astype(float)
@@ -71,10 +71,10 @@ def numbers(raw: Raw) -> np.ndarray:
             return np.array(list(map(float, raw)))
     except ValueError:
         pass  # some cell states no number
-    return np.array([number(cell) for cell in raw])
+    return np.array([cell_number(cell) for cell in raw])
 
 
-def missing(raw: Raw, rows: np.ndarray) -> np.ndarray:
+def missing_readings(raw: Raw, rows: np.ndarray) -> np.ndarray:
     """Returns True for each of some rows in which there is no reading, shape (rows,)."""
     if isinstance(raw, np.ndarray):
         return np.isnan(raw[rows].astype(float))

@@ -13,9 +13,9 @@ from collections.abc import Iterable
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data.input_errors import BadConfiguration, BadData, number
+from calibration.data.input_errors import BadConfiguration, BadData, bound_text
 from calibration.data.runs import Runs
-from calibration.data.surface_labels import scaled
+from calibration.data.surface_labels import rows_of_scaled_adhesion
 from mmrjax.model import params
 from mmrjax.model.paper_tables import BENCH
 from mmrjax.model.robot import Robot
@@ -61,8 +61,10 @@ def stated_masses(robot: Robot, runs: Runs) -> dict[str, StatedMass]:
     if wrong.size:
         row = int(wrong[0])
         raise BadData(
-            f"{runs.source} row {row + 1}, total_mass_kg: got {number(runs['total_mass_kg'][row])} with a payload of "
-            f"{number(runs['payload_kg'][row])} kg; expected a robot of {number(low)} to {number(high)} kg without it"
+            f"{runs.source} row {row + 1}, total_mass_kg: got {bound_text(runs['total_mass_kg'][row])} "
+            "with a payload of "
+            f"{bound_text(runs['payload_kg'][row])} kg; expected a robot of {bound_text(low)} to "
+            f"{bound_text(high)} kg without it"
         )
     found = {}
     for index in np.unique(which):
@@ -85,7 +87,7 @@ def with_table_mass(robot: Robot, runs: Runs) -> Robot:
     return params.replace(robot, {f"{name}.mass": jnp.asarray(mass, float) for name, mass in masses.items()})
 
 
-def remarks(robot: Robot, runs: Runs) -> list[str]:
+def mass_notes(robot: Robot, runs: Runs) -> list[str]:
     """Returns notes on masses of the table that differ from the robot's, and on the mass that is written.
 
     Args:
@@ -108,7 +110,7 @@ def remarks(robot: Robot, runs: Runs) -> list[str]:
             )
     of_table5 = np.zeros(len(runs), bool)
     if runs.has("surface"):
-        of_table5 = scaled(robot, runs["configuration"], runs["surface"])
+        of_table5 = rows_of_scaled_adhesion(robot, runs["configuration"], runs["surface"])
     others = [s for s in np.unique(runs["surface"][of_table5]) if s != BENCH] if of_table5.any() else []
     if others:
         said.append(

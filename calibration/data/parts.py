@@ -58,7 +58,7 @@ class MotorSheet:
         temperature_winding_max: largest permissible winding temperature [°C].
         mass: [kg].
         price: of one piece without tax [EUR of 2020].
-        gearboxes: families of `gearboxes()` that the source combines it with, among those packaged.
+        gearboxes: families of `packaged_gearboxes()` that the source combines it with, among those packaged.
         source: sheet and where it was read.
         note: further facts.
     """
@@ -196,18 +196,18 @@ def _rows(kind: type[Sheet], file: str) -> Iterator[Sheet]:
 
 
 @functools.cache
-def motors() -> tuple[MotorSheet, ...]:
+def packaged_motors() -> tuple[MotorSheet, ...]:
     """The packaged motors, in the order of `parts/motors.csv`."""
     return tuple(_rows(MotorSheet, "motors.csv"))
 
 
 @functools.cache
-def gearboxes() -> tuple[GearboxSheet, ...]:
+def packaged_gearboxes() -> tuple[GearboxSheet, ...]:
     """The packaged gearboxes of up to three stages, by family and ratio."""
     return tuple(_rows(GearboxSheet, "gearboxes.csv"))
 
 
 @functools.cache
-def cells() -> tuple[CellSheet, ...]:
+def packaged_cells() -> tuple[CellSheet, ...]:
     """The packaged cells; the first is the paper's, whose mass no sheet that was found states."""
     return tuple(_rows(CellSheet, "cells.csv"))

@@ -135,7 +135,7 @@ class Posterior:
         return np.sqrt(np.einsum("ij,jk,ik->i", slopes, self.covariance, slopes))
 
 
-def write(posterior: Posterior, path: Path | str) -> None:
+def write_posterior(posterior: Posterior, path: Path | str) -> None:
     """Write a posterior as NetCDF 3, which `xarray.open_dataset` reads with units and long names."""
     from scipy.io import netcdf_file
 
@@ -180,7 +180,7 @@ def write(posterior: Posterior, path: Path | str) -> None:
             put("tied_ratio", [t[2] for t in p.tied], "f8", ("follower",), "ratio to that")
 
 
-def read(path: Path | str) -> Posterior:
+def read_posterior(path: Path | str) -> Posterior:
     """Read `posterior.nc`.
 
     Raises:
@@ -238,7 +238,7 @@ def _of(data: Any) -> Posterior:
     )
 
 
-def joined(parts: Sequence[Posterior], covariance: np.ndarray) -> Posterior:
+def join_posteriors(parts: Sequence[Posterior], covariance: np.ndarray) -> Posterior:
     """Joins sets of coordinates into one; `covariance` is the covariance of all of them."""
     fields = {
         f: np.concatenate([getattr(p, f) for p in parts])

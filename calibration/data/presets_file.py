@@ -12,7 +12,7 @@ from typing import Any
 
 from calibration.data import input_files
 from calibration.data.columns import Layout
-from calibration.data.input_errors import BadConfiguration, allowed_words, parsed, stated_number
+from calibration.data.input_errors import BadConfiguration, allowed_words, parse_number, stated_number
 from mmrjax.model import channels
 
 #: Presets that come with the package, in `calibration/data/presets/`.
@@ -84,42 +84,42 @@ def of_columns(columns: Mapping[str, Any], where: str = "the stated table") -> P
     """Returns the columns that a table `[columns]` states.
 
     Raises:
-        BadConfiguration: as `read`.
+        BadConfiguration: as `parse_preset`.
     """
     return _parsed({"columns": dict(columns)}, where, {})
 
 
-def find(stated: str | Path) -> Preset:
+def find_preset(stated: str | Path) -> Preset:
     """Returns a packaged preset by its name, or the preset of a file; numbers that it asks for may follow.
 
     Args:
         stated: `vesc,pole_pairs=7`, `mine.toml`.
 
     Raises:
-        BadConfiguration: no such preset or file, a number that is missing or unknown, or as `read`.
+        BadConfiguration: no such preset or file, a number that is missing or unknown, or as `parse_preset`.
     """
     name, *others = str(stated).split(SEPARATOR)
     given: dict[str, float] = {}
     for each in others:
         key, equals, text = (part.strip() for part in each.partition("="))
         try:
-            given[key] = stated_number(parsed(text), f"--columns {name}, {key}")
+            given[key] = stated_number(parse_number(text), f"--columns {name}, {key}")
         except ValueError as error:
             got = f"{key}{equals}{text}"
             raise BadConfiguration(
                 f"--columns {name}: got {got}; expected a name and a number, as pole_pairs=7"
             ) from error
     if name in PACKAGED:
-        return read(_packaged(name), name, given)
+        return parse_preset(_packaged(name), name, given)
     path = Path(name)
     if not path.exists():
         raise BadConfiguration(
             f"--columns: got {name}; no such file and no packaged preset; {allowed_words(name, PACKAGED)}"
         )
-    return read(input_files.toml_text(path, path.name), path.name, given)
+    return parse_preset(input_files.toml_text(path, path.name), path.name, given)
 
 
-def recognised(names: Sequence[str]) -> str:
+def recognise_preset(names: Sequence[str]) -> str:
     """Returns the packaged preset with most columns in a source, at least `OF_A_PRESET`; empty if no preset has.
 
     Args:
@@ -128,14 +128,14 @@ def recognised(names: Sequence[str]) -> str:
     best, most = "", OF_A_PRESET - 1
     ends = {*names, *(re.split(r"[/.]", name)[-1] for name in names)}
     for name in PACKAGED:
-        preset = find(SEPARATOR.join([name, *(f"{key}=1" for key in asked(name))]))
+        preset = find_preset(SEPARATOR.join([name, *(f"{key}=1" for key in numbers_to_state(name))]))
         count = sum(any(theirs in ends for theirs in column.theirs) for column in preset.columns)
         if count > most:
             best, most = name, count
     return best
 
 
-def asked(name: str) -> tuple[str, ...]:
+def numbers_to_state(name: str) -> tuple[str, ...]:
     """Returns names of the numbers that a packaged preset asks for and has no usual value for."""
     numbers = input_files.toml_content(_packaged(name), name).get("ask", {})
     return tuple(key for key, stated in numbers.items() if isinstance(stated, str) or "usual" not in stated)
@@ -145,7 +145,7 @@ def _packaged(name: str) -> str:
     return (resources.files("calibration") / "data" / "presets" / f"{name}.toml").read_text("utf-8")
 
 
-def read(text: str, where: str, given: Mapping[str, float]) -> Preset:
+def parse_preset(text: str, where: str, given: Mapping[str, float]) -> Preset:
     """Returns the preset that a TOML text states.
 
     Args:
@@ -252,7 +252,7 @@ def _texts(stated: Any, where: str, form: str = "expected a list of names") -> t
     return tuple(stated)
 
 
-def merged(
+def merge_columns(
     first: Iterable[tuple[str, str, float]], others: Iterable[tuple[str, str, float]]
 ) -> tuple[tuple[str, str, float], ...]:
     """Columns of two tables; `first` wins where both have a column, or read the same source column."""

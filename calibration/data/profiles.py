@@ -18,8 +18,8 @@ from jaxtyping import Array
 
 from calibration.data import delimited, input_files
 from calibration.data.columns import LOAD, SUPPLY
-from calibration.data.input_errors import BadConfiguration, BadData, allowed_words, is_number, number
-from calibration.data.named_arrays import texts
+from calibration.data.input_errors import BadConfiguration, BadData, allowed_words, bound_text, is_number
+from calibration.data.named_arrays import column_texts
 from calibration.data.sources import opening, reading
 from mmrjax.errors import count_noun
 from mmrjax.missions.mission import Start
@@ -198,7 +198,7 @@ def known_columns() -> dict[str, tuple[str, str]]:
     }
 
 
-def read(source: str | Path) -> ProfileTable:
+def read_profile(source: str | Path) -> ProfileTable:
     """Returns a packaged profile, by its name, or the profile of a file in any format of a table.
 
     Raises:
@@ -210,22 +210,22 @@ def read(source: str | Path) -> ProfileTable:
     if str(source) in PACKAGED:
         file = resources.files("calibration") / "data" / "profiles" / f"{source}.csv"
         return _of_text(file.read_bytes(), str(source))
-    path, within = opening.split(str(source))
+    path, within = opening.split_source(str(source))
     if not path.exists():
         raise BadData(f"{source}: no such file and no packaged profile; {allowed_words(str(source), PACKAGED)}")
-    table = reading.table(path, within)
+    table = reading.read_whole_table(path, within)
     if table is None:
-        return _of_text(input_files.table(path, path.name or str(source)), path.name)
-    rows = [list(table.header), *map(list, zip(*map(texts, table.values), strict=True))]
+        return _of_text(input_files.csv_bytes(path, path.name or str(source)), path.name)
+    rows = [list(table.header), *map(list, zip(*map(column_texts, table.values), strict=True))]
     return _parsed(table.name, _settings(table.name, []), rows, table.digest, table.notes)
 
 
 def _of_text(content: bytes, name: str) -> ProfileTable:
-    text, encoded = delimited.text(name, content)
+    text, encoded = delimited.decode_text(name, content)
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     above = next((k for k, line in enumerate(lines) if not line.startswith("#")), len(lines))
     settings = _settings(name, lines[:above])
-    rows, notes = delimited.cells(name, lines[above:])
+    rows, notes = delimited.split_cells(name, lines[above:])
     return _parsed(name, settings, rows, hashlib.sha256(content).hexdigest(), (*encoded, *notes))
 
 
@@ -365,7 +365,7 @@ class _Cells:
         """A number in the unit of `Profile`."""
         quantity, unit = QUANTITIES[field], self.columns[field][1]
         low, high = quantity.limits(unit)
-        allowed = f"{number(low)} to {number(high)}"
+        allowed = f"{bound_text(low)} to {bound_text(high)}"
         try:
             written = float(self.text(field, row))
         except ValueError:

@@ -14,7 +14,7 @@ LEAST, ALIKE = 0.3, 0.8
 STEPS = 0.5
 
 
-def period(values: np.ndarray) -> float:
+def reading_period(values: np.ndarray) -> float:
     """Rows of a log between two readings of a slow sensor; 0 for a channel that is read in every row.
 
     A slow sensor changes at even distances of two rows or more, and rarely sooner. An instrument of coarse steps
@@ -54,7 +54,7 @@ def used_once(values: np.ndarray, time: np.ndarray, run: np.ndarray | None = Non
     names = np.zeros(len(values), int) if run is None else np.unique(run, return_inverse=True)[1]
     order = np.lexsort((time, names))
     recordings = np.split(order, np.flatnonzero(np.diff(names[order])) + 1)
-    periods = [period(values[rows]) for rows in recordings]
+    periods = [reading_period(values[rows]) for rows in recordings]
     of_period = sum(len(rows) for rows, p in zip(recordings, periods, strict=True) if p)
     found = [p for p in periods if p]
     if not found or min(found) < ALIKE * max(found) or of_period < 0.5 * len(values):

@@ -127,23 +127,23 @@ class Requirements:
     text: str = ""
 
 
-def load(path: Path | None) -> Requirements:
+def load_requirements(path: Path | None) -> Requirements:
     """The requirements of a file, or without one the paper's aims.
 
     Raises:
-        BadConfiguration: no such file, and what `read` raises.
+        BadConfiguration: no such file, and what `parse_requirements` raises.
     """
     if path is None or str(path) == PAPER:
         packaged = resources.files("calibration") / "data" / "aims" / f"{PAPER}.toml"
-        return read(packaged.read_text("utf-8"), f"{PAPER}.toml")
+        return parse_requirements(packaged.read_text("utf-8"), f"{PAPER}.toml")
     if not path.is_file():
         raise BadConfiguration(
             f"{path}: no such file; expected a TOML file of requirements (see docs/howto/requirements.md)"
         )
-    return read(toml_text(path, path), path.name)
+    return parse_requirements(toml_text(path, path), path.name)
 
 
-def read(text: str, where: str) -> Requirements:
+def parse_requirements(text: str, where: str) -> Requirements:
     """Requirements from the text of a file.
 
     The file states quantities by name. The value of each is a number (the least or the most allowed, by its usual

@@ -10,8 +10,8 @@ import numpy as np
 
 from calibration.data import rig_file
 from calibration.data.columns import CURRENT, LOAD, SPEED, SUPPLY
-from calibration.data.courses import applied, changing, stretches
-from calibration.data.input_errors import rounded
+from calibration.data.courses import applied_drive, changing_columns, course_stretches
+from calibration.data.input_errors import three_digits
 from calibration.data.robot_file import RobotFile
 from calibration.data.runs import Runs
 from mmrjax.errors import count_noun
@@ -42,7 +42,7 @@ class Fact:
     odd: str = ""
 
 
-def facts(robot: Robot) -> list[Fact]:
+def derived_facts(robot: Robot) -> list[Fact]:
     """Returns facts that follow from the numbers of a robot's motor, gearbox and loads."""
     found = [*_motor(robot), *_gearbox(robot)]
     for name, load in robot.configurations.items():
@@ -52,7 +52,7 @@ def facts(robot: Robot) -> list[Fact]:
 
 def _within(value: float, low: float, high: float, why: str) -> str:
     """`why` if a value is outside the usual range, else empty."""
-    return "" if low <= value <= high else f"{why} (usual: {rounded(low)} to {rounded(high)})"
+    return "" if low <= value <= high else f"{why} (usual: {three_digits(low)} to {three_digits(high)})"
 
 
 def _motor(robot: Robot) -> Iterator[Fact]:
@@ -63,29 +63,29 @@ def _motor(robot: Robot) -> Iterator[Fact]:
     if with_constant:
         per_volt = 1 / constant / RPM
         odd = _within(per_volt, 5, 20_000, "is torque_constant in N·m/A? 1 mN·m/A is 0.001")
-        yield Fact("speed without load, of each volt", f"{rounded(per_volt)} rpm/V", odd)
+        yield Fact("speed without load, of each volt", f"{three_digits(per_volt)} rpm/V", odd)
         idle = float(motor.friction_coulomb) / constant
         odd = _within(idle, 0, 10, "is friction_coulomb in N·m? it is torque_constant times the no-load current")
-        yield Fact("current that the motor's dry friction takes", f"{rounded(idle)} A", odd)
+        yield Fact("current that the motor's dry friction takes", f"{three_digits(idle)} A", odd)
     if with_constant and voltage is not None:
         fastest = voltage / constant
         odd = "" if fastest < 2 * motor.speed_limit else "more than twice motor.speed_limit; look at torque_constant"
-        yield Fact(f"speed without load at {rounded(voltage)} V", f"{rounded(fastest / RPM)} rpm", odd)
+        yield Fact(f"speed without load at {three_digits(voltage)} V", f"{three_digits(fastest / RPM)} rpm", odd)
     if with_resistance and voltage is not None:
         odd = _within(voltage / resistance, 0.02, 1000, "look at motor.resistance")
-        yield Fact(f"stall current at {rounded(voltage)} V", f"{rounded(voltage / resistance)} A", odd)
+        yield Fact(f"stall current at {three_digits(voltage)} V", f"{three_digits(voltage / resistance)} A", odd)
     if with_constant and with_resistance:
         size = constant**2 / resistance
         odd = _within(
             size, 1e-7, 1.0, "torque_constant and resistance are unlikely to be of one motor; look at their units"
         )
-        yield Fact("torque over speed k²/R", f"{rounded(size * 1e3)} mN·m·s", odd)
+        yield Fact("torque over speed k²/R", f"{three_digits(size * 1e3)} mN·m·s", odd)
         if inertia > 0:
             constant_time = inertia / size
             why = "look at motor.inertia (1 g·cm² is 1e-7 kg·m²), torque_constant and resistance"
             odd = _within(constant_time, 5e-4, 0.5, why)
             yield Fact(
-                "mechanical time constant of the motor alone J R/k²", f"{rounded(constant_time * 1e3)} ms", odd
+                "mechanical time constant of the motor alone J R/k²", f"{three_digits(constant_time * 1e3)} ms", odd
             )
 
 
@@ -122,8 +122,11 @@ def _drawn(robot: Robot, what: str, torque: float, places: str) -> Iterator[Fact
     if limit is not None and robot.knows(["motor.resistance"]):
         stall = limit / float(robot.motor.resistance)
         if current > stall:
-            odd = f"above the stall current {rounded(stall)} A at {rounded(limit)} V, so it stands; look at {places}"
-    yield Fact(what, f"{rounded(current)} A each motor", odd)
+            odd = (
+                f"above the stall current {three_digits(stall)} A at {three_digits(limit)} V, so it stands; "
+                f"look at {places}"
+            )
+    yield Fact(what, f"{three_digits(current)} A each motor", odd)
 
 
 def _shaft(robot: Robot, name: str, load: Shaft) -> Iterator[Fact]:
@@ -136,15 +139,19 @@ def _shaft(robot: Robot, name: str, load: Shaft) -> Iterator[Fact]:
         )
         length = float(load.inertia) * GRAVITY / gravity
         why = f"{name}.inertia and {name}.torque_gravity are unlikely to be of one arm: m l² and m g l"
-        yield Fact(f"{name}: swings as a pendulum of", f"{rounded(length * 1e3)} mm", _within(length, 0.01, 3.0, why))
+        yield Fact(
+            f"{name}: swings as a pendulum of", f"{three_digits(length * 1e3)} mm", _within(length, 0.01, 3.0, why)
+        )
     if float(load.inertia) > 0 and float(robot.motor.inertia) > 0:
         share = float(load.inertia) / (float(robot.motor.inertia) * float(robot.gearbox.ratio) ** 2)
         why = f"look at {name}.inertia and motor.inertia [kg·m²]; 1 g·cm² is 1e-7"
-        yield Fact(f"{name}: inertia over the motor's at the output", rounded(share), _within(share, 1e-4, 1e4, why))
+        yield Fact(
+            f"{name}: inertia over the motor's at the output", three_digits(share), _within(share, 1e-4, 1e4, why)
+        )
     if float(load.radius) != 1.0:
         travel = 2 * math.pi * float(load.radius)
         yield Fact(
-            f"{name}: travel of a turn", f"{rounded(travel * 1e3)} mm", _within(travel, 1e-4, 10.0, "look at it")
+            f"{name}: travel of a turn", f"{three_digits(travel * 1e3)} mm", _within(travel, 1e-4, 10.0, "look at it")
         )
 
 
@@ -153,7 +160,7 @@ def _vehicle(robot: Robot, name: str) -> Iterator[Fact]:
     sides, mass, radius = float(robot.sides), float(load.mass), float(load.radius)
     rolling, static = float(load.ground.rolling_resistance), float(load.ground.friction.static)
     odd = _within(mass, 0.05, 2000, f"is {name}.mass in kg?")
-    yield Fact(f"{name}: weight", f"{rounded(mass)} kg, {rounded(mass * GRAVITY)} N", odd)
+    yield Fact(f"{name}: weight", f"{three_digits(mass)} kg, {three_digits(mass * GRAVITY)} N", odd)
     guide = float(load.track.guide_friction) * float(load.track.guide_share)
     torque = mass * GRAVITY * (rolling + guide) * radius / sides + float(load.track.loss_coulomb)
     places = f"{name}.ground.rolling_resistance and {name}.track.loss_coulomb"
@@ -170,10 +177,10 @@ def _vehicle(robot: Robot, name: str) -> Iterator[Fact]:
     climb = pull * sides / (radius * mass * GRAVITY) - rolling - guide
     odd = "" if climb > 0 else "its motors cannot move it; look at mass, ratio, torque_constant and resistance"
     angle = "any" if climb >= 1 else f"{math.degrees(math.asin(max(climb, 0.0))):.0f}°"
-    yield Fact(f"{name}: steepest slope that the stall torque holds at {rounded(limit)} V", angle, odd)
+    yield Fact(f"{name}: steepest slope that the stall torque holds at {three_digits(limit)} V", angle, odd)
     speed = limit / float(robot.motor.torque_constant) / float(robot.gearbox.ratio) * radius
     odd = _within(speed, 0.005, 15, f"look at {name}.radius, gearbox.ratio and motor.torque_constant")
-    yield Fact(f"{name}: speed without load at {rounded(limit)} V", f"{rounded(speed)} m/s", odd)
+    yield Fact(f"{name}: speed without load at {three_digits(limit)} V", f"{three_digits(speed)} m/s", odd)
 
 
 def doubtful_time(runs: Runs, robot: Robot) -> str:
@@ -185,7 +192,7 @@ def doubtful_time(runs: Runs, robot: Robot) -> str:
         return ""
     longest = FAR * time_constant(robot)
     moving = [c for c in runs.channels if c.zero_at_rest and c.directed and runs.has(c.column)]
-    for stretch in (s for run in stretches(runs) for s in run if len(s.rows) >= 4 * RISING):
+    for stretch in (s for run in course_stretches(runs) for s in run if len(s.rows) >= 4 * RISING):
         time = runs["time_s"][stretch.rows]
         for channel in moving:
             shown = runs[channel.column][stretch.rows]
@@ -199,8 +206,9 @@ def doubtful_time(runs: Runs, robot: Robot) -> str:
             lasts, column = time[rises[-1]] - time[rises[0]], runs.headings.get("time_s", "time_s")
             return (
                 f"{runs.source} rows {stretch.rows[rises[0]] + 1} to {stretch.rows[rises[-1]] + 1}: {channel.label} "
-                f"changes over {rounded(lasts)} s at a constant voltage, where these motors take about "
-                f"{rounded(longest / FAR)} s; is {column} in milliseconds? then name it time_ms, or state [columns] "
+                f"changes over {three_digits(lasts)} s at a constant voltage, where these motors take about "
+                f"{three_digits(longest / FAR)} s; is {column} in milliseconds? then name it time_ms, or "
+                "state [columns] "
                 f'time_ms = "{column}"'
             )
     return ""
@@ -226,8 +234,9 @@ def doubtful_current(runs: Runs, robot: Robot) -> str:
         return ""
     theirs = runs.headings.get(column, column)
     return (
-        f"{runs.source}, {theirs}: up to {rounded(largest)} A, where the file's numbers turn the load slowly with "
-        f"{rounded(needed)} A; is it in another unit (mA, mN·m)? then state [columns] {column} = "
+        f"{runs.source}, {theirs}: up to {three_digits(largest)} A, where the file's numbers turn the load "
+        "slowly with "
+        f"{three_digits(needed)} A; is it in another unit (mA, mN·m)? then state [columns] {column} = "
         f'{{column = "{theirs}", factor = ...}}'
     )
 
@@ -243,7 +252,7 @@ def _times_between(runs: Runs) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
         yield name, rows, np.diff(runs["time_s"][rows])
 
 
-def gap(runs: Runs) -> str:
+def gap_sentence(runs: Runs) -> str:
     """Sentence on the longest time between two rows of a run, if rows may be missing there; empty otherwise."""
     worst, told = 0.0, ""
     for _, rows, steps in _times_between(runs):
@@ -254,8 +263,8 @@ def gap(runs: Runs) -> str:
         k, worst = int(np.argmax(steps)), float(steps.max())
         more = f" (and {count_noun(int(long.sum()) - 1, 'other row')} after a gap)" if long.sum() > 1 else ""
         told = (
-            f"{runs.source} row {rows[k + 1] + 1}, time_s: {rounded(worst)} s after the row before it, where "
-            f"{rounded(usual)} s is usual{more}; a fit holds the imposed quantity for that time; if rows are "
+            f"{runs.source} row {rows[k + 1] + 1}, time_s: {three_digits(worst)} s after the row before it, where "
+            f"{three_digits(usual)} s is usual{more}; a fit holds the imposed quantity for that time; if rows are "
             'missing, give the rows from there on another run_id, with start = "measured" in the rig\'s file'
         )
     return told
@@ -266,7 +275,7 @@ def gap(runs: Runs) -> str:
 UNEVEN, TURNS_BACK, ROWS_OF_CLOCK = 0.1, -0.3, 50
 
 
-def jitter(runs: Runs) -> str:
+def jitter_sentence(runs: Runs) -> str:
     """Sentence on a clock that jitters about even rows; empty otherwise.
 
     If rows are even and the clock's errors independent, the times between rows correlate with the next by -1/2. If
@@ -282,22 +291,22 @@ def jitter(runs: Runs) -> str:
             run = f" of run {name}" if name else ""
             return (
                 f"{runs.source} rows {rows[0] + 1} to {rows[-1] + 1}, time_s: the clock{run} jitters by "
-                f"{rounded(spread / 2**0.5)} s about even rows; a fit takes its times as they are; give even "
-                f"ones, {rounded(float(np.mean(steps)))} s apart"
+                f"{three_digits(spread / 2**0.5)} s about even rows; a fit takes its times as they are; give even "
+                f"ones, {three_digits(float(np.mean(steps)))} s apart"
             )
     return ""
 
 
 def one_level(runs: Runs) -> str:
     """Sentence on a log without any condition that changes; empty for others."""
-    conditions = (*changing(runs), *(c for c in runs.layout.sides if runs.has(c)))
+    conditions = (*changing_columns(runs), *(c for c in runs.layout.sides if runs.has(c)))
     column = runs.layout.imposed_column
     if not (runs.sampled and runs.has(column) and np.isfinite(runs[column]).all()):
         return ""
     if any(len(np.unique(runs[c])) > 1 for c in conditions):
         return ""
     return (
-        f"{runs.source} rows 1 to {len(runs)}, {runs.headings.get(column, column)}: {rounded(runs[column][0])} "
+        f"{runs.source} rows 1 to {len(runs)}, {runs.headings.get(column, column)}: {three_digits(runs[column][0])} "
         f"{column.rpartition('_')[2]} in every row; after the start one level shows one current and one speed, "
         "which do not separate losses that rise with either; log three levels or more, both ways if it turns back"
     )
@@ -308,7 +317,7 @@ def one_level(runs: Runs) -> str:
 INNER, ROWS_INNER, FITS, REACHES = 0.25, 30, 0.2, 0.8
 
 
-def saturated(runs: Runs) -> str:
+def saturation_sentence(runs: Runs) -> str:
     """Sentence on a voltage in a log that the driver does not reach; empty without evidence.
 
     Rows of small voltage give U = R I + k ω by least squares. In rows of a larger voltage, current and speed show one
@@ -321,7 +330,7 @@ def saturated(runs: Runs) -> str:
         return ""
     if any(runs.layout.magnitude(c.name) for c in runs.channels if c.column in (current, speed)):
         return ""
-    given, shown = applied(runs), np.stack([runs[current], runs[speed]], 1)
+    given, shown = applied_drive(runs), np.stack([runs[current], runs[speed]], 1)
     read = np.isfinite(shown).all(1)
     inner = read & (given != 0) & (np.abs(given) <= INNER * float(np.max(np.abs(given))))
     if inner.sum() < ROWS_INNER:
@@ -338,9 +347,10 @@ def saturated(runs: Runs) -> str:
     row = int(np.flatnonzero(beyond)[0])
     column = "duty" if runs.has("duty") else runs.headings.get(SUPPLY, SUPPLY)
     return (
-        f"{runs.source} row {row + 1}, {column}: commands {rounded(given[row])} V, where current and speed show "
-        f"{rounded(limit)} V at most, and so in {100 * np.mean(beyond):.2g} % of the log; the driver limits it: give "
-        f"the voltage that it applies, or limit the column to {rounded(limit)} V"
+        f"{runs.source} row {row + 1}, {column}: commands {three_digits(given[row])} V, where current and speed show "
+        f"{three_digits(limit)} V at most, and so in {100 * np.mean(beyond):.2g} % of the log; the driver "
+        "limits it: give "
+        f"the voltage that it applies, or limit the column to {three_digits(limit)} V"
     )
 
 
@@ -356,7 +366,7 @@ def doubtful_torque(runs: Runs, robot: Robot) -> str:
     of_current = robot.rig.imposed == "motor_current"
     if not runs.has(LOAD) or not (of_current or (robot.rig.imposed == "voltage" and robot.knows(VOLTAGE))):
         return ""
-    current = np.abs(applied(runs)) / (1.0 if of_current else float(robot.motor.resistance))
+    current = np.abs(applied_drive(runs)) / (1.0 if of_current else float(robot.motor.resistance))
     lost, made = (_torque(robot, x) for x in (0.0, 1.0))  # it rises with the current on a line
     stall = np.maximum(lost + (made - lost) * current, 0.0)
     braked = (runs[LOAD] != 0) & (current > 0)
@@ -365,17 +375,17 @@ def doubtful_torque(runs: Runs, robot: Robot) -> str:
         return ""
     row, theirs = int(np.flatnonzero(beyond)[0]), runs.headings.get(LOAD, LOAD)
     return (
-        f"{runs.source} row {row + 1}, {theirs}: got {rounded(runs[LOAD][row])} N·m, where the motors stall at "
-        f'{rounded(stall[row])} N·m; is it in mN·m? then state [columns] load_torque_mNm = "{theirs}"'
+        f"{runs.source} row {row + 1}, {theirs}: got {three_digits(runs[LOAD][row])} N·m, where the motors stall at "
+        f'{three_digits(stall[row])} N·m; is it in mN·m? then state [columns] load_torque_mNm = "{theirs}"'
     )
 
 
-def doubts(runs: Runs, robot: Robot) -> tuple[str, ...]:
+def log_doubts(runs: Runs, robot: Robot) -> tuple[str, ...]:
     """Sentences on a log's times, its levels and limits, and on units that do not fit the robot."""
     every = (
-        gap(runs),
-        jitter(runs),
-        saturated(runs),
+        gap_sentence(runs),
+        jitter_sentence(runs),
+        saturation_sentence(runs),
         one_level(runs),
         doubtful_time(runs, robot),
         doubtful_current(runs, robot),
@@ -414,7 +424,7 @@ class Origin:
     why: str
 
 
-def origins(file: RobotFile) -> list[Origin]:
+def number_origins(file: RobotFile) -> list[Origin]:
     """Returns the origin of each number of a robot; in each part, numbers that no file states come last."""
     robot, stated = file.robot, file.stated
     priors = {name: sd for name, _, sd in robot.rig.priors}

@@ -79,7 +79,7 @@ FOLLOWS = {
 }
 
 
-def linear(table: dict[str, Any], name: str, where: str, sds: dict[str, float], sides: float) -> None:
+def linear_to_shaft(table: dict[str, Any], name: str, where: str, sds: dict[str, float], sides: float) -> None:
     """Converts the table of a linear unit, and its sds, into the table of the shaft of one of its drives.
 
     Travel r per radian is lead / 2π or the drum's radius. With n drives, each drive has
@@ -164,7 +164,7 @@ def vehicle_defaults(on_tracks: bool, table: Mapping[str, Any], sides: float) ->
     return found | {DYNAMIC: DYNAMIC_SHARE * stated(*DYNAMIC.split(".")[:-1], "static"), "inertia": wheels}
 
 
-def rig(content: dict[str, Any], where: str, loads: Sequence[str], *, travels: bool, inherits: bool) -> Rig:
+def parse_rig(content: dict[str, Any], where: str, loads: Sequence[str], *, travels: bool, inherits: bool) -> Rig:
     """The rig that a file's content states; takes the `KEYS` out of it.
 
     Args:
@@ -286,7 +286,7 @@ def _columns(stated: Any, where: str) -> tuple[tuple[str, str, float], ...]:
     return tuple(found)
 
 
-def needed(rig: Rig, values: Iterable[tuple[str, Any]] = ()) -> tuple[str, ...]:
+def needed_parameters(rig: Rig, values: Iterable[tuple[str, Any]] = ()) -> tuple[str, ...]:
     """Required parameters of a robot that starts from nothing: of its drive, and of its turns if it turns.
 
     Args:
@@ -357,7 +357,7 @@ def moved_priors(robot: Robot, values: Mapping[str, float]) -> Robot:
     return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, priors=priors))
 
 
-def lines(rig: Rig) -> tuple[list[str], dict[str, list[str]]]:
+def rig_lines(rig: Rig) -> tuple[list[str], dict[str, list[str]]]:
     """Lines of a robot file that state a rig: of its head, and by table."""
     head = [
         f'imposed = "{rig.imposed}"  # on the drives: voltage, motor_speed or motor_current',

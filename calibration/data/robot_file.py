@@ -13,9 +13,9 @@ from typing import Any
 import jax.numpy as jnp
 
 from calibration.data import rig_file, stated
-from calibration.data.configuration_tables import loads, resolved_likes
+from calibration.data.configuration_tables import loads_from_tables, resolved_likes
 from calibration.data.effect_file import Library
-from calibration.data.input_errors import BadConfiguration, allowed_words, is_number, number
+from calibration.data.input_errors import BadConfiguration, allowed_words, bound_text, is_number
 from calibration.data.input_files import toml_content, toml_text
 from calibration.data.writing import write_text
 from mmrjax import effects
@@ -89,7 +89,7 @@ class RobotFile:
 
 
 @in_double
-def load(name_or_path: str, library: Library = effects.BY_NAME, notes: list[str] | None = None) -> Robot:
+def load_robot(name_or_path: str, library: Library = effects.BY_NAME, notes: list[str] | None = None) -> Robot:
     """A robot by its name or from its file.
 
     Args:
@@ -99,22 +99,24 @@ def load(name_or_path: str, library: Library = effects.BY_NAME, notes: list[str]
     Raises:
         BadConfiguration: no such name or file, or an invalid value in the file.
     """
-    return find(name_or_path, library, notes).robot
+    return find_robot_file(name_or_path, library, notes).robot
 
 
-def read(path: Path, library: Library = effects.BY_NAME, notes: list[str] | None = None) -> Robot:
-    """The robot alone of `parse`."""
-    return parse(path, library, notes).robot
+def read_robot(path: Path, library: Library = effects.BY_NAME, notes: list[str] | None = None) -> Robot:
+    """The robot alone of `parse_robot_file`."""
+    return parse_robot_file(path, library, notes).robot
 
 
-def find(name_or_path: str, library: Library = effects.BY_NAME, notes: list[str] | None = None) -> RobotFile:
+def find_robot_file(
+    name_or_path: str, library: Library = effects.BY_NAME, notes: list[str] | None = None
+) -> RobotFile:
     """A robot by its name (`nominal`, `sm1`, `sm2`) or from a TOML file, with effects of `library`.
 
     Args:
         notes: receives a sentence for each value that is allowed and unlikely.
 
     Raises:
-        BadConfiguration: no such name or file, or what `parse` raises.
+        BadConfiguration: no such name or file, or what `parse_robot_file` raises.
     """
     if name_or_path in paper_robots.ROBOTS:
         return RobotFile(paper_robots.ROBOTS[name_or_path](), name_or_path)
@@ -124,11 +126,11 @@ def find(name_or_path: str, library: Library = effects.BY_NAME, notes: list[str]
             f"--robot: got {name_or_path}, no such file and no known robot; "
             f"{allowed_words(name_or_path, paper_robots.ROBOTS)}"
         )
-    return parse(path, library, notes)
+    return parse_robot_file(path, library, notes)
 
 
-def parse(path: Path, library: Library = effects.BY_NAME, notes: list[str] | None = None) -> RobotFile:
-    """Read a robot file; its effects are looked up in `library` (see `effect_file.library`) and among the curves.
+def parse_robot_file(path: Path, library: Library = effects.BY_NAME, notes: list[str] | None = None) -> RobotFile:
+    """Read a robot file; its effects are looked up in `library` and among the curves.
 
     The file states, all optional:
         schema: version of this form.
@@ -146,7 +148,7 @@ def parse(path: Path, library: Library = effects.BY_NAME, notes: list[str] | Non
             `effects.scaled`).
 
     Args:
-        notes: as for `find`.
+        notes: as for `find_robot_file`.
 
     Raises:
         BadConfiguration: not TOML, an unknown key (with the choices), a value that is no number, not finite, or
@@ -183,7 +185,7 @@ def parse(path: Path, library: Library = effects.BY_NAME, notes: list[str] | Non
     of_size = {name: _of_size(sized, name, value, path.name) for name, value in factors.items()}
     robot = with_effects(robot, tuple(present), {**library, **of_size}, acting, where=path.name)
     parameters = dict(_flatten(content))
-    robot = rig_file.with_priors(change(robot, parameters, where=path.name, notes=notes), sds, path.name)
+    robot = rig_file.with_priors(change_robot(robot, parameters, where=path.name, notes=notes), sds, path.name)
     return RobotFile(robot, str(path), frozenset(parameters), linear, text)
 
 
@@ -199,8 +201,8 @@ def _without_parameters(
         resolved_likes(content, where)
     tables = {key: value for key, value in content.items() if key not in rig_file.KEYS and isinstance(value, dict)}
     sds = stated.taken_apart(tables, where)
-    found = loads(base, content, sds, where)
-    rig = rig_file.rig(content, where, list(found.by_name), travels=found.travels, inherits=base is not None)
+    found = loads_from_tables(base, content, sds, where)
+    rig = rig_file.parse_rig(content, where, list(found.by_name), travels=found.travels, inherits=base is not None)
     if base is not None:
         return dataclasses.replace(base, configurations=Configurations(found.by_name), rig=rig), sds, found.linear
     robot = paper_robots.blank_robot(Configurations(found.by_name), rig=rig)
@@ -213,7 +215,7 @@ def _without_parameters(
     for name in given:
         if "." not in name and name not in COUNTS:
             raise BadConfiguration(f"{where}, {name}: no such parameter; {_parameters(name, known)}")
-    missing = [name for name in rig_file.needed(rig, given.items()) if name not in given]
+    missing = [name for name in rig_file.needed_parameters(rig, given.items()) if name not in given]
     if not found.travels and "speed" in rig.channels:
         missing += [f"{name}.radius" for name in found.by_name if f"{name}.radius" not in given]
     rig_file.refuse_missing([*missing, *found.missing], known, where, given)
@@ -269,14 +271,14 @@ def with_effects(
     return dataclasses.replace(robot, effects=tuple(present))
 
 
-def change(robot: Robot, values: Mapping[str, Any], where: str, notes: list[str] | None = None) -> Robot:
+def change_robot(robot: Robot, values: Mapping[str, Any], where: str, notes: list[str] | None = None) -> Robot:
     """The robot with parameters replaced, each checked; `sides`, `battery.cells`, RATINGS, SWITCHES and CHOICES too.
 
     Args:
-        values: by dotted name [SI]; where: opens the message of an error; notes: as for `find`.
+        values: by dotted name [SI]; where: opens the message of an error; notes: as for `find_robot_file`.
 
     Raises:
-        BadConfiguration: as `parse`.
+        BadConfiguration: as `parse_robot_file`.
     """
     stated = dict(values)
     counts = {name: _count(where, name, stated.pop(name)) for name in COUNTS if name in stated}
@@ -318,17 +320,17 @@ def _refused(name: str, value: Any, known: Mapping[str, params.Parameter]) -> st
         return f"no such parameter; {_parameters(name, known)}"
     spec = known[name].spec
     low, high = spec.bounds
-    allowed = f"{number(low)} to {number(high)} {spec.unit} ({spec.meaning})"
+    allowed = f"{bound_text(low)} to {bound_text(high)} {spec.unit} ({spec.meaning})"
     if not is_number(value):
         form = ', alone or with its standard deviation as "0.61 ± 0.03"' if isinstance(value, str) else ""
         return f"got {value!r}; expected a number, {allowed}{form}"
     if name == "gearbox.ratio" and 0 < value < 1:
         return (
-            f"got {number(value)}; expected turns of the motor for one of the output, at least 1; is "
-            f"{number(1 / value)} meant?"
+            f"got {bound_text(value)}; expected turns of the motor for one of the output, at least 1; is "
+            f"{bound_text(1 / value)} meant?"
         )
     if not math.isfinite(value) or not low <= value <= high:
-        return f"got {number(value)}; expected {allowed}"
+        return f"got {bound_text(value)}; expected {allowed}"
     return ""
 
 
@@ -360,9 +362,9 @@ def _choice(where: str, name: str, value: Any) -> str:
 def _rating(where: str, name: str, value: Any) -> float:
     low, high, unit, what = RATINGS[name]
     if not is_number(value) or not low <= value <= high:
-        got = number(value) if is_number(value) else repr(value)
+        got = bound_text(value) if is_number(value) else repr(value)
         raise BadConfiguration(
-            f"{where}, {name}: got {got}; expected a number, {number(low)} to {number(high)} {unit} ({what})"
+            f"{where}, {name}: got {got}; expected a number, {bound_text(low)} to {bound_text(high)} {unit} ({what})"
         )
     return float(value)
 
@@ -413,8 +415,8 @@ def _check_pairs(robot: Robot, where: str) -> None:
             )
 
 
-def write(robot: Robot, path: Path, *, note: str = "") -> None:
-    """Write a robot with everything that it states, with unit, meaning and source; `read` returns the same robot.
+def write_robot(robot: Robot, path: Path, *, note: str = "") -> None:
+    """Write a robot with everything that it states, with unit, meaning and source; `read_robot` gives it back.
 
     Parameters that a robot which starts from nothing does not state are left out.
     """
@@ -425,7 +427,7 @@ def write(robot: Robot, path: Path, *, note: str = "") -> None:
         "motor": [],
         "gearbox": [],
     }
-    head, more = rig_file.lines(robot.rig)
+    head, more = rig_file.rig_lines(robot.rig)
     if rig_file.same_rig(robot.rig) and whole and robot.has_ground:
         head, more = [], {}
     for name, load in robot.configurations.items():
@@ -461,7 +463,7 @@ def _lines_of_parameters(robot: Robot, nothing: Robot) -> Iterator[tuple[str, st
     """Table and line of each parameter that a file has to state, or that differs from the robot it starts from."""
     whole = robot.rig.inherits
     start = {p.name: float(p.value) for p in params.walk_parameters(nothing)}
-    needed = rig_file.needed(robot.rig, ((p.name, float(p.value)) for p in params.walk_parameters(robot)))
+    needed = rig_file.needed_parameters(robot.rig, ((p.name, float(p.value)) for p in params.walk_parameters(robot)))
     always = (*(f"{name}." for name in robot.configurations), "effects.")
     for parameter in params.walk_parameters(robot):
         table, _, key = parameter.name.rpartition(".")

@@ -20,7 +20,7 @@ from calibration.data.columns import (
     WHEN,
     Layout,
 )
-from calibration.data.input_errors import BadData, number
+from calibration.data.input_errors import BadData, bound_text
 from calibration.data.table import driven_on
 from mmrjax.model import channels
 from mmrjax.model.channels import Channel
@@ -32,7 +32,7 @@ SIGN_SDS, SIGN_SHARE = 4.0, 0.05
 STILL = 0.02
 
 
-def complete(name: str, columns: dict[str, np.ndarray], rows: int, layout: Layout) -> None:
+def complete_columns(name: str, columns: dict[str, np.ndarray], rows: int, layout: Layout) -> None:
     """Fills columns that a table may leave out, and refuses values that contradict each other."""
     _fill(name, columns, rows, layout)
     _check_driving(name, columns)
@@ -83,7 +83,7 @@ def _fill(name: str, columns: dict[str, np.ndarray], rows: int, layout: Layout) 
 def _only(name: str, columns: dict[str, np.ndarray], layout: Layout) -> str:
     """Returns the configuration of a table without that column: the only one, or the only one with its surfaces."""
     labels = np.unique(columns.get("surface", np.zeros(0, str)))
-    found = surfaces.common(layout.configurations, labels)
+    found = surfaces.common_configuration(layout.configurations, labels)
     if found is None:
         raise BadData(
             f"{name}: column configuration is missing, and the robot has {', '.join(layout.configurations)}"
@@ -104,7 +104,7 @@ def _check_driving(name: str, columns: dict[str, np.ndarray]) -> None:
         if driven[at]:
             raise BadData(f"{name} row {at + 1}, duty: got an empty cell; expected a number, -1 to 1")
         raise BadData(
-            f"{name} row {at + 1}, duty: got {number(duty[at])} in mode {modes[at]}; expected 0 or an empty cell"
+            f"{name} row {at + 1}, duty: got {bound_text(duty[at])} in mode {modes[at]}; expected 0 or an empty cell"
         )
     columns["duty"] = np.nan_to_num(duty)
 
@@ -130,8 +130,8 @@ def _check_mass(name: str, columns: dict[str, np.ndarray]) -> None:
 
 
 def too_light(where: str, total: float, payload: float) -> str:
-    included = f"more than the payload of {number(payload)} kg that it includes"
-    return f"{where}, total_mass_kg: got {number(total)}; expected {included}"
+    included = f"more than the payload of {bound_text(payload)} kg that it includes"
+    return f"{where}, total_mass_kg: got {bound_text(total)}; expected {included}"
 
 
 def _check_deviations(name: str, columns: dict[str, np.ndarray], shown: tuple[Channel, ...]) -> None:
@@ -185,7 +185,7 @@ def _driven(name: str, columns: dict[str, np.ndarray], layout: Layout) -> tuple[
         moving = idle[np.abs(readings[idle]) > STILL * np.max(np.abs(readings))]
         if moving.size and moving.size < len(readings):
             raise BadData(
-                f"{name} row {moving[0] + 1}, {channel.column}: got {number(readings[moving[0]])} where "
+                f"{name} row {moving[0] + 1}, {channel.column}: got {bound_text(readings[moving[0]])} where "
                 f"{zero} is 0; expected what drives it, or remove the row"
             )
     if idle.size == len(size):
@@ -205,7 +205,7 @@ def _check_level(name: str, columns: dict[str, np.ndarray]) -> None:
         row = int(np.flatnonzero(slope)[0])
         more = f", and so in {np.count_nonzero(slope)} of {len(slope)} rows" if np.count_nonzero(slope) > 1 else ""
         raise BadData(
-            f"{name} row {row + 1}, slope_deg: got {number(slope[row])} in a table of settled turns{more}; on a "
+            f"{name} row {row + 1}, slope_deg: got {bound_text(slope[row])} in a table of settled turns{more}; on a "
             "slope the heading changes all the time, so that no turn is settled there: expected 0; remove such rows "
             "(simulate --left, --right and --slope with --model drive follows one over time)"
         )
@@ -225,7 +225,7 @@ def _check_signs(name: str, columns: dict[str, np.ndarray], layout: Layout) -> N
             wrong = np.flatnonzero(readings < 0)
             if wrong.size:
                 raise BadData(
-                    f"{name} row {wrong[0] + 1}, {channel.column}: got {number(readings[wrong[0]])}; expected no "
+                    f"{name} row {wrong[0] + 1}, {channel.column}: got {bound_text(readings[wrong[0]])}; expected no "
                     "negative reading, as the robot's file states that the instrument shows magnitude alone"
                 )
             continue
@@ -242,7 +242,8 @@ def _check_signs(name: str, columns: dict[str, np.ndarray], layout: Layout) -> N
             at = int(against[0])
             alike = "" if channel not in channels.OF_TURNS else f"; a turn has {' and '.join(layout.sides)} too"
             raise BadData(
-                f"{name} row {at + 1}, {channel.column}: got {number(readings[at])} at {number(imposed[at])} {unit}; "
+                f"{name} row {at + 1}, {channel.column}: got {bound_text(readings[at])} at "
+                f"{bound_text(imposed[at])} {unit}; "
                 "nothing else drives the motors there, so expected a reading with the sign of the drive, the "
                 f"same in every row{alike}"
             )
@@ -251,8 +252,8 @@ def _check_signs(name: str, columns: dict[str, np.ndarray], layout: Layout) -> N
             alone = f"; or signed = false for {channel.name} in the robot's file, if it shows magnitude alone"
             hint = alone if layout.crosses_zero else ""
             raise BadData(
-                f"{name} row {at + 1}, {channel.column}: got {number(readings[at])} at "
-                f"{number(imposed[at])} {unit}; expected readings with their signs, negative backward{hint}"
+                f"{name} row {at + 1}, {channel.column}: got {bound_text(readings[at])} at "
+                f"{bound_text(imposed[at])} {unit}; expected readings with their signs, negative backward{hint}"
             )
 
 
@@ -263,7 +264,7 @@ def _doubt(columns: dict[str, np.ndarray], channel: Channel) -> np.ndarray | flo
     return np.fmax(share, SIGN_SDS * np.nan_to_num(columns.get(channel.sd_column, np.zeros(len(readings)))))
 
 
-def lacks(name: str, columns: dict[str, np.ndarray], layout: Layout) -> Iterator[str]:
+def missing_data_notes(name: str, columns: dict[str, np.ndarray], layout: Layout) -> Iterator[str]:
     """Yields notes on missing channels and readings, on copies of rows, and on runs with several rows."""
     for channel in layout.channels:
         if channel.column not in columns:
@@ -302,13 +303,13 @@ def lacks(name: str, columns: dict[str, np.ndarray], layout: Layout) -> Iterator
             )
 
 
-def drives(name: str, columns: dict[str, np.ndarray], layout: Layout) -> Iterator[str]:
+def driven_backward_notes(name: str, columns: dict[str, np.ndarray], layout: Layout) -> Iterator[str]:
     """Yields a note on settled rows in which a load torque without a sign drives a shaft that runs backward."""
     on = np.flatnonzero(driven_on(columns, layout))
     if on.size and not set(TIME) & set(columns) and columns[LOAD].min() >= 0:
         more = f", and so in {on.size} rows" if on.size > 1 else ""
         yield (
-            f"{name} row {on[0] + 1}, {LOAD}: got {number(columns[LOAD][on[0]])} where the shaft is driven "
+            f"{name} row {on[0] + 1}, {LOAD}: got {bound_text(columns[LOAD][on[0]])} where the shaft is driven "
             f"backward{more}: it turns the shaft on there; a brake's torque is negative backward"
         )
 

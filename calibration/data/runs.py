@@ -28,8 +28,8 @@ from calibration.data import (
     sides,
 )
 from calibration.data.columns import CONDITIONS, DUTY, SUPPLY, TIME, WHEN, Column, Layout
-from calibration.data.input_errors import BadConfiguration, BadData, number
-from calibration.data.named_arrays import NamedArrays, Raw, missing, numbers, texts
+from calibration.data.input_errors import BadConfiguration, BadData, bound_text
+from calibration.data.named_arrays import NamedArrays, Raw, column_numbers, column_texts, missing_readings
 from calibration.data.sources import opening, reading
 from calibration.data.sources.reading import Mapped
 from calibration.data.table import Runs
@@ -37,7 +37,7 @@ from mmrjax.model.quantities import MM, RPM
 from mmrjax.model.rig import Instrument
 from mmrjax.model.robot import NO_BRAKE, Robot
 
-__all__ = ["CONDITIONS", "DUTY", "MM", "RPM", "WHEN", "Runs", "of_arrays", "read", "single"]
+__all__ = ["CONDITIONS", "DUTY", "MM", "RPM", "WHEN", "Runs", "of_arrays", "read_runs", "single_run"]
 
 
 #: Tables that come with the package.
@@ -46,7 +46,7 @@ PACKAGED = {"measured": "measured.csv", "simulated_by_paper": "simulated_by_pape
 LISTED = 8
 
 
-def read(
+def read_runs(
     source: Any,
     robot: Robot | None = None,
     *,
@@ -74,14 +74,16 @@ def read(
     layout, between = Layout.of(robot), "held" if robot is None else robot.rig.between_rows
     preset = None
     if columns is not None:
-        preset = presets_file.of_columns(columns) if isinstance(columns, Mapping) else presets_file.find(columns)
+        preset = (
+            presets_file.of_columns(columns) if isinstance(columns, Mapping) else presets_file.find_preset(columns)
+        )
     if isinstance(source, str | Path) and str(source) in PACKAGED:
         with resources.as_file(resources.files("calibration") / "data" / PACKAGED[str(source)]) as path:
-            arrays, mapped = delimited.arrays(path, str(source)), layout.mapped
+            arrays, mapped = delimited.read_csv_columns(path, str(source)), layout.mapped
     else:
-        if isinstance(source, str | Path) and not opening.split(str(source))[0].exists():
+        if isinstance(source, str | Path) and not opening.split_source(str(source))[0].exists():
             raise BadData(f"{source}: no such file and no packaged table; packaged: {', '.join(PACKAGED)}")
-        found = reading.read(source, layout, preset, between)
+        found = reading.read_columns(source, layout, preset, between)
         arrays, mapped = found.arrays, found.mapped
     if preset is None:
         _refuse_a_loggers_names(arrays, layout)
@@ -92,8 +94,8 @@ def _refuse_a_loggers_names(arrays: NamedArrays, layout: Layout) -> None:
     """Refuses a source without any column of a known name whose columns match a preset."""
     if any(m is not None for m in layout.meanings(arrays.name, list(dict.fromkeys(arrays.header)))):
         return
-    if name := presets_file.recognised(arrays.header):
-        numbers_asked = "".join(f",{key}=..." for key in presets_file.asked(name))
+    if name := presets_file.recognise_preset(arrays.header):
+        numbers_asked = "".join(f",{key}=..." for key in presets_file.numbers_to_state(name))
         raise BadData(
             f"{arrays.name}: has no column with a known name, but columns of {name}; add --columns "
             f'{name}{numbers_asked}, in Python columns="{name}{numbers_asked}"'
@@ -132,7 +134,7 @@ def of_arrays(
     if not arrays.header:
         expected = ", ".join((*layout.required(measured=True, battery=False), *layout.measured_columns))
         raise BadData(f"{name}: the file is empty; expected a header with {expected}")
-    header, layout, capitals = column_names.understood(
+    header, layout, capitals = column_names.match_column_names(
         name, arrays.header, layout, inferred=inferred, of_turns=of_turns
     )
     meanings = layout.meanings(name, header)
@@ -149,7 +151,7 @@ def of_arrays(
     if measured:
         notes = (*notes, *copied, *_without_repeats(name, columns, layout))
     layout, unsigned = _with_instruments(columns, layout, measured)
-    row_checks.complete(name, columns, int(kept.sum()), layout)
+    row_checks.complete_columns(name, columns, int(kept.sum()), layout)
     if battery and layout.imposed == "voltage":
         columns[SUPPLY] = np.full(int(kept.sum()), np.nan)
     elif measured and not set(TIME) <= set(columns):  # a history may stop, and go on forwards against its motors
@@ -159,13 +161,13 @@ def of_arrays(
     if not any(column in columns for column in WHEN):
         columns["order"] = np.arange(1.0, kept.sum() + 1)
     extras = {c: _extra(raw)[kept] for c, m, raw in zip(header, meanings, arrays.values, strict=True) if m is None}
-    notes = (*notes, *capitals, *changed, *(row_checks.lacks(name, columns, layout) if measured else ()))
+    notes = (*notes, *capitals, *changed, *(row_checks.missing_data_notes(name, columns, layout) if measured else ()))
     notes = (*notes, *(row_checks.shows_magnitude(name, i) for i in unsigned))
-    notes = (*notes, *row_checks.drives(name, columns, layout))
+    notes = (*notes, *row_checks.driven_backward_notes(name, columns, layout))
     headings = {m.column: m.shown for m in meanings if m is not None}
     runs = Runs(name, columns, tuple(extras), arrays.digest, extras, layout, notes, headings)
     if robot is not None:
-        contradictions.check(runs, robot)
+        contradictions.check_contradictions(runs, robot)
     return runs
 
 
@@ -182,10 +184,10 @@ def _columns(
         if meaning is None:
             continue
         if meaning.column == "configuration":
-            raw, more = _configurations_in_case(arrays.name, texts(raw), layout)
+            raw, more = _configurations_in_case(arrays.name, column_texts(raw), layout)
             notes += more
         if meaning.column in TIME:
-            runs = texts(by_name["run_id"]) if "run_id" in by_name else None
+            runs = column_texts(by_name["run_id"]) if "run_id" in by_name else None
             raw, more_notes = clock.from_the_first(arrays.name, meaning, raw, runs)
             notes += more_notes
         if battery and meaning.column == SUPPLY and layout.imposed == "voltage":
@@ -193,11 +195,13 @@ def _columns(
         elif meaning.column in layout.idle:
             _refuse_idle(arrays, meaning, raw, layout)
         else:
-            columns[meaning.column], refused = cell_values.values(meaning, raw, layout)
+            columns[meaning.column], refused = cell_values.convert_column(meaning, raw, layout)
             wrong = np.flatnonzero(refused).tolist()
             count += len(wrong)
             for k in wrong[:LISTED]:
-                said = cell_values.refusal(arrays.row(k), meaning, texts(raw[k : k + 1])[0], layout)
+                said = cell_values.refused_cell_sentence(
+                    arrays.row(k), meaning, column_texts(raw[k : k + 1])[0], layout
+                )
                 bad.append((k, j, said))
     if bad:
         raise BadData(_listed(arrays.name, [sentence for _, _, sentence in sorted(bad)], count))
@@ -243,7 +247,9 @@ def _with_instruments(
     """The layout with the instruments inferred from the readings, and instruments without sign."""
     inferred = instruments.infer_instruments(layout.instruments, columns)
     stated = {i.channel for i in inferred}
-    unsigned = tuple(i for i in sides.magnitudes(columns, layout) if measured and i.channel not in stated)
+    unsigned = tuple(
+        i for i in sides.unsigned_current_channels(columns, layout) if measured and i.channel not in stated
+    )
     return dataclasses.replace(layout, instruments=(*inferred, *unsigned)), unsigned
 
 
@@ -262,9 +268,9 @@ def _extra(raw: Raw) -> np.ndarray:
     """A column without a role: numbers where every cell that has a reading is one, else words."""
     if isinstance(raw, np.ndarray):
         return raw
-    found = numbers(raw)
+    found = column_numbers(raw)
     lost = np.flatnonzero(np.isnan(found))
-    return found if missing(raw, lost).all() else np.array(raw)
+    return found if missing_readings(raw, lost).all() else np.array(raw)
 
 
 def _refuse_idle(arrays: NamedArrays, meaning: Column, raw: Raw, layout: Layout) -> None:
@@ -280,7 +286,7 @@ def _refuse_idle(arrays: NamedArrays, meaning: Column, raw: Raw, layout: Layout)
     else:
         acts = [row for row, cell in enumerate(raw) if cell.strip("0.-") != ""][:1]
     for row in acts:
-        raise BadData(f"{arrays.row(row)}, {meaning.shown}: got {texts(raw[row : row + 1])[0]}; {why}")
+        raise BadData(f"{arrays.row(row)}, {meaning.shown}: got {column_texts(raw[row : row + 1])[0]}; {why}")
 
 
 def _refuse_stated(arrays: NamedArrays, voltages: Raw) -> None:
@@ -291,12 +297,13 @@ def _refuse_stated(arrays: NamedArrays, voltages: Raw) -> None:
         stated = [row for row, cell in enumerate(voltages) if cell][:1]
     for row in stated:
         raise BadData(
-            f"{arrays.row(row)}, supply_voltage_V: got {texts(voltages[row : row + 1])[0]} together with --battery, "
+            f"{arrays.row(row)}, supply_voltage_V: got {column_texts(voltages[row : row + 1])[0]} together "
+            "with --battery, "
             "whose charge sets the voltage; expected an empty cell, or no such column"
         )
 
 
-def single(cells: dict[str, Any], layout: Layout | None = None) -> Runs:
+def single_run(cells: dict[str, Any], layout: Layout | None = None) -> Runs:
     """Returns one run from options by column name, each checked as a cell of a file; on a battery without a voltage.
 
     Args:
@@ -311,10 +318,10 @@ def single(cells: dict[str, Any], layout: Layout | None = None) -> Runs:
     for column, value in cells.items():
         quantity = rows[column]
         meaning = Column(quantity, column, next(iter(quantity.units)))
-        text = number(value) if isinstance(value, float) else str(value)
-        columns[column], refused = cell_values.values(meaning, [text], layout)
+        text = bound_text(value) if isinstance(value, float) else str(value)
+        columns[column], refused = cell_values.convert_column(meaning, [text], layout)
         if refused.any():
-            raise BadConfiguration(cell_values.refusal("option", meaning, text, layout, hints=False))
+            raise BadConfiguration(cell_values.refused_cell_sentence("option", meaning, text, layout, hints=False))
     if layout.imposed == "voltage":
         columns.setdefault(SUPPLY, np.array([math.nan]))
     if "total_mass_kg" in cells and cells["total_mass_kg"] <= cells["payload_kg"]:

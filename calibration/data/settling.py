@@ -12,8 +12,8 @@ import numpy as np
 
 from calibration.data.columns import LOAD, SPEED, TIME
 from calibration.data.contradictions import GAP
-from calibration.data.courses import applied, differs
-from calibration.data.input_errors import BadData, number
+from calibration.data.courses import applied_drive, differs_from_row_before
+from calibration.data.input_errors import BadData, bound_text
 from calibration.data.instruments import step_of
 from calibration.data.runs import Runs
 from mmrjax.errors import count_noun
@@ -64,7 +64,7 @@ class Signal:
         channel: of the table of settled runs; shown: its readings [unit of the column], NaN if missing or a glitch.
         angle: the angle whose rate it is [unit of its column], empty if the channel is read directly.
         step: of its instrument [unit], 0 without; largest: size of its readings but for the last two in a hundred.
-        glitches: True for readings far from the readings next to them, see `glitches`, shape (rows,).
+        glitches: True for readings far from the readings next to them, see `find_glitches`, shape (rows,).
     """
 
     channel: Channel
@@ -187,7 +187,7 @@ def _digits(x: float, digits: int = 7) -> float:
     return float(f"{x:.{digits}g}") if math.isfinite(x) else math.nan
 
 
-def settle(
+def settle_log(
     runs: Runs,
     *,
     shortest: float | None = None,
@@ -200,7 +200,7 @@ def settle(
 
     The log is divided into levels where the imposed quantity changes. Of each level the end is taken, extended
     backward while every channel's mean stays the same. The means over this stretch are the settled run. Means leave
-    out glitches; see `glitches`. The sd of a mean has four parts:
+    out glitches; see `find_glitches`. The sd of a mean has four parts:
 
     * noise with its autocorrelation (Geyer's initial positive sequence, 1992),
     * the error from the steps of the instrument (Widrow and Kollár, Quantization noise, 2008, first term for normal
@@ -248,7 +248,7 @@ def _divided(runs: Runs, shortest: float | None, drift: float, inertia: Mapping[
     step = float(np.median(np.concatenate([np.diff(runs["time_s"][rows]) for rows in each])))
     shortest = max(LEAST, 20 * step) if shortest is None else shortest
     half = max(1, round(shortest / 6 / step))
-    drives = applied(runs)
+    drives = applied_drive(runs)
     gaps: list[int] = []
     levels: list[np.ndarray] = []
     divided_by = (*(runs.of_sides if runs.turns else (drives,)), *([runs[LOAD]] if runs.has(LOAD) else []))
@@ -272,7 +272,7 @@ def _divided(runs: Runs, shortest: float | None, drift: float, inertia: Mapping[
 # --- time and channels ----------------------------------------------------------------------------------
 
 
-def shown(robot: Robot) -> tuple[Channel, ...]:
+def settled_channels(robot: Robot) -> tuple[Channel, ...]:
     """Channels that the settled runs of a robot's logs can have: its own, and rates of its angles."""
     rates = {rate for angle, rate, _ in RATES if angle in {c.column for c in robot.channels}}
     return tuple(c for c in channels.EVERY if (c in robot.channels and c.settled) or c.name in rates)
@@ -289,11 +289,13 @@ def _in_order(runs: Runs) -> list[np.ndarray]:
             row, was, now = int(rows[k + 1]) + 1, time[rows[k]], time[rows[k + 1]]
             if now == was:
                 raise BadData(
-                    f"{runs.source} row {row}, time_s: {number(now)} s is repeated; give each sample its own time, "
+                    f"{runs.source} row {row}, time_s: {bound_text(now)} s is repeated; give each sample "
+                    "its own time, "
                     "with more digits if the clock has them, or remove one"
                 )
             raise BadData(
-                f"{runs.source} row {row}, time_s: goes back from {number(was)} to {number(now)} s; give each "
+                f"{runs.source} row {row}, time_s: goes back from {bound_text(was)} to {bound_text(now)} "
+                "s; give each "
                 "recording its own run_id, or sort the rows"
             )
     if max(map(len, each)) < FEWEST:
@@ -312,7 +314,7 @@ def _signals(
     found = []
     for c in runs.channels:
         if c.settled and runs.has(c.column) and np.isfinite(runs[c.column]).any():
-            off = glitches(runs[c.column], levels, width, _step(runs, c, runs[c.column]), drift)
+            off = find_glitches(runs[c.column], levels, width, _step(runs, c, runs[c.column]), drift)
             shown = np.where(off, np.nan, runs[c.column])
             found.append(Signal(c, shown, none, _step(runs, c, shown), _size(shown), off))
     have = {s.channel.name for s in found}
@@ -321,7 +323,7 @@ def _signals(
             whole = np.full(len(runs), np.nan)
             shown = np.full(len(runs), np.nan)
             read = next(c for c in runs.channels if c.column == angle)
-            off = glitches(runs[angle], levels, width, _step(runs, read, runs[angle]), None)
+            off = find_glitches(runs[angle], levels, width, _step(runs, read, runs[angle]), None)
             for rows in each:
                 whole[rows] = np.where(off[rows], np.nan, runs[angle][rows] * factor)
                 shown[rows] = _rate(runs["time_s"][rows], whole[rows], half)
@@ -331,7 +333,9 @@ def _signals(
     return tuple(found)
 
 
-def glitches(shown: np.ndarray, levels: list[np.ndarray], width: int, step: float, drift: float | None) -> np.ndarray:
+def find_glitches(
+    shown: np.ndarray, levels: list[np.ndarray], width: int, step: float, drift: float | None
+) -> np.ndarray:
     """True for readings that are far from the readings next to them, shape (rows,).
 
     A glitch differs from the median of the `width` readings around it by more than `FAR` robust sds, `FAR` steps and
@@ -404,7 +408,7 @@ def _check_alive(runs: Runs, signal: Signal) -> None:
             column, _, factor = next(x for x in RATES if x[1] == signal.channel.name)
             value, unit = signal.angle[np.isfinite(signal.angle)][0] / factor, column.rpartition("_")[2]
         raise BadData(
-            f"{runs.source} rows 1 to {len(runs)}, {column}: {number(value)} {unit} in every row; the channel is "
+            f"{runs.source} rows 1 to {len(runs)}, {column}: {bound_text(value)} {unit} in every row; the channel is "
             "frozen or not connected; remove the column, or the channel from the rig's file"
         )
 
@@ -447,7 +451,7 @@ def _levels(
     """
     if not len(rows):
         return
-    cuts = differs(rows, (runs[name] for name in EXACT if runs.has(name)))
+    cuts = differs_from_row_before(rows, (runs[name] for name in EXACT if runs.has(name)))
     cuts[0] = True
     x = drives[rows]
     largest, noise = float(np.max(np.abs(drives))), _noise(x)
@@ -788,10 +792,10 @@ NEAR = 0.03
 
 def _shows(found: Settled, s: Stretch, channel: Channel) -> str:
     """Place of a stretch, with a channel's reading there and the imposed value, for a message."""
-    shown, unit = number(_digits(s.mean[channel.name], 4)), found.runs.layout.imposed_column.rpartition("_")[2]
+    shown, unit = bound_text(_digits(s.mean[channel.name], 4)), found.runs.layout.imposed_column.rpartition("_")[2]
     return (
         f"{found.runs.source} rows {s.rows[0] + 1} to {s.rows[-1] + 1}, {channel.column}: shows {shown} "
-        f"{channel.unit} at {number(_digits(s.imposed, 4))} {unit}"
+        f"{channel.unit} at {bound_text(_digits(s.imposed, 4))} {unit}"
     )
 
 

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from calibration.data.columns import DUTY, SIDES, SUPPLY, VOLTS, Layout
-from calibration.data.input_errors import BadData, number
-from calibration.data.table import Runs, driven
+from calibration.data.input_errors import BadData, bound_text
+from calibration.data.table import Runs, drive_of_sides
 from mmrjax.model import channels
 from mmrjax.model.quantities import TURN
 from mmrjax.model.rig import Instrument
@@ -22,7 +22,7 @@ FEWEST, MOSTLY = 3, 0.75
 ROUNDED = 0.01
 
 
-def shares(volts: np.ndarray, supply: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+def supply_and_shares(volts: np.ndarray, supply: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Returns the supply's voltage [V], by default the larger of both sides', and the share of each side.
 
     Args:
@@ -58,13 +58,14 @@ def of_volts(name: str, columns: dict[str, np.ndarray], battery: bool) -> tuple[
         (other,) = {*VOLTS} - {*stated}
         raise BadData(f"{name}: column {other} is missing, {stated[0]} is stated; state the drive of both sides")
     volts = np.stack([columns.pop(c) for c in VOLTS])
-    supply, parts = shares(volts, columns.get(SUPPLY))
+    supply, parts = supply_and_shares(volts, columns.get(SUPPLY))
     beyond = np.abs(volts) > np.abs(supply) * (1 + ROUNDED)
     if beyond.any():
         side, row = (int(k[0]) for k in np.nonzero(beyond))
         raise BadData(
-            f"{name} row {row + 1}, {[*VOLTS][side]}: got {number(volts[side, row])} of a supply of "
-            f"{number(supply[row])} V; expected no more than {SUPPLY}, or no such column: the supply's is then the "
+            f"{name} row {row + 1}, {[*VOLTS][side]}: got {bound_text(volts[side, row])} of a supply of "
+            f"{bound_text(supply[row])} V; expected no more than {SUPPLY}, or no such column: the supply's "
+            "is then the "
             "larger of both sides'"
         )
     origin = SUPPLY if SUPPLY in columns else f"{SUPPLY}, the larger of both"
@@ -72,7 +73,7 @@ def of_volts(name: str, columns: dict[str, np.ndarray], battery: bool) -> tuple[
     return (f"{name}: {' and '.join(VOLTS)} are read as {' and '.join(SIDES)}, shares of {origin}",)
 
 
-def check(runs: Runs) -> None:
+def check_turns(runs: Runs) -> None:
     """Refuses a table of turns with exchanged sides or a yaw rate of the other sign.
 
     Raises:
@@ -113,7 +114,7 @@ def _refuse_against(
     if told.sum() < FEWEST or against.sum() <= MOSTLY * told.sum():
         return
     row = int(np.argmax(np.where(against, np.abs(drive), -1.0)))
-    got, at = (" and ".join(number(float(f"{x[row]:.4g}")) for x in sides) for sides in (shown, runs.of_sides))
+    got, at = (" and ".join(bound_text(float(f"{x[row]:.4g}")) for x in sides) for sides in (shown, runs.of_sides))
     unit = runs.layout.imposed_column.rpartition("_")[2]
     raise BadData(
         f"{runs.source} row {row + 1}, {column}: got {got} where left and right side are driven at {at} {unit}, "
@@ -121,7 +122,7 @@ def _refuse_against(
     )
 
 
-def magnitudes(columns: Mapping[str, np.ndarray], layout: Layout) -> tuple[Instrument, ...]:
+def unsigned_current_channels(columns: Mapping[str, np.ndarray], layout: Layout) -> tuple[Instrument, ...]:
     """Instruments of the sides' currents that show no sign: their readings are positive in every row that drives
     their side backward.
 
@@ -131,7 +132,7 @@ def magnitudes(columns: Mapping[str, np.ndarray], layout: Layout) -> tuple[Instr
     if not layout.sides or not set(layout.sides) <= set(columns):
         return ()
     found = []
-    for side, drive in zip(channels.SIDES, driven(columns, layout), strict=True):
+    for side, drive in zip(channels.SIDES, drive_of_sides(columns, layout), strict=True):
         channel = channels.find_channel(f"motor_current_{side}")
         if channel.column in columns:
             shown = columns[channel.column]

@@ -6,7 +6,7 @@ import math
 import re
 from typing import Any
 
-from calibration.data.input_errors import BadConfiguration, parsed
+from calibration.data.input_errors import BadConfiguration, parse_number
 
 FORM = 'expected a number, or one with its standard deviation as "0.61 ± 0.03" or "0.61 ± 5 %"'
 _SIGNS = r"(?:±|\+/-|\+-)"
@@ -29,7 +29,7 @@ def stated_number(text: str, where: str) -> tuple[float, float]:
     parts = re.split(_SIGNS, text)
     try:
         value, sd = parts
-        mean, size = parsed(value), parsed(sd.strip().removesuffix("%"))
+        mean, size = parse_number(value), parse_number(sd.strip().removesuffix("%"))
     except ValueError:
         raise BadConfiguration(f"{where}: got {text!r}; {FORM}") from None
     if not math.isfinite(mean):

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import TypeVar
 
 from calibration.data.columns import Layout
-from calibration.data.surface_labels import named
+from calibration.data.surface_labels import configuration_on_surface
 from calibration.data.table import Runs
 from mmrjax.errors import allowed_words
 from mmrjax.model.paper_tables import SURFACES
@@ -26,18 +26,19 @@ MISSPELT = 0.75
 V = TypeVar("V")
 
 
-def common(configurations: Sequence[str], labels: Iterable[str]) -> str | None:
+def common_configuration(configurations: Sequence[str], labels: Iterable[str]) -> str | None:
     """Returns the only configuration, or the configuration with all of these surfaces; otherwise None."""
     if len(configurations) == 1:
         return configurations[0]
     stems = [
-        {c[: -len(end)] for c in configurations if c.endswith(end)} for end in (named("", label) for label in labels)
+        {c[: -len(end)] for c in configurations if c.endswith(end)}
+        for end in (configuration_on_surface("", label) for label in labels)
     ]
     stem = set.intersection(*stems) if stems else set()
     return stem.pop() if len(stem) == 1 else None
 
 
-def refused(label: str, layout: Layout) -> str:
+def allowed_labels(label: str, layout: Layout) -> str:
     """Allowed labels for the message about a label; empty if the label is allowed itself."""
     if not layout.inherits:
         return "" if label else "the name of a surface"
@@ -63,13 +64,17 @@ def with_surface_configurations(robot: Robot, runs: Runs) -> Robot:
     leaders: dict[str, str] = {}
     for configuration in dict.fromkeys(c for c, _ in pairs):
         mine = [label for c, label in pairs if c == configuration]
-        own = [x for x in mine if x not in labelled or named(configuration, x) in members]
-        present = [named(configuration, x) for x in own if named(configuration, x) in members]
+        own = [x for x in mine if x not in labelled or configuration_on_surface(configuration, x) in members]
+        present = [
+            configuration_on_surface(configuration, x)
+            for x in own
+            if configuration_on_surface(configuration, x) in members
+        ]
         if not own or (len(mine) == 1 and not present) or (configuration not in members and not present):
             continue
         stays = configuration in members and len(own) < len(mine)
         pattern = members[configuration] if configuration in members else members[present[0]]
-        names = list(dict.fromkeys(named(configuration, x) for x in own))
+        names = list(dict.fromkeys(configuration_on_surface(configuration, x) for x in own))
         if configuration in members and not stays:  # in its place
             members = {
                 n: m for key, value in members.items()
@@ -116,6 +121,10 @@ def names_of_surfaces(names: Iterable[str], robot: Robot, runs: Runs) -> list[st
             found.append(name)
             continue
         mine = runs["surface"][runs["configuration"] == configuration]
-        on = [n for n in dict.fromkeys(named(configuration, s) for s in mine) if n in robot.configurations]
+        on = [
+            n
+            for n in dict.fromkeys(configuration_on_surface(configuration, s) for s in mine)
+            if n in robot.configurations
+        ]
         found += [f"{n}.{rest}" for n in (on if rest.startswith((GROUND, "*")) else on[:1])]
     return found

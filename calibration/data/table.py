@@ -36,7 +36,7 @@ def driven_on(columns: Mapping[str, np.ndarray], layout: Layout) -> np.ndarray:
     return columns[LOAD] * imposed < 0 if LOAD in columns else np.zeros(len(imposed), bool)
 
 
-def driven(columns: Mapping[str, np.ndarray], layout: Layout) -> np.ndarray:
+def drive_of_sides(columns: Mapping[str, np.ndarray], layout: Layout) -> np.ndarray:
     """Voltage [V] of the left and the right side, on a battery a share of it, or their speed [rpm], shape (2, rows);
     negative backward.
 
@@ -94,8 +94,8 @@ class Runs:
 
     @property
     def of_sides(self) -> np.ndarray:
-        """See `driven`; of a table with `turns`."""
-        return driven(self.columns, self.layout)
+        """See `drive_of_sides`; of a table with `turns`."""
+        return drive_of_sides(self.columns, self.layout)
 
     @property
     def channels(self) -> tuple[Channel, ...]:
@@ -147,7 +147,7 @@ class Runs:
 
         A speed has it, and so has a current if nothing else drives the motors. A bridge that reverses the voltage
         reverses the supply's current. In a turn each side has its own sign, and the yaw rate has the sign of their
-        difference (`sides.check`).
+        difference (`sides.check_turns`).
         """
         if (
             self.turns
@@ -213,8 +213,8 @@ class Runs:
     def configurations(self, robot: Robot) -> np.ndarray:
         """Index of each row's configuration in `robot`, shape (rows,).
 
-        It is the configuration on the row's surface (`surface_labels.named`) if the robot has it, else the row's
-        configuration.
+        It is the configuration on the row's surface (`surface_labels.configuration_on_surface`) if the robot has it,
+        else the row's configuration.
 
         Raises:
             InputError: a configuration that the robot does not have; the message lists its configurations.
@@ -238,7 +238,7 @@ class Runs:
         if not self.has("surface"):
             return stated
         pairs = list(zip(stated.tolist(), self["surface"].tolist(), strict=True))
-        on = {pair: surface_labels.named(*pair) for pair in set(pairs)}
+        on = {pair: surface_labels.configuration_on_surface(*pair) for pair in set(pairs)}
         return np.array([on[p] if on[p] in robot.configurations else p[0] for p in pairs])
 
     def conditions(self, robot: Robot, *, battery: float = 0.0, discharge: float = 0.0) -> Conditions:
@@ -261,7 +261,7 @@ class Runs:
         adhesion, lateral = np.ones(len(self)), np.ones(len(self))
         if self.has("surface"):
             on_tracks = np.array([float(c.on_tracks) > 0.5 for c in robot.configurations.members])[which]
-            scaled = surface_labels.scaled(robot, self["configuration"], self["surface"])
+            scaled = surface_labels.rows_of_scaled_adhesion(robot, self["configuration"], self["surface"])
             adhesion[scaled] = [
                 adhesion_ratio(s, t) for s, t in zip(self["surface"][scaled], on_tracks[scaled], strict=True)
             ]

@@ -10,7 +10,7 @@ import numpy as np
 
 from calibration.data import delimited, input_files, named_arrays
 from calibration.data.input_errors import BadConfiguration, BadData
-from calibration.data.named_arrays import texts
+from calibration.data.named_arrays import column_texts
 from calibration.data.sources import reading
 from mmrjax.climbing import terrain
 from mmrjax.climbing.climb_simulation import ON_GROUND, Sequence, roller_clearance
@@ -26,14 +26,14 @@ HIGHEST = 1000.0
 _LENGTHS = {"m": 1.0, "mm": 1e-3}
 
 
-def stairs(text: str) -> tuple[float, float, int]:
+def parse_stairs(text: str) -> tuple[float, float, int]:
     """Rise and tread [m] and count of «170x290x3» in mm.
 
     Raises:
         BadConfiguration: something else, or a stair without rise or tread.
     """
     cells = text.lower().replace("×", "x").split("x")
-    numbers = [named_arrays.number(c) for c in cells]
+    numbers = [named_arrays.cell_number(c) for c in cells]
     if len(cells) != 3 or not np.isfinite(numbers).all():
         raise BadConfiguration(f"--stairs: got {text}; expected RISExTREADxCOUNT in mm, such as 170x290x3")
     rise, tread, count = numbers
@@ -48,13 +48,13 @@ def _read(path: Path, option: str, wanted: Rows[Rows[str]]) -> tuple[dict[str, n
     """Columns of the first of some headers that a file has."""
     if not path.exists():
         raise BadConfiguration(f"{option}: got {path}, no such file")
-    table = reading.table(path)
+    table = reading.read_whole_table(path)
     if table is None:
-        text, _ = delimited.text(path.name, input_files.table(path, path.name or str(path)))
+        text, _ = delimited.decode_text(path.name, input_files.csv_bytes(path, path.name or str(path)))
         lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
-        rows, _ = delimited.cells(path.name, lines)
+        rows, _ = delimited.split_cells(path.name, lines)
     else:
-        rows = [list(table.header), *map(list, zip(*map(texts, table.values), strict=True))]
+        rows = [list(table.header), *map(list, zip(*map(column_texts, table.values), strict=True))]
     header = [cell.strip() for cell in rows[0]] if rows else []
     names = next((names for names in wanted if set(names) <= set(header)), None)
     if names is None:
@@ -71,7 +71,7 @@ def _read(path: Path, option: str, wanted: Rows[Rows[str]]) -> tuple[dict[str, n
         for name in names:
             j = header.index(name)
             cell = row[j] if j < len(row) else ""
-            if not np.isfinite(value := named_arrays.number(cell)):
+            if not np.isfinite(value := named_arrays.cell_number(cell)):
                 raise BadData(f"{path.name} row {k}, {name}: got {cell!r}; expected a number")
             found[name].append(value)
     if len(rows) < 2:
@@ -140,13 +140,13 @@ def read_sequence(path: Path, robot: Robot, begins: tuple[float, float]) -> Sequ
         return Sequence(jnp.asarray(at), front, rear, jnp.asarray(begins), over_time)
     for name in angles:
         for k, value in enumerate(columns[name]):
-            if why := beyond(robot, value):
+            if why := lever_angle_refusal(robot, value):
                 raise BadData(f"{path.name} row {k + 2}, {name}: {why}")
     front, rear = (jnp.asarray(np.radians(columns[name])) for name in angles)
     return Sequence(jnp.asarray(at), front, rear, over_time=over_time)
 
 
-def below(robot: Robot, angle: float) -> str:
+def lever_start_refusal(robot: Robot, angle: float) -> str:
     """Reason why levers cannot begin at an angle [deg] on level ground; empty if they can."""
     gear = robot.running_gear
     axle = robot.radius_pulley + gear.grouser_height
@@ -160,7 +160,7 @@ def below(robot: Robot, angle: float) -> str:
     )
 
 
-def beyond(robot: Robot, angle: float) -> str:
+def lever_angle_refusal(robot: Robot, angle: float) -> str:
     """Reason why levers cannot reach an angle [deg]; empty if they can."""
     levers = robot.running_gear.levers
     least, most = (float(np.degrees(np.asarray(x))) for x in (levers.angle_least, levers.angle_most))

@@ -14,7 +14,7 @@ from calibration.data.table import Runs
 FIRST = 5
 
 
-def thinned(runs: Runs, most: int = ROWS) -> Runs:
+def thin_log(runs: Runs, most: int = ROWS) -> Runs:
     """Returns a log with about `most` of its rows, if it has more; `Runs.log` keeps the drive in all rows.
 
     Each run keeps its first rows, its last row, and one row of every few in between. Of neighbouring rows, it keeps

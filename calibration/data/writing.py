@@ -17,7 +17,7 @@ from calibration.data import frames
 
 
 @contextlib.contextmanager
-def naming(path: Path | str) -> Iterator[None]:
+def naming_file(path: Path | str) -> Iterator[None]:
     """Adds the file's name to an error of the system while the file is written, as a full disk does not name it."""
     try:
         yield
@@ -29,13 +29,13 @@ def naming(path: Path | str) -> Iterator[None]:
 
 def write_text(path: Path, text: str) -> None:
     """Write a text file."""
-    with naming(path):
+    with naming_file(path):
         path.write_text(text, encoding="utf-8")
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Write a JSON file; numbers that are not finite become null."""
-    write_text(path, json.dumps(finite(content), indent=2, ensure_ascii=False) + "\n")
+    write_text(path, json.dumps(finite_or_null(content), indent=2, ensure_ascii=False) + "\n")
 
 
 def write_table(path: Path, columns: Mapping[str, np.ndarray], tables: str = "csv") -> None:
@@ -47,9 +47,9 @@ def write_table(path: Path, columns: Mapping[str, np.ndarray], tables: str = "cs
     if tables == "parquet":
         from pyarrow import parquet
 
-        with naming(path):
+        with naming_file(path):
             parquet.write_table(frames.to_arrow(columns), path.with_suffix(".parquet"))
-    with naming(path), path.open("w", newline="", encoding="utf-8") as stream:
+    with naming_file(path), path.open("w", newline="", encoding="utf-8") as stream:
         _write_rows(stream, columns)
 
 
@@ -63,24 +63,24 @@ def table_text(columns: Mapping[str, np.ndarray]) -> str:
 def _write_rows(stream: TextIO, columns: Mapping[str, np.ndarray]) -> None:
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(columns)
-    writer.writerows(zip(*(map(cell, column) for column in columns.values()), strict=True))
+    writer.writerows(zip(*(map(cell_text, column) for column in columns.values()), strict=True))
 
 
-def cell(value: Any) -> str:
+def cell_text(value: Any) -> str:
     """A cell of a table."""
     if isinstance(value, float | np.floating):
         return f"{value:.9g}" if math.isfinite(value) else ""
     return str(value)
 
 
-def finite(value: Any) -> Any:
+def finite_or_null(value: Any) -> Any:
     """JSON-able data with null in place of numbers that are not finite."""
     if isinstance(value, Mapping):
-        return {key: finite(v) for key, v in value.items()}
+        return {key: finite_or_null(v) for key, v in value.items()}
     if isinstance(value, list | tuple):
-        return [finite(v) for v in value]
+        return [finite_or_null(v) for v in value]
     if isinstance(value, np.ndarray):
-        return finite(value.tolist())
+        return finite_or_null(value.tolist())
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, float) and not math.isfinite(value):

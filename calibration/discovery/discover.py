@@ -21,7 +21,7 @@ from calibration.data.effect_file import Library
 from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.data.posterior_file import Posterior
 from calibration.data.runs import Runs
-from calibration.data.thinning import thinned
+from calibration.data.thinning import thin_log
 from calibration.described import described, in_words
 from calibration.discovery import findings, kept, menu, prediction, preference, scales
 from calibration.discovery.active_set import CandidateSpace, candidate_space
@@ -280,7 +280,7 @@ def prepare_loop(
     menu.check_forbidden(forbidden, robot)
     if not robot.rig.inherits:
         scales.precompute_nominal()
-    runs = thinned(runs.of(robot), rows)
+    runs = thin_log(runs.of(robot), rows)
     distinct, numbers, notes = without_copies(runs)
     kind = observers.observer_kind(distinct)
     if len(distinct) < kind.fewest:

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from calibration.data.posterior_file import ANGLE, LOG, NORMAL, Posterior, joined
+from calibration.data.posterior_file import ANGLE, LOG, NORMAL, Posterior, join_posteriors
 from calibration.discovery.active_set import ActiveSet, CandidateSpace
 from calibration.discovery.discrepancy import Discrepancy, Shaped
 from calibration.inference.fit_posterior import posterior_of_coordinates
@@ -48,7 +48,7 @@ def posterior_of_curve(space: CandidateSpace, active: tuple[str, ...], curve: Di
     )
     places = [*kept, *range(inner, len(shaped))]
     covariance = (turn @ curve.covariance @ turn.T)[np.ix_(places, places)]
-    return joined([*base, ordinates], covariance)
+    return join_posteriors([*base, ordinates], covariance)
 
 
 def _of(
@@ -59,7 +59,7 @@ def _of(
     covariance: np.ndarray,
 ) -> Posterior:
     parts, kept = _parts(coordinates, space, active, z)
-    return joined(parts, covariance[np.ix_(kept, kept)])
+    return join_posteriors(parts, covariance[np.ix_(kept, kept)])
 
 
 def _parts(

@@ -741,11 +741,11 @@ class DiscoveryResult:
         write_table(folder / "rows.csv", self.rows_table(), tables)
         held = [described(HeldByPrior(self.held_by_prior))] if self.held_by_prior else []
         note = "\n".join([described(self, "header", robot_name), *held])
-        robot_file.write(self.robot, folder / "robot.toml", note=note)
-        robot_file.write(self.refit, folder / REFIT_FILE, note=described(self, "refit header", robot_name))
-        posterior.write(self.posterior, folder / posterior.FILE)
+        robot_file.write_robot(self.robot, folder / "robot.toml", note=note)
+        robot_file.write_robot(self.refit, folder / REFIT_FILE, note=described(self, "refit header", robot_name))
+        posterior.write_posterior(self.posterior, folder / posterior.FILE)
         if self.resolved is not None:
-            robot_file.write(self.resolved.robot, folder / TRACK_FILE, note=self.resolved.statement)
+            robot_file.write_robot(self.resolved.robot, folder / TRACK_FILE, note=self.resolved.statement)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from calibration.data.columns import CURRENT, LOAD, SPEED
-from calibration.data.courses import varies
+from calibration.data.courses import rows_of_varying_runs
 from calibration.data.runs import Runs
 from calibration.inference import held_out as refits
 from calibration.inference.problem import Problem
@@ -88,7 +88,7 @@ def blocks_of_kind(runs: Runs, by: str) -> dict[str, np.ndarray]:
         return {}  # the same blocks as `voltage`
     values = {c: group_into_levels(runs[c]) if c in GRADED else runs[c] for c in columns}
     labels = np.array([" ".join(str(values[c][k]) for c in columns) for k in range(len(runs))])
-    changes = varies(runs, BLOCKS[by])
+    changes = rows_of_varying_runs(runs, BLOCKS[by])
     if changes.all() and by != "run":
         return {}
     labels = np.where(changes, np.char.add("run ", runs.run_names.astype(str)), labels)

@@ -15,7 +15,7 @@ from calibration.data import surfaces
 from calibration.data.columns import ROWS
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.runs import Runs
-from calibration.data.thinning import thinned
+from calibration.data.thinning import thin_log
 from calibration.described import in_words
 from calibration.inference import blocks as holdout
 from calibration.inference import (
@@ -109,7 +109,7 @@ def calibrate(
     if not is_double():
         raise BadConfiguration(f"calibrate: {SINGLE}")
     solver = solvers.solver_by_name(solver) if isinstance(solver, str) else solver
-    runs, told = thinned(runs.of(robot), rows), in_words(tell)
+    runs, told = thin_log(runs.of(robot), rows), in_words(tell)
     plan = _make_plan(runs, model, starts, profiles, blocks)
     choose = functools.partial(_free_names, runs, plan, free, fix)
     ready = prepare(runs, robot, noise, stated, assume=False, choose=choose)

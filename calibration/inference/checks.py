@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from calibration.data.columns import SUPPLY
-from calibration.data.courses import applied
-from calibration.data.input_errors import BadConfiguration, BadData, number
+from calibration.data.courses import applied_drive
+from calibration.data.input_errors import BadConfiguration, BadData, bound_text
 from calibration.data.runs import Runs
 from calibration.inference import observers
 from calibration.inference.conduct import conduct_notes
@@ -52,7 +52,7 @@ def _check_motion(runs: Runs, noise: Noise) -> None:
     speeds = [(k, c) for k, c in enumerate(runs.channels) if c.zero_at_rest and runs.has(c.column)]
     if not runs.sampled or runs.turns or not speeds:
         return
-    driven = bool(applied(runs).any())
+    driven = bool(applied_drive(runs).any())
     for k, channel in speeds:
         shown = runs[channel.column][np.isfinite(runs[channel.column])]
         scatter = float(np.std(np.diff(shown))) / 2**0.5 if len(shown) > 2 else 0.0
@@ -61,7 +61,7 @@ def _check_motion(runs: Runs, noise: Noise) -> None:
         if driven and scatter <= WHITE * float(np.nanmax(noise.sd[:, k])) / channel.factor:
             return
     imposed, (_, channel) = runs.layout.imposed_column, speeds[0]
-    size, name, unit = number(float(f"{scatter:.2g}")), channel.name, channel.unit
+    size, name, unit = bound_text(float(f"{scatter:.2g}")), channel.name, channel.unit
     if driven:
         raise BadData(
             f"{runs.source} rows 1 to {len(runs)}, {channel.column}: readings are noise about zero ({size} {unit}), "
@@ -126,7 +126,8 @@ def _check_stuck_channels(runs: Runs) -> list[StiffSupply]:
                 stiff.append(StiffSupply(channel.column, float(readings[0])))
                 continue
             raise BadData(
-                f"{runs.source}, {channel.column}: {number(readings[0])} in every row although the conditions vary; "
+                f"{runs.source}, {channel.column}: {bound_text(readings[0])} in every row although the "
+                "conditions vary; "
                 "the instrument was stuck or the column is a copy"
             )
     return stiff
@@ -141,7 +142,9 @@ def _constant_conditions(runs: Runs) -> list[Constant]:
     return [
         Constant(column, runs[column][0], losses)
         for column, losses in alike.items()
-        if column in runs.axes and np.ptp(runs[column]) == 0 and (column != SUPPLY or np.ptp(applied(runs)) == 0)
+        if column in runs.axes
+        and np.ptp(runs[column]) == 0
+        and (column != SUPPLY or np.ptp(applied_drive(runs)) == 0)
     ]
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from calibration.data.courses import varies
+from calibration.data.courses import rows_of_varying_runs
 from calibration.data.runs import Runs
 from calibration.inference import observers
 from calibration.inference.fit_notes import EndsEarly, Fact, NeverGrips, Note
@@ -40,7 +40,7 @@ def conduct_notes(runs: Runs, robot: Robot) -> list[Note]:
     slow = measured & np.isfinite(steady) & (speed < SLOW * steady)
     early = (lasts < UNDER_WAY) & (slow | ~measured)
     slides = (lasts >= UNDER_WAY) & measured & np.isfinite(movers) & (movers > 0) & (speed < SLIDING * movers)
-    slides &= ~np.isin(names, runs.run_names[varies(runs)])  # their settled ends are only parts of them
+    slides &= ~np.isin(names, runs.run_names[rows_of_varying_runs(runs)])  # their settled ends are only parts of them
     said: list[Note] = []
     if early.any():
         seen = slow & early

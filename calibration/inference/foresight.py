@@ -10,7 +10,7 @@ import numpy as np
 from calibration.data.columns import ROWS
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.runs import Runs
-from calibration.data.thinning import thinned
+from calibration.data.thinning import thin_log
 from calibration.inference import identifiability, observers, optimizers, priors
 from calibration.inference.fit_notes import (
     Copied,
@@ -91,7 +91,7 @@ def predict_identifiability(runs: Runs, robot: Robot, noise: str | None = None, 
         BadData: data that cannot be used.
         BadConfiguration: no parameter of the robot can be freed.
     """
-    runs = thinned(runs.of(robot), rows)
+    runs = thin_log(runs.of(robot), rows)
     ready = prepare(runs, robot, noise)
     observe, robot, known = ready.observe, ready.robot, ready.noise
     present = {robot.configurations.names[k] for k in runs.configurations(robot)}

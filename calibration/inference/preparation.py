@@ -70,7 +70,7 @@ def prepare(
     robot = surfaces.with_surface_configurations(instruments.with_inferred_instruments(robot, runs), runs)
     priors = surfaces.of_surfaces(stated or {}, robot, runs)
     own_mass.check_priors(priors, robot, runs)
-    as_stated, weighed = robot, own_mass.remarks(robot, runs)
+    as_stated, weighed = robot, own_mass.mass_notes(robot, runs)
     robot = own_mass.with_table_mass(robot, runs)
     known = (noise_room.infer_noise if assume else noise_room.noise_from_table)(runs, observe.sizes(runs), noise)
     known, larger = repeats.enlarge_noise(known, runs)
@@ -86,5 +86,5 @@ def prepare(
         foreign=tuple(inherited_priors(robot, priors)),
         checked=(*larger, *checked),
         begins=tuple(begins),
-        doubted=rig_facts.doubts(runs, as_stated),
+        doubted=rig_facts.log_doubts(runs, as_stated),
     )

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from calibration.data.input_errors import BadConfiguration, allowed_words, number
+from calibration.data.input_errors import BadConfiguration, allowed_words, bound_text
 from calibration.data.surfaces import GROUND
 from mmrjax.compile.compiling import SELDOM, compiled
 from mmrjax.model import params
@@ -493,7 +493,8 @@ def _coordinate_of_parameter(
     mean, sd = stated or (float(parameter.value), spec.prior_sd(float(parameter.value)))
     if not low <= mean <= high:
         raise BadConfiguration(
-            f"--prior {parameter.name}: got {number(mean)}; expected {number(low)} to {number(high)} {spec.unit}"
+            f"--prior {parameter.name}: got {bound_text(mean)}; expected {bound_text(low)} to "
+            f"{bound_text(high)} {spec.unit}"
         )
     if sd <= 0:
         raise BadConfiguration(

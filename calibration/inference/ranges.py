@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from calibration.data.input_errors import BadData, number
+from calibration.data.input_errors import BadData, bound_text
 from calibration.data.runs import Runs
 from calibration.described import described
 from calibration.inference import observers
@@ -197,8 +197,10 @@ def _check_gear(runs: Runs, measured: np.ndarray, robot: Robot) -> None:
     found = float(np.median(turns)) if turns.size else ratio
     if abs(math.log(found * ratio)) < math.log(SAID):
         raise BadData(
-            f"{runs.source}: the motor turns about {number(float(f'{found:.2g}'))} times for one turn of the output, "
-            f"but gearbox.ratio is {number(float(f'{ratio:.4g}'))}: is it upside down? expected motor turns per turn "
+            f"{runs.source}: the motor turns about {bound_text(float(f'{found:.2g}'))} times for one turn "
+            "of the output, "
+            f"but gearbox.ratio is {bound_text(float(f'{ratio:.4g}'))}: is it upside down? expected motor "
+            "turns per turn "
             "of the output"
         )
 
@@ -212,8 +214,9 @@ def _check_masses(runs: Runs, robot: Robot) -> None:
     if max(factor, 1 / factor) > REFUSED:
         off, size = (factor, "large") if factor > 1 else (1 / factor, "small")
         raise BadData(
-            f"{runs.source}, total_mass_kg: about {number(float(f'{off:.2g}'))} times too {size} for this robot "
-            f"({', '.join(f'{number(m)} kg' for m in np.unique(own))} and the payload); check the unit, kg, and the "
+            f"{runs.source}, total_mass_kg: about {bound_text(float(f'{off:.2g}'))} times too {size} for this robot "
+            f"({', '.join(f'{bound_text(m)} kg' for m in np.unique(own))} and the payload); check the "
+            "unit, kg, and the "
             "mass in the robot's file"
         )
 

@@ -381,7 +381,7 @@ class CalibrationResult:
     def to_json(self) -> dict[str, Any]:
         """Entries of result.json, docs/schemas/calibrate.schema.json."""
         about, before, main = self.identifiability, _by_name(self.errors_before), self.main_blocks
-        return writing.finite(
+        return writing.finite_or_null(
             {
                 "schema": SCHEMA,
                 "model": self.model,
@@ -465,10 +465,10 @@ class CalibrationResult:
         folder.mkdir(parents=True, exist_ok=True)
         held = [described(HeldByPrior(self.undetermined))] if self.undetermined else []
         note = "\n".join([described(self, "header", robot_name), *held])
-        robot_file.write(self.robot, folder / "robot.toml", note=note)
+        robot_file.write_robot(self.robot, folder / "robot.toml", note=note)
         writing.write_json(folder / "result.json", self.to_json())
         writing.write_table(folder / "rows.csv", self.rows(), tables)
-        posterior.write(self.posterior, folder / posterior.FILE)
+        posterior.write_posterior(self.posterior, folder / posterior.FILE)
 
 
 def _by_name(values: dict[str, Any]) -> dict[str, dict[str, Any]]:

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.optimize import nnls
 
 from calibration.data.columns import LOAD, SPEED
-from calibration.data.courses import applied
+from calibration.data.courses import applied_drive
 from calibration.data.runs import Runs
 from calibration.inference.fit_notes import NoLoadGives, Unused
 from calibration.inference.residual_clusters import TIMES
@@ -52,7 +52,7 @@ def unexplained_torque_notes(runs: Runs) -> tuple[NoLoadGives, ...]:
     if speed is None or runs.sampled:
         return ()
     total = left = 0.0
-    torque, way = runs[column], np.sign(applied(runs))
+    torque, way = runs[column], np.sign(applied_drive(runs))
     read = np.isfinite(torque) & np.isfinite(speed)
     for name in np.unique(runs["configuration"]):
         mine = read & (runs["configuration"] == name)

@@ -13,7 +13,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from calibration.data.parts import CellSheet, GearboxSheet, MotorSheet, cells, gearboxes, motors
+from calibration.data.parts import (
+    CellSheet,
+    GearboxSheet,
+    MotorSheet,
+    packaged_cells,
+    packaged_gearboxes,
+    packaged_motors,
+)
 from mmrjax.model.robot import Robot
 
 #: The paper's parts among the sheets.
@@ -46,13 +53,14 @@ class Drive(NamedTuple):
 def drive_options(names: tuple[str, ...] = ()) -> tuple[Drive, ...]:
     """All motors of the sheets (or those named) with all sizes of gearbox that their source combines them with."""
     options = []
-    for motor in motors():
+    for motor in packaged_motors():
         if names and motor.name not in names:
             continue
         for family in motor.gearboxes:
-            for stages in sorted({g.stages for g in gearboxes() if g.family == family}):
+            for stages in sorted({g.stages for g in packaged_gearboxes() if g.family == family}):
                 ranked = sorted(
-                    (g for g in gearboxes() if (g.family, g.stages) == (family, stages)), key=lambda g: g.ratio
+                    (g for g in packaged_gearboxes() if (g.family, g.stages) == (family, stages)),
+                    key=lambda g: g.ratio,
                 )
                 ratios = tuple(BELT_STAGE * g.ratio for g in ranked)
                 options.append(Drive(motor, family, int(stages), ratios, ranked[0]))
@@ -61,12 +69,16 @@ def drive_options(names: tuple[str, ...] = ()) -> tuple[Drive, ...]:
 
 def packable_cells() -> tuple[CellSheet, ...]:
     """Cells with all data for a pack: capacity, full voltage and cut-off are stated, or are the paper's."""
-    return tuple(c for c in cells() if c.cells == 1 and (c.name == CELL or not math.isnan(c.voltage_cut_off)))
+    return tuple(
+        c for c in packaged_cells() if c.cells == 1 and (c.name == CELL or not math.isnan(c.voltage_cut_off))
+    )
 
 
 def mass_per_charge() -> float:
     """Mass of lithium-polymer cells [kg/C], from the only pack with a mass on its label."""
-    return next(c.mass / (c.cells * c.capacity) for c in cells() if not math.isnan(c.mass) and c.chemistry == _LIPO)
+    return next(
+        c.mass / (c.cells * c.capacity) for c in packaged_cells() if not math.isnan(c.mass) and c.chemistry == _LIPO
+    )
 
 
 _LIPO = "lithium-polymer"
@@ -99,9 +111,9 @@ def options_for_robot(robot: Robot, names: tuple[str, ...] = ()) -> Options:
         robot: source of friction, efficiencies and cells missing in sheets; names: of motors, empty: all.
     """
     chosen, packs = drive_options(names), packable_cells()
-    paper_motor = next(m for m in motors() if m.name == MOTOR)
-    paper_gear = next(g for g in gearboxes() if g.name == GEARBOX)
-    paper_cell = next(c for c in cells() if c.name == CELL)
+    paper_motor = next(m for m in packaged_motors() if m.name == MOTOR)
+    paper_gear = next(g for g in packaged_gearboxes() if g.name == GEARBOX)
+    paper_cell = next(c for c in packaged_cells() if c.name == CELL)
     sides, battery = float(robot.sides), robot.battery
     idle = paper_motor.torque_constant * paper_motor.current_no_load
     rows = []

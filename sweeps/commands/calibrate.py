@@ -13,15 +13,15 @@ from calibration.inference.result import CalibrationResult
 from calibration.inference.simulation_errors import OF_SIZE
 from mmrjax.errors import count_noun
 from sweeps import config as configuration
-from sweeps.console import pulse, say, tell
+from sweeps.console import print_message, print_output, step_reporter
 from sweeps.inputs import load_robot, read_runs
 from sweeps.pages import words
 from sweeps.report.words import fit_words
-from sweeps.skeleton import leave, page
+from sweeps.skeleton import finish_run_folder, page_writer
 from sweeps.store import open_folder
 
 
-def calibrate(
+def calibrate_robot(
     config: configuration.Calibrate, source: str, out: Path | None, force: bool, members: Path | None = None
 ) -> int:
     """Calibrate a robot to a table and leave a run folder; returns the exit code.
@@ -31,7 +31,10 @@ def calibrate(
     robot = load_robot(config).robot
     runs = read_runs(source, robot, columns=config.columns, measured=True, series=True)
     stated = priors.parse_priors(config.prior)
-    with open_folder("calibrate", config, robot, out, force, runs) as folder, pulse(tell, "fitting") as heard:
+    with (
+        open_folder("calibrate", config, robot, out, force, runs) as folder,
+        step_reporter(print_message, "fitting") as heard,
+    ):
         found = run(
             runs, robot, rows=config.rows, free=config.free, fix=config.fix, stated=stated,
             noise=config.noise or None, model=config.model, starts=config.starts, population=config.population,
@@ -42,14 +45,16 @@ def calibrate(
         print_calibration(found)
         settled = found.converged and all(b.converged for h in found.held_out.values() for b in h.blocks.values())
         manifest = {"seed": found.seed, "statuses": found.counts}
-        shown = page("calibration", found, robot_name=config.robot)
-        return leave(folder, config, manifest, solved=settled and words.solved(found.counts), page=shown, runs=runs)
+        shown = page_writer("calibration", found, robot_name=config.robot)
+        return finish_run_folder(
+            folder, config, manifest, solved=settled and words.every_run_solved(found.counts), page=shown, runs=runs
+        )
 
 
 def print_calibration(found: CalibrationResult) -> None:
     """Print the answer (adequate or not), parameters, errors and remarks."""
-    say(fit_words.calibration(found))
-    say(f"{found.adequacy.statement}.")
+    print_output(fit_words.calibration_answer(found))
+    print_output(f"{found.adequacy.statement}.")
     shown = Table(
         title=f"{count_noun(len(found), 'row')}, {found.model}", title_justify="left", box=None, pad_edge=False
     )
@@ -60,7 +65,7 @@ def print_calibration(found: CalibrationResult) -> None:
         low, high = (f"{v:.3g}" for v in p.interval)
         marks = "> " * p.interval_open[1] + "< " * p.interval_open[0]  # the end lies further out
         shown.add_row(name, f"{p.value:.4g}", f"{marks}{low} .. {high}", f"{p.shift:+.1f}", found.determined(name))
-    say(shown)
+    print_output(shown)
     errors = Table(title=f"rms of simulated - measured [% of {OF_SIZE}]", title_justify="left")
     for heading in ("", "rows", *(c.label for c in found.channels)):
         errors.add_column(heading, justify="right" if heading else "left")
@@ -69,9 +74,9 @@ def print_calibration(found: CalibrationResult) -> None:
     for which, by in lines.items():
         cells = ("-" if e.rows == 0 else f"{e.rms_percent:.1f}" for e in by.values())
         errors.add_row(which, f"{max(e.rows for e in by.values())}/{len(found)}", *cells)
-    say(errors)
+    print_output(errors)
     if Layout.of(found.robot).crosses_zero:
-        say(words.describe_rms(found.rms))
-    say(found.starts.statement())
+        print_output(words.describe_rms(found.rms))
+    print_output(found.starts.statement())
     for note in found.notes:
-        say(f"- {note}")
+        print_output(f"- {note}")

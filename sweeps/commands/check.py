@@ -16,23 +16,23 @@ from mmrjax.model.channels import HEAT
 from mmrjax.model.robot import Robot
 from sweeps import capabilities
 from sweeps import config as configuration
-from sweeps.console import pulse, tell
+from sweeps.console import print_message, step_reporter
 from sweeps.inputs import load_robot
 from sweeps.pages import words
 from sweeps.points import imposed
 from sweeps.report import check_report
 from sweeps.results import posture_results
-from sweeps.results.check_results import CheckResult, corner, limit
-from sweeps.skeleton import leave, report
+from sweeps.results.check_results import CheckResult, requirement_limit, worst_corner_text
+from sweeps.skeleton import finish_run_folder, print_report
 from sweeps.store import RunFolder, open_folder
 
 
-def check(config: configuration.Check, out: Path | None, force: bool) -> int:
+def check_robot(config: configuration.Check, out: Path | None, force: bool) -> int:
     """Compare a robot with requirements and write a run folder; returns the exit code.
 
     The code is 0 whether or not requirements are missed, and 3 if the solver failed at a worst corner.
     """
-    asked = requirements_file.load(Path(config.requirements))
+    asked = requirements_file.load_requirements(Path(config.requirements))
     file = load_robot(config)
     robot = file.robot
     imposed.check_on_ground(robot, "check")
@@ -40,21 +40,21 @@ def check(config: configuration.Check, out: Path | None, force: bool) -> int:
     _check_charge(robot, asked)
     _check_heat(robot, asked)
     with open_folder("check", config, robot, out, force) as folder:
-        with pulse(tell, "reading the requirements") as heard:
+        with step_reporter(print_message, "reading the requirements") as heard:
             outcomes = sheet.check_requirements(robot, asked, changes=config.changes, tell=in_words(heard))
             found = CheckResult(asked, robot, outcomes, posture_results.of_requirements(robot, outcomes))
         _write(folder, config, found)
-        shown = report(check_report.document(found, capabilities.shown_name(file), config.changes), file)
+        shown = print_report(check_report.check_document(found, capabilities.shown_name(file), config.changes), file)
         manifest = {"seed": None, **sheet.count_outcomes(found.outcomes)}
-        solved = words.solved(Counter(o.status for o in found.outcomes))
-        return leave(folder, config, manifest, solved=solved, page=shown)
+        solved = words.every_run_solved(Counter(o.status for o in found.outcomes))
+        return finish_run_folder(folder, config, manifest, solved=solved, page=shown)
 
 
 def _check_charge(robot: Robot, asked: requirements_file.Requirements) -> None:
     """Raise if a requirement needs a battery that the robot's file does not state."""
     for r in asked.each:
         depends = CHARGE in r.quantity.axes or r.quantity.group == "endurance"
-        if depends and r.envelope.battery and not capabilities.battery(robot):
+        if depends and r.envelope.battery and not capabilities.has_battery(robot):
             raise BadConfiguration(
                 f"{asked.source}, {r.name}: the robot's file states no battery; add [battery] to it, or state "
                 "supply_voltage_V in [envelope]"
@@ -74,22 +74,24 @@ def _check_heat(robot: Robot, asked: requirements_file.Requirements) -> None:
 
 def _write(folder: RunFolder, config: configuration.Check, found: CheckResult) -> None:
     folder.write_text("requirements.toml", found.asked.text)
-    robot_file.write(found.robot, folder.partial / "robot.toml", note=f"the robot of this check, from {config.robot}")
-    folder.write_table("requirements.csv", table(found))
+    robot_file.write_robot(
+        found.robot, folder.partial / "robot.toml", note=f"the robot of this check, from {config.robot}"
+    )
+    folder.write_table("requirements.csv", outcomes_table(found))
     folder.write_json("result.json", found.to_json())
 
 
-def table(found: CheckResult) -> dict[str, np.ndarray]:
+def outcomes_table(found: CheckResult) -> dict[str, np.ndarray]:
     """Outcomes as a table, one row for each requirement."""
     nan = float("nan")
     return {
         "name": np.array([o.requirement.name for o in found.outcomes]),
         "sense": np.array([o.requirement.sense for o in found.outcomes]),
-        "required": np.array([limit(o) for o in found.outcomes]),
+        "required": np.array([requirement_limit(o) for o in found.outcomes]),
         "value": np.array([nan if o.value is None else o.value for o in found.outcomes]),
         "margin": np.array([nan if o.margin is None else o.margin for o in found.outcomes]),
         "unit": np.array([o.requirement.quantity.unit for o in found.outcomes]),
         "met": np.array([o.met for o in found.outcomes]),
         "status": np.array([o.status for o in found.outcomes]),
-        "at": np.array([corner(o) for o in found.outcomes]),
+        "at": np.array([worst_corner_text(o) for o in found.outcomes]),
     }

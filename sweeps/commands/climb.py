@@ -28,12 +28,12 @@ from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
 from sweeps import config as configuration
 from sweeps.config_campaign import SIZE
-from sweeps.console import progress, say
+from sweeps.console import print_output, progress_bar
 from sweeps.inputs import check_configurations, load_robot
 from sweeps.points import imposed, scale
-from sweeps.points.climbs import NEAR, SLOW, SOUGHT, refused
+from sweeps.points.climbs import NEAR, SLOW, SOUGHT, climb_refusal
 from sweeps.results.climb_results import VERDICTS, Along, ClimbResult
-from sweeps.skeleton import leave, page
+from sweeps.skeleton import finish_run_folder, page_writer
 from sweeps.store import open_folder
 
 #: Runs of a round of a search.
@@ -44,14 +44,14 @@ SHOWN = ("margin_success", "crest_time_s", "crest_energy_J", "crest_current_rms_
 WIDTHS, WIDTH = {"payload": 0.2, "levers_front_deg": 1.0, "levers_rear_deg": 1.0, SIZE: 1.0}, 0.02
 
 
-def climb(config: configuration.Climb, out: Path | None, force: bool) -> int:
+def climb_obstacle(config: configuration.Climb, out: Path | None, force: bool) -> int:
     """Climb and leave a run folder; returns the exit code.
 
     0 done, whatever the verdict; 3 numbers went wrong.
     """
     file = load_robot(config)
     robot = file.robot
-    if (why := refused(robot)) is not None:
+    if (why := climb_refusal(robot)) is not None:
         raise BadConfiguration(f"climb: {why}")
     name = config.configuration or robot.configurations.names[0]
     check_configurations(robot, (name,), "--configuration")
@@ -74,14 +74,18 @@ def climb(config: configuration.Climb, out: Path | None, force: bool) -> int:
         if rows := found.slopes:
             folder.write_table("derivatives.csv", {name: np.array([row[name] for row in rows]) for name in rows[0]})
         folder.write_json("result.json", found.to_json())
-        robot_file.write(robot, folder.partial / "robot.toml", note=f"the robot of this climb, from {config.robot}")
+        robot_file.write_robot(
+            robot, folder.partial / "robot.toml", note=f"the robot of this climb, from {config.robot}"
+        )
         if config.film:
             from sweeps.pages import climb_figures
 
-            climb_figures.render(found, folder.partial / "climb.gif")
+            climb_figures.render_climb(found, folder.partial / "climb.gif")
         print_climb(found)
         manifest = {"seed": None, "verdict": found.verdict}
-        return leave(folder, config, manifest, solved=found.verdict != "failed", page=page("climb", found, file))
+        return finish_run_folder(
+            folder, config, manifest, solved=found.verdict != "failed", page=page_writer("climb", found, file)
+        )
 
 
 def _climbed(
@@ -99,8 +103,8 @@ def _climbed(
         every = [_terrain(config, float(size) / 1000)[0] for size in sizes]
         grounds = jax.tree.map(lambda *x: jnp.stack(x), *every)
         alike = [jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * len(sizes)), c) for c in (conditions, sequence)]
-        with progress(1, quiet=False) as advance:
-            told = scale.shares(advance, 1)
+        with progress_bar(1, quiet=False) as advance:
+            told = scale.share_counter(advance, 1)
             ended = climb_batch(
                 robot, alike[0], grounds, alike[1], duration=config.duration_s, step=config.time_step_s, progress=told
             )
@@ -115,10 +119,10 @@ def _climbed(
     elif along is None:
         grounds, ended = run(np.array([np.nan]))
     else:
-        with progress(1, quiet=False) as advance:
+        with progress_bar(1, quiet=False) as advance:
             derivatives = climb_derivatives(
                 along.given, along.values, along.widths, duration=config.duration_s, step=config.time_step_s,
-                progress=scale.shares(advance, 1),
+                progress=scale.share_counter(advance, 1),
             )  # fmt: skip
         ended = derivatives.climb
         grounds = jax.tree.map(lambda x: x[None], along.given(along.values).terrain)
@@ -141,7 +145,7 @@ def _along(config: configuration.Climb, robot: Robot, conditions: Conditions, se
         return None
     sizes = {"step": config.step_mm, "gap": config.gap_mm}
     if config.stairs is not None:
-        sizes["stairs"] = 1000 * terrains.stairs(config.stairs)[0]
+        sizes["stairs"] = 1000 * terrains.parse_stairs(config.stairs)[0]
     kind = next((k for k, size in sizes.items() if size is not None), None)
     levers = {"levers_front_deg": "front", "levers_rear_deg": "rear"}
     known = ["adhesion", "payload", "discharge" if config.battery else "voltage"]
@@ -212,7 +216,7 @@ def _terrain(config: configuration.Climb, size: Scalar) -> tuple[Terrain, str]:
     if config.terrain is not None:
         return terrains.read_terrain(config.terrain), f"the terrain of {config.terrain.name}"
     if config.stairs is not None:
-        rise, tread, count = terrains.stairs(config.stairs)
+        rise, tread, count = terrains.parse_stairs(config.stairs)
         if nose >= min(rise, tread) / 2:
             raise BadConfiguration(
                 f"--nose: got {config.nose_mm:g} mm; expected less than half of rise and tread, "
@@ -246,7 +250,7 @@ def _sequence(config: configuration.Climb, robot: Robot, name: str) -> Sequence:
     angles = []
     for option, given, usual in zip(("--levers-front", "--levers-rear"), stated[1:], own, strict=True):
         angle = usual if given is None else given
-        if given is not None and (why := terrains.beyond(robot, angle)):
+        if given is not None and (why := terrains.lever_angle_refusal(robot, angle)):
             raise BadConfiguration(f"{option}: {why}")
         angles.append(float(np.radians(angle)))
     if config.sequence is None:
@@ -263,23 +267,23 @@ def _sequence(config: configuration.Climb, robot: Robot, name: str) -> Sequence:
     if tracked:
         first = (float(found.first[0]), float(np.pi - found.first[1]))
         for option, angle in zip(("front", "rear"), first, strict=True):
-            if why := terrains.below(robot, float(np.degrees(angle))):
+            if why := terrains.lever_start_refusal(robot, float(np.degrees(angle))):
                 raise BadConfiguration(f"levers {option}: {why}")
     return found
 
 
 def print_climb(found: ClimbResult) -> None:
     """The answer, and what it took; for a person."""
-    say(found.statement())
+    print_output(found.statement())
     shown = Table(box=None, pad_edge=False, show_header=False)
     for key, value in found.numbers().items():
         stem, _, unit = key.rpartition("_")
         shown.add_row(stem.replace("_", " "), f"{value:.3g}", unit)
-    say(shown)
+    print_output(shown)
     if found.derivatives is not None and found.along is not None:
         _print_derivatives(found.along, found.derivatives)
     if found.tried:
-        say(", ".join(f"{size:g} mm {VERDICTS[verdict][0]}" for size, verdict in found.tried))
+        print_output(", ".join(f"{size:g} mm {VERDICTS[verdict][0]}" for size, verdict in found.tried))
 
 
 def _print_derivatives(along: Along, found: Derivatives) -> None:
@@ -290,4 +294,4 @@ def _print_derivatives(along: Along, found: Derivatives) -> None:
     for k, (name, unit, _, width) in enumerate(along.rows):
         rows = ((found.by[n][k], found.slope[n][k], found.slope_sd[n][k]) for n in SHOWN)
         shown.add_row(name, f"{width:.2g} {unit}", *(f"{d:.2g} ({s:.2g} ± {sd:.1g})" for d, s, sd in rows))
-    say(shown)
+    print_output(shown)

@@ -22,15 +22,17 @@ from sweeps import config as configuration
 from sweeps.inputs import beside_robot, fit_of, load_robot, read_runs
 from sweeps.points import run, uncertainty
 from sweeps.report import comparison_report
-from sweeps.results.comparison_results import Comparison, compared
-from sweeps.skeleton import report
+from sweeps.results.comparison_results import Comparison, compare_readings
+from sweeps.skeleton import print_report
 from sweeps.store import open_folder
 
 #: Fidelity that follows time histories, and over what their errors are shown besides.
 HISTORIES, OVER = "drive", {"time_s": "time [s]"}
 
 
-def compare(config: configuration.Compare, source: str, own_mass: bool, out: Path | None, force: bool) -> int:
+def compare_with_table(
+    config: configuration.Compare, source: str, own_mass: bool, out: Path | None, force: bool
+) -> int:
     """Simulate the runs of a table, compare them with its readings, write a run folder; returns the exit code."""
     file = load_robot(config)
     stated = runs = read_runs(source, file.robot, columns=config.columns, measured=True, series=True, of_turns=True)
@@ -44,17 +46,17 @@ def compare(config: configuration.Compare, source: str, own_mass: bool, out: Pat
     said = sentences(check_ranges(runs, robot))
     drawn = None if config.posterior is None else beside_robot(file)
     with open_folder("compare", config, robot, out, force, runs) as folder:
-        table = run.evaluate(robot, runs, config, folder)
-        comparison, summary = compared(stated, table, robot)
+        table = run.evaluate_runs(robot, runs, config, folder)
+        comparison, summary = compare_readings(stated, table, robot)
         folder.write_table("comparison.csv", comparison)
-        notes = (*missing(comparison, stated.channels), *said)
+        notes = (*missing_readings_notes(comparison, stated.channels), *said)
         found = Comparison(
             comparison, summary, stated.channels, Path(runs.source).name, config.model, capabilities.shown_name(file),
             fit_of(file, runs), notes=notes,
         )  # fmt: skip
-        shown = report(comparison_report.document(found), dataclasses.replace(file, robot=robot))
+        shown = print_report(comparison_report.comparison_document(found), dataclasses.replace(file, robot=robot))
         if drawn is not None and config.posterior is not None:
-            ends_of = uncertainty.intervals(robot, drawn, runs, config, config.posterior, folder)
+            ends_of = uncertainty.simulate_draws(robot, drawn, runs, config, config.posterior, folder)
             uncertainty.say_intervals(table, ends_of)
             table |= ends_of.columns
             ends = (uncertainty.SD, uncertainty.LOWER, uncertainty.UPPER)
@@ -64,7 +66,7 @@ def compare(config: configuration.Compare, source: str, own_mass: bool, out: Pat
             )
         further = {"errors": summary, "notes": [*file.remarks, *notes]}
         result = run.SimulationResult("compare", config.model, robot, runs, table, further)
-        return run.leave(folder, config, result, shown)
+        return run.write_run_folder(folder, config, result, shown)
 
 
 def _over_time(
@@ -80,23 +82,28 @@ def _over_time(
     model = None if config.model == fidelities.NAMES[0] else config.model
     ready = preparation.prepare(runs, file.robot)
     with open_folder("compare", config, ready.robot, out, force, runs) as folder:
-        table = run.followed(ready.robot, runs, model)
-        comparison, summary = compared(runs, table, ready.robot)
+        table = run.follow_histories(ready.robot, runs, model)
+        comparison, summary = compare_readings(runs, table, ready.robot)
         comparison |= {column: runs[column] for column in (*OVER, "run_id") if runs.has(column)}
         folder.write_table("comparison.csv", comparison)
-        notes = (*missing(comparison, runs.channels), *sentences((*ready.checked, *ready.begins, *ready.weighed)))
+        notes = (
+            *missing_readings_notes(comparison, runs.channels),
+            *sentences((*ready.checked, *ready.begins, *ready.weighed)),
+        )
         found = Comparison(
             comparison, summary, runs.channels, Path(runs.source).name, HISTORIES, capabilities.shown_name(file),
             fit_of(file, runs), OVER, notes,
         )  # fmt: skip
-        shown = report(comparison_report.document(found), dataclasses.replace(file, robot=ready.robot))
+        shown = print_report(
+            comparison_report.comparison_document(found), dataclasses.replace(file, robot=ready.robot)
+        )
         result = run.SimulationResult(
             "compare", HISTORIES, ready.robot, runs, table, {"errors": summary, "notes": [*file.remarks, *notes]}
         )
-        return run.leave(folder, config, result, shown)
+        return run.write_run_folder(folder, config, result, shown)
 
 
-def missing(table: dict[str, np.ndarray], channels: Sequence[Channel]) -> list[str]:
+def missing_readings_notes(table: dict[str, np.ndarray], channels: Sequence[Channel]) -> list[str]:
     """Sentences on channels with missing readings."""
     lost = {c.column: int(np.isnan(table[c.column]).sum()) for c in channels}
     rows = len(table["status"])

@@ -13,11 +13,11 @@ from rich.console import Console
 from rich.table import Table
 
 from sweeps import compilation_cache
-from sweeps.console import stage
+from sweeps.console import report_stage
 from sweeps.store import PACKAGES
 
 
-def doctor() -> int:
+def check_installation() -> int:
     """Print one line for each check; returns 0 if all pass, else 1."""
     checks: dict[str, Callable[[], str]] = {
         "Python": _python, "packages": _packages, "devices": _devices, "compilation cache": _cache,
@@ -30,7 +30,7 @@ def doctor() -> int:
     healthy = True
     for k, (name, check) in enumerate(checks.items(), 1):
         try:
-            with stage(k, len(checks), name):
+            with report_stage(k, len(checks), name):
                 found, passed = check(), True
         except Exception as error:
             found, passed = f"{type(error).__name__}: {error}", False
@@ -55,7 +55,7 @@ def _devices() -> str:
 
 
 def _cache() -> str:
-    return str(compilation_cache.describe())
+    return str(compilation_cache.describe_cache())
 
 
 def _run() -> str:

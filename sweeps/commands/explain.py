@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from calibration.data import effect_file
-from calibration.data.input_errors import BadConfiguration, number
+from calibration.data.input_errors import BadConfiguration, bound_text
 from mmrjax import derived, effects
 from mmrjax.effects import Effect
 from mmrjax.errors import similar_words
@@ -20,7 +20,7 @@ from mmrjax.missions import mission_batch
 from mmrjax.model import channels, paper_robots, params, quantities
 from mmrjax.model.params import Parameter, Spec
 from mmrjax.model.signals import Result
-from sweeps.console import say
+from sweeps.console import print_output
 from sweeps.pages import words
 from sweeps.report.words import effect_words
 from sweeps.results.climb_results import VERDICTS
@@ -32,25 +32,25 @@ WIDTH, INDENT = 80, 16
 EVERY_OUTPUT: tuple[Any, ...] = (*outputs.FURTHER, *derived.TABLE, *mission_batch.OUTPUTS, *mission_batch.OF_TURNS)
 
 
-def explain(name: str | None, files: tuple[str, ...] = ()) -> int:
+def explain_name(name: str | None, files: tuple[str, ...] = ()) -> int:
     """Explain an effect, status, flag, output, channel or parameter by its name; without a name, list all.
 
     Raises:
         BadConfiguration: unknown name; the message lists the nearest.
     """
-    library = {**effect_file.library(files), **effects.BESIDE}
-    known = names(library)
+    library = {**effect_file.effect_library(files), **effects.BESIDE}
+    known = explainable_names(library)
     if name is None:
         for kind, those in known.items():
-            say(_wrapped(kind, ", ".join(those)))
-        say("mmrjax explain NAME says what one means.")
+            print_output(_wrapped(kind, ", ".join(those)))
+        print_output("mmrjax explain NAME says what one means.")
         return 0
     found = False
     for kind, about in EXPLAINED.items():
         for k, (heading, text) in enumerate(about(name, library)):
             if k == 0:
-                say(f"{name}: {kind}")
-            say(_wrapped(heading, text))
+                print_output(f"{name}: {kind}")
+            print_output(_wrapped(heading, text))
             found = True
     if not found:
         below = [p for p in known["parameters"] if p.endswith(f".{name}")]
@@ -70,7 +70,7 @@ def _wrapped(heading: str, text: str) -> str:
     )  # fmt: skip
 
 
-def names(library: dict[str, type[Effect]]) -> dict[str, list[str]]:
+def explainable_names(library: dict[str, type[Effect]]) -> dict[str, list[str]]:
     """Every name that can be explained, by kind."""
     return {
         "effects": [name for name in library if name not in effects.UNNAMED],
@@ -89,7 +89,7 @@ def _effect(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
     effect = library.get(name)
     if effect is None:
         return
-    equation, meaning, source = effect_words.about(effect)
+    equation, meaning, source = effect_words.effect_summary(effect)
     yield "equation", equation
     yield "stands for", meaning
     yield "enters", f"the {effect.balance} balance{f', channel {effect.channel}' if effect.channel else ''}"
@@ -100,12 +100,12 @@ def _effect(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
             yield "bounds", _bounds(p.spec)
         else:
             yield f"  {p.name}", f"{float(p.value):g} {p.spec.unit}: {p.spec.meaning}"
-    if said := ", ".join(effect_words.declared(effect)):
+    if said := ", ".join(effect_words.effect_declarations(effect)):
         yield "declares", said
     yield "in data", f"{effect.family()}{_histories(effect)}"
     for line in _changes(made):
         yield "", line
-    for k, test in enumerate(effect_words.tests(effect)):
+    for k, test in enumerate(effect_words.effect_tests(effect)):
         yield "" if k else "on a bench", test
     if source:
         yield "source", source
@@ -182,7 +182,7 @@ def _channel(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
         return
     low, high = c.range
     yield "is", f"{c.label} [{c.unit_shown}], as its instrument shows it{c.where and f': {c.where}'}"
-    yield "column", f"{c.column}, its standard deviation {c.sd_column}, {number(low)} to {number(high)}"
+    yield "column", f"{c.column}, its standard deviation {c.sd_column}, {bound_text(low)} to {bound_text(high)}"
     if c.other_units:
         yield "other units", ", ".join(unit for unit, _ in c.other_units)
     yield "typical noise", f"{100 * c.sd_share:g} % of the reading, where nobody states it"
@@ -190,7 +190,7 @@ def _channel(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
     wrong = [e for e in library.values() if e.channel == c.name and e.name not in effects.UNNAMED]
     if wrong:
         yield "its errors", ", ".join(e.name for e in wrong)
-        for k, test in enumerate(effect_words.tests(wrong[0])):
+        for k, test in enumerate(effect_words.effect_tests(wrong[0])):
             yield "" if k else "on a bench", test
 
 
@@ -202,7 +202,7 @@ def _condition(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
     if c is None:
         return
     low, high = c.range
-    yield "is", f"{c.label} [{c.unit_shown or '-'}], {number(low)} to {number(high)}"
+    yield "is", f"{c.label} [{c.unit_shown or '-'}], {bound_text(low)} to {bound_text(high)}"
     yield "column", c.column
     if c.other_units or c.percent:
         yield "other units", ", ".join([unit for unit, _ in c.other_units] + [quantities.PERCENT] * c.percent)
@@ -261,7 +261,7 @@ def _prior(p: Parameter) -> str:
 
 def _bounds(spec: Spec) -> str:
     low, high = spec.bounds
-    return f"{number(low)} to {number(high)} {spec.unit}"
+    return f"{bound_text(low)} to {bound_text(high)} {spec.unit}"
 
 
 #: What explains a name, by kind.

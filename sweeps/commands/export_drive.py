@@ -7,29 +7,33 @@ from typing import Any
 
 from calibration.data import robot_file
 from sweeps import config as configuration
-from sweeps.export.formats import Export, exported
+from sweeps.export.formats import Export, export_format
 from sweeps.inputs import load_robot
 from sweeps.report import export_report
 from sweeps.report.words import export_words as words
-from sweeps.skeleton import leave, report
+from sweeps.skeleton import finish_run_folder, print_report
 from sweeps.store import open_folder
 
 
-def export(config: configuration.Export, out: Path | None, force: bool) -> int:
+def export_to_folder(config: configuration.Export, out: Path | None, force: bool) -> int:
     """Export a drive and leave a run folder with its files; returns the exit code, 0."""
     file = load_robot(config)
     with open_folder("export", config, file.robot, out, force) as folder:
-        found = exported(
+        found = export_format(
             file, config.to, configuration=config.configuration, data=config.data, at=config.joint,
             draws=config.draws, seed=config.seed,
         )  # fmt: skip
-        robot_file.write(file.robot, folder.partial / "robot.toml", note=f"what was exported, from {config.robot}")
+        robot_file.write_robot(
+            file.robot, folder.partial / "robot.toml", note=f"what was exported, from {config.robot}"
+        )
         for name, content in found.files.items():
             folder.write_bytes(name, content if isinstance(content, bytes) else content.encode())
-        folder.write_text("LAW.md", words.law(found))
+        folder.write_text("LAW.md", words.law_text(found))
         folder.write_json("result.json", to_json(found))
-        shown = report(export_report.document(found))
-        return leave(folder, config, {"seed": config.seed}, page=shown, runs=found.comparison.situation.runs)
+        shown = print_report(export_report.export_document(found))
+        return finish_run_folder(
+            folder, config, {"seed": config.seed}, page=shown, runs=found.comparison.situation.runs
+        )
 
 
 def to_json(found: Export) -> dict[str, Any]:
@@ -40,7 +44,7 @@ def to_json(found: Export) -> dict[str, Any]:
         "format": found.format,
         "robot": found.joint.file.name,
         "configuration": found.joint.configuration,
-        "statement": words.statement(found),
+        "statement": words.export_statement(found),
         "runs": len(compared.situation.command),
         "source": compared.situation.source,
         "reference": compared.reference,

@@ -9,22 +9,22 @@ from rich.table import Table
 
 from calibration.data import contents, presets_file
 from calibration.data.contents import SignalFacts
-from calibration.data.writing import finite
+from calibration.data.writing import finite_or_null
 from mmrjax.errors import count_noun
-from sweeps.console import say
+from sweeps.console import print_output
 
 
-def inspect(file: str, as_json: bool) -> int:
+def inspect_file(file: str, as_json: bool) -> int:
     """Print the signals of a file and the lines of `[columns]` for them; returns 0.
 
     Raises:
         BadData: a file that cannot be read.
     """
-    found = contents.inspect(file)
+    found = contents.inspect_source(file)
     if as_json:
-        print(json.dumps(finite(found.to_json()), indent=2, ensure_ascii=False))
+        print(json.dumps(finite_or_null(found.to_json()), indent=2, ensure_ascii=False))
         return 0
-    say(f"{found.name}: {found.kind}, {count_noun(len(found.signals), 'signal')}")
+    print_output(f"{found.name}: {found.kind}, {count_noun(len(found.signals), 'signal')}")
     table = Table(box=None, pad_edge=False)
     for heading in ("signal", "unit"):
         table.add_column(heading, overflow="fold")
@@ -32,19 +32,19 @@ def inspect(file: str, as_json: bool) -> int:
         table.add_column(heading, justify="right")
     for signal in found.signals:
         table.add_row(signal.path, signal.unit, str(signal.samples), *_numbers(signal))
-    say(table)
+    print_output(table)
     for signal in found.signals:
         if signal.refused:
-            say(f"- {signal.path} {signal.refused}")
+            print_output(f"- {signal.path} {signal.refused}")
     for note in found.notes:
-        say(f"- {note}")
+        print_output(f"- {note}")
     if found.preset:
-        numbers = "".join(f",{key}=..." for key in presets_file.asked(found.preset))
-        say(f"\nIts columns are those of the preset {found.preset}: add --columns {found.preset}{numbers}")
+        numbers = "".join(f",{key}=..." for key in presets_file.numbers_to_state(found.preset))
+        print_output(f"\nIts columns are those of the preset {found.preset}: add --columns {found.preset}{numbers}")
     if found.proposed:
-        say("\nFor the robot's file, to be checked:\n[columns]")
+        print_output("\nFor the robot's file, to be checked:\n[columns]")
         for line in found.proposed:
-            say(line)
+            print_output(line)
     return 0
 
 

@@ -25,12 +25,12 @@ from calibration.discovery.settings import fewest_replicates
 from calibration.inference import blocks, observers, priors
 from calibration.inference.simulation_errors import OF_SIZE
 from sweeps import config as configuration
-from sweeps.console import pulse, say, tell
+from sweeps.console import print_message, print_output, step_reporter
 from sweeps.inputs import load_robot, read_runs
 from sweeps.pages import words
 from sweeps.report.words import loop_words
-from sweeps.report.words.step_words import expected
-from sweeps.skeleton import leave, page
+from sweeps.report.words.step_words import expected_time
+from sweeps.skeleton import finish_run_folder, page_writer
 from sweeps.store import SOLVER_FAILED, RunFolder, open_folder
 
 T = TypeVar("T")
@@ -38,7 +38,7 @@ T = TypeVar("T")
 SCREENING_FILE, SCREENING = "screening.json", "mmrjax.screening/1"
 
 
-def loop(
+def run_loop(
     config: configuration.Loop,
     source: str,
     out: Path | None,
@@ -78,10 +78,13 @@ def _loop(
 
     def timed(text: str) -> None:
         used = time.monotonic() - began
-        more = expected(text, used)
-        tell(f"{used:4.0f} s  {text}{'' if more is None else f' (about {more:.0f} s more)'}")
+        more = expected_time(text, used)
+        print_message(f"{used:4.0f} s  {text}{'' if more is None else f' (about {more:.0f} s more)'}")
 
-    with open_folder("loop", config, robot, out, force, runs) as folder, pulse(timed, "preparing the table") as heard:
+    with (
+        open_folder("loop", config, robot, out, force, runs) as folder,
+        step_reporter(timed, "preparing the table") as heard,
+    ):
 
         def progress(text: str) -> None:
             heard(text)
@@ -93,14 +96,14 @@ def _loop(
             if name == "ranking":
                 _show_ranking(stages[name], folder, timed)
             if name == "verdict":
-                timed(f"{loop_words.verdict(stages[name])}; next, errors held out and other noises")
+                timed(f"{loop_words.verdict_line(stages[name])}; next, errors held out and other noises")
             return found
 
         try:
             with _alarm(left(), lambda: "verdict" not in stages):
                 found = discover(
                     runs, robot, rows=config.rows, noise=config.noise or None, stated=stated,
-                    library=effect_file.library(config.effects), replicates=replicates, seed=config.seed,
+                    library=effect_file.effect_library(config.effects), replicates=replicates, seed=config.seed,
                     prefer=config.prefer, forbidden=config.forbid, progress=progress, keep=keep, left=left,
                 )  # fmt: skip
         except KeyboardInterrupt as ended:
@@ -112,13 +115,15 @@ def _loop(
             found = _resolved(found, config, members, progress)
         print_discovery(found)
         if config.resolve and found.resolved is None:
-            say("The track model was not asked: nothing remains in slip, track or ground that it has a say in.")
+            print_output(
+                "The track model was not asked: nothing remains in slip, track or ground that it has a say in."
+            )
         found.save(folder.partial, config.robot, folder.tables)
         if config.report:
             progress("writing the report")
         manifest = {"seed": config.seed, "verdict": found.verdict}
-        shown = page("loop", found, robot_name=config.robot)
-        return leave(folder, config, manifest, solved=found.converged, page=shown, runs=found.runs)
+        shown = page_writer("loop", found, robot_name=config.robot)
+        return finish_run_folder(folder, config, manifest, solved=found.converged, page=shown, runs=found.runs)
 
 
 def _resolved(
@@ -136,7 +141,7 @@ def _say_out_of_time(within: float, begun: bool) -> None:
     """Say that time was out before a verdict [s]; `begun`: a stage has ended."""
     more = max(5, math.ceil(within / 30))  # twice as much
     first = "" if begun else f", nor a fit of the base model; give it more, as --within {more}min"
-    tell(f"no verdict within {within:g} s{first}")
+    print_message(f"no verdict within {within:g} s{first}")
 
 
 @contextlib.contextmanager
@@ -166,10 +171,10 @@ def _alarm(seconds: float | None, wanted: Callable[[], bool]) -> Iterator[None]:
 
 def _show_ranking(found: Ranking, folder: RunFolder, timed: Callable[[str], None]) -> None:
     """Say what regression makes of the library, and leave it in the run folder: the first answer."""
-    first, *lines = loop_words.ranking(found)
+    first, *lines = loop_words.ranking_lines(found)
     timed(first)
     for line in lines:
-        tell(line)
+        print_message(line)
     content = {"schema": SCREENING, "confirmed": False, **dataclasses.asdict(found)}
     folder.write_json(SCREENING_FILE, content)
 
@@ -180,26 +185,28 @@ def _say_kept(stages: dict[str, Any], folder: RunFolder, robot_name: str) -> Non
         return
     kept = [name for name in stages if folder.keeps(name)]
     if not kept:
-        tell(f"nothing could be kept of {', '.join(stages)}; the same command begins anew")
+        print_message(f"nothing could be kept of {', '.join(stages)}; the same command begins anew")
         return
-    tell(f"kept: {', '.join(kept)}; to continue, run the same command with --out {folder.path}")
+    print_message(f"kept: {', '.join(kept)}; to continue, run the same command with --out {folder.path}")
     if "verdict" in stages:
         traced = stages["verdict"]
-        tell(f"{loop_words.verdict(traced)}; errors held out and other noises are outstanding")
+        print_message(f"{loop_words.verdict_line(traced)}; errors held out and other noises are outstanding")
         return
     if "ranking" in stages:
-        for line in loop_words.ranking(stages["ranking"]):
-            tell(line)
+        for line in loop_words.ranking_lines(stages["ranking"]):
+            print_message(line)
     searches = [found for name, found in stages.items() if name.startswith("search")]
     if searches and (best := searches[-1][2].best) is not None:
         library = searches[-1][0].base.space.library
-        tell(loop_words.so_far(best.effects, [library[n].family() for n in best.effects]))
+        print_message(loop_words.so_far(best.effects, [library[n].family() for n in best.effects]))
     if "base" not in stages:
         return
     base = stages["base"][0].base
     robot = findings.proposed_robot(base.space, base.candidate)
-    robot_file.write(robot, folder.partial / REFIT_FILE, note=f"{robot_name}, fitted; the loop has no verdict yet")
-    tell(f"the best that is known so far is the refit, {folder.partial / REFIT_FILE}")
+    robot_file.write_robot(
+        robot, folder.partial / REFIT_FILE, note=f"{robot_name}, fitted; the loop has no verdict yet"
+    )
+    print_message(f"the best that is known so far is the refit, {folder.partial / REFIT_FILE}")
 
 
 def _effects(found: DiscoveryResult) -> Table:
@@ -211,9 +218,9 @@ def _effects(found: DiscoveryResult) -> Table:
         shown.add_column(heading, justify="right" if number else "left", no_wrap=number or heading == "effect")
     for e in found.effects:
         shown.add_row(
-            loop_words.called(found, e), ", or ".join(e.families), loop_words.size(e),
-            f"{loop_words.misfit(e.score)} ({100 * e.share:.0f} %)", f"{e.p_value:.2g}",
-            loop_words.alike(found, e) or "-",
+            loop_words.effect_called(found, e), ", or ".join(e.families), loop_words.effect_amplitude(e),
+            f"{loop_words.misfit_text(e.score)} ({100 * e.share:.0f} %)", f"{e.p_value:.2g}",
+            loop_words.indistinguishable_effects(found, e) or "-",
         )  # fmt: skip
     return shown
 
@@ -239,40 +246,40 @@ def print_discovery(found: DiscoveryResult) -> None:
     """Verdict, effects, errors and remarks, for a person; the answer and the next step last."""
     first = found.headline
     if len(first.factors) > 1:
-        say(f"{first.level}: {loop_words.headline(first)}.")
-    say(f"{found.verdict}: {found.statement}")
+        print_output(f"{first.level}: {loop_words.loop_headline(first)}.")
+    print_output(f"{found.verdict}: {found.statement}")
     if not found.robot.has_ground and found.effects:
-        say("The track balance of a shaft is what its load loses.")
-    for said in (loop_words.standing(found), loop_words.ruled_out(found)):
+        print_output("The track balance of a shaft is what its load loses.")
+    for said in (loop_words.support_sentence(found), loop_words.ruled_out(found)):
         if said:
-            say(said)
-    rise = loop_words.worse(found.held_out_worse, found.predicted)
+            print_output(said)
+    rise = loop_words.rising_errors_sentence(found.held_out_worse, found.predicted)
     if rise:
-        say(rise)
+        print_output(rise)
     if found.effects:
-        say(_effects(found))
-        say(
+        print_output(_effects(found))
+        print_output(
             "lowers misfit by: rise of χ² without it, all else refitted (share of the excess misfit); own p: among "
             "the strongest of the library"
         )
     if found.hidden:
-        say(loop_words.hidden(found))
+        print_output(loop_words.hidden_effects_sentence(found))
     if found.unnamed is not None:
-        say(loop_words.proposed_formula(found.unnamed))
+        print_output(loop_words.proposed_formula(found.unnamed))
     if found.resolved is not None:
-        say(found.resolved.statement)
+        print_output(found.resolved.statement)
         for note in found.resolved.notes:
-            say(f"- track model: {note}")
-    say(_errors(found))
+            print_output(f"- track model: {note}")
+    print_output(_errors(found))
     if Layout.of(found.robot).crosses_zero:
         shown_fits = {when: by for when, by in found.rms.items() if not (found.refit_alone and "after" in when)}
-        say(words.describe_rms(shown_fits))
+        print_output(words.describe_rms(shown_fits))
     if found.sensitivity:
-        say(f"{loop_words.at_other_noise(found.sensitivity)}")
+        print_output(f"{loop_words.at_other_noise(found.sensitivity)}")
     for note in found.notes:
-        say(f"- {note}")
-    say(loop_words.answer(found))
+        print_output(f"- {note}")
+    print_output(loop_words.completeness_answer(found))
     after = found.next_experiment
     if after is not None:
         sigma = f" (expected {after.expected_sigma:.1f} σ)" if after.separates else ""
-        say(f"Next: {after.name}: {after.description}{sigma}")
+        print_output(f"Next: {after.name}: {after.description}{sigma}")

@@ -31,12 +31,12 @@ from mmrjax.model.robot import Robot
 from mmrjax.model.signals import FLAGS, STATUSES
 from sweeps import capabilities
 from sweeps import config as configuration
-from sweeps.console import progress, say, tell
+from sweeps.console import print_message, print_output, progress_bar
 from sweeps.inputs import OPTIONS, load_robot, one_run, read_runs
 from sweeps.pages import words
 from sweeps.points import imposed, run
 from sweeps.results.mission_results import Missions
-from sweeps.skeleton import page
+from sweeps.skeleton import page_writer
 from sweeps.store import open_folder
 
 #: Rows of history.csv: of a run at most, at least, and of all runs together.
@@ -51,7 +51,7 @@ _PRINTED = (
 )  # fmt: skip
 
 
-def simulate(
+def simulate_missions(
     config: configuration.Simulate,
     given: str | dict[str, Any],
     stated: Collection[str],
@@ -72,9 +72,9 @@ def simulate(
     file = load_robot(config)
     robot = file.robot
     _check_robot(robot)
-    source = profiles.read(config.profile)
+    source = profiles.read_profile(config.profile)
     for note in source.notes:
-        tell(note)
+        print_message(note)
     _check_acting(robot, source)
     source.check_source(config.battery)
     for column in source.stated:
@@ -89,18 +89,18 @@ def simulate(
         runs = one_run(robot, given, config.battery, source.stated)
     for column in source.stated:
         if isinstance(given, str) and runs.has(column):
-            tell(f"{runs.source}, {column}: not used, {source.source} states it")
+            print_message(f"{runs.source}, {column}: not used, {source.source} states it")
     if "current_other" in source.values and not config.battery:
-        tell(f"{source.source}, current_other_A: not used, other consumers are on the battery")
+        print_message(f"{source.source}, current_other_A: not used, other consumers are on the battery")
     _check_turning(robot, runs, source)
     _check_cutoff(robot, runs, source, config)
     with open_folder("simulate", config, robot, out, force, runs) as folder:
-        found = simulated(robot, runs, source, config)
+        found = run_missions(robot, runs, source, config)
         folder.write_table("segments.csv", capabilities.without_idle(robot, found.segments))
         folder.write_table("history.csv", capabilities.without_idle(robot, found.course))
         print_missions(found, capabilities.idle_columns(robot))
         result = run.SimulationResult("simulate", config.model, robot, runs, found.table, found.to_json())
-        return run.leave(folder, config, result, page("mission", file, found))
+        return run.write_run_folder(folder, config, result, page_writer("mission", file, found))
 
 
 def _check_robot(robot: Robot) -> None:
@@ -153,7 +153,7 @@ def _check_turning(robot: Robot, runs: records.Runs, source: ProfileTable) -> No
 
 def _commanded(robot: Robot, runs: records.Runs, source: ProfileTable, config: configuration.Simulate) -> Conditions:
     """Conditions of the runs; of robots that turn with the lateral adhesion of a stated surface."""
-    conditions = run.commanded(robot, runs, config)
+    conditions = run.conditions_of_runs(robot, runs, config)
     if not source.turns or not runs.has(profiles.SURFACE) or source.surface is not None:
         return conditions
     members = robot.configurations.members
@@ -175,7 +175,7 @@ def _check_cutoff(robot: Robot, runs: records.Runs, source: ProfileTable, config
     """Refuse missions that begin with cells below their cut-off."""
     if not config.battery:
         return
-    conditions = run.commanded(robot, runs, config)
+    conditions = run.conditions_of_runs(robot, runs, config)
     cell = mission_batch.cell_below_cutoff(robot, conditions, source.profile(robot, conditions), source.start)
     below = np.flatnonzero(np.isfinite(cell))
     if len(below):
@@ -185,7 +185,7 @@ def _check_cutoff(robot: Robot, runs: records.Runs, source: ProfileTable, config
         )
 
 
-def simulated(robot: Robot, runs: records.Runs, source: ProfileTable, config: configuration.Simulate) -> Missions:
+def run_missions(robot: Robot, runs: records.Runs, source: ProfileTable, config: configuration.Simulate) -> Missions:
     """Runs over a profile."""
     conditions = _commanded(robot, runs, source, config)
     profile = source.profile(robot, conditions)
@@ -195,7 +195,7 @@ def simulated(robot: Robot, runs: records.Runs, source: ProfileTable, config: co
     segments: list[dict[str, np.ndarray]] = []
     courses: list[dict[str, np.ndarray]] = []
     done, whole = 0, True
-    with progress(len(runs), quiet=False) as advance:
+    with progress_bar(len(runs), quiet=False) as advance:
         for found in mission_batch.simulate_in_parts(robot, conditions, profile, source.start):
             count = len(found.steps)
             own = slice(done, done + count)
@@ -229,7 +229,7 @@ def _conditions(
     nothing = np.full(len(runs), np.nan)
     unknown = {*source.stated, *(["supply_voltage_V"] if config.battery else [])}
     unknown |= {"total_mass_kg"} if "payload_kg" in unknown else set()
-    about = {key: nothing if key in unknown else value for key, value in run.conditions(robot, runs).items()}
+    about = {key: nothing if key in unknown else value for key, value in run.condition_table(robot, runs).items()}
     if source.surface is not None:
         about.pop(profiles.SURFACE, None)
     return about
@@ -283,7 +283,7 @@ def _segment_of(found: Mission, k: int) -> np.ndarray:
     return np.where(segment < 0, np.iinfo(segment.dtype).max, segment)
 
 
-def thinned(segment: np.ndarray, current: np.ndarray, most: int, marked: np.ndarray | None = None) -> np.ndarray:
+def rows_to_keep(segment: np.ndarray, current: np.ndarray, most: int, marked: np.ndarray | None = None) -> np.ndarray:
     """Rows of a course to keep, in order: the peak of current of each segment, marked rows, evenly spread ones.
 
     Args:
@@ -312,7 +312,7 @@ def _course(
     signals = course.signals
     marked = course.event[filled] >= _LASTING
     largest = np.abs(signals.current).reshape(len(filled), -1).max(1)  # of either side
-    picked = np.flatnonzero(filled)[thinned(course.segment[filled], largest[filled], most, marked)]
+    picked = np.flatnonzero(filled)[rows_to_keep(course.segment[filled], largest[filled], most, marked)]
     course = jax.tree.map(lambda x: x[picked], course)
     signals, of_sides = course.signals, {}
     winding, housing = course.temperature_winding, course.temperature_housing
@@ -384,7 +384,7 @@ def print_missions(found: Missions, idle: Collection[str] = ()) -> None:
     count = len(table["status"])
     cycles, each = (f", {source.cycles} cycles", " each") if source.cycles > 1 else ("", "")
     segments = count_noun(source.segments, "segment")
-    say(f"profile {source.source}: {source.duration:g} s{cycles}, {segments}{each}")
+    print_output(f"profile {source.source}: {source.duration:g} s{cycles}, {segments}{each}")
     shown = Table(show_header=False)
     shown.add_row("configuration", *table["configuration"][:_SHOWN])
     for key in _PRINTED:
@@ -392,17 +392,19 @@ def print_missions(found: Missions, idle: Collection[str] = ()) -> None:
         if key in table and np.isfinite(table[key]).any() and key not in idle:
             shown.add_row(heading, *("-" if v != v else format(v, form) for v in table[key][:_SHOWN]))
     shown.add_row("status", *table["status"][:_SHOWN])
-    say(shown)
+    print_output(shown)
     for status in dict.fromkeys(table["status"]):
         if status != STATUSES[0]:
-            say(f"{status}: {words.STATUSES[status].why}{_charge_left(table, status)}")
+            print_output(f"{status}: {words.STATUSES[status].why}{_charge_left(table, status)}")
     for flag in FLAGS:
         flagged = int(np.sum([flag in str(f).split(";") for f in table["flags"]]))
         if flagged:
             said = np.array([flag in str(f).split(";") for f in found.segments["flags"]])
             where = f"{int(said.sum())} of {len(said)} segments"
-            say(f"{flag}: {words.FLAGS[flag]} ({where if count == 1 else f'{flagged} of {count} runs, {where}'})")
+            print_output(
+                f"{flag}: {words.FLAGS[flag]} ({where if count == 1 else f'{flagged} of {count} runs, {where}'})"
+            )
     if count > _SHOWN:
-        say(f"... and {count - _SHOWN} more in runs.csv")
+        print_output(f"... and {count - _SHOWN} more in runs.csv")
     if not found.whole:
-        tell("history.csv ends before the mission does, which has taken more steps than are kept")
+        print_message("history.csv ends before the mission does, which has taken more steps than are kept")

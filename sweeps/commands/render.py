@@ -14,7 +14,7 @@ from mmrjax.model.signals import STATUSES
 from mmrjax.undercarriage import rendering, rendering_from_above
 from sweeps import config as configuration
 from sweeps.commands import turn
-from sweeps.console import progress, say
+from sweeps.console import print_output, progress_bar
 from sweeps.inputs import load_robot, one_run
 from sweeps.pages import words
 from sweeps.points import imposed, run, scale
@@ -22,7 +22,7 @@ from sweeps.results.climb_results import Seen
 from sweeps.store import DONE, SOLVER_FAILED
 
 
-def render(
+def render_run(
     config: configuration.Render, given: dict[str, Any], file: Path, begin: float, end: float | None, slow: float,
     force: bool,
 ) -> int:  # fmt: skip
@@ -39,12 +39,12 @@ def render(
     robot = load_robot(config).robot
     imposed.check_on_ground(robot, "render")
     if config.turns:
-        turn.check(robot, given.get("configuration") or robot.configurations.names[0])
-        given = {**given, **turn.cells(config, given)}
-    conditions = run.commanded(robot, one_run(robot, given, config.battery), config)
-    run.refuse(robot, conditions, config)
-    with progress(1, quiet=False) as advance:
-        told = scale.shares(advance, 1)
+        turn.check_can_turn(robot, given.get("configuration") or robot.configurations.names[0])
+        given = {**given, **turn.turn_columns(config, given)}
+    conditions = run.conditions_of_runs(robot, one_run(robot, given, config.battery), config)
+    run.check_runs_bearable(robot, conditions, config)
+    with progress_bar(1, quiet=False) as advance:
+        told = scale.share_counter(advance, 1)
         trajectory = track_batch(robot, conditions, duration=options["duration"], step=options["step"], progress=told)
         told(1.0)
     trajectory, conditions = jax.tree.map(lambda x: x[0], (trajectory, conditions))
@@ -55,8 +55,8 @@ def render(
 
     _write(file, draw)
     status = STATUSES[int(trajectory.result.status)]
-    say(f"{status}: {words.STATUSES[status].why}")
-    say(str(file))
+    print_output(f"{status}: {words.STATUSES[status].why}")
+    print_output(str(file))
     return SOLVER_FAILED if status == "failed" else DONE
 
 
@@ -70,8 +70,8 @@ def render_climb(
     found = Seen.read(folder)
     from sweeps.pages import climb_figures
 
-    _write(file, lambda aside: climb_figures.render(found, aside, begin, end, slow))
-    say(str(file))
+    _write(file, lambda aside: climb_figures.render_climb(found, aside, begin, end, slow))
+    print_output(str(file))
     return DONE
 
 
@@ -86,7 +86,7 @@ def _write(file: Path, draw: Callable[[Path], Any]) -> None:
     """Draw into a file that is whole or not there."""
     aside = file.with_name(f".{file.stem}.writing{file.suffix}")
     try:
-        with progress(1, quiet=False, doing="drawing") as advance:
+        with progress_bar(1, quiet=False, doing="drawing") as advance:
             draw(aside)
             advance(1)
         aside.replace(file)

@@ -9,33 +9,37 @@ from calibration.data import runs as records
 from mmrjax import fidelities
 from mmrjax.model.paper_tables import CONFIGURATIONS
 from sweeps import config as configuration
-from sweeps.console import tell
+from sweeps.console import print_message
 from sweeps.inputs import load_robot
 from sweeps.paper import data, report
 from sweeps.points import imposed
-from sweeps.skeleton import leave
+from sweeps.skeleton import finish_run_folder
 from sweeps.store import open_folder
 
 
-def reproduce(config: configuration.Reproduce, out: Path | None, force: bool) -> int:
+def reproduce_paper(config: configuration.Reproduce, out: Path | None, force: bool) -> int:
     """Write the paper's figures and tables for a robot into a run folder; returns the exit code."""
     file = load_robot(config)
     robot = file.robot
     imposed.check_on_ground(robot, "reproduce")
-    runs = records.read("measured")
+    runs = records.read_runs("measured")
     gear = "track.guide_share" in fidelities.fidelity_facts(config.model).computes
     with open_folder("reproduce", config, robot, out, force) as folder:
-        _, rows = report.write(folder.partial, file, model=config.model, gear=gear)
+        _, rows = report.write_paper_page(folder.partial, file, model=config.model, gear=gear)
         result = {"schema": "mmrjax.reproduce/1", "model": config.model, "rows": 0}
         if rows is None:
-            tell(f"the paper's runs are of {', '.join(CONFIGURATIONS)}; none of them is this robot's")
+            print_message(f"the paper's runs are of {', '.join(CONFIGURATIONS)}; none of them is this robot's")
         else:
-            folder.write_table("rows.csv", data.table(rows))
-            result |= {"rows": len(rows.conditions), "errors": data.summary(rows), "adhesion_raised": rows.ratio}
-        robot_file.write(
+            folder.write_table("rows.csv", data.paper_rows_table(rows))
+            result |= {
+                "rows": len(rows.conditions),
+                "errors": data.bench_error_summary(rows),
+                "adhesion_raised": rows.ratio,
+            }
+        robot_file.write_robot(
             robot, folder.partial / "robot.toml", note=f"the robot of these figures, from {config.robot}"
         )
         folder.write_json("result.json", result)
-        return leave(
+        return finish_run_folder(
             folder, config, {"seed": None}, solved=rows is None or "failed" not in rows.plain["status"], runs=runs
         )

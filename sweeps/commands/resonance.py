@@ -33,13 +33,13 @@ from mmrjax.undercarriage.ripple_peaks import (
 )
 from sweeps import config as configuration
 from sweeps.config import GridPart
-from sweeps.console import progress, say
+from sweeps.console import print_output, progress_bar
 from sweeps.inputs import check_configurations, load_robot
 from sweeps.pages import words
 from sweeps.points import imposed, run, scale
-from sweeps.points.grid import grid
-from sweeps.results.resonance_results import SLOW, ResonanceResult, span
-from sweeps.skeleton import leave, page
+from sweeps.points.grid import grid_conditions
+from sweeps.results.resonance_results import SLOW, ResonanceResult, span_text
+from sweeps.skeleton import finish_run_folder, page_writer
 from sweeps.store import RunFolder, open_folder
 
 CHUNK = 96  # runs in one call
@@ -47,7 +47,7 @@ FEWEST = 5  # voltages over which a peak can be told
 SHORTEST = 0.5  # [s], of a run
 
 
-def resonance(config: configuration.Resonance, out: Path | None, force: bool) -> int:
+def map_resonance(config: configuration.Resonance, out: Path | None, force: bool) -> int:
     """Map the ripple of a robot and leave a run folder; returns the exit code.
 
     0 done; 3 done, but some runs did not settle, or slid, tipped or failed.
@@ -76,17 +76,19 @@ def resonance(config: configuration.Resonance, out: Path | None, force: bool) ->
             f"--duration: got {config.options['duration']:g} s; expected at least {SHORTEST:g} s, or no grousers pass"
         )
     runs, of_table8 = _points(config, robot)
-    conditions = run.commanded(robot, runs, config)
-    run.refuse(robot, conditions, config)
+    conditions = run.conditions_of_runs(robot, runs, config)
+    run.check_runs_bearable(robot, conditions, config)
     with open_folder("resonance", config, robot, out, force, runs) as folder:
         what = passing_parts(robot, robot.configurations.names.index(name))
         columns = _rippled(folder, robot, conditions, config, what)
-        table = {**run.conditions(robot, runs), "table8": of_table8, **columns}
+        table = {**run.condition_table(robot, runs), "table8": of_table8, **columns}
         found = _found(config, robot, what, table)
         _write(folder, config, found)
         print_resonance(found)
-        manifest, solved = {"seed": None, "statuses": found.statuses}, words.solved(found.statuses)
-        return leave(folder, config, manifest, solved=solved, page=page("resonance", found, file), runs=runs)
+        manifest, solved = {"seed": None, "statuses": found.statuses}, words.every_run_solved(found.statuses)
+        return finish_run_folder(
+            folder, config, manifest, solved=solved, page=page_writer("resonance", found, file), runs=runs
+        )
 
 
 def _grid(config: configuration.Resonance, voltages: tuple[float, ...], payloads: tuple[float, ...]) -> GridPart:
@@ -103,7 +105,7 @@ def _grid(config: configuration.Resonance, voltages: tuple[float, ...], payloads
 def _points(config: configuration.Resonance, robot: Robot) -> tuple[Runs, np.ndarray]:
     """The grid, then those points of Table 8 that it lacks; and which rows are of Table 8."""
     parts = [
-        grid(_grid(config, v, p), robot)
+        grid_conditions(_grid(config, v, p), robot)
         for v, p in ((config.voltages_V, config.payloads_kg), (VOLTAGES_V, PAYLOADS_KG))
     ]
     pairs = [list(zip(part["supply_voltage_V"], part["payload_kg"], strict=True)) for part in parts]
@@ -121,13 +123,13 @@ def _rippled(
     """The columns of ripple, chunk by chunk; chunks that an interrupted run left are not simulated again."""
     total, parts = conditions.shape[0], []
     size = min(CHUNK, total)
-    with progress(total, quiet=False) as advance:
+    with progress_bar(total, quiet=False) as advance:
         for first in range(0, total, size):
             rows = np.minimum(np.arange(first, first + size), total - 1)
             count, name = min(size, total - first), f"chunk-{first // size:06d}"
             part = folder.chunk(name)
             if part is None:
-                told = scale.shares(advance, count)
+                told = scale.share_counter(advance, count)
                 chosen = jax.tree.map(lambda x, rows=rows: x[rows], conditions)
                 options = {key: config.options[key] for key in ("duration", "step")}
                 ended = track_batch(robot, chosen, rolling=True, progress=told, **options)
@@ -165,7 +167,7 @@ def _found(
     assert config.configuration is not None
     payloads, middle = config.payloads_kg, config.voltages_V[len(config.voltages_V) // 2]
     at = _grid(config, (middle,), payloads)
-    linear = modes(robot, run.commanded(robot, grid(at, robot), config))
+    linear = modes(robot, run.conditions_of_runs(robot, grid_conditions(at, robot), config))
     by_payload = dict(zip(payloads, linear, strict=True))
     tops: list[Peak] = []
     ends: dict[float, tuple[float, float]] = {}
@@ -200,7 +202,9 @@ def _write(folder: RunFolder, config: configuration.Resonance, found: ResonanceR
         _rows([{"payload_kg": p, **m._asdict()} for p, modes in found.modes.items() for m in modes], Mode),
     )
     folder.write_table("peaks.csv", _rows([p._asdict() for p in found.peaks], Peak))
-    robot_file.write(found.robot, folder.partial / "robot.toml", note=f"the robot of this map, from {config.robot}")
+    robot_file.write_robot(
+        found.robot, folder.partial / "robot.toml", note=f"the robot of this map, from {config.robot}"
+    )
     folder.write_json("result.json", found.to_json())
 
 
@@ -226,12 +230,12 @@ def print_resonance(found: ResonanceResult) -> None:
     for name in names:
         shown.add_column(name)
     for payload, own in found.modes.items():
-        cells = {m.name: f"{m.frequency:.0f} ({span(m.low, m.high, 1)}), {m.damping:.2f}" for m in own}
+        cells = {m.name: f"{m.frequency:.0f} ({span_text(m.low, m.high, 1)}), {m.damping:.2f}" for m in own}
         shown.add_row(f"{payload:g}", *(cells.get(name, "-") for name in names))
-    say(shown)
-    say(found.statement())
+    print_output(shown)
+    print_output(found.statement())
     others = {s: n for s, n in found.statuses.items() if n and s != STATUSES[0]}
     if others:
-        say(f"of {len(found.table['status'])} runs: " + ", ".join(f"{n} {s}" for s, n in others.items()))
+        print_output(f"of {len(found.table['status'])} runs: " + ", ".join(f"{n} {s}" for s, n in others.items()))
     if SLOW in others:
-        say(f"{SLOW}: fewer than {PERIODS} {found.passing.name} passed in the second half of the run")
+        print_output(f"{SLOW}: fewer than {PERIODS} {found.passing.name} passed in the second half of the run")

@@ -16,7 +16,7 @@ from calibration.data.input_errors import BadConfiguration
 from calibration.data.rig_facts import Fact, Origin
 from calibration.data.rig_file import FREE
 from calibration.data.runs import Runs
-from calibration.data.writing import finite
+from calibration.data.writing import finite_or_null
 from calibration.described import described, sentences
 from calibration.inference import foresight, identifiability, priors
 from calibration.inference.fit_notes import Determination
@@ -31,7 +31,7 @@ from mmrjax.model.robot import Robot
 from mmrjax.model.shaft import Shaft
 from sweeps.commands.rig_template import EXAMPLE
 from sweeps.config import RobotPart
-from sweeps.console import say
+from sweeps.console import print_output
 from sweeps.inputs import load_robot, read_runs
 from sweeps.pages import words
 from sweeps.report.words import fit_words
@@ -188,7 +188,7 @@ class RigCheck:
         held = undetermined_names([p.name for p in self.foresight.parameters if p.held], pairs)
         traded = {name for pair in pairs for name in (pair.one, pair.other)}
         told = [p.name for p in self.foresight.parameters if not p.held and p.name not in traded]
-        told += [fit_words.combination(p) for p in pairs]
+        told += [fit_words.determined_combination(p) for p in pairs]
         parts = [f"These data determine {', '.join(told)}" if told else "These data determine no parameter"]
         parts += [f"{', '.join(held)} would not be determined by these runs"] * bool(held)
         return "; ".join(parts) + "."
@@ -272,7 +272,9 @@ def _use(column: str, robot: Robot) -> str:
     return "condition"
 
 
-def check(file: Path, data: str | None, effects: tuple[str, ...], as_json: bool, columns: str | None = None) -> int:
+def check_rig_file(
+    file: Path, data: str | None, effects: tuple[str, ...], as_json: bool, columns: str | None = None
+) -> int:
     """Say what was understood of a rig's file, and what a table can tell of it; returns 0.
 
     Raises:
@@ -283,25 +285,33 @@ def check(file: Path, data: str | None, effects: tuple[str, ...], as_json: bool,
         raise BadConfiguration(f"{file}: is a folder; expected a rig's TOML file")
     if not file.is_file():
         raise BadConfiguration(f"{file}: no such file; mmrjax rig new {file} writes one to fill in")
-    found = examined(file, data, effects, columns)
+    found = examine_rig_file(file, data, effects, columns)
     if as_json:
-        print(json.dumps(finite(found.to_json()), indent=2, ensure_ascii=False))
+        print(json.dumps(finite_or_null(found.to_json()), indent=2, ensure_ascii=False))
     else:
         print_check(found)
     return 0
 
 
-def examined(file: Path, data: str | None, effects: tuple[str, ...] = (), columns: str | None = None) -> RigCheck:
+def examine_rig_file(
+    file: Path, data: str | None, effects: tuple[str, ...] = (), columns: str | None = None
+) -> RigCheck:
     """Remarks on a rig's file, and on a table whose columns a preset may name."""
     rig = load_robot(RobotPart(robot=str(file), effects=effects))
     lines, robot = rig.text.splitlines(), rig.robot
     examples = tuple(k for k, line in enumerate(lines, 1) if EXAMPLE in line and not line.startswith("#"))
-    found = RigCheck(rig.name, robot, examples, tuple(rig_facts.origins(rig)), tuple(rig_facts.facts(robot)))
+    found = RigCheck(
+        rig.name, robot, examples, tuple(rig_facts.number_origins(rig)), tuple(rig_facts.derived_facts(robot))
+    )
     if data is None:
         return found
     runs = read_runs(data, robot, columns=columns, measured=True, series=True)
     seen = foresight.predict_identifiability(runs, robot)
-    doubts = (*filter(None, (settling.doubtful_sign(runs),)), *rig_facts.doubts(runs, robot), *sentences(seen.doubts))
+    doubts = (
+        *filter(None, (settling.doubtful_sign(runs),)),
+        *rig_facts.log_doubts(runs, robot),
+        *sentences(seen.doubts),
+    )
     return dataclasses.replace(found, runs=runs, foresight=seen, doubts=doubts)
 
 
@@ -315,29 +325,29 @@ def _table(title: str, *headings: str) -> Table:
 
 def print_check(found: RigCheck) -> None:
     """All of it, for a person."""
-    say(f"{found.file}")
+    print_output(f"{found.file}")
     for sentence in found.understood():
-        say(sentence)
+        print_output(sentence)
     shown = _table("\nchannels", "channel", "column", "sign", "step>r", "sd")
     for c in found.channels():
         step = FREE if c["quantum"] is None else f"{c['quantum']:.3g} {c['unit']}" if c["quantum"] else ""
         sign = {None: FREE, True: "signed", False: "magnitude"}[c["signed"]]
         shown.add_row(c["channel"], c["column"], sign, step, c["sd"])
-    say(shown)
+    print_output(shown)
     shown = _table("\nnumbers", "parameter", "value>r", "±>r", "unit", "from")
     for o in found.origins:
         sd = "" if o.sd is None else f"{o.sd:.2g}" if o.sd > 0 else "exact"
         shown.add_row(o.name, f"{o.value:.5g}", sd, o.unit, o.why)
-    say(shown)
+    print_output(shown)
     shown = _table("\nwhat follows", "", "value>r", "")
     for fact in found.facts:
         shown.add_row(fact.what, fact.value, "LOOK" if fact.odd else "ok")
-    say(shown)
+    print_output(shown)
     for sentence in found.remarks():
-        say(f"- {sentence}")
+        print_output(f"- {sentence}")
     if found.runs is not None and found.foresight is not None:
         _print_data(found, found.runs, found.foresight)
-    say(f"\n{found.statement()}")
+    print_output(f"\n{found.statement()}")
 
 
 def _print_data(found: RigCheck, runs: Runs, seen: Foresight) -> None:
@@ -348,11 +358,11 @@ def _print_data(found: RigCheck, runs: Runs, seen: Foresight) -> None:
         ends = [_words(c["words"]), ""] if c["words"] else [_end(c["least"]), _end(c["greatest"])]
         name = c["column"] if c["theirs"] in ("", c["column"]) else f"{c['column']}, yours {c['theirs']}"
         shown.add_row(name, c["use"], str(c["values"]), *ends)
-    say(shown)
+    print_output(shown)
     if len(seen.status) < len(runs):
-        say(f"- loop and calibrate use the readings of {len(seen.status)} of them, evenly in time (--rows)")
+        print_output(f"- loop and calibrate use the readings of {len(seen.status)} of them, evenly in time (--rows)")
     for sentence in [*found.unused(), *runs.missing()]:
-        say(f"- {sentence}")
+        print_output(f"- {sentence}")
     names, counts = np.unique(np.array(seen.status), return_counts=True)
     others = [
         f"{count_noun(count, 'row')}: {name}"
@@ -360,7 +370,7 @@ def _print_data(found: RigCheck, runs: Runs, seen: Foresight) -> None:
         if name not in words.SETTLED
     ]
     if others:
-        say(
+        print_output(
             f"- with the file's numbers not every row settles ({', '.join(others)}); rows without a "
             "steady state are not counted"
         )
@@ -369,10 +379,10 @@ def _print_data(found: RigCheck, runs: Runs, seen: Foresight) -> None:
     for p in sorted(seen.parameters, key=lambda p: p.share):
         row = (p.name, f"{p.value:.4g}", f"{p.prior_sd:.2g}", p.unit, f"{p.share:.2f}", found.determined(p))
         shown.add_row(*row)
-    say(shown)
-    say(f"not determined: above {identifiability.HELD:g}")
+    print_output(shown)
+    print_output(f"not determined: above {identifiability.HELD:g}")
     for one, other, size in seen.alike:
-        say(f"- {one} and {other} are nearly indistinguishable in these data (correlation {size:+.2f})")
+        print_output(f"- {one} and {other} are nearly indistinguishable in these data (correlation {size:+.2f})")
 
 
 def _words(words: list[str]) -> str:

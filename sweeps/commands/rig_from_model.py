@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from calibration.data.input_errors import BadConfiguration, allowed_words
-from calibration.data.input_files import content
+from calibration.data.input_files import file_bytes
 from sweeps.export import mujoco
 
 #: Largest model that is read [bytes].
@@ -18,7 +18,7 @@ LARGEST = 2**26
 LEAST_WEIGHT = 1e-9
 
 
-def text(source: Path, joint: str | None) -> str:
+def rig_text_from_model(source: Path, joint: str | None) -> str:
     """Text of a rig's file for one driven joint of a model.
 
     Args:
@@ -30,13 +30,13 @@ def text(source: Path, joint: str | None) -> str:
     reader = READERS.get(source.suffix.lower())
     if reader is None:
         raise BadConfiguration(f"--from: got {source}; expected a model that ends with {', '.join(READERS)}")
-    content(source, source, BadConfiguration, LARGEST)
+    file_bytes(source, source, BadConfiguration, LARGEST)
     return reader(source, joint)
 
 
 def of_mujoco(source: Path, joint: str | None) -> str:
     """The rig of a joint that a `<dcmotor>` of MuJoCo drives."""
-    library = mujoco.library()
+    library = mujoco.mujoco_module()
     try:
         model = library.MjModel.from_xml_path(str(source))
     except ValueError as error:

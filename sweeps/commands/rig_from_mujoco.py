@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from calibration.data.input_errors import BadConfiguration, allowed_words
-from sweeps.commands.rig_joint import Found, JointNumbers, hanging, is_round
+from sweeps.commands.rig_joint import Found, JointNumbers, hanging_torque_and_angle, is_round
 from sweeps.commands.rig_template import Stated
 from sweeps.export import mujoco
 
@@ -17,7 +17,7 @@ from sweeps.export import mujoco
 LEVEL, EQUAL = 0.1, 0.01
 
 
-def read(source: Path, joint: str | None) -> JointNumbers:
+def read_mujoco_hinge(source: Path, joint: str | None) -> JointNumbers:
     """Returns the numbers of a hinge, defaults resolved by MuJoCo's compiler.
 
     With a `<dcmotor>` on the hinge, its winding and effects are those of the motor.
@@ -28,7 +28,7 @@ def read(source: Path, joint: str | None) -> JointNumbers:
     Raises:
         BadConfiguration: a model that MuJoCo refuses, or a joint that it does not have or that is no hinge.
     """
-    library = mujoco.library()
+    library = mujoco.mujoco_module()
     try:
         model = library.MjModel.from_xml_path(str(source))
     except ValueError as error:
@@ -120,7 +120,7 @@ class _Model:
         mass = np.zeros((model.nv, model.nv))
         full = self.library.mj_fullM
         full(model, mass, data.qM) if hasattr(data, "qM") else full(model, data, mass)
-        return float(mass[dof, dof]) - armature, hanging(weights[1], weights[0])
+        return float(mass[dof, dof]) - armature, hanging_torque_and_angle(weights[1], weights[0])
 
     def _radius(self, joint: int) -> Found | None:
         """Radius of the largest cylinder or sphere about the axis, of collisions if there are any."""

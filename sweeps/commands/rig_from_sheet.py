@@ -7,7 +7,7 @@ import math
 import re
 from collections.abc import Mapping
 
-from calibration.data.input_errors import BadConfiguration, parsed, rounded
+from calibration.data.input_errors import BadConfiguration, parse_number, three_digits
 from sweeps.commands.rig_template import Stated
 
 _GRAVITY, _POUND_FORCE, _INCH = 9.80665, 4.4482216, 0.0254
@@ -55,7 +55,7 @@ def _number(name: str, text: str) -> float:
     split = re.fullmatch(r"\s*([-+\d.][\d.]*(?:[eE][-+]?\d+)?)\s*(.*?)\s*", text)
     factor = None if split is None else {_units(u): f for u, f in units.items()}.get(_units(split[2]))
     try:
-        value = parsed(split[1]) if split is not None and factor is not None else math.nan
+        value = parse_number(split[1]) if split is not None and factor is not None else math.nan
     except ValueError:
         value = math.nan
     if not (0 < value < math.inf) or factor is None:
@@ -63,7 +63,7 @@ def _number(name: str, text: str) -> float:
     return value * factor
 
 
-def read(stated: Mapping[str, str]) -> dict[str, Stated]:
+def read_data_sheet(stated: Mapping[str, str]) -> dict[str, Stated]:
     """Returns resistance, torque constant and friction of a motor as lines of a rig's file.
 
     U = R I_s at stall; U = R I_0 + k ω_0 and friction k I_0 at no load; M_s = k (I_s - I_0) at the stalled shaft.
@@ -128,8 +128,8 @@ def _current(sheet: Sheet) -> float:
         raise BadConfiguration("--no-load-speed and --stall-torque: both missing; the torque constant needs one")
     totals = [x for x in (sheet.stall, _ratio(sheet.voltage, sheet.resistance)) if x is not None]
     if totals and min(totals) <= sheet.idle:
-        raise BadConfiguration(f"--no-load-current: got {rounded(sheet.idle)} A, and the stall current is "
-                               f"{rounded(min(totals))} A; expected less")  # fmt: skip
+        raise BadConfiguration(f"--no-load-current: got {three_digits(sheet.idle)} A, and the stall current is "
+                               f"{three_digits(min(totals))} A; expected less")  # fmt: skip
     total = totals[0] if totals else None
     if total is not None and (sheet.resistance is not None or sheet.voltage is not None):
         return total - sheet.idle
@@ -154,7 +154,7 @@ def _difference(pairs: list[tuple[float, str]]) -> float:
 
 def _refuse_contradictions(*groups: tuple[list[tuple[float, str]], str, str]) -> None:
     found = [
-        f"{name} is {' and '.join(f'{rounded(value)} {unit} ({source})' for value, source in pairs)}, "
+        f"{name} is {' and '.join(f'{three_digits(value)} {unit} ({source})' for value, source in pairs)}, "
         f"{100 * _difference(pairs):.0f} % apart"
         for pairs, name, unit in groups
         if _difference(pairs) > LARGEST

@@ -10,7 +10,7 @@ import numpy as np
 
 from calibration.data.input_errors import BadConfiguration, allowed_words
 from mmrjax.model.signals import GRAVITY
-from sweeps.commands.rig_joint import Found, JointNumbers, hanging, is_round
+from sweeps.commands.rig_joint import Found, JointNumbers, hanging_torque_and_angle, is_round
 
 #: Types of a joint that turns.
 TURNS = ("revolute", "continuous")
@@ -29,7 +29,7 @@ EQUAL = 0.01
 Pose = tuple[np.ndarray, np.ndarray]
 
 
-def read(root: Element, file: str, joint: str | None) -> JointNumbers:
+def read_urdf_joint(root: Element, file: str, joint: str | None) -> JointNumbers:
     """Returns the numbers of a joint of a robot.
 
     Args:
@@ -329,4 +329,4 @@ def _weight(gravity: np.ndarray, axis: np.ndarray, moment: np.ndarray) -> tuple[
     """As `hanging`, of a first moment [kg·m] under gravity [m/s²], both in the frame of the joint."""
     across = np.cross(axis, moment)
     flat = np.cross(across, axis)  # the moment without its part along the axis
-    return hanging(float(axis @ np.cross(flat, gravity)), float(axis @ np.cross(across, gravity)))
+    return hanging_torque_and_angle(float(axis @ np.cross(flat, gravity)), float(axis @ np.cross(across, gravity)))

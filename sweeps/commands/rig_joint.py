@@ -102,7 +102,7 @@ class JointNumbers:
         return found | dict(self.drive)
 
 
-def hanging(torque: float, torque_quarter: float) -> tuple[float, float] | None:
+def hanging_torque_and_angle(torque: float, torque_quarter: float) -> tuple[float, float] | None:
     """Largest torque of gravity M and angle θ_0 where it hangs, of -M sin(θ - θ_0) [N·m], [rad]; None: no weight.
 
     Args:

@@ -8,10 +8,10 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from calibration.data.input_errors import BadConfiguration, allowed_words
-from calibration.data.input_files import content
+from calibration.data.input_files import file_bytes
 from sweeps.commands.rig_joint import JointNumbers
-from sweeps.commands.rig_template import KINDS, Stated, examples, filled, template
-from sweeps.console import say
+from sweeps.commands.rig_template import KINDS, Stated, example_numbers, fill_rig_template, rig_template
+from sweeps.console import print_output
 
 #: Kind of rig if neither an option nor a model states one.
 USUAL = "bench"
@@ -28,13 +28,13 @@ def joint_of(source: Path, joint: str | None) -> JointNumbers:
     Raises:
         BadConfiguration: no file, no such format, or a joint that it does not have or that does not turn.
     """
-    text = content(source, source, BadConfiguration, LARGEST)
+    text = file_bytes(source, source, BadConfiguration, LARGEST)
     try:
         _, root = next(ElementTree.iterparse(io.BytesIO(text), ("start",)))
         if root.tag == "robot":
             from sweeps.commands import rig_from_urdf
 
-            return rig_from_urdf.read(ElementTree.fromstring(text), source.name, joint)
+            return rig_from_urdf.read_urdf_joint(ElementTree.fromstring(text), source.name, joint)
     except (ElementTree.ParseError, ValueError, LookupError) as error:  # an encoding that Python does not know
         raise BadConfiguration(
             f"{source}: not a readable XML file ({error}); expected URDF or MuJoCo's XML"
@@ -43,17 +43,17 @@ def joint_of(source: Path, joint: str | None) -> JointNumbers:
         raise BadConfiguration(f"{source}: got <{root.tag}>; expected <robot> of URDF or <mujoco>")
     from sweeps.commands import rig_from_mujoco
 
-    return rig_from_mujoco.read(source, joint)
+    return rig_from_mujoco.read_mujoco_hinge(source, joint)
 
 
-def text(kind: str | None, source: Path | None, joint: str | None, sheet: Mapping[str, str] | None) -> str:
+def new_rig_text(kind: str | None, source: Path | None, joint: str | None, sheet: Mapping[str, str] | None) -> str:
     """Text of a rig's file, with the numbers of a joint and of a data sheet in their lines.
 
     Args:
         kind: None: what the joint moves, else `USUAL`; source: a model; joint: by name; sheet: numbers by name.
 
     Raises:
-        BadConfiguration: as `joint_of` and `rig_from_sheet.read`.
+        BadConfiguration: as `joint_of` and `rig_from_sheet.read_data_sheet`.
     """
     numbers: dict[str, Stated] = {}
     origins = []
@@ -65,16 +65,16 @@ def text(kind: str | None, source: Path | None, joint: str | None, sheet: Mappin
     if sheet is not None:
         from sweeps.commands import rig_from_sheet
 
-        numbers |= rig_from_sheet.read(sheet)
+        numbers |= rig_from_sheet.read_data_sheet(sheet)
         origins.append("a data sheet")
     kind = kind or USUAL
     if not origins:
-        return template(kind)
+        return rig_template(kind)
     origin = f"kind {kind}, filled in from {' and '.join(origins)}"
-    return filled(kind, numbers, f"{origin}; a comment names the source of each number, ± is a guess.")
+    return fill_rig_template(kind, numbers, f"{origin}; a comment names the source of each number, ± is a guess.")
 
 
-def new(
+def write_new_rig(
     file: Path,
     kind: str | None,
     force: bool,
@@ -85,7 +85,7 @@ def new(
     """Write a rig's file to fill in, or one with the numbers of a model or data sheet; returns 0.
 
     Args:
-        kind, source, joint, sheet: as of `text`.
+        kind, source, joint, sheet: as of `new_rig_text`.
 
     Raises:
         BadConfiguration: no such kind, model, joint or folder, a contradictory sheet, or a file that exists without
@@ -101,16 +101,16 @@ def new(
         raise BadConfiguration(f"{file}: {what}")
     if not file.parent.is_dir():
         raise BadConfiguration(f"{file}: no such folder as {file.parent}; make it first")
-    written = text(kind, source, joint, sheet)
+    written = new_rig_text(kind, source, joint, sheet)
     if source is None and sheet is None:
         what = f"{KINDS[kind or USUAL]}. Fill in what is marked example: yours, then"
     else:
-        lacking = ", ".join(examples(written))
+        lacking = ", ".join(example_numbers(written))
         what = written.removeprefix("# ").partition("; a comment")[0]
         what += f"; not found, so fill in: {lacking}. Then" if lacking else ". Next"
     try:
         file.write_text(written, encoding="utf-8")
     except OSError as error:
         raise BadConfiguration(f"{file}: cannot be written ({error.strerror}); state a file elsewhere") from error
-    say(f"{file}: {what}: mmrjax rig check {file} [DATA.csv]")
+    print_output(f"{file}: {what}: mmrjax rig check {file} [DATA.csv]")
     return 0

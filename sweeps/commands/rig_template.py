@@ -46,12 +46,12 @@ class Stated:
         return number if exact else f'"{number} ± {self.width}"'
 
 
-def template(kind: str) -> str:
+def rig_template(kind: str) -> str:
     """The file of a kind, to fill in."""
     return resources.files("sweeps").joinpath("rigs", f"{kind}.toml").read_text(encoding="utf-8")
 
 
-def filled(kind: str, numbers: Mapping[str, Stated], heading: str) -> str:
+def fill_rig_template(kind: str, numbers: Mapping[str, Stated], heading: str) -> str:
     """Returns the file of a kind with numbers in their lines.
 
     A number whose line the template lacks is added at the end of its table.
@@ -59,7 +59,7 @@ def filled(kind: str, numbers: Mapping[str, Stated], heading: str) -> str:
     Args:
         numbers: by dotted name, `load.` for the table of the load; heading: sentence for the first line.
     """
-    lines = template(kind).splitlines()
+    lines = rig_template(kind).splitlines()
     at = next(k for k, line in enumerate(lines) if line.startswith("load = "))
     load = lines[at - 1].strip("[]")
     for name, number in numbers.items():
@@ -87,7 +87,7 @@ def _put(lines: list[str], table: str, key: str, line: str) -> None:
     lines.insert(end, line)
 
 
-def examples(text: str) -> tuple[str, ...]:
+def example_numbers(text: str) -> tuple[str, ...]:
     """Returns names and units of the numbers that are still those of an example, as `motor.resistance [ohm]`."""
     found, table = [], ""
     for line in text.splitlines():

@@ -30,17 +30,17 @@ from mmrjax.model.quantities import RPM
 from mmrjax.model.robot import Robot
 from sweeps import config as configuration
 from sweeps.config import GridPart
-from sweeps.console import say, tell
+from sweeps.console import print_message, print_output
 from sweeps.inputs import beside_robot, load_robot, read_runs
 from sweeps.pages.words import short_name
 from sweeps.points import axes as axes_room
 from sweeps.points import grid as grid_room
 from sweeps.points import imposed
-from sweeps.points.grid import configurations, grid
+from sweeps.points.grid import grid_conditions, grid_configurations
 from sweeps.points.job import showing_turns
-from sweeps.points.run import refuse
+from sweeps.points.run import check_runs_bearable
 from sweeps.report.words import sensitivity_words
-from sweeps.skeleton import leave, page
+from sweeps.skeleton import finish_run_folder, page_writer
 from sweeps.store import open_folder
 
 #: Operating points where a sample is drawn at each: corners and middle of Table 8.
@@ -59,7 +59,7 @@ AXES = {
 }
 
 
-def sensitivity(config: configuration.Sensitivity, out: Path | None, force: bool) -> int:
+def study_sensitivity(config: configuration.Sensitivity, out: Path | None, force: bool) -> int:
     """Study a robot and leave a run folder; returns the exit code.
 
     0 done; 3 done, but the solver failed at some operating points.
@@ -76,21 +76,23 @@ def sensitivity(config: configuration.Sensitivity, out: Path | None, force: bool
     candidates = _candidates(config, robot, runs, bool(freed))
     conditions = runs.conditions(robot)
     turned: dict[str, Any] = {name: np.full(len(runs), np.mean(ranges[name])) for name in freed}
-    refuse(robot, dataclasses.replace(conditions, **turned), config)
+    check_runs_bearable(robot, dataclasses.replace(conditions, **turned), config)
     supply = Supply(float(config.battery), config.discharge_mAh * COULOMB_PER_MAH, np.asarray(conditions.adhesion))
-    study = Study(robot, inputs, Points.of(runs), outputs, config.model, config.options, supply, in_words(tell))
+    study = Study(
+        robot, inputs, Points.of(runs), outputs, config.model, config.options, supply, in_words(print_message)
+    )
     with open_folder("sensitivity", config, robot, out, force, runs) as folder:
         found = analyse_sensitivity(study, config.method, config.evaluations, config.seed, candidates)
         folder.write_json("result.json", found.to_json())
         for name, table in found.tables().items():
             folder.write_table(name, table)
-        robot_file.write(
+        robot_file.write_robot(
             file.robot, folder.partial / "robot.toml", note=f"the robot of this study, from {config.robot}"
         )
         print_sensitivity(found)
         manifest = {"seed": found.seed, "statuses": found.statuses}
-        shown = page("sensitivity", found, file)
-        return leave(folder, config, manifest, solved=found.solved, page=shown, runs=runs)
+        shown = page_writer("sensitivity", found, file)
+        return finish_run_folder(folder, config, manifest, solved=found.solved, page=shown, runs=runs)
 
 
 def _ranges(vary: tuple[str, ...]) -> dict[str, tuple[float, float]]:
@@ -145,12 +147,14 @@ def _operating_points(
     except ValueError:
         raise BadConfiguration(f"--vary: got {', '.join(config.vary)}; a range leaves what a run may have") from None
     notes: list[str] = []
-    stated = grid_room.resolved(stated, robot, config.battery, notes)
+    stated = grid_room.resolve_grid(stated, robot, config.battery, notes)
     for note in notes:
-        tell(note)
-    names = configurations(stated, robot)
+        print_message(note)
+    names = grid_configurations(stated, robot)
     imposed.check_turning(robot, ranges, names, "--vary")
-    return grid(stated.model_copy(update={"configurations": tuple(dict.fromkeys(names))}), robot, config.battery)
+    return grid_conditions(
+        stated.model_copy(update={"configurations": tuple(dict.fromkeys(names))}), robot, config.battery
+    )
 
 
 def words_of(name: str) -> str:
@@ -180,7 +184,7 @@ def _candidates(config: configuration.Sensitivity, robot: Robot, points: Runs, t
     elif turns or not Layout.of(robot).table8:
         runs, source = points, "the operating points"
     else:
-        runs = grid(GridPart(surface=config.surface), robot)
+        runs = grid_conditions(GridPart(surface=config.surface), robot)
         source = "Table 8"
     usual = noise.default_noise(robot.channels)
     stated = noise.parse_noise(usual, robot.channels)
@@ -193,7 +197,7 @@ def _candidates(config: configuration.Sensitivity, robot: Robot, points: Runs, t
 
 def print_sensitivity(found: SensitivityResult) -> None:
     """Print decisive inputs of each output, inputs without effect, and the next measurements."""
-    say(found.statement())
+    print_output(found.statement())
     title = sensitivity_words.METHODS[found.method]
     if found.evaluations:
         title += f", {found.evaluations:,} model evaluations"
@@ -204,13 +208,13 @@ def print_sensitivity(found: SensitivityResult) -> None:
         share = study.overall_share
         top = [k for k in np.argsort(-share)[:3] if share[k] >= NEGLIGIBLE]
         shown.add_row(study.row.label, *(f"{short_name(found.names[k])} {100 * share[k]:.0f} %" for k in top))
-    say(shown)
+    print_output(shown)
     idle = found.negligible
     if idle:
-        say(f"less than {100 * NEGLIGIBLE:g} % everywhere: {', '.join(idle)}")
+        print_output(f"less than {100 * NEGLIGIBLE:g} % everywhere: {', '.join(idle)}")
     if found.next_runs is not None:
         n = found.next_runs
         labels = "; ".join(n.points.label(k) for k in range(len(n.points)))
-        say(f"next runs, of {n.candidates} ({n.source}), read to {n.noise}: {labels}")
+        print_output(f"next runs, of {n.candidates} ({n.source}), read to {n.noise}: {labels}")
     for note in found.notes:
-        say(f"- {note}")
+        print_output(f"- {note}")

@@ -23,36 +23,36 @@ from sweeps import config as configuration
 from sweeps.inputs import load_robot, read_runs
 from sweeps.report import settle_report
 from sweeps.report.words import settle_words
-from sweeps.skeleton import leave, report
+from sweeps.skeleton import finish_run_folder, print_report
 from sweeps.store import open_folder
 
 
-def settle(config: configuration.Settle, source: str, out: Path | None, force: bool) -> int:
+def settle_to_folder(config: configuration.Settle, source: str, out: Path | None, force: bool) -> int:
     """Find the settled runs of a log and write a run folder with their table; returns the exit code, 0."""
     robot = load_robot(config).robot
     runs = read_runs(source, robot, columns=config.columns, measured=True, series=True)
     named = [] if config.columns is None else ["--columns", config.columns]
     loop = shlex.join(["mmrjax", "loop", source, "--robot", config.robot, *named])
-    found = settling.settle(
+    found = settling.settle_log(
         runs,
         shortest=config.shortest_s,
         drift=config.drift,
-        inertia=inertia(robot),
-        rolling=rolling(robot),
+        inertia=acceleration_currents(robot),
+        rolling=rolling_readings(robot),
         loop=loop,
     )
     few = settle_words.too_few(found, SettledRuns.fewest, loop)
     with open_folder("settle", config, robot, out, force, runs) as folder:
-        robot_file.write(robot, folder.partial / "robot.toml", note=f"the rig of this log, from {config.robot}")
+        robot_file.write_robot(robot, folder.partial / "robot.toml", note=f"the rig of this log, from {config.robot}")
         folder.write_table("settled.csv", found.table())
-        folder.write_table("stretches.csv", stretches(found))
+        folder.write_table("stretches.csv", stretches_table(found))
         folder.write_json("result.json", to_json(found, few))
         turned = sentences(ranges.turned_signs(found.settled_runs(), robot))
-        shown = report(settle_report.document(found, few, turned))
-        return leave(folder, config, {"seed": None, "settled": len(found.kept)}, page=shown, runs=runs)
+        shown = print_report(settle_report.settle_document(found, few, turned))
+        return finish_run_folder(folder, config, {"seed": None, "settled": len(found.kept)}, page=shown, runs=runs)
 
 
-def rolling(robot: Robot) -> dict[str, dict[str, float]]:
+def rolling_readings(robot: Robot) -> dict[str, dict[str, float]]:
     """Readings of speeds in each configuration at 1 rad/s of the motors, the load rolling [unit of the column].
 
     By channel; only speeds of shafts for a vehicle, which slips.
@@ -61,12 +61,12 @@ def rolling(robot: Robot) -> dict[str, dict[str, float]]:
     for k, (name, load) in enumerate(robot.configurations.items()):
         none, turns = jnp.zeros(()), float(load.radius) / float(robot.gearbox.ratio)
         state = State(none, jnp.ones(()), jnp.asarray(turns), none)
-        speeds = {c.name: _shown(robot, k, c, state) for c in settling.shown(robot) if c.zero_at_rest}
+        speeds = {c.name: _shown(robot, k, c, state) for c in settling.settled_channels(robot) if c.zero_at_rest}
         found[name] = {n: x for n, x in speeds.items() if n != "speed" or not robot.has_ground}
     return found
 
 
-def inertia(robot: Robot) -> dict[str, Inertia]:
+def acceleration_currents(robot: Robot) -> dict[str, Inertia]:
     """Current that acceleration takes in each configuration, where it is known."""
     constant, ratio = float(robot.motor.torque_constant), float(robot.gearbox.ratio)
     found = {}
@@ -76,7 +76,9 @@ def inertia(robot: Robot) -> dict[str, Inertia]:
         none, one = jnp.zeros(()), jnp.ones(())
         rolling = float(load.radius) / ratio
         states = State(one, none, none, none), State(none, one, jnp.asarray(rolling), none)  # of 1 A, and of 1 rad/s
-        currents, speeds = ({c.name: _shown(robot, k, c, state) for c in settling.shown(robot)} for state in states)
+        currents, speeds = (
+            {c.name: _shown(robot, k, c, state) for c in settling.settled_channels(robot)} for state in states
+        )
         current = next((n for n, x in currents.items() if x and not speeds[n]), "")
         speed = next((n for n, x in speeds.items() if x), "")
         known = current or robot.rig.imposed == "motor_current"
@@ -96,7 +98,7 @@ def _shown(robot: Robot, configuration: int, channel: Channel, state: State) -> 
         return 0.0
 
 
-def stretches(found: Settled) -> dict[str, np.ndarray]:
+def stretches_table(found: Settled) -> dict[str, np.ndarray]:
     """Every stretch of a log, a row each: where it is, why it is left out, means, their sds, changes."""
     every = found.stretches
     table: dict[str, np.ndarray] = {
@@ -106,7 +108,7 @@ def stretches(found: Settled) -> dict[str, np.ndarray]:
         "first_row": np.array([s.rows[0] + 1 for s in every]),
         "last_row": np.array([s.rows[-1] + 1 for s in every]),
         "imposed": np.array([s.imposed for s in every]),
-        "left_out": np.array([settle_words.reason(s) if s.why else "" for s in every]),
+        "left_out": np.array([settle_words.left_out_reason(s) if s.why else "" for s in every]),
     }
     for signal in found.signals:
         channel = signal.channel
@@ -125,7 +127,7 @@ def to_json(found: Settled, few: str = "") -> dict[str, Any]:
     left = settle_words.left_out(found.stretches, bool(few))
     return {
         "schema": "mmrjax.settle/1",
-        "statement": settle_words.statement(found),
+        "statement": settle_words.settle_statement(found),
         "samples": len(found.runs),
         "settled": len(found.kept),
         "shortest_s": found.shortest,
@@ -136,5 +138,5 @@ def to_json(found: Settled, few: str = "") -> dict[str, Any]:
             s.channel.name: sum(k.glitches.get(s.channel.name, 0) for k in found.kept) for s in found.signals
         },
         "left_out": [dict(zip(("why", "stretches", "samples", "rows", "do"), row, strict=True)) for row in left],
-        "notes": [*filter(None, [few]), *settle_words.remarks(found)],
+        "notes": [*filter(None, [few]), *settle_words.settle_remarks(found)],
     }

@@ -30,13 +30,13 @@ from mmrjax.model.robot import Robot
 from mmrjax.model.signals import BATTERY_EMPTY, STATUSES
 from sweeps import capabilities
 from sweeps import config as configuration
-from sweeps.console import progress, say
+from sweeps.console import print_output, progress_bar
 from sweeps.inputs import beside_robot, load_robot, one_run, read_runs
 from sweeps.pages import posture_words, words
 from sweeps.points import run, scale, uncertainty
 from sweeps.points.job import showing_turns
 from sweeps.results import posture_results
-from sweeps.skeleton import page
+from sweeps.skeleton import page_writer
 from sweeps.store import RunFolder, open_folder
 
 _HISTORIES = 1000  # runs of which histories are kept
@@ -56,7 +56,9 @@ PAD = 16
 PERMISSIBLE = "permissible_time_s"
 
 
-def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: Path | None, force: bool) -> int:
+def simulate_to_folder(
+    config: configuration.Simulate, given: str | dict[str, Any], out: Path | None, force: bool
+) -> int:
     """Simulate runs of a file (its name), or one of options (by column); leave a run folder; returns the exit code.
 
     Raises:
@@ -76,36 +78,38 @@ def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: P
     with open_folder("simulate", config, robot, out, force, runs) as folder:
         seen = showing_turns(robot, runs.axes)
         table, histories = _simulated(folder, seen, runs, config)
-        table[PERMISSIBLE] = permissible(robot, table)
-        stands = posture_results.postures(robot, runs, run.commanded(robot, runs, config))
-        notes = remarks(robot, table) + capabilities.unknown(robot)
+        table[PERMISSIBLE] = permissible_durations(robot, table)
+        stands = posture_results.posture_of_runs(robot, runs, run.conditions_of_runs(robot, runs, config))
+        notes = run_remarks(robot, table) + capabilities.unknown_numbers_sentence(robot)
         found = None
         if drawn is not None and config.posterior is not None:
-            found = uncertainty.intervals(robot, drawn, runs, config, config.posterior, folder)
+            found = uncertainty.simulate_draws(robot, drawn, runs, config, config.posterior, folder)
             table |= found.columns
         print_runs(
             {key: value[:_SHOWN] for key, value in capabilities.without_idle(robot, table).items()}, seen.channels
         )
         for note in notes:
-            say(note)
+            print_output(note)
         if found is not None:
-            say(f"± one sd over {found.draws} robots drawn from the posterior; 95 % intervals are in runs.csv")
+            print_output(
+                f"± one sd over {found.draws} robots drawn from the posterior; 95 % intervals are in runs.csv"
+            )
             uncertainty.say_lost(found)
         if len(runs) > _SHOWN:
-            say(f"... and {len(runs) - _SHOWN} more in runs.csv")
+            print_output(f"... and {len(runs) - _SHOWN} more in runs.csv")
         further: dict[str, Any] = {"notes": [*file.remarks, *notes]}
         if stands is not None:
             folder.write_table("posture.csv", stands.table)
-            say(posture_words.stands(stands))
-            further["notes"] += posture_words.remarks(stands)
+            print_output(posture_words.posture_sentences(stands))
+            further["notes"] += posture_words.tipping_remarks(stands)
         if histories is not None and robot.has_ground:
-            further["starts"] = starts(robot, histories, runs)
+            further["starts"] = starts_from_standstill(robot, histories, runs)
         if PEAK in table:
             further[PEAK] = float(np.nanmax(table[PEAK], initial=0.0))
         result = run.SimulationResult("simulate", config.model, robot, runs, table, further)
         of_page = dataclasses.replace(file, robot=seen)
-        shown = page("runs", of_page, model=config.model, runs=table, histories=histories, stands=stands)
-        return run.leave(folder, config, result, shown)
+        shown = page_writer("runs", of_page, model=config.model, runs=table, histories=histories, stands=stands)
+        return run.write_run_folder(folder, config, result, shown)
 
 
 def _simulated(
@@ -114,18 +118,18 @@ def _simulated(
     """The table of the runs; where the fidelity keeps them over time these are written, and returned too."""
     fidelity = fidelities.get_fidelity(config.model)
     if fidelity.histories is None:
-        return run.evaluate(robot, runs, config, folder), None
-    conditions = run.commanded(robot, runs, config)
-    run.refuse(robot, conditions, config)
-    with progress(len(runs), quiet=not fidelity.facts.slow) as advance:
-        told = scale.shares(advance, len(runs))
+        return run.evaluate_runs(robot, runs, config, folder), None
+    conditions = run.conditions_of_runs(robot, runs, config)
+    run.check_runs_bearable(robot, conditions, config)
+    with progress_bar(len(runs), quiet=not fidelity.facts.slow) as advance:
+        told = scale.share_counter(advance, len(runs))
         batch = jax.device_get(fidelity.histories(robot, conditions, config.options, told))
         told(1.0)
     assert batch.history is not None  # the fidelity was asked for it
     folder.write_table("history.csv", capabilities.without_idle(robot, history_table(robot, batch.history, runs)))
     if batch.history.reactions is not None:
         folder.write_table("reactions.csv", reactions_table(batch.history, runs))
-    return {**run.conditions(robot, runs), **over_time(robot, batch)}, batch
+    return {**run.condition_table(robot, runs), **over_time(robot, batch)}, batch
 
 
 def over_time(robot: Robot, batch: Run) -> dict[str, np.ndarray]:
@@ -136,7 +140,7 @@ def over_time(robot: Robot, batch: Run) -> dict[str, np.ndarray]:
     """
     history, status = batch.history, np.asarray(batch.result.status)
     assert history is not None  # the fidelity was asked for it
-    columns = run.ended(robot, batch)
+    columns = run.ending_columns(robot, batch)
     current, time = np.asarray(history.signals.total_current), np.asarray(history.time)
     finite = np.isfinite(current)
     last = np.where(finite.any(-1), finite.shape[-1] - 1 - np.argmax(finite[..., ::-1], -1), 0)
@@ -161,9 +165,9 @@ def over_time(robot: Robot, batch: Run) -> dict[str, np.ndarray]:
     return columns
 
 
-def permissible(robot: Robot, table: dict[str, np.ndarray]) -> np.ndarray:
+def permissible_durations(robot: Robot, table: dict[str, np.ndarray]) -> np.ndarray:
     """Permissible duration of each run's current from ambient temperature [s]; inf: continuous, NaN: no current."""
-    current = amperes(robot, table)
+    current = motor_currents(robot, table)
     known = np.isfinite(current)
     filled = np.zeros(len(current) + -len(current) % PAD)
     filled[: len(current)] = np.where(known, current, 0.0)
@@ -181,7 +185,7 @@ def _permissible(motor: Motor, currents: Float[Array, " runs"]) -> Scalar:
     return jax.vmap(motor.time_permissible)(currents)
 
 
-def amperes(robot: Robot, table: dict[str, np.ndarray]) -> np.ndarray:
+def motor_currents(robot: Robot, table: dict[str, np.ndarray]) -> np.ndarray:
     """Size of the current of one motor [A], of sides driven apart the larger; NaN where no column tells it."""
     if all(column in table for column in _OF_SIDES):
         return np.asarray(np.max([np.abs(table[column]) for column in _OF_SIDES], axis=0))
@@ -191,11 +195,11 @@ def amperes(robot: Robot, table: dict[str, np.ndarray]) -> np.ndarray:
     return np.full(len(table["status"]), np.nan)
 
 
-def remarks(robot: Robot, table: dict[str, np.ndarray]) -> list[str]:
+def run_remarks(robot: Robot, table: dict[str, np.ndarray]) -> list[str]:
     """Remarks that the numbers alone do not show, one sentence each, on a few runs at most."""
     said: list[str] = []
     several = len(table["status"]) > 1
-    times = table[PERMISSIBLE] if PERMISSIBLE in table else permissible(robot, table)
+    times = table[PERMISSIBLE] if PERMISSIBLE in table else permissible_durations(robot, table)
     for k, status in enumerate(table["status"]):
         name = f"run {k + 1}: " if several else ""
         flags, cell = str(table["flags"][k]).split(";"), float(table["voltage_cell_V"][k])
@@ -217,7 +221,7 @@ def remarks(robot: Robot, table: dict[str, np.ndarray]) -> list[str]:
                 f"current, from {ambient:g} °C"
             )
         if np.isinf(table["winding_settled_C"][k]):
-            current = float(amperes(robot, table)[k])
+            current = float(motor_currents(robot, table)[k])
             said.append(
                 f"{name}winding, long running: {words.NONE_SETTLES} at {current:.2f} A a motor, as resistance "
                 "rises faster than its heat leaves; it stays permissible up to "
@@ -254,7 +258,7 @@ def history_table(robot: Robot, history: History, runs: records.Runs) -> dict[st
     }
 
 
-def starts(robot: Robot, batch: Run, runs: records.Runs) -> list[dict[str, Any]]:
+def starts_from_standstill(robot: Robot, batch: Run, runs: records.Runs) -> list[dict[str, Any]]:
     """Of each run from standstill its stages, their slip (33) and the acceleration time; no stages where it does not
     get under way."""
     assert batch.history is not None  # the fidelity was asked for it
@@ -321,7 +325,7 @@ def print_runs(table: dict[str, np.ndarray], shown: Sequence[Channel]) -> None:
             pairs = zip(table[key], table[key + uncertainty.SD], strict=True)
             cells = ["-" if v != v else uncertainty.with_sd(v, sd, digits) for v, sd in pairs]
         printed.add_row(heading, *cells)
-    say(printed)
+    print_output(printed)
     for status in dict.fromkeys(table["status"]):
         if status != STATUSES[0]:
-            say(f"{status}: {words.STATUSES[status].why}")
+            print_output(f"{status}: {words.STATUSES[status].why}")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from calibration.data import requirements_file, robot_file
 from calibration.data.input_errors import BadConfiguration, allowed_words
-from calibration.data.parts import motors
+from calibration.data.parts import packaged_motors
 from calibration.described import in_words
 from calibration.sizing import sheet
 from calibration.sizing.chart import Chart, chart_extent, margin_chart
@@ -16,22 +16,22 @@ from calibration.sizing.design import OBJECTIVES
 from calibration.sizing.design_search import size_robot as search
 from sweeps import capabilities
 from sweeps import config as configuration
-from sweeps.console import pulse, tell
+from sweeps.console import print_message, step_reporter
 from sweeps.inputs import load_robot
 from sweeps.pages import words
 from sweeps.points import imposed
 from sweeps.report import size_report
-from sweeps.results.size_results import SizeResult, described
-from sweeps.skeleton import leave, report
+from sweeps.results.size_results import SizeResult, describe_design
+from sweeps.skeleton import finish_run_folder, print_report
 from sweeps.store import RunFolder, open_folder
 
 
-def size(config: configuration.Size, out: Path | None, force: bool) -> int:
+def size_to_folder(config: configuration.Size, out: Path | None, force: bool) -> int:
     """Search for a design and write a run folder; returns the exit code.
 
     The code is 0 whether or not a design meets everything, and 3 if the solver failed at a worst corner of the best.
     """
-    asked = requirements_file.load(Path(config.requirements))
+    asked = requirements_file.load_requirements(Path(config.requirements))
     file = load_robot(config)
     robot = file.robot
     imposed.check_on_ground(robot, "size")
@@ -42,13 +42,13 @@ def size(config: configuration.Size, out: Path | None, force: bool) -> int:
             raise BadConfiguration(f"{where}: got {name}; {allowed_words(name, OBJECTIVES)}")
     if config.pareto and len(set(config.pareto)) != 2:
         raise BadConfiguration(f"--pareto: got {', '.join(config.pareto)}; expected two different objectives")
-    known = [m.name for m in motors()]
+    known = [m.name for m in packaged_motors()]
     for name in config.motors:
         if name not in known:
             raise BadConfiguration(f"--motors: got {name}; {allowed_words(name, known)}")
     sheet.refuse_impossible(robot, asked)
     with open_folder("size", config, robot, out, force) as folder:
-        with pulse(tell, "drawing designs") as heard:
+        with step_reporter(print_message, "drawing designs") as heard:
             sizing = search(
                 robot, asked, objectives, starts=config.starts, motors=config.motors, seed=config.seed,
                 tell=in_words(heard),
@@ -66,12 +66,12 @@ def size(config: configuration.Size, out: Path | None, force: bool) -> int:
                 charts = tuple(margin_chart(r, asked, chart_extent(asked)) for r in drawn)
         found = SizeResult(asked, robot, sizing, objectives, outcomes, charts)
         _write(folder, config, found)
-        shown = report(
-            size_report.document(found, capabilities.shown_name(file)), dataclasses.replace(file, robot=best)
+        shown = print_report(
+            size_report.size_document(found, capabilities.shown_name(file)), dataclasses.replace(file, robot=best)
         )
         manifest = {"seed": config.seed, "feasible": sizing.best is not None}
-        solved = words.solved(Counter(o.status for o in outcomes))
-        return leave(folder, config, manifest, solved=solved, page=shown)
+        solved = words.every_run_solved(Counter(o.status for o in outcomes))
+        return finish_run_folder(folder, config, manifest, solved=solved, page=shown)
 
 
 def _write(folder: RunFolder, config: configuration.Size, found: SizeResult) -> None:
@@ -79,6 +79,6 @@ def _write(folder: RunFolder, config: configuration.Size, found: SizeResult) -> 
     folder.write_text("requirements.toml", found.asked.text)
     note = f"the robot that was changed, {config.robot}: no design meets the requirements"
     if best is not None:
-        note = f"sized for {found.asked.source} from {config.robot}: {described(best)}"
-    robot_file.write(found.robot if best is None else best.robot, folder.partial / "robot.toml", note=note)
+        note = f"sized for {found.asked.source} from {config.robot}: {describe_design(best)}"
+    robot_file.write_robot(found.robot if best is None else best.robot, folder.partial / "robot.toml", note=note)
     folder.write_json("result.json", found.to_json())

@@ -22,16 +22,16 @@ from mmrjax.model.signals import STATUSES
 from sweeps import config_campaign, skeleton
 from sweeps.config import Sweep
 from sweeps.config_campaign import Campaign, How
-from sweeps.console import progress, say, tell
+from sweeps.console import print_message, print_output, progress_bar
 from sweeps.inputs import beside_robot, load_robot
 from sweeps.pages import words
 from sweeps.points import axes, grid, run, scale, uncertainty
-from sweeps.points.identity import Identity, identity
-from sweeps.points.job import laid_out, prepare, showing_turns
+from sweeps.points.identity import Identity, job_identity
+from sweeps.points.job import laid_out, prepare_job, showing_turns
 from sweeps.points.sampled_design import Blocks
 from sweeps.points.tasks import task_of
 from sweeps.points.zarr_store import STORE, Done, Layout, SweepStore
-from sweeps.skeleton import page
+from sweeps.skeleton import page_writer
 from sweeps.store import DONE, SOLVER_FAILED, default_path, open_folder
 
 #: Most runs of which a grid leaves a table, runs.csv; of more it leaves a store, in a tenth of the time and bytes.
@@ -43,7 +43,9 @@ PROBED = 64
 NOTHING_SPECIAL = How()
 
 
-def sweep(config: Campaign | Sweep, where: str, out: Path | None, force: bool, options: How = NOTHING_SPECIAL) -> int:
+def sweep_to_folder(
+    config: Campaign | Sweep, where: str, out: Path | None, force: bool, options: How = NOTHING_SPECIAL
+) -> int:
     """Simulate a design and leave a run folder, of a grid of up to `TABLE` runs with a table; returns the exit code.
 
     Args:
@@ -54,14 +56,14 @@ def sweep(config: Campaign | Sweep, where: str, out: Path | None, force: bool, o
     if not isinstance(config, Sweep):
         return _into_store(config, file, where, out, force, options)
     notes: list[str] = []
-    resolved = grid.resolved(config, file.robot, config.battery, notes)
-    count = math.prod(map(len, grid.axes(resolved, file.robot, config.battery).values()))
+    resolved = grid.resolve_grid(config, file.robot, config.battery, notes)
+    count = math.prod(map(len, grid.grid_axes(resolved, file.robot, config.battery).values()))
     small = options == NOTHING_SPECIAL and (count <= TABLE or config.posterior is not None)
     if options == NOTHING_SPECIAL and not small:
-        tell(f"{count:,} points: {STORE} in place of runs.csv, which a sweep of at most {TABLE:,} has; the same "
-             "command with --export csv writes it too")  # fmt: skip
+        print_message(f"{count:,} points: {STORE} in place of runs.csv, which a sweep of at most {TABLE:,} has; "
+             "the same command with --export csv writes it too")  # fmt: skip
     for note in notes:
-        tell(note)
+        print_message(note)
     if small:
         return _into_table(resolved, file, out, force)
     of_grid = resolved.model_copy(update={"configurations": config.configurations})
@@ -70,35 +72,37 @@ def sweep(config: Campaign | Sweep, where: str, out: Path | None, force: bool, o
 
 def _into_table(config: Sweep, file: RobotFile, out: Path | None, force: bool) -> int:
     robot = file.robot
-    runs = grid.grid(config, robot, config.battery)
+    runs = grid.grid_conditions(config, robot, config.battery)
     drawn = None if config.posterior is None else beside_robot(file)
     with open_folder("sweep", config, robot, out, force) as folder:
-        table = run.evaluate(robot, runs, config, folder)
-        print_counts(run.counts(table), "runs")
+        table = run.evaluate_runs(robot, runs, config, folder)
+        print_counts(run.runs_by_status(table), "runs")
         if drawn is not None and config.posterior is not None:
-            found = uncertainty.intervals(robot, drawn, runs, config, config.posterior, folder)
+            found = uncertainty.simulate_draws(robot, drawn, runs, config, config.posterior, folder)
             uncertainty.say_intervals(table, found)
             table |= found.columns
         result = run.SimulationResult("sweep", config.model, robot, runs, table)
-        return run.leave(folder, config, result, page("sweep", file, model=config.model, runs=table))
+        return run.write_run_folder(
+            folder, config, result, page_writer("sweep", file, model=config.model, runs=table)
+        )
 
 
 def _into_store(config: Campaign, file: RobotFile, where: str, out: Path | None, force: bool, options: How) -> int:
     robot = file.robot
-    plan = axes.plan(config, robot, where)
+    plan = axes.plan_design(config, robot, where)
     robot = showing_turns(robot, {*plan.axes, *plan.conditions})
     pool = None
     if options.scheduler is not None and not options.dry_run:
         from sweeps.points import cluster
 
-        pool = cluster.connect(options.scheduler)
+        pool = cluster.connect_workers(options.scheduler)
     try:
         device = scale.device_kind() if pool is None else pool.device
         task = task_of(config, robot)
         wanted = options.outputs or config.outputs or task.usual
         chunk = config.chunk or scale.default_chunk(task, None if pool is None else device)
         config = config.model_copy(update={"chunk": chunk, "outputs": wanted})
-        job = prepare(config, robot, plan, where)
+        job = prepare_job(config, robot, plan, where)
         layout = laid_out(config, job)
         path = out or default_path("sweep")
         if options.dry_run:
@@ -106,12 +110,12 @@ def _into_store(config: Campaign, file: RobotFile, where: str, out: Path | None,
             return DONE
         files = [*([config.robot] if Path(config.robot).is_file() else []), *config.effects, *plan.data]
         files += [config.profile] if config.profile is not None and config.profile not in profiles.PACKAGED else []
-        same = identity(config, robot, files, device)
+        same = job_identity(config, robot, files, device)
         store = SweepStore(path, same, layout, force=force)
         try:
             if not store.finished:
-                simulate(store, job, options, pool)
-            return finish(store, config, file, job, same, options)
+                simulate_chunks(store, job, options, pool)
+            return finish_sweep(store, config, file, job, same, options)
         except BaseException:
             if options.shard is None:
                 store.abandon()
@@ -136,7 +140,7 @@ def dry_run(job: scale.Job, layout: Layout, path: Path) -> None:
     spent = []
     for _ in range(2 if slow else 4):  # the first compiles
         start = time.perf_counter()
-        scale.fetched(compiled(compiled.points(0)), 1)
+        scale.fetch_values(compiled(compiled.points(0)), 1)
         spent.append(time.perf_counter() - start)
     each = min(spent[1:]) / compiled.size
     design = job.plan.design
@@ -146,13 +150,13 @@ def dry_run(job: scale.Job, layout: Layout, path: Path) -> None:
     rows = {
         "points": f"{design.points:,} ({dimensions})",
         "chunks": f"{len(blocks):,} of {blocks.points:,} points on {device_words(compiled)}",
-        "store": f"{amount(layout.size)} (uncompressed); free {amount(free)} in {_existing(path)}",
-        "time": f"about {duration(each * blocks.points * len(blocks))} once compiled, {1 / each:,.0f} points/s "
-        f"(timed here on {compiled.size:,} points); compiling {duration(max(spent[0] - spent[1], 0.0))}",
+        "store": f"{bytes_text(layout.size)} (uncompressed); free {bytes_text(free)} in {_existing(path)}",
+        "time": f"about {duration_text(each * blocks.points * len(blocks))} once compiled, {1 / each:,.0f} points/s "
+        f"(timed here on {compiled.size:,} points); compiling {duration_text(max(spent[0] - spent[1], 0.0))}",
     }
     for heading, text in rows.items():
         shown.add_row(heading, text)
-    say(shown)
+    print_output(shown)
     _refuse_without_space(layout.size, 1.0, path)
 
 
@@ -181,12 +185,13 @@ def _refuse_without_space(size: int, share: float, path: Path) -> None:
     needed, free = math.ceil(size * share) + MARGIN, _free(path)
     if needed > free:
         raise BadConfiguration(
-            f"--out: the results would take {amount(needed)} (uncompressed); {_existing(path)} has {amount(free)} "
+            f"--out: the results would take {bytes_text(needed)} (uncompressed); {_existing(path)} has "
+            f"{bytes_text(free)} "
             'free; choose another disk, fewer points or outputs, or storage = "float32"'
         )
 
 
-def amount(size: float) -> str:
+def bytes_text(size: float) -> str:
     """Bytes as a person reads them."""
     for unit in ("B", "kB", "MB", "GB", "TB"):
         if size < 1000 or unit == "TB":
@@ -195,7 +200,7 @@ def amount(size: float) -> str:
     raise AssertionError
 
 
-def duration(seconds: float) -> str:
+def duration_text(seconds: float) -> str:
     """Seconds as a person reads them."""
     for unit, length in (("days", 86400.0), ("h", 3600.0), ("min", 60.0)):
         if seconds >= 2 * length:
@@ -206,13 +211,13 @@ def duration(seconds: float) -> str:
 # --- the run --------------------------------------------------------------------------------------------------------
 
 
-def share(shard: tuple[int, int] | None, chunks: int) -> range:
+def chunks_of_shard(shard: tuple[int, int] | None, chunks: int) -> range:
     """Chunks of the k-th of n shares."""
     k, n = shard or (1, 1)
     return range((k - 1) * chunks // n, k * chunks // n)
 
 
-def simulate(store: SweepStore, job: scale.Job, options: How, pool: Any) -> None:
+def simulate_chunks(store: SweepStore, job: scale.Job, options: How, pool: Any) -> None:
     """Compute and write the chunks of this process's share that are not done.
 
     Raises:
@@ -221,7 +226,7 @@ def simulate(store: SweepStore, job: scale.Job, options: How, pool: Any) -> None
     """
     store.begin(options.shard or (1, 1))
     done = store.done()
-    mine = share(options.shard, len(job.blocks))
+    mine = chunks_of_shard(options.shard, len(job.blocks))
     left = [k for k in mine if k not in done]
     _refuse_without_space(store.layout.size, len(left) / len(job.blocks), store.path)
     if not left:
@@ -229,15 +234,15 @@ def simulate(store: SweepStore, job: scale.Job, options: How, pool: Any) -> None
     total = sum(job.blocks.count(k) for k in mine)
     before = total - sum(job.blocks.count(k) for k in left)
     if before:
-        tell(f"{store.partial}: goes on after {before:,} of {total:,} points")
+        print_message(f"{store.partial}: goes on after {before:,} of {total:,} points")
     times = scale.Times()
     try:
-        with progress(total, quiet=False, done=before, rate=True) as advance:
+        with progress_bar(total, quiet=False, done=before, rate=True) as advance:
             if pool is not None:
                 chunks = pool.produce(job, left)
             else:
-                chunks = scale.produce(scale.Compiled(job), left, times, advance)
-            scale.run(store.write, job, chunks, advance, times)
+                chunks = scale.produce_chunks(scale.Compiled(job), left, times, advance)
+            scale.write_chunks(store.write, job, chunks, advance, times)
     except OSError as error:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT):
             raise
@@ -252,41 +257,45 @@ class DiskFull(InputError):
     """No space left in the middle of a sweep, which can be taken up again."""
 
 
-def finish(store: SweepStore, config: Campaign, file: RobotFile, job: scale.Job, same: Identity, options: How) -> int:
+def finish_sweep(
+    store: SweepStore, config: Campaign, file: RobotFile, job: scale.Job, same: Identity, options: How
+) -> int:
     """Write what a whole sweep leaves, and move it into place; say how far it is where it is not whole."""
     left = False
     if not store.finished:
         with store.last() as left:
             if left:
-                leave(store, config, file, job, same)
+                write_sweep_folder(store, config, file, job, same)
     done = store.done()
     if not store.finished:
-        say(f"{len(done)} of {len(job.blocks)} chunks of {store.partial} are done; the last share finishes the sweep "
-            "or the same command without --shard")  # fmt: skip
+        print_output(f"{len(done)} of {len(job.blocks)} chunks of {store.partial} are done; the last share "
+            "finishes the sweep or the same command without --shard")  # fmt: skip
         return DONE
     if options.export:
         from sweeps.points import export
 
         for kind in options.export:
-            tell(str(export.export(kind, store.path, store.layout)))
-    counts = statuses(done.values())
+            print_message(str(export.export_runs(kind, store.path, store.layout)))
+    counts = points_by_status(done.values())
     if not left:
         print_counts(counts, "points", job.task.model)
-        say(str(store.path))
-    return DONE if words.solved(counts) else SOLVER_FAILED
+        print_output(str(store.path))
+    return DONE if words.every_run_solved(counts) else SOLVER_FAILED
 
 
-def leave(store: SweepStore, config: Campaign, file: RobotFile, job: scale.Job, same: Identity) -> None:
+def write_sweep_folder(store: SweepStore, config: Campaign, file: RobotFile, job: scale.Job, same: Identity) -> None:
     """Write all files of a run folder except the store, then move the store into place."""
-    robot_file.write(job.robot, store.partial / "robot.toml", note=f"the robot of this sweep, from {config.robot}")
-    found = summary(store.layout, job, store.done().values())
+    robot_file.write_robot(
+        job.robot, store.partial / "robot.toml", note=f"the robot of this sweep, from {config.robot}"
+    )
+    found = sweep_summary(store.layout, job, store.done().values())
     store.write_json("result.json", found)
     print_counts(found["statuses"], "points", job.task.model)
     manifest = {"statuses": found["statuses"], "seed": config.samples.get("seed", 0), "hashes": same["data"]}
-    skeleton.leave(store, config, manifest, page=page("campaign", file, store.layout, found))
+    skeleton.finish_run_folder(store, config, manifest, page=page_writer("campaign", file, store.layout, found))
 
 
-def summary(layout: Layout, job: scale.Job, done: Iterable[Done]) -> dict[str, Any]:
+def sweep_summary(layout: Layout, job: scale.Job, done: Iterable[Done]) -> dict[str, Any]:
     """`result.json`."""
     done = list(done)
     units = {v.name: v.attributes["units"] for v in layout.variables if "units" in v.attributes}
@@ -299,7 +308,7 @@ def summary(layout: Layout, job: scale.Job, done: Iterable[Done]) -> dict[str, A
         "points": job.plan.design.points,
         "dimensions": dict(zip(job.plan.design.dimensions, job.plan.design.shape, strict=True)),
         "samples": list(job.plan.design.samples.names) if job.plan.design.samples is not None else [],
-        "statuses": statuses(done),
+        "statuses": points_by_status(done),
         "outputs": {
             name: {
                 "unit": units[name],
@@ -311,7 +320,7 @@ def summary(layout: Layout, job: scale.Job, done: Iterable[Done]) -> dict[str, A
     }
 
 
-def statuses(done: Iterable[Done]) -> dict[str, int]:
+def points_by_status(done: Iterable[Done]) -> dict[str, int]:
     """Number of points by status; every status is included."""
     total = np.sum([d.statuses for d in done], axis=0, dtype=int)
     return dict(zip(STATUSES, np.broadcast_to(total, len(STATUSES)).tolist(), strict=True))
@@ -326,4 +335,4 @@ def print_counts(counts: Mapping[str, int], things: str, model: str = "") -> Non
     for status, count in counts.items():
         if count:
             shown.add_row(status, f"{count:,}", words.VERDICTS.get((model, status)) or words.STATUSES[status].why)
-    say(shown)
+    print_output(shown)

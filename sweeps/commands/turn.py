@@ -26,12 +26,12 @@ from mmrjax.model.conditions import Conditions
 from mmrjax.model.robot import Robot
 from sweeps import capabilities
 from sweeps import config as configuration
-from sweeps.console import progress, say, stage
+from sweeps.console import print_output, progress_bar, report_stage
 from sweeps.inputs import load_robot, one_run
 from sweeps.pages import posture_words, turn_words
 from sweeps.points import imposed, run, scale
 from sweeps.results import posture_results
-from sweeps.skeleton import page
+from sweeps.skeleton import page_writer
 from sweeps.store import open_folder
 
 #: Duties of the inner side, as shares of the outer one's, over which a settled turn is shown.
@@ -40,7 +40,7 @@ SHARES = np.linspace(1.0, -1.0, 97)
 SHOWN = tuple(c.name for c in channels.OF_TURNS)
 
 
-def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: Path | None, force: bool) -> int:
+def simulate_turn(config: configuration.Simulate, given: str | dict[str, Any], out: Path | None, force: bool) -> int:
     """Simulate one run of options whose sides are driven apart; leave a run folder; returns the exit code.
 
     Raises:
@@ -51,19 +51,19 @@ def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: P
                                "duty_right in it, or one run by options")  # fmt: skip
     file = load_robot(config)
     robot = file.robot
-    check(robot, given.get("configuration") or robot.configurations.names[0])
-    runs = one_run(robot, {**given, **cells(config, given)}, config.battery)
+    check_can_turn(robot, given.get("configuration") or robot.configurations.names[0])
+    runs = one_run(robot, {**given, **turn_columns(config, given)}, config.battery)
     settled = config.model == fidelities.NAMES[0]
     with open_folder("simulate", config, robot, out, force, runs) as folder:
-        asked = run.commanded(robot, runs, config)
-        run.refuse(robot, asked, config)
+        asked = run.conditions_of_runs(robot, runs, config)
+        run.check_runs_bearable(robot, asked, config)
         shown = _channels(robot, settled)
         stages = 2 + config.demands
         if config.demands:
-            with stage(1, stages, "duties of the demanded turn"):
+            with report_stage(1, stages, "duties of the demanded turn"):
                 asked, runs = _demanded(robot, asked, runs, config)
         if settled:
-            with stage(stages - 1, stages, "settled turns over the duties of the inner side"):
+            with report_stage(stages - 1, stages, "settled turns over the duties of the inner side"):
                 batch, swept = _with_others(robot, asked)
             turns = {**_duties(swept), **_columns(robot, shown, swept, batch)}
             folder.write_table("turns.csv", capabilities.without_idle(robot, turns))
@@ -72,30 +72,33 @@ def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: P
             fidelity = fidelities.get_fidelity(config.model)
             assert fidelity.histories is not None  # of `drive` and `track`
             slow = fidelity.facts.slow
-            with stage(stages - 1, stages, "the turn over time", slow), progress(1, quiet=not slow) as advance:
-                told = scale.shares(advance, 1)
+            with (
+                report_stage(stages - 1, stages, "the turn over time", slow),
+                progress_bar(1, quiet=not slow) as advance,
+            ):
+                told = scale.share_counter(advance, 1)
                 first = jax.device_get(fidelity.histories(robot, asked, config.options, told))
                 told(1.0)
             turns, history = None, first.history
             assert history is not None
             folder.write_table("history.csv", history_table(history, shown))
         own = {name: np.asarray(values) for name, values in first.columns.items()}
-        table = {**run.conditions(robot, runs), **_columns(robot, shown, asked, first), **own}
+        table = {**run.condition_table(robot, runs), **_columns(robot, shown, asked, first), **own}
         turn = {name: _number(table[name][0]) for name in turning_figures.COLUMNS}
-        facts = turn_words.turn(robot, {name: values[0] for name, values in table.items()}, _ended(history))
-        say(facts.answer)
+        facts = turn_words.turn_in_words(robot, {name: values[0] for name, values in table.items()}, _ended(history))
+        print_output(facts.answer)
         if facts.sides:
             print_sides(facts.sides)
         for note in facts.notes:
-            say(f"- {note}")
-        with stage(stages, stages, "posture"):
-            stands = posture_results.postures(robot, runs, asked)
+            print_output(f"- {note}")
+        with report_stage(stages, stages, "posture"):
+            stands = posture_results.posture_of_runs(robot, runs, asked)
         if stands is not None:
             folder.write_table("posture.csv", stands.table)
-            say(posture_words.stands(stands))
+            print_output(posture_words.posture_sentences(stands))
         result = run.SimulationResult("simulate", config.model, robot, runs, table, {"turn": turn})
-        shows = page("turn", file, model=config.model, run=table, facts=facts, history=history, turns=turns)
-        return run.leave(folder, config, result, shows)
+        shows = page_writer("turn", file, model=config.model, run=table, facts=facts, history=history, turns=turns)
+        return run.write_run_folder(folder, config, result, shows)
 
 
 #: Of a demanded turn: as how much wider a robot slides than it is, to begin with; what its load takes, in shares of
@@ -154,7 +157,7 @@ def _demanded(robot: Robot, asked: Conditions, runs: Runs, config: configuration
             f"{demand} take {np.abs(volts).max():.3g} V at one motor" if np.isfinite(volts).all()
             else f"no settled turn of {demand} was found"
         )  # fmt: skip
-        reaches = turn_words.reach(config.speed_m_s, config.yaw_rate_rad_s, *at_full_voltage())
+        reaches = turn_words.turn_not_found_reason(config.speed_m_s, config.yaw_rate_rad_s, *at_full_voltage())
         raise BadConfiguration(f"--speed, --yaw-rate: {why}; {source}, {reaches}")
     duties = volts / supply
     columns = {**runs.columns, **dict(zip(SIDES, duties[:, None], strict=True))}
@@ -173,7 +176,7 @@ def _ended(history: History | None) -> dict[str, float] | None:
     }
 
 
-def check(robot: Robot, named: str) -> None:
+def check_can_turn(robot: Robot, named: str) -> None:
     """Refuse a robot that cannot turn, in this configuration.
 
     Raises:
@@ -184,7 +187,7 @@ def check(robot: Robot, named: str) -> None:
         raise BadConfiguration("--left, --right: the robot's file says that its motors are not driven by voltage")
 
 
-def cells(config: configuration.TurnPart, given: dict[str, Any]) -> dict[str, Any]:
+def turn_columns(config: configuration.TurnPart, given: dict[str, Any]) -> dict[str, Any]:
     """Columns of the run: duties of the supply's voltage, which is the larger one where it is not stated."""
     found: dict[str, Any] = {} if config.heading_deg is None else {"heading_deg": config.heading_deg}
     if config.duty_left is not None:
@@ -197,7 +200,7 @@ def cells(config: configuration.TurnPart, given: dict[str, Any]) -> dict[str, An
             f"--voltage: got {supply:g}; expected at least {most:g} V, what --left and --right ask"
         )
     volts = np.array([config.left_V, config.right_V])
-    source, duties = sides.shares(volts, None if supply is None else np.asarray(supply))
+    source, duties = sides.supply_and_shares(volts, None if supply is None else np.asarray(supply))
     return found | {SUPPLY: float(source), **dict(zip(SIDES, map(float, duties), strict=True))}
 
 
@@ -251,4 +254,4 @@ def print_sides(sides: list[tuple[str, str, str]]) -> None:
         shown.add_column(heading, justify="left" if not heading else "right")
     for row in sides:
         shown.add_row(*row)
-    say(shown)
+    print_output(shown)

@@ -95,7 +95,7 @@ class Comparison:
 NATIVE, EXPORTED, TRANSLATED, WITHOUT = "native", "exported", "exported, not refitted", "exported without the effects"
 
 
-def compare(
+def compare_format(
     situation: Situation,
     law_of: Callable[[Joint, Mapping[str, float]], FormatLaw],
     fates: Sequence[Fate],
@@ -113,7 +113,7 @@ def compare(
     joint = situation.joint
     law = law_of(joint, {})
     inside = situation.inside
-    theta = refit(law, situation, inside)
+    theta = refit_parameters(law, situation, inside)
     names = tuple(e.name for e in joint.inside)
     found = list(fates)
     for effect in joint.inside:
@@ -130,19 +130,19 @@ def compare(
         models[TRANSLATED] = situation.readings(_at(law, law.start, situation))
     if names:
         plain = law_of(joint, dict.fromkeys(names, 0.0))
-        bare = refit(plain, situation, situation.without(names))
+        bare = refit_parameters(plain, situation, situation.without(names))
         models[WITHOUT] = situation.readings(_at(plain, bare, situation))
     reference = situation.measured if situation.is_measured else situation.native
     return Comparison(
         situation, dict(zip(law.names, map(float, law.start), strict=True)),
         dict(zip(law.names, map(float, theta), strict=True)), tuple(found),
-        tuple(Errors(label, errors(joint, shown, reference)) for label, shown in models.items()),
+        tuple(Errors(label, channel_errors(joint, shown, reference)) for label, shown in models.items()),
         "the measured readings" if situation.is_measured else "the native model",
         models[EXPORTED], exported,
     )  # fmt: skip
 
 
-def errors(joint: Joint, shown: np.ndarray, reference: np.ndarray) -> dict[str, float]:
+def channel_errors(joint: Joint, shown: np.ndarray, reference: np.ndarray) -> dict[str, float]:
     """Rms of the difference over the rms of the reference [%], by channel that has readings."""
     found = {}
     for k, channel in enumerate(channels_of(joint)):
@@ -154,17 +154,17 @@ def errors(joint: Joint, shown: np.ndarray, reference: np.ndarray) -> dict[str, 
 
 
 def _at(law: FormatLaw, theta: Any, situation: Situation) -> AtJoint:
-    current, speed = evaluated(law, jnp.asarray(theta), situation.command, situation.load, situation.way)
+    current, speed = evaluate_law(law, jnp.asarray(theta), situation.command, situation.load, situation.way)
     return AtJoint(np.asarray(current), np.asarray(speed))
 
 
 @eqx.filter_jit
-def evaluated(law: FormatLaw, theta: Any, command: Any, load: Any, way: Any) -> tuple[Any, Any]:
+def evaluate_law(law: FormatLaw, theta: Any, command: Any, load: Any, way: Any) -> tuple[Any, Any]:
     """Current of one motor [A] and speed of the joint [rad/s] by a format's law, compiled."""
     return law(theta, *map(jnp.asarray, (command, load, way)))
 
 
-def refit(law: FormatLaw, situation: Situation, native: AtJoint) -> np.ndarray:
+def refit_parameters(law: FormatLaw, situation: Situation, native: AtJoint) -> np.ndarray:
     """Least-squares fit of a format's parameters to the native model's currents and speeds.
 
     Residuals are relative to each quantity's rms. Parameters stay positive: each is the square of an unknown. No
@@ -204,7 +204,7 @@ def share_kept(law: FormatLaw, bare: FormatLaw, situation: Situation, native: At
     where the effect changes nothing.
     """
     left = [
-        _stacked(exact) - _stacked(_at(model, refit(model, situation, exact), situation))
+        _stacked(exact) - _stacked(_at(model, refit_parameters(model, situation, exact), situation))
         for model, exact in ((law, native), (bare, native_bare))
     ]
     change = (_stacked(native) - _stacked(native_bare)) / (sizes := _sizes(native))

@@ -11,7 +11,7 @@ from calibration.data.posterior_file import Posterior
 from mmrjax.model import quantities
 from mmrjax.model.params import Parameter
 from mmrjax.model.signals import Signals
-from sweeps.export.joint import Joint, typical
+from sweeps.export.joint import Joint, mean_surroundings
 from sweeps.export.law_source import Constant
 
 #: Draws of the posterior by which intervals are found, and the shares of them below their ends.
@@ -29,7 +29,7 @@ def posterior_of(joint: Joint) -> Posterior | None:
     path = source.with_name(posterior_file.FILE)
     if source.suffix != ".toml" or not path.is_file():
         return None
-    found = posterior_file.read(path)
+    found = posterior_file.read_posterior(path)
     found.check(joint.file.robot, str(path))
     return found
 
@@ -48,7 +48,7 @@ def constants_of(joint: Joint, signals: Signals, posterior: Posterior | None) ->
         source = f"fitted; prior: {spec.source}" if kind == OF_POSTERIOR else spec.source
         value = float(parameter.value)
         found.append(Constant(name, value, spec.unit, spec.meaning, source, low, high, kind))
-    for name, mean in typical(signals, joint.surroundings()).items():
+    for name, mean in mean_surroundings(signals, joint.surroundings()).items():
         word = name.removeprefix("surroundings.")
         known = quantities.CONDITIONS.get(word)
         unit = {"normal": "N", "mass": "kg", "slope": "rad", "payload": "kg"}.get(word, "SI")

@@ -10,9 +10,9 @@ from calibration.data.input_errors import BadConfiguration
 from calibration.data.posterior_file import Posterior
 from calibration.data.robot_file import RobotFile
 from calibration.data.runs import Runs
-from calibration.data.writing import naming
+from calibration.data.writing import naming_file
 from mmrjax.model.robot import Robot
-from sweeps.export.formats import Export, exported
+from sweeps.export.formats import Export, export_format
 from sweeps.report.words import export_words
 
 
@@ -47,11 +47,11 @@ def export(
         BadConfiguration: an unknown format, a drive that is not one joint, a folder that holds some of these files.
         BadData: a table that is refused.
     """
-    file = RobotFile(robot, "robot") if isinstance(robot, Robot) else robot_file.find(str(robot))
-    found = exported(
+    file = RobotFile(robot, "robot") if isinstance(robot, Robot) else robot_file.find_robot_file(str(robot))
+    found = export_format(
         file, to, configuration=configuration, data=data, at=joint, draws=draws, seed=seed, posterior=posterior
     )
-    texts = {**found.files, "LAW.md": export_words.law(found)}
+    texts = {**found.files, "LAW.md": export_words.law_text(found)}
     found = dataclasses.replace(found, files=texts)
     if out is not None:
         folder = Path(out)
@@ -59,6 +59,6 @@ def export(
             raise BadConfiguration(f"out: {taken} exists already; choose another folder, or remove it")
         folder.mkdir(parents=True, exist_ok=True)
         for name, content in texts.items():
-            with naming(folder / name):
+            with naming_file(folder / name):
                 (folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
     return found

@@ -63,7 +63,7 @@ class Symbol:
         return self.op == "const"
 
 
-def const(value: Any) -> Symbol:
+def constant_symbol(value: Any) -> Symbol:
     """Returns the symbol of a number or a truth value."""
     return Symbol.of("const", (), bool(value) if isinstance(value, bool | np.bool_) else float(value))
 
@@ -72,11 +72,11 @@ def _is(x: Symbol, value: float) -> bool:
     return x.is_const and x.value == value and not isinstance(x.value, bool)
 
 
-def apply(op: str, *args: Symbol) -> Symbol:
+def apply_operation(op: str, *args: Symbol) -> Symbol:
     """Returns the symbol of an operation, simplified where an operand is 0, 1 or all are numbers."""
     if all(a.is_const for a in args):
         try:
-            return const(_FOLDED[op](*(a.value for a in args)))
+            return constant_symbol(_FOLDED[op](*(a.value for a in args)))
         except (ArithmeticError, ValueError):
             return Symbol.of(op, args)
     if (op == "add" and _is(args[0], 0)) or (op == "mul" and _is(args[0], 1)):
@@ -84,26 +84,26 @@ def apply(op: str, *args: Symbol) -> Symbol:
     if (op in ("add", "sub") and _is(args[1], 0)) or (op in ("mul", "div", "pow") and _is(args[1], 1)):
         return args[0]
     if (op == "mul" and (_is(args[0], 0) or _is(args[1], 0))) or (op == "div" and _is(args[0], 0)):
-        return const(0.0)
+        return constant_symbol(0.0)
     if (op == "sub" and _is(args[0], 0)) or (op == "mul" and _is(args[0], -1)):
-        return apply("neg", args[1])
+        return apply_operation("neg", args[1])
     if op == "mul" and _is(args[1], -1):
-        return apply("neg", args[0])
+        return apply_operation("neg", args[0])
     if op == "neg" and args[0].op == "neg":
         return args[0].args[0]
     if op == "add" and args[1].op == "neg":
-        return apply("sub", args[0], args[1].args[0])
+        return apply_operation("sub", args[0], args[1].args[0])
     if op == "add" and args[0].op == "neg":
-        return apply("sub", args[1], args[0].args[0])
+        return apply_operation("sub", args[1], args[0].args[0])
     if op == "sub" and args[1].op == "neg":
-        return apply("add", args[0], args[1].args[0])
+        return apply_operation("add", args[0], args[1].args[0])
     if op in ("and", "or") and any(a.is_const for a in args):
         known, other = args if args[0].is_const else args[::-1]
         return (other if known.value else known) if op == "and" else (known if known.value else other)
     return Symbol.of(op, args)
 
 
-def where(condition: Symbol, yes: Symbol, no: Symbol) -> Symbol:
+def choice_symbol(condition: Symbol, yes: Symbol, no: Symbol) -> Symbol:
     """Returns the symbol of a choice; that of one branch where both are equal or the condition is known."""
     if condition.is_const:
         return yes if condition.value else no
@@ -119,18 +119,26 @@ def _each(function: Callable[..., Symbol], *arrays: np.ndarray) -> np.ndarray:
 
 
 def _power(x: Symbol, n: int) -> Symbol:
-    return apply("div", const(1.0), _power(x, -n)) if n < 0 else apply("pow", x, const(n))
+    return (
+        apply_operation("div", constant_symbol(1.0), _power(x, -n))
+        if n < 0
+        else apply_operation("pow", x, constant_symbol(n))
+    )
 
 
 def _logistic(x: Symbol) -> Symbol:
-    return apply("div", const(1.0), apply("add", const(1.0), apply("exp", apply("neg", x))))
+    return apply_operation(
+        "div",
+        constant_symbol(1.0),
+        apply_operation("add", constant_symbol(1.0), apply_operation("exp", apply_operation("neg", x))),
+    )
 
 
 def _converted(x: Symbol, kind: Any) -> Symbol:
     if x.op in _LOGICAL and np.issubdtype(kind, np.number):
-        return where(x, const(1.0), const(0.0))
+        return choice_symbol(x, constant_symbol(1.0), constant_symbol(0.0))
     if x.is_const:
-        return const(bool(x.value) if kind == np.bool_ else float(x.value))
+        return constant_symbol(bool(x.value) if kind == np.bool_ else float(x.value))
     return x
 
 
@@ -142,14 +150,14 @@ def _dot(a: np.ndarray, b: np.ndarray, dimensions: Any) -> np.ndarray:
     found = np.empty(a.shape[:-1] + b.shape[:-1], object)
     for i in np.ndindex(a.shape[:-1]):
         for j in np.ndindex(b.shape[:-1]):
-            found[i + j] = _total([apply("mul", x, y) for x, y in zip(a[i], b[j], strict=True)])
+            found[i + j] = _total([apply_operation("mul", x, y) for x, y in zip(a[i], b[j], strict=True)])
     return found
 
 
 def _total(terms: Sequence[Symbol]) -> Symbol:
-    found = const(0.0)
+    found = constant_symbol(0.0)
     for term in terms:
-        found = apply("add", found, term)
+        found = apply_operation("add", found, term)
     return found
 
 
@@ -208,7 +216,7 @@ def _evaluated(jaxpr: Any, consts: Sequence[Any], arguments: Sequence[np.ndarray
         x, name, p = [read(v) for v in eqn.invars], eqn.primitive.name, eqn.params
         inner = next((p[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in p), None)
         if name in _SIMPLE:
-            found = [_each(lambda *a, op=_SIMPLE[name]: apply(op, *a), *x)]
+            found = [_each(lambda *a, op=_SIMPLE[name]: apply_operation(op, *a), *x)]
         elif name in _SAME:
             found = list(x)
         elif name == "integer_pow":
@@ -216,13 +224,13 @@ def _evaluated(jaxpr: Any, consts: Sequence[Any], arguments: Sequence[np.ndarray
         elif name == "square":
             found = [_each(lambda a: _power(a, 2), x[0])]
         elif name == "rsqrt":
-            found = [_each(lambda a: apply("div", const(1.0), apply("sqrt", a)), x[0])]
+            found = [_each(lambda a: apply_operation("div", constant_symbol(1.0), apply_operation("sqrt", a)), x[0])]
         elif name == "logistic":
             found = [_each(_logistic, x[0])]
         elif name == "select_n" and len(x) == 3:
-            found = [_each(lambda c, no, yes: where(_truth(c), yes, no), *x)]
+            found = [_each(lambda c, no, yes: choice_symbol(_truth(c), yes, no), *x)]
         elif name == "clamp":
-            found = [_each(lambda low, a, high: apply("min", apply("max", a, low), high), *x)]
+            found = [_each(lambda low, a, high: apply_operation("min", apply_operation("max", a, low), high), *x)]
         elif name == "convert_element_type":
             found = [_each(lambda a, kind=p["new_dtype"]: _converted(a, kind), x[0])]
         elif name == "iota":
@@ -243,18 +251,18 @@ def _evaluated(jaxpr: Any, consts: Sequence[Any], arguments: Sequence[np.ndarray
 
 
 def _truth(x: Symbol) -> Symbol:
-    return const(bool(x.value)) if x.is_const else x
+    return constant_symbol(bool(x.value)) if x.is_const else x
 
 
 def _numbers(value: Any) -> np.ndarray:
     value = np.asarray(value)
     found = np.empty(value.shape, object)
     for k in np.ndindex(value.shape):
-        found[k] = const(value[k].item())
+        found[k] = constant_symbol(value[k].item())
     return found
 
 
-def traced(function: Callable[..., Any], names: Sequence[str], what: str) -> Symbol:
+def trace_function(function: Callable[..., Any], names: Sequence[str], what: str) -> Symbol:
     """Returns a scalar function of scalars as an expression of their names.
 
     Args:
@@ -300,7 +308,7 @@ def names_of(*symbols: Symbol) -> list[str]:
 
 
 #: The number 0.
-ZERO = const(0.0)
+ZERO = constant_symbol(0.0)
 
 
 class Dialect:
@@ -334,7 +342,7 @@ class Torch(Dialect):
 NUMPY, JAX, TORCH = Dialect("np"), Dialect("jnp"), Torch()
 
 
-def number(value: Any) -> str:
+def number_text(value: Any) -> str:
     """Shortest text of a number that reads back as the same number."""
     return repr(value if isinstance(value, bool) else float(value))
 
@@ -361,7 +369,7 @@ def lines_of(result: Symbol, dialect: Dialect, spelled: Callable[[str], str], in
         if id(x) in local:
             return local[id(x)]
         if x.is_const:
-            shown = number(x.value)
+            shown = number_text(x.value)
             return f"({shown})" if shown.startswith("-") and outer >= 7 else shown
         if x.op == "name":
             return spelled(x.value)

@@ -16,7 +16,7 @@ from mmrjax import __version__
 from sweeps.export import jax_actuator
 from sweeps.export.comparison import APPROXIMATED, HELD, Fate
 from sweeps.export.joint import Joint
-from sweeps.export.law_source import Constant, executed, jax_source
+from sweeps.export.law_source import Constant, jax_source, module_from_source
 from sweeps.export.situation import Situation
 
 #: Points of an axis on either side of rest; how far beyond the runs the axes reach.
@@ -49,14 +49,16 @@ class Map(eqx.Module):
         return np.clip(share, 0.0, 1.0)
 
 
-def axis(largest: float) -> np.ndarray:
+def symmetric_axis(largest: float) -> np.ndarray:
     """Values from -`largest` to `largest`, 0 and both its neighbours close together, where friction turns round."""
     half = np.linspace(0.0, largest, POINTS + 1)[1:]
     near = np.array([1e-3 * largest])
     return np.concatenate([-half[::-1], -near, [0.0], near, half])
 
 
-def mapped(module: ModuleType, params: Mapping[str, Any], speed: np.ndarray, torque: np.ndarray, guess: float) -> Map:
+def steady_state_map(
+    module: ModuleType, params: Mapping[str, Any], speed: np.ndarray, torque: np.ndarray, guess: float
+) -> Map:
     """Steady states at each speed [rad/s] and torque [N·m] of the joint; `guess`: resistance, of the first step."""
     speeds, torques = (jnp.asarray(x.ravel()) for x in np.meshgrid(speed, torque, indexing="ij"))
     params = {name: jnp.asarray(value, float) for name, value in params.items()}
@@ -64,7 +66,7 @@ def mapped(module: ModuleType, params: Mapping[str, Any], speed: np.ndarray, tor
     @jax.jit
     def solved(params: Any) -> dict[str, Any]:
         def lacking(voltage: Any) -> Any:
-            return jax_actuator.settled(module, params, voltage, speeds)[0] - torques
+            return jax_actuator.settled_actuator(module, params, voltage, speeds)[0] - torques
 
         def again(voltage: Any, _: None) -> tuple[Any, None]:
             left, rise = jax.jvp(lacking, (voltage,), (jnp.ones_like(voltage),))
@@ -73,7 +75,7 @@ def mapped(module: ModuleType, params: Mapping[str, Any], speed: np.ndarray, tor
         constant, ratio = params["motor.torque_constant"], params["gearbox.ratio"]
         start = constant * ratio * speeds + guess * torques / (constant * ratio)
         voltage = jax.lax.scan(again, start, None, STEPS)[0]
-        return jax_actuator.settled(module, params, voltage, speeds)[1] | {"left": lacking(voltage)}
+        return jax_actuator.settled_actuator(module, params, voltage, speeds)[1] | {"left": lacking(voltage)}
 
     found = {name: np.asarray(x).reshape(len(speed), len(torque)) for name, x in solved(params).items()}
     return Map(speed, torque, {name: found[name] for name in COLUMNS})
@@ -107,11 +109,13 @@ class TableLaw(eqx.Module):
 
 def map_of(situation: Situation, constants: Sequence[Constant], amplitudes: Mapping[str, float] | None = None) -> Map:
     """The tables of a drive, as far as the runs reach and a little beyond."""
-    module = executed(jax_source(situation.joint, constants))
+    module = module_from_source(jax_source(situation.joint, constants))
     params = jax_actuator.steady_params(situation.joint, constants, amplitudes or {})
     reach = float(np.max(np.abs(situation.inside.speed))) * BEYOND
     most = max(float(np.max(np.abs(situation.load))), 1e-6) * BEYOND
-    return mapped(module, params, axis(reach), axis(most), float(situation.joint.robot.motor.resistance))
+    return steady_state_map(
+        module, params, symmetric_axis(reach), symmetric_axis(most), float(situation.joint.robot.motor.resistance)
+    )
 
 
 def law_of(situation: Situation, constants: Sequence[Constant]) -> Any:
@@ -125,10 +129,14 @@ def law_of(situation: Situation, constants: Sequence[Constant]) -> Any:
     return law
 
 
-def fates(situation: Situation, constants: Sequence[Constant]) -> list[Fate]:
+def fates_in_tables(situation: Situation, constants: Sequence[Constant]) -> list[Fate]:
     """Fates of the base's terms, and of effects outside the joint."""
     joint = situation.joint
-    found = [f for f in jax_actuator.fates(joint) if f.name not in ("rotor inertia", "current limit of the driver")]
+    found = [
+        f
+        for f in jax_actuator.fates_in_actuator(joint)
+        if f.name not in ("rotor inertia", "current limit of the driver")
+    ]
     means = {c.name: c.value for c in constants}
     changed = []
     for fate in found:
@@ -142,26 +150,26 @@ def fates(situation: Situation, constants: Sequence[Constant]) -> list[Fate]:
     return [*changed, Fate("rotor inertia", APPROXIMATED, how), lines]
 
 
-def held(joint: Joint) -> dict[str, str]:
+def effects_in_tables(joint: Joint) -> dict[str, str]:
     """Words for each effect inside the joint without a memory; one with a memory is held at its settled value."""
     settled = "its settled value: a table has no memory"
     return {e.name: settled if e.memory_size is not None else "the tables" for e in joint.inside}
 
 
-def files(joint: Joint, found: Map, notes: Sequence[str]) -> dict[str, str | bytes]:
+def table_files(joint: Joint, found: Map, notes: Sequence[str]) -> dict[str, str | bytes]:
     """The tables as CSV and as a C header that reads them."""
     grid = np.meshgrid(found.speed, found.torque, indexing="ij")
     columns = {"joint_speed_rad_s": grid[0].ravel(), "joint_torque_Nm": grid[1].ravel()}
     columns |= {column: found.values[name].ravel() for name, column in COLUMNS.items()}
     columns["efficiency"] = found.efficiency.ravel()
-    return {"feed_forward.csv": table_text(columns), "feed_forward.h": header(joint, found, notes)}
+    return {"feed_forward.csv": table_text(columns), "feed_forward.h": c_header(joint, found, notes)}
 
 
 def _array(values: np.ndarray) -> str:
     return ", ".join(f"{x:.7g}f" if "." in f"{x:.7g}" or "e" in f"{x:.7g}" else f"{x:.7g}.0f" for x in values)
 
 
-def header(joint: Joint, found: Map, notes: Sequence[str]) -> str:
+def c_header(joint: Joint, found: Map, notes: Sequence[str]) -> str:
     """Text of a C header: axes, tables, and a function that reads each of them."""
     name = joint.name
     guard = f"{name}_FEED_FORWARD_H".upper()

@@ -17,9 +17,9 @@ from mmrjax.errors import count_noun
 from sweeps.export import comparison, feed_forward, jax_actuator, mjlab, mujoco, onnx, randomization
 from sweeps.export.comparison import Comparison, Fate
 from sweeps.export.constants import constants_of, posterior_of
-from sweeps.export.joint import Joint, joint
+from sweeps.export.joint import Joint, joint_of_robot
 from sweeps.export.law_source import Constant
-from sweeps.export.situation import AtJoint, Situation, situation
+from sweeps.export.situation import AtJoint, Situation, situation_of_joint
 
 #: Names of formats and their uses.
 FORMATS = {
@@ -53,7 +53,7 @@ class Export:
 
 
 @in_double
-def exported(
+def export_format(
     file: RobotFile,
     to: str,
     *,
@@ -80,10 +80,10 @@ def exported(
     if not at.isprintable() or not at or any(c in at for c in "\"'<>&"):
         raise BadConfiguration(f"--joint: got {at!r}; expected the name of a joint, without quotes and brackets")
     if to in ("mujoco", "randomization"):
-        mujoco.library()
-    drive = joint(file, configuration)
+        mujoco.mujoco_module()
+    drive = joint_of_robot(file, configuration)
     posterior = posterior_of(drive) if posterior is None else posterior
-    runs = situation(drive, data)
+    runs = situation_of_joint(drive, data)
     constants = constants_of(drive, runs.signals, posterior)
     make = {
         "mujoco": _mujoco, "randomization": _mujoco, "table": _table, "jax": _actuator, "onnx": _actuator,
@@ -107,30 +107,32 @@ def notes_of(runs: Situation) -> list[str]:
 def _mujoco(begun: Export, runs: Situation, at: str, draws: int, seed: int) -> Export:
     drive = begun.joint
     normal = float(np.mean(np.asarray(runs.signals.normal)))
-    found = comparison.compare(
-        runs, mujoco.law_of(normal), mujoco.fates(drive, normal), mujoco.TERMS, mujoco.approximated
+    found = comparison.compare_format(
+        runs, mujoco.law_of(normal), mujoco.fates_in_mujoco(drive, normal), mujoco.TERMS, mujoco.approximated_terms
     )
-    motor, name = mujoco.motor(drive, found.refitted), f"{drive.name}_drive"
+    motor, name = mujoco.mjcf_motor(drive, found.refitted), f"{drive.name}_drive"
     about = mujoco.attribute_notes(drive, begun.constants, found.translated, found.refitted)
     mass = float(np.mean(np.asarray(runs.signals.mass)))
     volts = float(drive.robot.motor.voltage_limit or np.max(np.abs(runs.command)))
     middle = (float(np.mean(runs.command)), float(np.mean(runs.load)))
     texts = {
-        "drive.xml": mujoco.fragment(drive, motor, about, notes_of(runs), name, at, volts),
-        "scene.xml": mujoco.scene(drive, mass, name, at, *middle),
+        "drive.xml": mujoco.mjcf_fragment(drive, motor, about, notes_of(runs), name, at, volts),
+        "scene.xml": mujoco.mjcf_scene(drive, mass, name, at, *middle),
     }
     checks = _checked(texts, motor, runs, found)
     files: Mapping[str, str | bytes] = texts
     if begun.format == "randomization":
-        values = randomization.drawn(drive, begun.posterior, begun.constants, found.refitted, normal, draws, seed)
-        files = randomization.files(values)
+        values = randomization.draw_parameters(
+            drive, begun.posterior, begun.constants, found.refitted, normal, draws, seed
+        )
+        files = randomization.randomization_files(values)
     return dataclasses.replace(begun, files=files, comparison=found, checks=checks)
 
 
 def _checked(texts: Mapping[str, str], motor: mujoco.Motor, runs: Situation, found: Comparison) -> dict[str, float]:
     """Largest differences of MuJoCo C from the format's law, and errors of both on the same runs [%]."""
     rows = np.unique(np.linspace(0, len(runs.command) - 1, min(CHECKED, len(runs.command))).astype(int))
-    got = mujoco.run(texts, motor, runs, found.exported, rows.tolist())
+    got = mujoco.settle_in_mujoco(texts, motor, runs, found.exported, rows.tolist())
     law = AtJoint(found.exported.current[rows], found.exported.speed[rows])
     native = AtJoint(runs.inside.current[rows], runs.inside.speed[rows])
 
@@ -148,24 +150,28 @@ def _checked(texts: Mapping[str, str], motor: mujoco.Motor, runs: Situation, fou
 
 def _actuator(begun: Export, runs: Situation, at: str, draws: int, seed: int) -> Export:
     drive, constants, notes = begun.joint, begun.constants, notes_of(runs)
-    law, held = jax_actuator.law_of(runs, constants), jax_actuator.held(drive)
+    law, held = jax_actuator.law_of(runs, constants), jax_actuator.effects_in_actuator(drive)
     checks: dict[str, float] = {}
     if begun.format == "jax":
-        files = jax_actuator.files(drive, constants, notes)
+        files = jax_actuator.jax_files(drive, constants, notes)
     elif begun.format == "mjlab":
-        files = mjlab.files(drive, constants, notes)
+        files = mjlab.mjlab_files(drive, constants, notes)
     else:
-        files = onnx.files(drive, constants)
+        files = onnx.onnx_files(drive, constants)
         model: Any = files["actuator.onnx"]
-        checks["ONNX against JAX, largest of 10,000 states [relative]"] = onnx.difference(drive, constants, model)
-    found = comparison.compare(runs, law, jax_actuator.fates(drive), held, mujoco.approximated)
+        checks["ONNX against JAX, largest of 10,000 states [relative]"] = onnx.difference_from_jax(
+            drive, constants, model
+        )
+    found = comparison.compare_format(
+        runs, law, jax_actuator.fates_in_actuator(drive), held, mujoco.approximated_terms
+    )
     return dataclasses.replace(begun, files=files, comparison=found, checks=checks)
 
 
 def _table(begun: Export, runs: Situation, at: str, draws: int, seed: int) -> Export:
     drive, constants = begun.joint, begun.constants
-    law, held = feed_forward.law_of(runs, constants), feed_forward.held(drive)
-    fates: list[Fate] = feed_forward.fates(runs, constants)
-    found = comparison.compare(runs, law, fates, held, mujoco.approximated)
-    files = feed_forward.files(drive, feed_forward.map_of(runs, constants), notes_of(runs))
+    law, held = feed_forward.law_of(runs, constants), feed_forward.effects_in_tables(drive)
+    fates: list[Fate] = feed_forward.fates_in_tables(runs, constants)
+    found = comparison.compare_format(runs, law, fates, held, mujoco.approximated_terms)
+    files = feed_forward.table_files(drive, feed_forward.map_of(runs, constants), notes_of(runs))
     return dataclasses.replace(begun, files=files, comparison=found)

@@ -12,9 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from sweeps.export.comparison import DROPPED, HELD, Fate
-from sweeps.export.joint import Joint, integrates
-from sweeps.export.law_source import Constant, executed, jax_source, numbers
-from sweeps.export.mujoco import outside
+from sweeps.export.joint import Joint, memory_grows
+from sweeps.export.law_source import Constant, constant_values, jax_source, module_from_source
+from sweeps.export.mujoco import fates_outside_joint
 from sweeps.export.situation import Situation
 
 #: Steps of a run to its steady state, and their length [s]: of an implicit step so long, Newton's method is left.
@@ -39,7 +39,7 @@ class ActuatorLaw(eqx.Module):
 
     def __call__(self, theta: Any, command: Any, load: Any, way: Any) -> tuple[Any, Any]:
         def torque(speed: Any) -> Any:
-            return settled(self.module, self.params, command, speed)[0] - load
+            return settled_actuator(self.module, self.params, command, speed)[0] - load
 
         def nearer(speed: Any, _: None) -> tuple[Any, None]:
             left, rise = jax.jvp(torque, (speed,), (jnp.ones_like(speed),))
@@ -48,10 +48,12 @@ class ActuatorLaw(eqx.Module):
             return jnp.where(way * (speed + stride) > 0, speed + stride, 0.5 * speed), None
 
         speed = jax.lax.scan(nearer, self.guess, None, STEPS)[0]
-        return settled(self.module, self.params, command, speed)[1]["current"], speed
+        return settled_actuator(self.module, self.params, command, speed)[1]["current"], speed
 
 
-def settled(module: ModuleType, params: Mapping[str, Any], command: Any, speed: Any) -> tuple[Any, dict[str, Any]]:
+def settled_actuator(
+    module: ModuleType, params: Mapping[str, Any], command: Any, speed: Any
+) -> tuple[Any, dict[str, Any]]:
     """Torque [N·m] and inside of an actuator at a constant voltage [V] and speed of the joint [rad/s]."""
     state = module.initial_state(jnp.shape(speed))
 
@@ -65,8 +67,8 @@ def settled(module: ModuleType, params: Mapping[str, Any], command: Any, speed: 
 
 def steady_params(joint: Joint, constants: Sequence[Constant], amplitudes: Mapping[str, float]) -> dict[str, Any]:
     """Parameters of the actuator in steady travel: without what repeats with an angle, whose mean is 0."""
-    params = dict(numbers(constants))
-    waves = {p.name: 0.0 for p in joint.parts if integrates(p)}
+    params = dict(constant_values(constants))
+    waves = {p.name: 0.0 for p in joint.parts if memory_grows(p)}
     for name, value in {**amplitudes, **waves}.items():
         if f"effects.{name}.amplitude" in params:
             params[f"effects.{name}.amplitude"] = value
@@ -75,7 +77,7 @@ def steady_params(joint: Joint, constants: Sequence[Constant], amplitudes: Mappi
 
 def law_of(situation: Situation, constants: Sequence[Constant]) -> Any:
     """Returns the function from a joint and amplitudes to the law of its actuator in these runs."""
-    module = executed(jax_source(situation.joint, constants))
+    module = module_from_source(jax_source(situation.joint, constants))
 
     def law(joint: Joint, amplitudes: Mapping[str, float]) -> ActuatorLaw:
         params = steady_params(joint, constants, amplitudes)
@@ -88,7 +90,7 @@ def law_of(situation: Situation, constants: Sequence[Constant]) -> Any:
     return law
 
 
-def fates(joint: Joint) -> list[Fate]:
+def fates_in_actuator(joint: Joint) -> list[Fate]:
     """Fates of the base's terms, and of effects outside the joint."""
     robot = joint.robot
     found = [
@@ -105,21 +107,21 @@ def fates(joint: Joint) -> list[Fate]:
         found.append(Fate("backlash", DROPPED, "the joint is rigid; it needs a second body"))
     if joint.limit is not None:
         found.append(Fate("current limit of the driver", HELD, "a bound of the current"))
-    return [*found, *outside(joint)]
+    return [*found, *fates_outside_joint(joint)]
 
 
-def held(joint: Joint) -> dict[str, str]:
+def effects_in_actuator(joint: Joint) -> dict[str, str]:
     """Words for each effect inside the joint; the law has all of them."""
     return {e.name: "a function of the law" for e in joint.inside}
 
 
-def files(joint: Joint, constants: Sequence[Constant], notes: Sequence[str]) -> dict[str, str | bytes]:
+def jax_files(joint: Joint, constants: Sequence[Constant], notes: Sequence[str]) -> dict[str, str | bytes]:
     """The actuator's source, and its program as `jax.export` serialises it."""
     source = jax_source(joint, constants, notes)
-    return {"actuator.py": source, "actuator.jaxexport": serialised(executed(source))}
+    return {"actuator.py": source, "actuator.jaxexport": serialise_actuator(module_from_source(source))}
 
 
-def serialised(module: ModuleType) -> bytes:
+def serialise_actuator(module: ModuleType) -> bytes:
     """The actuator in single precision, of any number of joints, with first derivatives.
 
     `jax.export.deserialize(bytes).call(params, state, command, joint_position, joint_velocity, dt)`.

@@ -19,7 +19,7 @@ from mmrjax.model import balances, contact, params
 from mmrjax.model.channels import EVERY
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Signals
-from sweeps.export.expressions import ZERO, Symbol, apply, const, names_of, traced
+from sweeps.export.expressions import ZERO, Symbol, apply_operation, constant_symbol, names_of, trace_function
 
 #: Balances that a joint has; what enters another one belongs to what the joint moves, or to an instrument.
 INSIDE = ("supply", "electrical", "inductance", "motor", "gearbox", "track", "inertia")
@@ -130,7 +130,7 @@ def _symbols(part: Part) -> list[Symbol]:
     return [part.value, part.slope, part.rate_slope, *([] if part.rate is None else [part.rate])]
 
 
-def joint(file: RobotFile, configuration: str | None = None) -> Joint:
+def joint_of_robot(file: RobotFile, configuration: str | None = None) -> Joint:
     """Returns the drive of a robot as the actuator of one joint.
 
     Args:
@@ -206,7 +206,7 @@ class _Tracer:
             at = lambda x: jnp.asarray(value(*numbers[:k], x, *numbers[k + 1 :]))  # noqa: E731
             return jax.jvp(at, (numbers[k],), (jnp.ones_like(numbers[k]),))[1]
 
-        return traced(slope if by else value, self.names, what)
+        return trace_function(slope if by else value, self.names, what)
 
     def _given(self, known: dict[str, Any]) -> tuple[Robot, Signals]:
         robot = params.replace(self.joint.robot, {n: known[n] for n in self.parameters})
@@ -281,7 +281,7 @@ def _parts(joint: Joint) -> Iterator[Part]:
         if effect.memory_size is not None:
             rate = lambda r, s, alone=alone: alone(r)[0].rate(r, s)  # noqa: E731
         yield _part(
-            trace, effect.name, effect.balance, balances.BALANCES[effect.balance][0], *described(effect),
+            trace, effect.name, effect.balance, balances.BALANCES[effect.balance][0], *effect_docstring(effect),
             variable.get(effect.balance, ""), value, rate, effect.name,
         )  # fmt: skip
 
@@ -301,7 +301,7 @@ def _part(
     return part
 
 
-def described(effect: Effect | type[Effect]) -> tuple[str, str]:
+def effect_docstring(effect: Effect | type[Effect]) -> tuple[str, str]:
     """Equation and meaning of an effect, from its docstring."""
     kind = effect if isinstance(effect, type) else type(effect)
     paragraphs = (inspect.getdoc(kind.plain or kind) or kind.name).split("\n\n")
@@ -315,17 +315,17 @@ def known_as(effect: Effect) -> bool:
     return effect.name in library.BY_NAME or effect.name in library.BESIDE
 
 
-def integrates(part: Part) -> bool:
+def memory_grows(part: Part) -> bool:
     """True if a part's memory grows without end, as a phase does: it has no settled value but its mean, 0."""
     return part.rate is not None and part.rate_slope.is_const and part.rate_slope.value == 0
 
 
-def values(joint: Joint) -> dict[str, float]:
+def parameter_values(joint: Joint) -> dict[str, float]:
     """Numbers of the law's parameters [SI], by dotted name."""
     return {n: float(p.value) for n, p in joint.parameters().items()}
 
 
-def typical(signals: Signals, names: Sequence[str]) -> dict[str, float]:
+def mean_surroundings(signals: Signals, names: Sequence[str]) -> dict[str, float]:
     """Mean of signals of the surroundings over runs [SI], by name; 0 if unknown."""
     found: dict[str, float] = {}
     for name in names:
@@ -345,14 +345,14 @@ def channels_of(joint: Joint) -> tuple[Any, ...]:
     return shown or tuple(c for c in settled if c.name in ("motor_current", "motor_speed"))
 
 
-def combined(parts: Sequence[Part], field: str) -> Symbol:
+def sum_over_parts(parts: Sequence[Part], field: str) -> Symbol:
     """Sum of a field of several parts."""
-    found = const(0.0)
+    found = constant_symbol(0.0)
     for part in parts:
-        found = apply("add", found, getattr(part, field))
+        found = apply_operation("add", found, getattr(part, field))
     return found
 
 
-def merged(known: Mapping[str, float], more: Mapping[str, float]) -> dict[str, float]:
+def merge_numbers(known: Mapping[str, float], more: Mapping[str, float]) -> dict[str, float]:
     """Two tables of numbers as one; the second one's win."""
     return {**known, **more}

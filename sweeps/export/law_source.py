@@ -59,7 +59,7 @@ _TORCH = _Library(
 )
 
 
-def arguments(symbol: Symbol) -> list[str]:
+def function_arguments(symbol: Symbol) -> list[str]:
     """Arguments of the function of an expression, besides its parameters."""
     used = names_of(symbol)
     found = [n for n in _ARGUMENTS if n in used]
@@ -72,7 +72,7 @@ def _function(name: str, symbol: Symbol, document: str, dialect: Dialect) -> str
             return word
         return "memory" if word.startswith("memory.") else f'p["{word}"]'
 
-    head = f"def {name}({', '.join(['p', *arguments(symbol)])}):"
+    head = f"def {name}({', '.join(['p', *function_arguments(symbol)])}):"
     body = textwrap.indent(_wrapped(document), "    ")
     return "\n".join([head, body, *lines_of(symbol, dialect, spelled)])
 
@@ -84,22 +84,22 @@ def _wrapped(document: str) -> str:
     return '"""' + "\n".join(lines) + '\n"""'
 
 
-def call(part: Part, suffix: str = "", memory: str | None = None) -> str:
+def call_text(part: Part, suffix: str = "", memory: str | None = None) -> str:
     """Text of the call of a part's function."""
     symbol = {"": part.value, "_slope": part.slope, "_rate": part.rate, "_rate_slope": part.rate_slope}[suffix]
     assert symbol is not None
     given = ["p", *(("state" + f'["{part.name}"]' if memory is None else memory) if a == "memory" else a
-                    for a in arguments(symbol))]  # fmt: skip
+                    for a in function_arguments(symbol))]  # fmt: skip
     return f"{part.name}{suffix}({', '.join(given)})"
 
 
 def _sum(parts: Sequence[Part], suffix: str = "", memory: Mapping[str, str] | None = None) -> str:
     memory = memory or {}
-    terms = [call(p, suffix, memory.get(p.name)) for p in parts if suffix != "_slope" or p.by]
+    terms = [call_text(p, suffix, memory.get(p.name)) for p in parts if suffix != "_slope" or p.by]
     return " + ".join(terms) or "0.0"
 
 
-def functions(joint: Joint, dialect: Dialect) -> str:
+def functions_text(joint: Joint, dialect: Dialect) -> str:
     """Text of the functions of all parts, with their derivatives and rates."""
     found = []
     for part in joint.parts:
@@ -125,10 +125,10 @@ def step_lines(joint: Joint, library: _Library) -> list[str]:
     lines = [
         "p, voltage, angle, wheel_speed = params, command, joint_position, joint_velocity",
         'motor_speed = p["gearbox.ratio"] * wheel_speed',
-        f"way = {call(joint.of('way')[0])}",
+        f"way = {call_text(joint.of('way')[0])}",
         "# Current of the winding: L dI/dt = U - E - U_R - ..., one implicit Euler step, linear in the current.",
         'current = state["current"]',
-        f"left = voltage - {call(joint.of('back')[0])} - ({_sum(circuit)})",
+        f"left = voltage - {call_text(joint.of('back')[0])} - ({_sum(circuit)})",
         f"slope = {library.positive(_sum(circuit, '_slope'))}",
         f"current = current + dt * left / ({_sum(joint.of('inductance'))} + dt * slope)",
     ]
@@ -140,17 +140,18 @@ def step_lines(joint: Joint, library: _Library) -> list[str]:
     if joint.remembering:
         lines.append("# Memories: one implicit Euler step each.")
     lines += [
-        f'memory["{p.name}"] = state["{p.name}"] + dt * {call(p, "_rate")} / (1.0 - dt * {call(p, "_rate_slope")})'
+        f'memory["{p.name}"] = state["{p.name}"] + dt * {call_text(p, "_rate")} / (1.0 - dt * '
+        f"{call_text(p, '_rate_slope')})"
         for p in joint.remembering
-        if all(a not in ("load", "pull") for a in arguments(p.rate or p.value))
+        if all(a not in ("load", "pull") for a in function_arguments(p.rate or p.value))
     ]
     lines += [
         f"lost = {_sum(circuit, '', later)}",
         "# Torques from the winding to the wheel.",
-        f"made = {call(joint.of('torque')[0])}",
+        f"made = {call_text(joint.of('torque')[0])}",
         f"at_shaft = made - ({_sum(joint.of('motor'), '', later)})",
-        f"load = at_shaft - {call(joint.of('idle')[0])}",
-        f'through = p["gearbox.ratio"] * {call(joint.of("efficiency")[0])} * load',
+        f"load = at_shaft - {call_text(joint.of('idle')[0])}",
+        f'through = p["gearbox.ratio"] * {call_text(joint.of("efficiency")[0])} * load',
         *_solved("load", "through", gear, later),
         *_solved("pull", "load", track, later),
         'info = {"current": current, "voltage": voltage, "motor_speed": motor_speed, "power": voltage * current,',
@@ -224,13 +225,13 @@ def torch_source(
 
 def _source(joint: Joint, constants: Sequence[Constant], library: _Library, what: str, notes: Sequence[str]) -> str:
     states = ", ".join(f'"{n}": zero' for n in ("current", *(p.name for p in joint.remembering)))
-    added = "".join(f" + {call(p)}" for p in joint.of("inertia"))
+    added = "".join(f" + {call_text(p)}" for p in joint.of("inertia"))
     body = textwrap.indent("\n".join(step_lines(joint, library)), "    ")
     zero = "jnp.zeros(shape)" if library.dialect is JAX else "torch.zeros(shape, device=device)"
     given = "shape=()" if library.dialect is JAX else "shape=(), device=None"
     return (
         f"{_header(joint, what, notes)}\n{library.imports}\n\n{constants_text(constants)}\n\n\n"
-        f"{functions(joint, library.dialect)}\n\n\n"
+        f"{functions_text(joint, library.dialect)}\n\n\n"
         f"def armature(params):\n"
         f'    """Inertia of the rotor at the joint, J i² η, for the joint\'s own armature [kg·m²]."""\n'
         f"    p = params\n"
@@ -244,13 +245,13 @@ def _source(joint: Joint, constants: Sequence[Constant], library: _Library, what
     )
 
 
-def executed(source: str, name: str = "exported_law") -> ModuleType:
+def module_from_source(source: str, name: str = "exported_law") -> ModuleType:
     """Module of a source text."""
     module = ModuleType(name)
     exec(compile(source, f"<{name}>", "exec"), module.__dict__)
     return module
 
 
-def numbers(constants: Sequence[Constant]) -> dict[str, Any]:
+def constant_values(constants: Sequence[Constant]) -> dict[str, Any]:
     """Values of constants by name."""
     return {c.name: c.value for c in constants}

@@ -63,6 +63,6 @@ class DriveActuatorCfg(ActuatorCfg):
 '''
 
 
-def files(joint: Joint, constants: Sequence[Constant], notes: Sequence[str]) -> dict[str, str | bytes]:
+def mjlab_files(joint: Joint, constants: Sequence[Constant], notes: Sequence[str]) -> dict[str, str | bytes]:
     """The source of the law in PyTorch with the classes of mjlab."""
     return {"mjlab_actuator.py": torch_source(joint, constants, notes, imports=_IMPORTS) + _CLASSES}

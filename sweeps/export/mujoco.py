@@ -95,12 +95,12 @@ def law_of(normal: float) -> Any:
     """Returns the function from a joint and amplitudes to its law, at a normal load of one side [N]."""
 
     def law(joint: Joint, amplitudes: Mapping[str, float]) -> MujocoLaw:
-        return translated(joint, normal, amplitudes)
+        return translate_law(joint, normal, amplitudes)
 
     return law
 
 
-def translated(joint: Joint, normal: float, amplitudes: Mapping[str, float] | None = None) -> MujocoLaw:
+def translate_law(joint: Joint, normal: float, amplitudes: Mapping[str, float] | None = None) -> MujocoLaw:
     """Law of the format with the native law's parameters, for a motor that drives.
 
     Losses in proportion to the load take a share 1 - η of the torque. `<dcmotor>` has one motor constant for torque
@@ -123,7 +123,7 @@ def translated(joint: Joint, normal: float, amplitudes: Mapping[str, float] | No
         damping += float(load.loss_viscous)
     names = [RESISTANCE, CONSTANT, FRICTION, DAMPING, SHARE]
     start = [resistance / share, float(motor.torque_constant), dry, damping, 1 / share]
-    if excess := stribeck(joint, known):
+    if excess := stribeck_friction(joint, known):
         names += [EXCESS, FADE]
         start += [max(excess[0], 0.0), excess[1]]
     if "thermal_drift" in known:
@@ -133,7 +133,7 @@ def translated(joint: Joint, normal: float, amplitudes: Mapping[str, float] | No
     return MujocoLaw(tuple(names), *(jnp.asarray(x, float) for x in numbers))
 
 
-def stribeck(joint: Joint, known: Mapping[str, Mapping[str, float]]) -> tuple[float, float] | None:
+def stribeck_friction(joint: Joint, known: Mapping[str, Mapping[str, float]]) -> tuple[float, float] | None:
     """Excess of friction at a crawl [N·m] and its fading speed [rad/s], at the joint; None without such effects."""
     gear = joint.robot.gearbox
     ratio, share = float(gear.ratio), float(gear.efficiency_load)
@@ -148,7 +148,7 @@ def stribeck(joint: Joint, known: Mapping[str, Mapping[str, float]]) -> tuple[fl
     return sum(a for a, _ in found), max(v for _, v in found)
 
 
-def fates(joint: Joint, normal: float) -> list[Fate]:
+def fates_in_mujoco(joint: Joint, normal: float) -> list[Fate]:
     """Fates of the base's terms, and of effects outside the joint."""
     robot, load = joint.robot, joint.load
     gear = robot.gearbox
@@ -177,10 +177,10 @@ def fates(joint: Joint, normal: float) -> list[Fate]:
         found.append(Fate("backlash", DROPPED, "the joint is rigid; a format needs a second body for it"))
     if joint.limit is not None:
         found.append(Fate("current limit of the driver", HELD, "forcerange"))
-    return [*found, *outside(joint)]
+    return [*found, *fates_outside_joint(joint)]
 
 
-def outside(joint: Joint) -> list[Fate]:
+def fates_outside_joint(joint: Joint) -> list[Fate]:
     """Fates of effects that no joint has."""
     where = {
         "sensor": "an error of an instrument, no part of a drive",
@@ -191,7 +191,7 @@ def outside(joint: Joint) -> list[Fate]:
     return [Fate(e.name, DROPPED, where.get(e.balance, other)) for e in joint.outside]
 
 
-def approximated(balance: str) -> str:
+def approximated_terms(balance: str) -> str:
     """Terms that replace an effect of a balance."""
     return "resistance" if balance in ("supply", "electrical") else "resistance, frictionloss and damping"
 
@@ -221,7 +221,7 @@ class Motor:
         return self.values[FRICTION] - (self.lugre[2] * self.ratio if self.lugre else 0.0)
 
 
-def motor(joint: Joint, values: Mapping[str, float]) -> Motor:
+def mjcf_motor(joint: Joint, values: Mapping[str, float]) -> Motor:
     """Numbers of the MJCF for refitted parameters."""
     robot, known = joint.robot, _numbers(joint, {})
     gear, share = robot.gearbox, float(robot.gearbox.efficiency_load)
@@ -261,7 +261,7 @@ def _comment(lines: Sequence[str], indent: str) -> str:
     return "".join(f"{indent}<!-- {t} -->\n" for t in text)
 
 
-def fragment(
+def mjcf_fragment(
     joint: Joint, found: Motor, about: Mapping[str, str], notes: Sequence[str], name: str, at: str, volts: float
 ) -> str:
     """Text of the fragment that a model includes.
@@ -309,7 +309,7 @@ def _version() -> str:
     return ".".join(map(str, FIRST[:2]))
 
 
-def scene(joint: Joint, mass: float, name: str, at: str, command: float, load: float) -> str:
+def mjcf_scene(joint: Joint, mass: float, name: str, at: str, command: float, load: float) -> str:
     """Text of a model of one joint that runs: what the drive moves as a body that turns with it.
 
     A vehicle rolls without sliding, so one side's share of its mass acts at the wheel as m r². The actuator
@@ -410,7 +410,7 @@ def attribute_notes(
     }
 
 
-def library() -> Any:
+def mujoco_module() -> Any:
     """Returns the module of MuJoCo.
 
     Raises:
@@ -428,19 +428,21 @@ def library() -> Any:
     return found
 
 
-def compiled(files: Mapping[str, str]) -> Any:
+def compile_scene(files: Mapping[str, str]) -> Any:
     """Model of a scene and the fragment that it includes, in memory."""
     assets = {name: text.encode() for name, text in files.items()}
-    return library().MjModel.from_xml_string(files["scene.xml"], assets)
+    return mujoco_module().MjModel.from_xml_string(files["scene.xml"], assets)
 
 
-def run(files: Mapping[str, str], found: Motor, at: Situation, expected: AtJoint, rows: Sequence[int]) -> AtJoint:
+def settle_in_mujoco(
+    files: Mapping[str, str], found: Motor, at: Situation, expected: AtJoint, rows: Sequence[int]
+) -> AtJoint:
     """Current and speed of some runs, settled in MuJoCo C by the scene.
 
     Args:
         expected: by the steady law, near which each run begins; rows: which runs.
     """
-    mujoco, model = library(), compiled(files)
+    mujoco, model = mujoco_module(), compile_scene(files)
     model.opt.gravity[:] = 0  # an arm's weight is part of the stated load
     data = mujoco.MjData(model)
     current, speed = np.empty(len(rows)), np.empty(len(rows))

@@ -13,7 +13,7 @@ import numpy as np
 
 from calibration.data.input_errors import BadConfiguration
 from sweeps.export.joint import Joint
-from sweeps.export.law_source import Constant, executed, jax_source
+from sweeps.export.law_source import Constant, jax_source, module_from_source
 
 #: Version of the operators, which onnxruntime has had since 1.14.
 OPSET = 18
@@ -43,7 +43,7 @@ def step_of(joint: Joint, constants: Sequence[Constant]) -> tuple[Any, list[str]
     Inputs are the state, the command, position and velocity of the joint, each of shape (joints,), and the step's
     length, of shape (1,); outputs are torque, state, voltage taken and power.
     """
-    module = executed(jax_source(joint, constants))
+    module = module_from_source(jax_source(joint, constants))
     states = list(module.initial_state())
 
     def step(*given: Any) -> tuple[Any, ...]:
@@ -57,7 +57,7 @@ def step_of(joint: Joint, constants: Sequence[Constant]) -> tuple[Any, list[str]
     return step, inputs, ["torque", *(f"next_{s}" for s in states), "power"]
 
 
-def files(joint: Joint, constants: Sequence[Constant]) -> dict[str, str | bytes]:
+def onnx_files(joint: Joint, constants: Sequence[Constant]) -> dict[str, str | bytes]:
     """The model as a file, checked by ONNX.
 
     Raises:
@@ -74,7 +74,7 @@ def files(joint: Joint, constants: Sequence[Constant]) -> dict[str, str | bytes]
     return {"actuator.onnx": model.SerializeToString()}
 
 
-def difference(joint: Joint, constants: Sequence[Constant], model: bytes) -> float:
+def difference_from_jax(joint: Joint, constants: Sequence[Constant], model: bytes) -> float:
     """Largest difference of the model's outputs from JAX's over random states, relative to each output's rms."""
     runtime = _library("onnxruntime")
     step, inputs, _ = step_of(joint, constants)

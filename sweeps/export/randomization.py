@@ -20,7 +20,7 @@ from sweeps.export.law_source import Constant
 MOST = 1_000_000
 
 
-def drawn(
+def draw_parameters(
     joint: Joint,
     posterior: Posterior | None,
     constants: Sequence[Constant],
@@ -45,7 +45,7 @@ def drawn(
     values = posterior.draw(draws, seed)
     own = {p.name for p in params.walk_parameters(joint.robot)}
     columns = {name: values[:, k] for k, name in enumerate(posterior.names) if name in own}
-    centre = mujoco.translated(joint, normal)
+    centre = mujoco.translate_law(joint, normal)
     factors = {
         n: refitted[n] / x if (x := float(v)) > 0 else 1.0 for n, v in zip(centre.names, centre.start, strict=True)
     }
@@ -53,9 +53,9 @@ def drawn(
     for k in range(draws):
         robot = params.replace(joint.robot, {name: np.asarray(x[k]) for name, x in columns.items()})
         other = joint.with_robot(robot)
-        law = mujoco.translated(other, normal)
+        law = mujoco.translate_law(other, normal)
         theta = {n: factors[n] * float(v) for n, v in zip(law.names, law.start, strict=True)}
-        motor = mujoco.motor(other, theta)
+        motor = mujoco.mjcf_motor(other, theta)
         numbers = {
             "gear": motor.ratio, "motorconst": theta[mujoco.CONSTANT], "resistance": theta[mujoco.RESISTANCE],
             "inductance": motor.inductance, "armature": motor.armature, "frictionloss": motor.friction,
@@ -68,7 +68,7 @@ def drawn(
     return {name: np.asarray(x) for name, x in found.items()} | actuator
 
 
-def files(found: Mapping[str, np.ndarray]) -> dict[str, str | bytes]:
+def randomization_files(found: Mapping[str, np.ndarray]) -> dict[str, str | bytes]:
     """The draws as NumPy's archive and as JSON."""
     stream = io.BytesIO()
     arrays: Any = dict(found)

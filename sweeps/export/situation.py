@@ -21,7 +21,7 @@ from sweeps.config import GridPart
 from sweeps.export.joint import Joint, channels_of
 from sweeps.inputs import read_runs
 from sweeps.points import imposed
-from sweeps.points.grid import grid
+from sweeps.points.grid import grid_conditions
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,7 +119,7 @@ def _solved(robot: Robot, conditions: Conditions) -> tuple[np.ndarray, Signals]:
     return np.asarray(is_done(result.status)), signals
 
 
-def situation(joint: Joint, data: Runs | str | None) -> Situation:
+def situation_of_joint(joint: Joint, data: Runs | str | None) -> Situation:
     """Returns the runs of a table in the joint's configuration, or of a grid where there is no table.
 
     Raises:
@@ -128,12 +128,12 @@ def situation(joint: Joint, data: Runs | str | None) -> Situation:
     """
     robot = joint.file.robot
     if data is None:
-        if not Layout.of(robot).table8 and imposed.limit(robot) is None:
+        if not Layout.of(robot).table8 and imposed.imposed_limit(robot) is None:
             raise BadConfiguration(
                 f"--data: not stated, and {joint.file.name} has no motor.voltage_limit for a grid of operating "
                 "points; give a table of runs, or state the limit"
             )
-        runs = grid(GridPart.model_construct(configurations=(joint.configuration,)), robot)
+        runs = grid_conditions(GridPart.model_construct(configurations=(joint.configuration,)), robot)
         source = "a grid of operating points, without readings"
     else:
         runs = _table(data, joint)
@@ -182,7 +182,9 @@ def _table(data: Runs | str, joint: Joint) -> Runs:
         from calibration.data import settling
         from sweeps.commands import settle
 
-        found = settling.settle(runs, inertia=settle.inertia(robot), rolling=settle.rolling(robot))
+        found = settling.settle_log(
+            runs, inertia=settle.acceleration_currents(robot), rolling=settle.rolling_readings(robot)
+        )
         runs = found.settled_runs()
     here = runs.configurations_named(robot) == joint.configuration
     if not here.any():

@@ -9,16 +9,16 @@ from matplotlib.figure import Figure
 from calibration.inference import blocks
 from calibration.inference.identifiability import Z95
 from calibration.inference.result import CalibrationResult
-from sweeps.pages.figure_style import BLUE, FAINT, INK, ORANGE, VERMILION, figure
+from sweeps.pages.figure_style import BLUE, FAINT, INK, ORANGE, VERMILION, new_figure
 from sweeps.pages.words import short_name
 
 #: Most panels of a pair plot, and radii that hold 68 % and 95 % of a normal distribution of two [sds].
 PAIRED, RADII = 6, (1.515, 2.448)
 
 
-def parameters(found: CalibrationResult) -> Figure:
+def draw_parameter_intervals(found: CalibrationResult) -> Figure:
     """Estimate of each parameter in prior sds, with its 95 % interval and the prior's."""
-    fig, grid = figure(1, 1, 1.1 + 0.32 * len(found.parameters))
+    fig, grid = new_figure(1, 1, 1.1 + 0.32 * len(found.parameters))
     axes = grid[0, 0]
     axes.axvspan(-Z95, Z95, color="#eeeeee", lw=0, zorder=0)
     axes.axvline(0, color=FAINT, lw=0.9)
@@ -36,11 +36,11 @@ def parameters(found: CalibrationResult) -> Figure:
     return fig
 
 
-def profiles(found: CalibrationResult) -> Figure:
+def draw_profile_likelihoods(found: CalibrationResult) -> Figure:
     """Profile likelihood of each parameter: rise of the objective over its value, with the 95 % level."""
     profiled = [(name, p, p.profile) for name, p in found.parameters.items() if p.profile is not None]
     rows = -(-len(profiled) // 4)
-    fig, grid = figure(rows, 4, 2.1 * rows, sharey=True)
+    fig, grid = new_figure(rows, 4, 2.1 * rows, sharey=True)
     for axes in grid.flat[len(profiled) :]:
         axes.set_visible(False)
     for axes, (name, p, profile) in zip(grid.flat, profiled, strict=False):
@@ -60,10 +60,10 @@ def profiles(found: CalibrationResult) -> Figure:
     return fig
 
 
-def correlations(found: CalibrationResult) -> Figure:
+def draw_correlations(found: CalibrationResult) -> Figure:
     """Posterior correlation of every pair of parameters, and the singular values."""
     names = [short_name(n) for n in found.identifiability.names]
-    fig, grid = figure(1, 2, 1.6 + 0.36 * len(names), width_ratios=[1.7, 1.0])
+    fig, grid = new_figure(1, 2, 1.6 + 0.36 * len(names), width_ratios=[1.7, 1.0])
     left, right = grid[0]
     c = found.identifiability.correlation
     image = left.imshow(c, cmap=matplotlib.colormaps["RdBu_r"], vmin=-1, vmax=1)
@@ -86,14 +86,14 @@ def correlations(found: CalibrationResult) -> Figure:
     return fig
 
 
-def pairs(found: CalibrationResult) -> Figure:
+def draw_correlated_pairs(found: CalibrationResult) -> Figure:
     """Posterior of the most correlated pairs of parameters: contours that hold 68 % and 95 %."""
     posterior = found.posterior
     sd = np.sqrt(np.diag(posterior.covariance))
     correlation = np.abs(posterior.covariance / np.outer(sd, sd))
     every = [(i, j) for i in range(len(posterior)) for j in range(i)]
     chosen = sorted(every, key=lambda pair: -np.nan_to_num(correlation[pair]))[:PAIRED]
-    fig, grid = figure(-(-len(chosen) // 3), min(3, len(chosen)), 2.9 * -(-len(chosen) // 3))
+    fig, grid = new_figure(-(-len(chosen) // 3), min(3, len(chosen)), 2.9 * -(-len(chosen) // 3))
     turn = np.linspace(0, 2 * np.pi, 120)
     circle = np.stack([np.cos(turn), np.sin(turn)], 1)
     for axes in grid.ravel()[len(chosen) :]:
@@ -118,7 +118,7 @@ def before_after(found: CalibrationResult) -> Figure:
     """rms errors by channel: before, fitted, and with each kind of block held out."""
     lines = {"before": found.errors_before, "fitted": found.errors_after}
     lines |= {f"held out: {blocks.kind_in_words(k, ' + ')}": found.held_out[k].errors for k in found.held_out_alike}
-    fig, grid = figure(1, len(found.channels), 1.1 + 0.36 * len(lines), sharey=True)
+    fig, grid = new_figure(1, len(found.channels), 1.1 + 0.36 * len(lines), sharey=True)
     for axes, channel in zip(grid[0], found.channels, strict=True):
         most = int(np.isfinite(found.readings[channel.name].measured).sum())
         for row, (words, by) in enumerate(lines.items()):

@@ -12,7 +12,7 @@ from matplotlib.axis import Axis
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 
-from sweeps.pages.figure_style import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, SKY, VERMILION, figure, note
+from sweeps.pages.figure_style import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, SKY, VERMILION, corner_note, new_figure
 from sweeps.pages.words import short_name
 
 #: Bins of a histogram, and along a name at most; at least, and points of each that more need.
@@ -30,15 +30,15 @@ class Varied(NamedTuple):
     words: tuple[str, ...] = ()
 
 
-def spread(output: np.ndarray, label: str, varied: Mapping[str, Varied]) -> Figure:
+def draw_output_spread(output: np.ndarray, label: str, varied: Mapping[str, Varied]) -> Figure:
     """Histogram of an output, its median over the two names that it follows most, and over both together.
 
     Args:
         output: of the points that settled; label: with its unit.
         varied: by name, at these points.
     """
-    names = sorted(varied, key=lambda name: -share(varied[name].values, output))[:2]
-    fig, ((histogram, *others),) = figure(1, 2 + len(names) if len(names) == 2 else 2, 2.9)
+    names = sorted(varied, key=lambda name: -variance_share(varied[name].values, output))[:2]
+    fig, ((histogram, *others),) = new_figure(1, 2 + len(names) if len(names) == 2 else 2, 2.9)
     histogram.hist(output, bins=_number(output, BARS), color=BLUE)
     histogram.set(xlabel=label, ylabel="points", title="how often")
     for axes, name in zip(others, names, strict=False):
@@ -50,13 +50,13 @@ def spread(output: np.ndarray, label: str, varied: Mapping[str, Varied]) -> Figu
     return fig
 
 
-def endings(codes: np.ndarray, names: Sequence[str], across: Varied, up: Varied) -> Figure:
+def draw_grid_statuses(codes: np.ndarray, names: Sequence[str], across: Varied, up: Varied) -> Figure:
     """Status of the points of a grid over two of its axes.
 
     Args:
         codes: of the points; names: of the codes.
     """
-    fig, axes = figure(1, 1, 4.2)
+    fig, axes = new_figure(1, 1, 4.2)
     ax = axes[0, 0]
     x, y = np.unique(across.values), np.unique(up.values)
     grid = np.full((len(y), len(x)), np.nan)
@@ -77,7 +77,7 @@ def _number(values: np.ndarray, most: int) -> int:
     return min(most, max(LEAST, len(values) // EACH))
 
 
-def bins(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def bin_values(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Bin of each value, and the bins' middles: its levels where there are few, else equal numbers of points."""
     levels, number = np.unique(values), _number(values, BINS)
     if len(levels) <= number:
@@ -86,9 +86,9 @@ def bins(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.clip(np.searchsorted(edges, values, side="right") - 1, 0, len(edges) - 2), (edges[1:] + edges[:-1]) / 2
 
 
-def share(values: np.ndarray, output: np.ndarray) -> float:
+def variance_share(values: np.ndarray, output: np.ndarray) -> float:
     """Share of an output's variance that lies between the bins of a name: its first-order index, roughly."""
-    which, middles = bins(values)
+    which, middles = bin_values(values)
     count = np.bincount(which, minlength=len(middles))
     mean = np.bincount(which, output, minlength=len(middles)) / np.maximum(count, 1)
     total = float(np.var(output))
@@ -100,18 +100,18 @@ def by_chance(values: np.ndarray) -> float:
 
     Of normal outputs the share is then a beta variable; 0 for a single bin, 1 where every value has a bin of its own.
     """
-    within, between = len(values) - (used := len(np.unique(bins(values)[0]))), used - 1
+    within, between = len(values) - (used := len(np.unique(bin_values(values)[0]))), used - 1
     return float(scipy.stats.beta.ppf(0.99, between / 2, within / 2)) if within and between else float(within == 0)
 
 
 def _band(axes: Axes, values: np.ndarray, output: np.ndarray) -> None:
-    which, middles = bins(values)
+    which, middles = bin_values(values)
     quantiles = np.array([np.quantile(output[which == k], (0.05, 0.5, 0.95)) for k in range(len(middles))])
     axes.fill_between(middles, quantiles[:, 0], quantiles[:, 2], color=BLUE, alpha=0.2, linewidth=0)
     axes.plot(middles, quantiles[:, 1], color=BLUE)
-    found = share(values, output)
+    found = variance_share(values, output)
     if found > by_chance(values):
-        note(axes, f"{100 * found:.0f} % of the variance")
+        corner_note(axes, f"{100 * found:.0f} % of the variance")
 
 
 def _ticks(axis: Axis, varied: Varied) -> None:
@@ -127,7 +127,7 @@ def _map(
     output: np.ndarray,
     label: str,
 ) -> None:
-    (a, across), (b, along) = bins(one.values), bins(other.values)
+    (a, across), (b, along) = bin_values(one.values), bin_values(other.values)
     cells = np.full((len(along), len(across)), np.nan)
     cell = b * len(across) + a
     order = np.argsort(cell, kind="stable")

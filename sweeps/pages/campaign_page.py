@@ -15,7 +15,7 @@ from mmrjax.fidelities.variation import STATUS
 from mmrjax.model import signals
 from sweeps.pages import campaign_figures, words
 from sweeps.pages.campaign_figures import Varied
-from sweeps.pages.page import Album, named, render
+from sweeps.pages.page import Album, render_page, robot_section
 from sweeps.points.climbs import LARGEST, SIZE, VERDICT
 from sweeps.points.zarr_store import STORE, Layout
 from sweeps.results.climb_results import VERDICTS
@@ -24,14 +24,14 @@ from sweeps.results.climb_results import VERDICTS
 THINNED, CHUNKS, DRAWN = 200_000, 100, 6
 
 
-def write(folder: Path, file: RobotFile, layout: Layout, result: dict[str, Any]) -> Path:
+def write_campaign_page(folder: Path, file: RobotFile, layout: Layout, result: dict[str, Any]) -> Path:
     """Write `report.html` and `figures/` for a store whose every chunk is done.
 
     Args:
         folder: that holds the store; file: of the robot that was varied.
         result: `result.json`.
     """
-    values, found = thinned(folder / STORE, layout)
+    values, found = sample_points(folder / STORE, layout)
     album = Album(folder)
     total = result["points"]
     statuses = [
@@ -39,12 +39,12 @@ def write(folder: Path, file: RobotFile, layout: Layout, result: dict[str, Any])
             "name": s,
             "count": n,
             "percent": 100 * n / total,
-            "meaning": words.VERDICTS.get((result["model"], s)) or words.meaning(s),
+            "meaning": words.VERDICTS.get((result["model"], s)) or words.status_meaning(s),
         }
         for s, n in result["statuses"].items()
         if n
     ]
-    return render(
+    return render_page(
         folder,
         "campaign.html.j2",
         album,
@@ -57,7 +57,7 @@ def write(folder: Path, file: RobotFile, layout: Layout, result: dict[str, Any])
         verdicts=_verdicts(album, values, found, layout),
         largest=_largest(values, found, layout),
         thinned=len(values),
-        **named(file),
+        **robot_section(file),
     )
 
 
@@ -79,7 +79,9 @@ def _outputs(
                 n: Varied(values[usable, k], _label(n, known[n].get("units", "")), layout.labels.get(n, ()))
                 for k, n in enumerate(layout.design.names)
             }
-            album.add(f"spread_{name}", partial(campaign_figures.spread, numbers, _label(label, unit), varied))
+            album.add(
+                f"spread_{name}", partial(campaign_figures.draw_output_spread, numbers, _label(label, unit), varied)
+            )
     return rows
 
 
@@ -101,7 +103,7 @@ def _verdicts(album: Album, values: np.ndarray, found: dict[str, np.ndarray], la
             )
             for n in (*pair, SIZE)
         )
-        album.add("endings", partial(campaign_figures.endings, codes[shown], meanings, across, up))
+        album.add("endings", partial(campaign_figures.draw_grid_statuses, codes[shown], meanings, across, up))
     rows = []
     for k in np.unique(codes):
         short, meaning = VERDICTS[meanings[k]]
@@ -130,7 +132,7 @@ def _label(name: str, unit: str) -> str:
     return name if unit in ("", "1") else f"{name} [{unit}]"
 
 
-def thinned(store: Path, layout: Layout) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+def sample_points(store: Path, layout: Layout) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Some of the points, at random and always the same ones.
 
     Returns:

@@ -5,32 +5,40 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
-from sweeps.pages.figure_style import FAINT, GREEN, INK, VERMILION, figure
-from sweeps.results.check_results import CheckResult, label, limit, reached, wanted
+from sweeps.pages.figure_style import FAINT, GREEN, INK, VERMILION, new_figure
+from sweeps.results.check_results import (
+    CheckResult,
+    reached_value_text,
+    required_value_text,
+    requirement_label,
+    requirement_limit,
+)
 
 #: Margins beyond are drawn so far [%]; their number says how large they are.
 LONGEST = 100.0
 
 
-def margins(found: CheckResult) -> Figure:
+def draw_margins(found: CheckResult) -> Figure:
     """A bar for each requirement: its margin in percent of what is required, right where it is met."""
     rows = found.outcomes
-    fig, axes = figure(1, 1, 0.9 + 0.42 * len(rows))
+    fig, axes = new_figure(1, 1, 0.9 + 0.42 * len(rows))
     ax = axes[0, 0]
     for k, o in enumerate(rows):
         if o.margin is None:
-            ax.text(-1.5, k, f"no value: {reached(o)}", va="center", ha="right", color=VERMILION, fontsize=8.5)
+            ax.text(
+                -1.5, k, f"no value: {reached_value_text(o)}", va="center", ha="right", color=VERMILION, fontsize=8.5
+            )
             continue
-        share = 100 * o.margin / max(abs(limit(o)), 1e-12)
+        share = 100 * o.margin / max(abs(requirement_limit(o)), 1e-12)
         drawn = float(np.clip(share, -LONGEST, LONGEST))
         ax.barh(k, drawn, height=0.62, color=GREEN if o.met else VERMILION)
         beyond = "" if abs(share) <= LONGEST else " (beyond the axis)"
         right = drawn >= 0
         ax.annotate(
-            f"{reached(o)}, {share:+.0f} %{beyond}", (drawn, k), xytext=(5 if right else -5, 0),
+            f"{reached_value_text(o)}, {share:+.0f} %{beyond}", (drawn, k), xytext=(5 if right else -5, 0),
             textcoords="offset points", va="center", ha="left" if right else "right", fontsize=8.5, color=INK,
         )  # fmt: skip
-    ax.set_yticks(range(len(rows)), [f"{label(o)} {wanted(o)}" for o in rows])
+    ax.set_yticks(range(len(rows)), [f"{requirement_label(o)} {required_value_text(o)}" for o in rows])
     ax.set_ylim(len(rows) - 0.4, -0.6)
     ax.set_xlim(-1.45 * LONGEST, 1.6 * LONGEST)
     ax.set_xticks(np.arange(-100, 101, 50))

@@ -14,9 +14,9 @@ from mmrjax.climbing import belt_loop, footing
 from mmrjax.climbing.footing import PITCH, SHAFT
 from mmrjax.model.paper_tables import BODY_HEIGHT
 from mmrjax.undercarriage import rendering
-from sweeps.pages.figure_style import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, VERMILION, figure, style
+from sweeps.pages.figure_style import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, VERMILION, figure_settings, new_figure
 from sweeps.results.climb_results import SHOWN as IN_TITLE
-from sweeps.results.climb_results import ClimbResult, Seen, coordinates
+from sweeps.results.climb_results import ClimbResult, Seen, footing_coordinates
 
 #: What can be drawn.
 Drawable = ClimbResult | Seen
@@ -73,7 +73,7 @@ def _draw(axes: Any, found: Drawable, q: np.ndarray, colour: str = BLUE) -> None
             axes.plot(*tips.T, ".", color=INK, ms=2.5)
 
 
-def instants(found: Drawable) -> list[tuple[str, int]]:
+def decisive_instants(found: Drawable) -> list[tuple[str, int]]:
     """Decisive samples of the run in order of time: label and index."""
     t = found.table
     picked = {
@@ -90,11 +90,11 @@ def instants(found: Drawable) -> list[tuple[str, int]]:
     return [(named[k], k) for k in sorted(named)][:SHOWN]
 
 
-def silhouettes(found: ClimbResult) -> Figure:
+def draw_silhouettes(found: ClimbResult) -> Figure:
     """The robot at the decisive instants."""
-    shown = instants(found)
-    q = coordinates(found.table)
-    fig, axes = figure(-(-len(shown) // 3), 3, 2.7 * -(-len(shown) // 3))
+    shown = decisive_instants(found)
+    q = footing_coordinates(found.table)
+    fig, axes = new_figure(-(-len(shown) // 3), 3, 2.7 * -(-len(shown) // 3))
     for n, (ax, (name, k)) in enumerate(zip(axes.ravel(), shown, strict=False), 1):
         _ground(ax, found, q[k, 0] - 0.5, q[k, 0] + 0.5)
         _draw(ax, found, q[k])
@@ -106,10 +106,10 @@ def silhouettes(found: ClimbResult) -> Figure:
     return fig
 
 
-def course(found: ClimbResult) -> Figure:
+def draw_climb_course(found: ClimbResult) -> Figure:
     """Posture, margin and the currents of all drives over time, with the instants of the silhouettes."""
     t = found.table
-    fig, axes = figure(4, 1, 8.0, sharex=True)
+    fig, axes = new_figure(4, 1, 8.0, sharex=True)
     rows = [
         ("angle [deg]", {"pitch, nose up": ("pitch_deg", BLUE), "front levers": ("front_deg", ORANGE),
                          "rear levers": ("rear_deg", PURPLE)}),
@@ -121,7 +121,7 @@ def course(found: ClimbResult) -> Figure:
         ("energy [J]", {"from the supply": ("supply_J", INK), "sliding": ("sliding_J", VERMILION),
                         "windings": ("winding_J", ORANGE), "stored": ("stored_J", GREEN)}),
     ]  # fmt: skip
-    at = [t["time_s"][k] for _, k in instants(found)]
+    at = [t["time_s"][k] for _, k in decisive_instants(found)]
     for ax, (label, lines) in zip(axes.ravel(), rows, strict=True):
         for name, (column, colour) in lines.items():
             ax.plot(t["time_s"], t[column], color=colour, lw=1.3, label=name)
@@ -136,11 +136,11 @@ def course(found: ClimbResult) -> Figure:
     return fig
 
 
-def search(found: ClimbResult) -> Figure:
+def draw_size_search(found: ClimbResult) -> Figure:
     """Outcome of each size tried."""
     sizes, verdicts = np.array([s for s, _ in found.tried]), [v for _, v in found.tried]
     kinds = list(dict.fromkeys(verdicts))
-    fig, axes = figure(1, 1, 1.0 + 0.4 * len(kinds))
+    fig, axes = new_figure(1, 1, 1.0 + 0.4 * len(kinds))
     ax = axes[0, 0]
     for k, kind in enumerate(kinds):
         at = sizes[[v == kind for v in verdicts]]
@@ -163,9 +163,9 @@ class Film(NamedTuple):
 
     def sheet(self, k: int) -> Figure:
         """The robot at sample `k`."""
-        found, q = self.found, coordinates(self.found.table)
+        found, q = self.found, footing_coordinates(self.found.table)
         low, high = q[:, 1].min() - 0.3, q[:, 1].max() + 0.35
-        with style():
+        with figure_settings():
             sheet = Figure(figsize=(7.2, 4.6), dpi=80, layout="constrained")
             ax = sheet.subplots()
             _ground(ax, found, q[k, 0] - 0.7, q[k, 0] + 0.7)
@@ -177,7 +177,7 @@ class Film(NamedTuple):
         return sheet
 
 
-def render(
+def render_climb(
     found: Drawable, file: Path, begin: float | None = None, end: float | None = None, slow: float | None = None
 ) -> Path:
     """The run as a film (.gif, .mp4) or a picture (.png), of the instant `begin` or else of the largest pitch."""

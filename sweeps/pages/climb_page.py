@@ -8,18 +8,18 @@ from pathlib import Path
 from calibration.data.robot_file import RobotFile
 from mmrjax.climbing.climb_derivatives import OUTPUTS
 from sweeps.pages import climb_figures
-from sweeps.pages.page import Album, named, render
+from sweeps.pages.page import Album, render_page, robot_section
 from sweeps.results.climb_results import VERDICTS, ClimbResult
 
 
-def write(folder: Path, found: ClimbResult, file: RobotFile) -> Path:
+def write_climb_page(folder: Path, found: ClimbResult, file: RobotFile) -> Path:
     """Write `report.html` and `figures/` of a climb; returns the path of the page."""
     album = Album(folder)
-    album.add("silhouettes", partial(climb_figures.silhouettes, found))
-    album.add("course", partial(climb_figures.course, found))
+    album.add("silhouettes", partial(climb_figures.draw_silhouettes, found))
+    album.add("course", partial(climb_figures.draw_climb_course, found))
     if found.tried:
-        album.add("search", partial(climb_figures.search, found))
-    return render(
+        album.add("search", partial(climb_figures.draw_size_search, found))
+    return render_page(
         folder,
         "climb.html.j2",
         album,
@@ -57,5 +57,5 @@ def write(folder: Path, found: ClimbResult, file: RobotFile) -> Path:
         if found.along
         else [],
         verdicts=[{"name": name, "short": short, "meaning": meaning} for name, (short, meaning) in VERDICTS.items()],
-        **named(file),
+        **robot_section(file),
     )

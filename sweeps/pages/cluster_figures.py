@@ -9,18 +9,18 @@ from matplotlib.figure import Figure
 
 from calibration.inference.residual_clusters import ResidualCluster
 from mmrjax.model import channels
-from sweeps.pages.figure_style import BLUE, FAINT, INK, figure
+from sweeps.pages.figure_style import BLUE, FAINT, INK, new_figure
 
 #: Clusters shown, panels in a row, width of a strip.
 SHOWN, ACROSS, WIDE = 6, 3, 0.5
 
 
-def clusters(found: Sequence[ResidualCluster]) -> Figure:
+def draw_clusters(found: Sequence[ResidualCluster]) -> Figure:
     """Residuals of each finding over its column, a dot a row; bar: mean of a level."""
     found = found[:SHOWN]
     across = min(ACROSS, len(found))
     rows = -(-len(found) // across)
-    fig, grid = figure(rows, across, 2.6 * rows)
+    fig, grid = new_figure(rows, across, 2.6 * rows)
     for axes in grid.flat[len(found) :]:
         axes.set_visible(False)
     for axes, one in zip(grid.flat, found, strict=False):

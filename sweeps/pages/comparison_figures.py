@@ -10,17 +10,17 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from mmrjax.model.channels import Channel
-from sweeps.pages.figure_style import axis_label, figure, looks, note
+from sweeps.pages.figure_style import axis_label, configuration_looks, corner_note, new_figure
 
 
-def parity(table: dict[str, np.ndarray], channels: Sequence[Channel], band: bool = True) -> Figure:
+def draw_parity(table: dict[str, np.ndarray], channels: Sequence[Channel], band: bool = True) -> Figure:
     """Simulated over measured, one panel a channel; a reading that is missing is not drawn.
 
     Args:
         band: whether ±5 % are shaded.
     """
-    fig, grid = figure(1, len(channels), 3.6)
-    look = looks(table["configuration"])
+    fig, grid = new_figure(1, len(channels), 3.6)
+    look = configuration_looks(table["configuration"])
     for axes, channel in zip(grid[0], channels, strict=True):
         measured, simulated = table[channel.column], table[f"simulated_{channel.column}"]
         both = np.isfinite(measured) & np.isfinite(simulated)
@@ -38,11 +38,11 @@ def parity(table: dict[str, np.ndarray], channels: Sequence[Channel], band: bool
         axes.set_xlim(*span)
         axes.set_ylim(*span)
         if not both.any():
-            note(axes, "no row has both numbers")
+            corner_note(axes, "no row has both numbers")
     if grid[0, 0].get_legend_handles_labels()[0]:
         grid[0, 0].legend(loc="lower right")
     if band:
-        note(grid[0, 0], "band: ±5 %")
+        corner_note(grid[0, 0], "band: ±5 %")
     return fig
 
 
@@ -70,8 +70,8 @@ def errors_over(
         conditions = varied or dict(list(conditions.items())[:1])
     if not conditions:
         conditions, table = {"row": "row"}, {**table, "row": np.arange(1.0, len(table["configuration"]) + 1)}
-    fig, grid = figure(len(channels), len(conditions), 2.3 * len(channels), sharex="col", sharey="row")
-    look = looks(table["configuration"])
+    fig, grid = new_figure(len(channels), len(conditions), 2.3 * len(channels), sharex="col", sharey="row")
+    look = configuration_looks(table["configuration"])
     for row, channel in zip(grid, channels, strict=True):
         error = table[f"error_{channel.name}_percent"]
         half = 5.0

@@ -7,15 +7,15 @@ from matplotlib.figure import Figure
 
 from sweeps.export.comparison import Comparison
 from sweeps.export.joint import channels_of
-from sweeps.pages.figure_style import BLUE, FAINT, INK, VERMILION, figure
+from sweeps.pages.figure_style import BLUE, FAINT, INK, VERMILION, new_figure
 
 
-def readings(compared: Comparison) -> Figure:
+def draw_export_readings(compared: Comparison) -> Figure:
     """Readings of the exported drive over those of the reference, a panel for each channel."""
     at = compared.situation
     shown = [(k, c) for k, c in enumerate(channels_of(at.joint)) if c.name in compared.errors[0].percent]
     reference = at.measured if at.is_measured else at.native
-    fig, grid = figure(1, max(len(shown), 1), 3.4)
+    fig, grid = new_figure(1, max(len(shown), 1), 3.4)
     for axes, (k, channel) in zip(grid[0], shown, strict=False):
         size = 1 / channel.factor
         given = reference[:, k] * size

@@ -34,7 +34,7 @@ BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY = "#0072B2", "#D55E00", "#009E73", "
 _CYCLE = ((BLUE, "o"), (VERMILION, "s"), (GREEN, "^"), (PURPLE, "D"), (ORANGE, "v"), (SKY, "P"))
 
 
-def looks(names: Iterable[str]) -> dict[str, tuple[str, str]]:
+def configuration_looks(names: Iterable[str]) -> dict[str, tuple[str, str]]:
     """Colour and marker of each configuration, in the order in which they first come."""
     return {name: _CYCLE[k % len(_CYCLE)] for k, name in enumerate(dict.fromkeys(map(str, names)))}
 
@@ -76,14 +76,14 @@ LETTERS, NAMES = 42, 20
 
 
 @contextmanager
-def style(width: float = WIDTH) -> Iterator[None]:
+def figure_settings(width: float = WIDTH) -> Iterator[None]:
     """The settings of every figure, for as long as the block lasts; at the width `NARROW` panels are stacked."""
     with matplotlib.rc_context(_RC | {"figure.figsize": (width, width)}):
         yield
 
 
-def figure(rows: int, columns: int, height: float, **keywords: Any) -> tuple[Figure, np.ndarray]:
-    """A figure of the width of `style` and its axes, shape (rows, columns)."""
+def new_figure(rows: int, columns: int, height: float, **keywords: Any) -> tuple[Figure, np.ndarray]:
+    """A figure of the width of `figure_settings` and its axes, shape (rows, columns)."""
     stacked = matplotlib.rcParams["figure.figsize"][0] == NARROW
     size = WIDTH, height
     if stacked and columns > 1:
@@ -115,7 +115,7 @@ def legend_columns(labels: Iterable[str]) -> int:
 
 
 def can_stack(fig: Figure) -> bool:
-    """True for a figure that `figure` made, which can be drawn for a phone."""
+    """True for a figure that `new_figure` made, which can be drawn for a phone."""
     return pages.FOR_PHONES and hasattr(fig, "panels")
 
 
@@ -149,7 +149,7 @@ def has_colour_scale(fig: Figure) -> bool:
 LEAST, LEAST_NARROW, CONTRAST = 8.5, 10.0, 4.6
 
 
-def svg(fig: Figure) -> str:
+def figure_as_svg(fig: Figure) -> str:
     """The figure as an SVG document that refers to nothing outside itself; its text is text.
 
     `data-axes` of the document says where its axes are and what they run over, so that a page can show values.
@@ -158,7 +158,7 @@ def svg(fig: Figure) -> str:
     for written in fig.findobj(lambda artist: isinstance(artist, Text)):
         assert isinstance(written, Text)
         written.set_fontsize(max(written.get_fontsize(), least))
-        written.set_color(readable(written.get_color()))
+        written.set_color(readable_colour(written.get_color()))
     if (engine := fig.get_layout_engine()) is not None:
         fig.set_dpi(72)  # that of SVG
         engine.execute(fig)
@@ -191,7 +191,7 @@ def _wrap(fig: Figure) -> bool:
     return wrapped
 
 
-def readable(colour: Any) -> Any:
+def readable_colour(colour: Any) -> Any:
     """A text's colour, darkened until it can be read on white paper; what is near white is for a dark ground, and
     stays."""
     channels = np.array(to_rgb(colour))
@@ -253,7 +253,7 @@ def label_end(axes: Axes, x: np.ndarray, y: np.ndarray, words: str, colour: str,
         )
 
 
-def note(axes: Axes, words: str, x: float = 0.02, y: float = 0.97, **keywords: Any) -> None:
+def corner_note(axes: Axes, words: str, x: float = 0.02, y: float = 0.97, **keywords: Any) -> None:
     """A remark in a corner of the axes (axes fractions)."""
     keywords = {"fontsize": 8.5, "color": INK, "va": "top", "ha": "left", **keywords}
     axes.text(x, y, words, transform=axes.transAxes, **keywords)

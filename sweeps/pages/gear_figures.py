@@ -13,7 +13,17 @@ from mmrjax.model.paper_tables import PITCH_GROUSER, PITCH_TOOTH
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import STATUSES
 from mmrjax.undercarriage import ripple
-from sweeps.pages.figure_style import BLUE, FAINT, GREEN, INK, ORANGE, figure, label_end, looks, note
+from sweeps.pages.figure_style import (
+    BLUE,
+    FAINT,
+    GREEN,
+    INK,
+    ORANGE,
+    configuration_looks,
+    corner_note,
+    label_end,
+    new_figure,
+)
 
 TAIL = 0.3  # of a run at its end that is looked at for ripple [s]
 SHOWN = 0.15  # and drawn [s]
@@ -57,7 +67,7 @@ class Gear:
         return ripple.period_pitch(PITCH_GROUSER if self.on_tracks else PITCH_TOOTH, speed, self.radius)
 
 
-def gears(
+def members_with_gear(
     robot: Robot,
     history: Any,
     status: np.ndarray,
@@ -86,8 +96,8 @@ def gears(
 
 def current_ripple(shown: list[Gear], title: str = "{}") -> tuple[Figure, list[dict[str, Any]]]:
     """Total current at the end of each run, and what ripples by how much."""
-    fig, grid = figure(1, len(shown), 3.0)
-    look = looks(gear.name for gear in shown)
+    fig, grid = new_figure(1, len(shown), 3.0)
+    look = configuration_looks(gear.name for gear in shown)
     facts = []
     for axes, gear in zip(grid[0], shown, strict=True):
         last, tail, expected = gear.tail(SHOWN), gear.tail(TAIL), gear.period
@@ -123,9 +133,9 @@ def current_ripple(shown: list[Gear], title: str = "{}") -> tuple[Figure, list[d
     return fig, facts
 
 
-def touchdown(gear: Gear, title: str = "grousers land (dotted)") -> Figure:
+def draw_touchdowns(gear: Gear, title: str = "grousers land (dotted)") -> Figure:
     """Current of a run on tracks over time with touchdowns marked, above the load on each grouser."""
-    fig, grid = figure(2, 1, 5.0, sharex=True)
+    fig, grid = new_figure(2, 1, 5.0, sharex=True)
     last = gear.tail(SHOWN)
     time = 1e3 * (gear.time[last] - gear.time[last][0])
     lands = ripple.touchdowns(time, gear.reactions.grouser[last], gear.reactions.place[last])
@@ -146,10 +156,10 @@ def touchdown(gear: Gear, title: str = "grousers land (dotted)") -> Figure:
     return fig
 
 
-def reactions(shown: list[Gear], title: str = "{}, one side") -> Figure:
+def draw_reactions(shown: list[Gear], title: str = "{}, one side") -> Figure:
     """Normal reactions of one side: of all grousers and the lower guide on tracks, of both wheels on wheels."""
-    fig, grid = figure(1, len(shown), 3.2)
-    look = looks(gear.name for gear in shown)
+    fig, grid = new_figure(1, len(shown), 3.2)
+    look = configuration_looks(gear.name for gear in shown)
     for axes, gear in zip(grid[0], shown, strict=True):
         last, colour = gear.tail(SHOWN), look[gear.name][0]
         loads = gear.reactions
@@ -176,7 +186,7 @@ def reactions(shown: list[Gear], title: str = "{}, one side") -> Figure:
         axes.set(ylim=(0, 1.25 * top), xlabel="time [ms]", ylabel="normal reaction [N]")
         axes.set_title(title.format(gear.name))
         if gear.on_tracks:
-            note(axes, "orange: what the lower guide carries; above it: all grousers")
+            corner_note(axes, "orange: what the lower guide carries; above it: all grousers")
         else:
             axes.set_xlim(0, 1.3e3 * SHOWN)
     return fig

@@ -18,7 +18,16 @@ from mmrjax.model.channels import Channel
 from mmrjax.model.quantities import MM
 from mmrjax.model.robot import Robot
 from sweeps.pages import words
-from sweeps.pages.figure_style import BLUE, FAINT, INK, VERMILION, axis_label, figure, looks, note
+from sweeps.pages.figure_style import (
+    BLUE,
+    FAINT,
+    INK,
+    VERMILION,
+    axis_label,
+    configuration_looks,
+    corner_note,
+    new_figure,
+)
 
 INRUSH = 0.04  # s, shown enlarged
 _STAGES = (("I", "#fdebd0", "starting"), ("II", "#e3eef7", "slipping"), ("III", "#eaf5ea", "uniform"))
@@ -89,7 +98,9 @@ class Start:
         return float(self.current[last].mean()), float(self.speed[last].mean())
 
 
-def starts(robot: Robot, history: Any, status: np.ndarray, which: Sequence[int], names: Sequence[str]) -> list[Start]:
+def members_from_standstill(
+    robot: Robot, history: Any, status: np.ndarray, which: Sequence[int], names: Sequence[str]
+) -> list[Start]:
     """Members of a batch of runs from standstill, of any fidelity that has histories.
 
     Args:
@@ -121,15 +132,15 @@ def from_standstill(shown: list[Start], current_title: str = "total current", sp
 
     For a run that ends backward, backward is drawn positive.
     """
-    fig, grid = figure(len(shown), 3, 3.1 * len(shown), width_ratios=[0.85, 1.2, 1.35])
-    look = looks(start.configuration for start in shown)
+    fig, grid = new_figure(len(shown), 3, 3.1 * len(shown), width_ratios=[0.85, 1.2, 1.35])
+    look = configuration_looks(start.configuration for start in shown)
     for (zoom, current, speed), start in zip(grid, shown, strict=True):
         zoom.set_title(f"{start.name}\nfirst {1e3 * INRUSH:.0f} ms")
         backward = ", backward positive" if start.sense < 0 else ""
         current.set_title(current_title + backward)
         speed.set_title(speed_title + backward)
         if not start.time.size:
-            note(zoom, f"no numbers: {words.short(start.status)}", color=VERMILION)
+            corner_note(zoom, f"no numbers: {words.short_status(start.status)}", color=VERMILION)
             continue
         colour = look[start.configuration][0]
         _inrush(zoom, start, colour)
@@ -166,7 +177,7 @@ def _current(axes: Axes, start: Start, colour: str) -> None:
     axes.set(xlabel="time [s]", ylabel="total current [A]")
     _stages(axes, start)
     if cut:
-        note(axes, f"peak {peak:.3g} A cut off", x=0.02, y=0.8, color=colour)
+        corner_note(axes, f"peak {peak:.3g} A cut off", x=0.02, y=0.8, color=colour)
     during = (start.time > start.starting) & (start.time < start.slipping)
     middle = float(np.median(start.current[during])) if during.any() else 0.0
     if start.slipping - start.starting > 1.5 * _share(axes, f"{middle:.2f} A") * last and start.gets_under_way:
@@ -197,7 +208,7 @@ def _speeds(axes: Axes, start: Start, colour: str) -> None:
     place = (6, 6) if beside else (6, -12)
     axes.annotate("$V_x$ (robot)", at, xytext=place, textcoords="offset points", color=colour, fontsize=8.5)
     if start.status not in words.SETTLED:
-        note(axes, f"ends: {words.short(start.status)}", y=0.15, color=VERMILION)
+        corner_note(axes, f"ends: {words.short_status(start.status)}", y=0.15, color=VERMILION)
 
 
 def slip_over_start(shown: list[Start]) -> Figure:
@@ -205,13 +216,13 @@ def slip_over_start(shown: list[Start]) -> Figure:
 
     The slip's mean is drawn over each stage and over t'. For a run that ends backward, backward is drawn positive.
     """
-    fig, grid = figure(len(shown), 2, 3.1 * len(shown), width_ratios=[1.2, 1.0])
-    look = looks(start.configuration for start in shown)
+    fig, grid = new_figure(len(shown), 2, 3.1 * len(shown), width_ratios=[1.2, 1.0])
+    look = configuration_looks(start.configuration for start in shown)
     for (speeds, slip), start in zip(grid, shown, strict=True):
         speeds.set_title(f"{start.name}\nspeeds{', backward positive' if start.sense < 0 else ''}")
         slip.set_title("slip")
         if start.stages is None:
-            note(speeds, f"no numbers: {words.short(start.status)}", color=VERMILION)
+            corner_note(speeds, f"no numbers: {words.short_status(start.status)}", color=VERMILION)
             continue
         colour = look[start.configuration][0]
         last = float(start.time[-1])
@@ -240,7 +251,7 @@ def slip_over_start(shown: list[Start]) -> Figure:
         if start.gets_under_way:
             _means(speeds, slip, start, upto)
         if start.status not in words.SETTLED:
-            note(slip, f"ends: {words.short(start.status)}", y=0.15, color=VERMILION)
+            corner_note(slip, f"ends: {words.short_status(start.status)}", y=0.15, color=VERMILION)
     return fig
 
 
@@ -314,7 +325,7 @@ class Course:
         return float(values[-1]) if values.size else np.nan
 
 
-def courses(read: Iterable[Channel], history: Any, status: np.ndarray, names: Sequence[str]) -> list[Course]:
+def members_as_read(read: Iterable[Channel], history: Any, status: np.ndarray, names: Sequence[str]) -> list[Course]:
     """Members of a batch of runs as their instruments show them.
 
     Args:
@@ -336,12 +347,12 @@ def courses(read: Iterable[Channel], history: Any, status: np.ndarray, names: Se
 def over_time(shown: list[Course]) -> Figure:
     """A row for each run, a panel for each channel."""
     read = channels.channels_named(shown[0].readings)
-    fig, grid = figure(len(shown), len(read), 2.6 * len(shown))
+    fig, grid = new_figure(len(shown), len(read), 2.6 * len(shown))
     for row, course in zip(grid, shown, strict=True):
         row[0].set_title(course.name)
         for axes, channel in zip(row, read, strict=True):
             axes.plot(course.time, course.readings[channel.name], color=BLUE)
             axes.set(xlabel="time [s]", ylabel=axis_label(channel))
         if course.status not in words.SETTLED:
-            note(row[0], f"ends: {words.short(course.status)}", color=VERMILION)
+            corner_note(row[0], f"ends: {words.short_status(course.status)}", color=VERMILION)
     return fig

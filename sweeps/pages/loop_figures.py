@@ -16,8 +16,19 @@ from calibration.inference.bases import place_in_words
 from calibration.inference.details import TimeStatistics
 from mmrjax.effects.curve import EVERY_VARIABLE, Variable
 from mmrjax.model.channels import EVERY, SIDES, Channel
-from sweeps.pages.figure_style import BLUE, FAINT, GREEN, INK, ORANGE, SKY, figure, legend_columns, looks, note
-from sweeps.pages.sweep_figures import UNITS, imposed
+from sweeps.pages.figure_style import (
+    BLUE,
+    FAINT,
+    GREEN,
+    INK,
+    ORANGE,
+    SKY,
+    configuration_looks,
+    corner_note,
+    legend_columns,
+    new_figure,
+)
+from sweeps.pages.sweep_figures import UNITS, imposed_column
 from sweeps.pages.words import short_name
 
 #: Effects on the ladder and on the map of look-alikes.
@@ -51,10 +62,10 @@ ABREAST = 110
 
 def before_after(table: dict[str, np.ndarray], channels: Sequence[Channel], verdict: str) -> Figure:
     """Residual of every reading in sigmas, before and after; runs grouped by configuration and voltage."""
-    own = imposed(table)
+    own = imposed_column(table)
     beside = [c for c in ("payload_kg", "slope_deg", "load_torque_Nm") if c in table]
     order = np.lexsort((*(table[c] for c in beside), table[own], table["configuration"]))
-    fig, grid = figure(len(channels), 1, 1.8 * len(channels), sharex=True)
+    fig, grid = new_figure(len(channels), 1, 1.8 * len(channels), sharex=True)
     levels = np.unique(table[own]).size
     few = levels <= 8 or own == "supply_voltage_V"  # else a group by configuration alone
     named = not few or np.unique(table["configuration"]).size > 1
@@ -103,7 +114,7 @@ def over_time(runs: Runs, table: dict[str, np.ndarray], channels: Sequence[Chann
     running mean as a line. The `table` is of the rows of `runs`."""
     names = list(dict.fromkeys(runs.run_names.tolist()))[:RUNS_SHOWN]
     count = len(channels)
-    fig, grid = figure(count, len(names), 1.8 * count, sharex="col", sharey="row")
+    fig, grid = new_figure(count, len(names), 1.8 * count, sharex="col", sharey="row")
     whens = [("before", ORANGE)] if verdict != "none" else []
     whens += [("after", BLUE)]
     for column, name in enumerate(names):
@@ -122,7 +133,8 @@ def over_time(runs: Runs, table: dict[str, np.ndarray], channels: Sequence[Chann
                 axes.set_ylabel(f"{channel.label} [σ]")
         first = mine[0]
         grid[0, column].set_title(
-            f"{name}\n{table['configuration'][first]} {_range(table[imposed(table)][mine])} {UNITS[imposed(table)]}"
+            f"{name}\n{table['configuration'][first]} {_range(table[imposed_column(table)][mine])} "
+            f"{UNITS[imposed_column(table)]}"
             + (f" {_range(table['slope_deg'][mine])}°" if "slope_deg" in table else ""), fontsize=8,
         )  # fmt: skip
         grid[-1, column].set_xlabel("time [s]")
@@ -136,7 +148,7 @@ def time_statistics(detail: TimeStatistics, channels: Sequence[Channel], verdict
     sides = [("before", detail.before, ORANGE), ("after", detail.after, BLUE)]
     sides = sides if verdict != "none" else sides[1:]
     count = len(channels)
-    fig, grid = figure(1, count + 1, 2.9, width_ratios=[1] * count + [1.5])
+    fig, grid = new_figure(1, count + 1, 2.9, width_ratios=[1] * count + [1.5])
     for axes, channel in zip(grid[0, :count], channels, strict=True):
         lags = np.arange(1, detail.before.memory.lags + 1)
         limit = 2 / np.sqrt(detail.samples)
@@ -161,12 +173,12 @@ def time_statistics(detail: TimeStatistics, channels: Sequence[Channel], verdict
     return fig
 
 
-def ladder(found: DiscoveryResult) -> Figure:
+def draw_effect_scores(found: DiscoveryResult) -> Figure:
     """Score of every effect at the base fit, with the threshold that noise alone passes in few tables."""
     rungs = found.scores[:RUNGS]
     named = {e.name for e in found.effects}
     alike = {n for e in found.effects for n in e.members} - named
-    fig, grid = figure(1, 1, 1.1 + 0.24 * len(rungs))
+    fig, grid = new_figure(1, 1, 1.1 + 0.24 * len(rungs))
     axes = grid[0, 0]
     root = [np.sqrt(r.score) for r in rungs]
     colours = [BLUE if r.name in named else SKY if r.name in alike else "#c9c9c9" for r in rungs]
@@ -190,9 +202,9 @@ KINDS = {
 }
 
 
-def null(before: Evidence) -> Figure:
+def draw_bootstrap_statistics(before: Evidence) -> Figure:
     """The strongest statistics among bootstrap tables in which nothing is missing, and those of the data."""
-    fig, grid = figure(1, len(KINDS), 2.5)
+    fig, grid = new_figure(1, len(KINDS), 2.5)
     for axes, (name, text) in zip(grid[0], KINDS.items(), strict=True):
         kind = before.kinds[name]
         axes.hist(kind.null, bins=30, color="#c9c9c9")
@@ -200,15 +212,15 @@ def null(before: Evidence) -> Figure:
         axes.axvline(kind.found, color=BLUE, lw=2)
         axes.set_xlabel(text)
         axes.set_yticks([])
-    note(grid[0, 0], "grey: bootstrap\norange: threshold\nblue: these data", x=0.62)
+    corner_note(grid[0, 0], "grey: bootstrap\norange: threshold\nblue: these data", x=0.62)
     return fig
 
 
-def errors(found: DiscoveryResult) -> Figure:
+def draw_errors(found: DiscoveryResult) -> Figure:
     """rms error before and after, fitted and held out by every kind of block."""
     lines = {"fitted": found.errors}
     lines |= {f"held out by\n{blocks.kind_in_words(k, ', ')}": v for k, v in found.errors_held_out.items()}
-    fig, grid = figure(1, len(found.channels), 2.9, sharey=False)
+    fig, grid = new_figure(1, len(found.channels), 2.9, sharey=False)
     for place, channel in enumerate(found.channels):
         axes = grid[0, place]
         for k, (colour, when) in enumerate(((ORANGE, "before"), (BLUE, "after"))):
@@ -230,9 +242,9 @@ def errors(found: DiscoveryResult) -> Figure:
 NEAR = 1 / 12
 
 
-def given(table: dict[str, np.ndarray]) -> tuple[np.ndarray, str]:
+def imposed_axis(table: dict[str, np.ndarray]) -> tuple[np.ndarray, str]:
     """Imposed quantity of runs and its label; for a supply with a driver, the voltage after the duty."""
-    own = imposed(table)
+    own = imposed_column(table)
     if own == "supply_voltage_V" and "duty" in table and np.isfinite(table["duty"]).all():
         return table[own] * table["duty"], "voltage given to the motors [V]"
     return table[own], IMPOSED_WORDS[own]
@@ -256,7 +268,7 @@ def conditions_and_readings(table: dict[str, np.ndarray]) -> dict[str, np.ndarra
         sides = {f"voltage_{s}_V": table["supply_voltage_V"] * table[f"duty_{s}"] for s in SIDES}
         table, known = table | sides, known | {f"voltage_{s}_V": (f"voltage, {s}", "V") for s in SIDES}
     found = {f"{label} [{unit}]": table[c] for c, (label, unit) in known.items() if c in table}
-    values, words = given(table)
+    values, words = imposed_axis(table)
     found |= {words: values}
     for label, left in list(found.items()):
         if (right := found.get(label.replace(", left", ", right"))) is not None and ", left" in label:
@@ -293,9 +305,9 @@ class Change:
     with_it: np.ndarray
 
 
-def laws(found: DiscoveryResult, table: dict[str, np.ndarray], changes: Mapping[str, Change]) -> Figure:
+def draw_effect_laws(found: DiscoveryResult, table: dict[str, np.ndarray], changes: Mapping[str, Change]) -> Figure:
     """Contribution of each effect found: readings minus the robot without it, and the effect's change."""
-    fig, grid = figure(1, len(changes), 3.4)
+    fig, grid = new_figure(1, len(changes), 3.4)
     for axes, (name, change) in zip(grid[0], changes.items(), strict=True):
         c = change.channel
         x, label = depends_on(table, np.where(found.included, change.with_it - change.without, np.nan))
@@ -318,7 +330,7 @@ def defects_of(table: dict[str, np.ndarray], when: str, balance: str) -> dict[st
     return {side: table[column] for side, column in sides.items() if column in table}
 
 
-def closed(table: dict[str, np.ndarray]) -> list[str]:
+def closed_equations(table: dict[str, np.ndarray]) -> list[str]:
     """Equations that the readings close: those with a defect somewhere, at least one."""
     found = [b for b in DEFECT_WORDS if any(np.nan_to_num(x).any() for x in defects_of(table, "before", b).values())]
     return found or ["track"]
@@ -329,32 +341,34 @@ def _over(table: dict[str, np.ndarray], column: str, label: str, side: str = "")
 
     The imposed quantity replaces a variable that the table lacks or that does not vary.
     """
-    own = imposed(table)
+    own = imposed_column(table)
     if side:
         column = f"motor_current_{side}_A" if column == "current_A" else f"motor_speed_{side}_rpm"
         label = f"motor {'current' if 'current' in column else 'speed'} of that side [{column.rpartition('_')[2]}]"
     column = "total_" + column if column == "current_A" else column
     if column not in table or (column not in ("total_current_A", own) and np.unique(table[column]).size == 1):
-        return given(table)
+        return imposed_axis(table)
     return table[column], label
 
 
-def defects(table: dict[str, np.ndarray], verdict: str, crosses_zero: bool = False) -> Figure:
+def draw_defects(table: dict[str, np.ndarray], verdict: str, crosses_zero: bool = False) -> Figure:
     """Defect of each equation by run, over the variable that shows it, before and after.
 
     Args:
         crosses_zero: whether readings may (`Layout.crosses_zero`): drawn are the equations that they close.
     """
     whens = ("before",) if verdict in ("none", *WITHOUT_NAME) else ("before", "after")
-    drawn = {b: DEFECT_WORDS[b] for b in (closed(table) if crosses_zero else DEFECT_WORDS)}
-    fig, grid = figure(len(whens), len(drawn), 2.6 * len(whens) + 0.5, sharex="col", sharey="col")
+    drawn = {b: DEFECT_WORDS[b] for b in (closed_equations(table) if crosses_zero else DEFECT_WORDS)}
+    fig, grid = new_figure(len(whens), len(drawn), 2.6 * len(whens) + 0.5, sharex="col", sharey="col")
     for row, when in enumerate(whens):
         for axes, (balance, (words, unit, column, of_what)) in zip(grid[row], drawn.items(), strict=True):
             balance_words = RIG_WORDS.get(balance, words) if crosses_zero else words
             by_side = defects_of(table, when, balance)
             names = [(name, side) for name in dict.fromkeys(table["configuration"]) for side in by_side]
             axes.axhline(0, color=FAINT, lw=0.8)
-            for (name, side), (colour, marker) in zip(names, looks(map(", ".join, names)).values(), strict=True):
+            for (name, side), (colour, marker) in zip(
+                names, configuration_looks(map(", ".join, names)).values(), strict=True
+            ):
                 mine = table["configuration"] == name
                 x, label = _over(table, column, of_what, side)
                 y = by_side[side][mine] * (1e3 if balance == "slip" else 1.0)
@@ -376,7 +390,7 @@ def look_alikes(found: DiscoveryResult) -> Figure:
     """|cos| between what the base leaves of two effects' signatures, for the effects that score highest."""
     names = [s.name for s in found.scores if s.score > 0][:ALIKE]
     cosine = found.cosine[: len(names), : len(names)]
-    fig, grid = figure(1, 1, 5.6)
+    fig, grid = new_figure(1, 1, 5.6)
     axes = grid[0, 0]
     shown = axes.imshow(cosine, cmap="Blues", vmin=0, vmax=1)
     for i in range(len(names)):
@@ -394,7 +408,7 @@ def look_alikes(found: DiscoveryResult) -> Figure:
 def base_shift(found: DiscoveryResult) -> Figure:
     """Each base parameter in prior sds, before and after the effects were added."""
     shift = found.base_shift
-    fig, grid = figure(1, 1, 1.0 + 0.27 * len(shift))
+    fig, grid = new_figure(1, 1, 1.0 + 0.27 * len(shift))
     axes = grid[0, 0]
     axes.axvspan(-2, 2, color="#eeeeee", lw=0, zorder=0)
     axes.axvline(0, color=FAINT, lw=0.9)
@@ -410,13 +424,13 @@ def base_shift(found: DiscoveryResult) -> Figure:
     return fig
 
 
-def curve(found: UnnamedDiscrepancy) -> Figure:
+def draw_unnamed_curve(found: UnnamedDiscrepancy) -> Figure:
     """The defect that has no name, run by run over the variable that shows it, with the smooth curve and its band."""
     variable = found.variable if found.window is None else str(found.window["axis"])
     abscissa = EVERY_VARIABLE.get(variable, Variable("rad", 0.0, 0.0, "", f"phase of the wave, {variable}", "rad"))
     words, scale = abscissa.label, 1 / abscissa.shown
     words += f" [{abscissa.unit_shown}]" if abscissa.unit_shown else ""
-    fig, grid = figure(1, 1, 3.4)
+    fig, grid = new_figure(1, 1, 3.4)
     axes = grid[0, 0]
     axes.axhline(0, color=FAINT, lw=0.8)
     if found.over is not None and found.defect is not None and found.defect_sd is not None:

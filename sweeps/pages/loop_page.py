@@ -20,10 +20,10 @@ from mmrjax.effects import BY_NAME
 from mmrjax.model import params
 from mmrjax.model.robot import Robot
 from sweeps.pages import cluster_figures, loop_figures
-from sweeps.pages.page import Album, columns, curves, first_rows, render
+from sweeps.pages.page import Album, channel_columns, first_rows, render_page, unnamed_curves
 from sweeps.pages.time_overlay import time_overlay
 from sweeps.pages.words import GLOSSARY, words_shown
-from sweeps.report.condition_columns import conditions
+from sweeps.report.condition_columns import condition_formats
 from sweeps.report.words import loop_words
 from sweeps.report.words.note_words import describe
 
@@ -49,7 +49,7 @@ def _drawn(found: DiscoveryResult) -> str:
 def _run_by_run(album: Album, found: DiscoveryResult) -> None:
     table = rows_of(found)
     album.add("before_after", lambda: loop_figures.before_after(table, found.channels, _drawn(found)))
-    album.add("defects", lambda: loop_figures.defects(table, _drawn(found), Layout.of(found.robot).crosses_zero))
+    album.add("defects", lambda: loop_figures.draw_defects(table, _drawn(found), Layout.of(found.robot).crosses_zero))
 
 
 def _over_time(album: Album, found: DiscoveryResult) -> None:
@@ -69,26 +69,26 @@ def _over_time(album: Album, found: DiscoveryResult) -> None:
 SECTIONS: dict[type[Detail], Section] = {EquationDefects: _run_by_run, TimeStatistics: _over_time}
 
 
-def alike(found: DiscoveryResult) -> list[str]:
+def indistinguishable_in_words(found: DiscoveryResult) -> list[str]:
     """Of each effect, and of a discrepancy without a name, what these data cannot tell from it, in words."""
     curve = [] if found.unnamed is None else [found.unnamed]
     without_name = [", ".join(b for b in c.balances_alike if b != c.balance) for c in curve]
-    return [*(loop_words.alike(found, e) for e in found.effects), *without_name]
+    return [*(loop_words.indistinguishable_effects(found, e) for e in found.effects), *without_name]
 
 
-def findings(found: DiscoveryResult, changed: Mapping[str, loop_figures.Change]) -> list[dict[str, str]]:
+def effect_findings(found: DiscoveryResult, changed: Mapping[str, loop_figures.Change]) -> list[dict[str, str]]:
     """Each effect of the model for the first screen: what it is, how large, how sure, what else it could be."""
     listed = []
     for e in found.effects:
-        size = loop_words.size(e)
+        size = loop_words.effect_amplitude(e)
         if (change := changed.get(e.name)) is not None:
             size += f", which changes the {change.channel.label} by {change.rms:.2g} %"
-        sure, other = loop_words.how_sure(found, e), loop_words.alike(found, e)
+        sure, other = loop_words.how_sure(found, e), loop_words.indistinguishable_effects(found, e)
         listed.append({"name": e.name, "what": ", or ".join(e.families), "size": size, "sure": sure, "alike": other})
     return listed
 
 
-def changes(found: DiscoveryResult) -> dict[str, loop_figures.Change]:
+def changes_by_effect(found: DiscoveryResult) -> dict[str, loop_figures.Change]:
     """Change of settled runs by each effect; empty for histories and for effects that the written robot lacks."""
     added = [e.name for e in found.effects if e.name in {x.name for x in found.robot.effects}]
     if not isinstance(found.detail, EquationDefects) or not added:
@@ -125,7 +125,7 @@ def would_be_seen(found: DiscoveryResult) -> list[dict[str, Any]]:
     return sorted(listed, key=lambda one: one["times"])
 
 
-def unseen(found: DiscoveryResult) -> list[dict[str, Any]]:
+def held_out_rows(found: DiscoveryResult) -> list[dict[str, Any]]:
     """Errors of the refit and with what was found, by kind of block held out, with the rows that each reaches; marked
     where they are better or worse."""
     total, many = len(found.runs), not found.refit_alone
@@ -151,7 +151,7 @@ def unseen(found: DiscoveryResult) -> list[dict[str, Any]]:
     return lines
 
 
-def summary(found: DiscoveryResult) -> list[dict[str, Any]]:
+def error_summary(found: DiscoveryResult) -> list[dict[str, Any]]:
     """Errors as stated, fitted again, and with what was found: seen, and unseen by the first kind of block.
 
     A change is marked if both lines are over the same number of rows.
@@ -185,7 +185,7 @@ def check_first(found: DiscoveryResult) -> list[str]:
     return [f"{text if '.' in text.split()[0] else text[0].upper() + text[1:]}." for text in said if text]
 
 
-def write(folder: Path, found: DiscoveryResult, *, robot_name: str) -> Path:
+def write_loop_page(folder: Path, found: DiscoveryResult, *, robot_name: str) -> Path:
     """Write `report.html` and `figures/` for a pass of the loop.
 
     Args:
@@ -199,31 +199,31 @@ def write(folder: Path, found: DiscoveryResult, *, robot_name: str) -> Path:
     table, sized = rows_of(found), Layout.of(found.robot).crosses_zero
     SECTIONS[type(found.detail)](album, found)
     if found.residual_clusters:
-        album.add("clusters", lambda: cluster_figures.clusters(found.residual_clusters))
-    album.add("errors", lambda: loop_figures.errors(found))
-    changed = changes(found)
+        album.add("clusters", lambda: cluster_figures.draw_clusters(found.residual_clusters))
+    album.add("errors", lambda: loop_figures.draw_errors(found))
+    changed = changes_by_effect(found)
     if changed:
-        album.add("laws", lambda: loop_figures.laws(found, table, changed))
+        album.add("laws", lambda: loop_figures.draw_effect_laws(found, table, changed))
     if found.unnamed is not None:
         curve = found.unnamed
-        album.add("curve", lambda: loop_figures.curve(curve))
-    album.add("ladder", lambda: loop_figures.ladder(found))
-    album.add("null", lambda: loop_figures.null(found.before))
+        album.add("curve", lambda: loop_figures.draw_unnamed_curve(curve))
+    album.add("ladder", lambda: loop_figures.draw_effect_scores(found))
+    album.add("null", lambda: loop_figures.draw_bootstrap_statistics(found.before))
     album.add("look_alikes", lambda: loop_figures.look_alikes(found))
     album.add("base_shift", lambda: loop_figures.base_shift(found))
-    return render(
+    return render_page(
         Path(folder),
         "loop.html.j2",
         album,
         of_channels=found.channels,
         title=f"Is the {words_shown(Path(robot_name).name)} model complete?",
-        answer=loop_words.answer(found),
-        findings=findings(found, changed),
-        summary=summary(found),
-        unseen=unseen(found),
+        answer=loop_words.completeness_answer(found),
+        findings=effect_findings(found, changed),
+        summary=error_summary(found),
+        unseen=held_out_rows(found),
         would_be_seen=would_be_seen(found),
         glossary=GLOSSARY,
-        curves=curves(found.robot),
+        curves=unnamed_curves(found.robot),
         files={
             "robot.toml": f"the robot {'with what was found' if found.written and found.effects else 'refitted'}",
             "fitted.toml": "the robot refitted, with nothing added",
@@ -233,20 +233,20 @@ def write(folder: Path, found: DiscoveryResult, *, robot_name: str) -> Path:
         check_first=check_first(found),
         document=found.to_json(),
         p=loop_words.p_value(found.before.p_value),
-        cluster="" if found.cluster is None else loop_words.cluster(found.cluster),
-        standing=loop_words.standing(found),
+        cluster="" if found.cluster is None else loop_words.cluster_sentence(found.cluster),
+        standing=loop_words.support_sentence(found),
         ruled_out=loop_words.ruled_out(found),
-        alike=alike(found),
-        doubts=[loop_words.tentative(found, e) for e in found.effects] + [""] * (found.unnamed is not None),
+        alike=indistinguishable_in_words(found),
+        doubts=[loop_words.tentative_reason(found, e) for e in found.effects] + [""] * (found.unnamed is not None),
         other_noise=loop_words.at_other_noise(found.sensitivity),
-        worse=loop_words.worse(found.held_out_worse, found.predicted),
+        worse=loop_words.rising_errors_sentence(found.held_out_worse, found.predicted),
         rows=first_rows(rows_of(found)),
-        conditions=conditions(rows_of(found)),
-        columns=columns(found.channels),
+        conditions=condition_formats(rows_of(found)),
+        columns=channel_columns(found.channels),
         sized=sized,
         has_ground=found.robot.has_ground,
         sides=max(1, len(loop_figures.defects_of(table, "before", "track"))),
-        closed=loop_figures.closed(table) if sized and isinstance(found.detail, EquationDefects) else [],
+        closed=loop_figures.closed_equations(table) if sized and isinstance(found.detail, EquationDefects) else [],
         rms=found.rms,
         determined={
             n: described(Determination.of(n, p.held_by_prior, found.together)) for n, p in found.base_shift.items()

@@ -20,9 +20,9 @@ from sweeps.pages.figure_style import (
     PURPLE,
     SKY,
     VERMILION,
-    figure,
+    corner_note,
     legend_columns,
-    note,
+    new_figure,
 )
 from sweeps.points.imposed import UNLIMITED
 
@@ -39,11 +39,13 @@ _BARS = {
 
 
 def label_of_sink(name: str) -> str:
-    """Name of a place where energy goes, as in the bars of `energy`."""
+    """Name of a place where energy goes, as in the bars of `draw_mission_energy`."""
     return _BARS[name][0]
 
 
-def course(rows: Mapping[str, np.ndarray], cycle: float | None, limit: float, linear: bool, sides: float) -> Figure:
+def draw_mission_course(
+    rows: Mapping[str, np.ndarray], cycle: float | None, limit: float, linear: bool, sides: float
+) -> Figure:
     """A run over its profile, a row a subject; with several cycles, the first one is also drawn.
 
     Args:
@@ -53,7 +55,7 @@ def course(rows: Mapping[str, np.ndarray], cycle: float | None, limit: float, li
     """
     spans = [float(rows["time_s"][-1]), *([cycle] if cycle is not None else [])]
     titles = ["the mission", "its first cycle"]
-    fig, grid = figure(4, len(spans), 9.6, width_ratios=[1.5, 1.0][: len(spans)], sharex="col")
+    fig, grid = new_figure(4, len(spans), 9.6, width_ratios=[1.5, 1.0][: len(spans)], sharex="col")
     for column, (span, title) in enumerate(zip(spans, titles, strict=False)):
         axes = grid[:, column]
         _, size, unit = next(t for t in _TIMES if span >= t[0])
@@ -82,7 +84,7 @@ def of_sides(rows: Mapping[str, np.ndarray]) -> Figure:
     Args:
         rows: of history.csv, of one run with sides.
     """
-    fig, grid = figure(3, 1, 6.4, sharex=True)
+    fig, grid = new_figure(3, 1, 6.4, sharex=True)
     span = float(rows["time_s"][-1])
     _, size, unit = next(t for t in _TIMES if span >= t[0])
     time = rows["time_s"] / size
@@ -124,7 +126,7 @@ def _speed(axes: Axes, time: np.ndarray, rows: Mapping[str, np.ndarray], linear:
         axes.plot(time, demanded, color=INK, lw=0.9, ls=(0, (4, 2)), label="demanded")
     axes.set_ylabel("motor speed [rpm]" if turning else "speed [mm/s]")
     if turning or not np.any(rows["slope_deg"]):
-        note(axes, "" if turning else "level ground", x=0.98, y=0.04, va="bottom", ha="right", color=FAINT)
+        corner_note(axes, "" if turning else "level ground", x=0.98, y=0.04, va="bottom", ha="right", color=FAINT)
         if legend:
             _legend(axes)
         return
@@ -166,7 +168,7 @@ def _near(rows: Mapping[str, np.ndarray], limit: float) -> bool:
 
 def _temperatures(axes: Axes, time: np.ndarray, rows: Mapping[str, np.ndarray], limit: float, legend: bool) -> None:
     if "housing_temperature_C" not in rows:
-        note(axes, "not known: the robot's file does not\nstate how heat leaves the windings")
+        corner_note(axes, "not known: the robot's file does not\nstate how heat leaves the windings")
         axes.set_yticks([])
         return
     axes.plot(time, rows["winding_temperature_C"], color=VERMILION, lw=1.4, label="winding")
@@ -200,10 +202,12 @@ def _source(axes: Axes, time: np.ndarray, rows: Mapping[str, np.ndarray]) -> Non
     beside.plot(time, volts, color=BLUE, lw=0.8, alpha=0.8)
     for k in np.flatnonzero(rows["event"] == "below_cut_off")[-1:]:
         axes.axvline(time[k], color=VERMILION, lw=1.0, ls="--")
-        note(axes, "cells below their cut-off from the broken line on", x=0.02, y=0.06, va="bottom", color=FAINT)
+        corner_note(
+            axes, "cells below their cut-off from the broken line on", x=0.02, y=0.06, va="bottom", color=FAINT
+        )
 
 
-def energy(run: Mapping[str, Any], on_battery: bool) -> Figure:
+def draw_mission_energy(run: Mapping[str, Any], on_battery: bool) -> Figure:
     """Energy of one run by use, in the order of the chain [Wh], and its share of the energy drawn [%].
 
     Args:
@@ -218,7 +222,7 @@ def energy(run: Mapping[str, Any], on_battery: bool) -> Figure:
     bars.append(("left in motion at the end", float(run["energy_stored_Wh"]), FAINT))
     bars.append(("returned to the source", float(run["energy_returned_Wh"]), GREEN))
     bars = [bar for bar in bars if abs(bar[1]) > 1e-5 * max(drawn, 1e-12)]
-    fig, grid = figure(1, 1, 0.9 + 0.34 * len(bars))
+    fig, grid = new_figure(1, 1, 0.9 + 0.34 * len(bars))
     axes = grid[0, 0]
     place = np.arange(len(bars), dtype=float)
     widths = np.array([bar[1] for bar in bars])

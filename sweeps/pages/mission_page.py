@@ -15,8 +15,8 @@ from mmrjax.model.robot import Robot
 from mmrjax.model.signals import FLAGS
 from sweeps import capabilities
 from sweeps.pages import mission_figures, turn_page, words
-from sweeps.pages.page import ROWS, Album, named, render, statuses
-from sweeps.pages.runs_page import labels, warmed
+from sweeps.pages.page import ROWS, Album, render_page, robot_section, status_rows
+from sweeps.pages.runs_page import run_headings, warming_share
 from sweeps.points.imposed import UNLIMITED
 from sweeps.results.mission_results import Missions
 
@@ -24,7 +24,7 @@ from sweeps.results.mission_results import Missions
 SEGMENTS = 60
 
 
-def write(folder: Path, file: RobotFile, found: Missions) -> Path:
+def write_mission_page(folder: Path, file: RobotFile, found: Missions) -> Path:
     """Write `report.html` and `figures/` for finished missions; in detail the first run.
 
     Args:
@@ -45,14 +45,16 @@ def write(folder: Path, file: RobotFile, found: Missions) -> Path:
     limit = float(robot.motor.temperature_limit)
     cycle = float(source.time[-1] - source.time[0]) if source.cycles > 1 else None
     on_battery = bool(np.isfinite(first["state_of_charge"]))
-    album.add("course", lambda: mission_figures.course(rows, cycle, limit, source.linear, float(robot.sides)))
-    album.add("energy", lambda: mission_figures.energy(first, on_battery))
+    album.add(
+        "course", lambda: mission_figures.draw_mission_course(rows, cycle, limit, source.linear, float(robot.sides))
+    )
+    album.add("energy", lambda: mission_figures.draw_mission_energy(first, on_battery))
     if source.turns:
         x, y, yaw = rows["x_mm"] / 1e3, rows["y_mm"] / 1e3, np.radians(rows["yaw_deg"])
-        album.add("path", lambda: turn_page.path(robot, first, x, y, yaw))
+        album.add("path", lambda: turn_page.draw_path(robot, first, x, y, yaw))
         album.add("sides", lambda: mission_figures.of_sides(rows))
     names = _names(runs)
-    return render(
+    return render_page(
         folder,
         "mission.html.j2",
         album,
@@ -62,14 +64,14 @@ def write(folder: Path, file: RobotFile, found: Missions) -> Path:
         first=names[0],
         run=first,
         on_battery=on_battery,
-        answer=answer(first),
+        answer=mission_answer(first),
         cards=_cards({key: value for key, value in first.items() if key not in idle}),
         limits=_limits(robot, first),
         flagged=_flags(first, found, name),
         rows=[
             {"label": label, **{k: v[i] for k, v in runs.items()}} for i, label in enumerate(names[:ROWS])
         ],
-        statuses=statuses(runs),
+        statuses=status_rows(runs),
         segments=_segments(found, name),
         returned=max(float(first["energy_returned_Wh"]), 0.0),
         kept=len(rows["time_s"]),
@@ -77,20 +79,20 @@ def write(folder: Path, file: RobotFile, found: Missions) -> Path:
         heat=robot.knows(WARMING),
         travels="distance_m" not in idle,
         turns=source.turns,
-        **named(file),
+        **robot_section(file),
     )  # fmt: skip
 
 
 def _names(runs: dict[str, np.ndarray]) -> list[str]:
     """Headings of runs; what the profile states in the place of a run's condition is left out."""
     answer = []
-    for label in labels(runs):
+    for label in run_headings(runs):
         head, *parts = label.split(", ")
         answer.append(", ".join([head, *(p for p in parts if not p.startswith("nan"))]))
     return answer
 
 
-def answer(run: dict[str, Any]) -> str:
+def mission_answer(run: dict[str, Any]) -> str:
     """One sentence: energy of the mission, its largest shares, and how long the battery lasts."""
     drawn = float(run["energy_drawn_Wh"])
     text = f"The mission takes {float(run['energy_Wh']):.3g} Wh"
@@ -104,7 +106,7 @@ def answer(run: dict[str, Any]) -> str:
     if np.isfinite(run["endurance_s"]):
         text += f"; a full battery lasts {run['endurance_s'] / 60:.0f} min"
     status = str(run["status"])
-    return text + ("." if status == "converged" else f". It ends early: {words.meaning(status)}.")
+    return text + ("." if status == "converged" else f". It ends early: {words.status_meaning(status)}.")
 
 
 def _cards(run: dict[str, Any]) -> list[dict[str, str]]:
@@ -143,7 +145,8 @@ def _limits(robot: Robot, run: dict[str, Any]) -> list[dict[str, Any]]:
         asked.append(("rms torque, one gearbox", run["rms_torque_Nm"], float(gearbox.torque_limit), "N·m", 2))
     answer = [
         {"words": words, "value": f"{value:.{digits}f} {unit}", "limit": f"{limit:.{digits}f} {unit}",
-         "percent": warmed(value, limit, float(motor.temperature_ambient)) if unit == "°C" else 100 * value / limit}
+         "percent": (warming_share(value, limit, float(motor.temperature_ambient)) if unit == "°C"
+                     else 100 * value / limit)}
         for words, value, limit, unit, digits in asked
         if np.isfinite(value) and limit < UNLIMITED and (words not in OF_HEAT or heat)
     ]  # fmt: skip
@@ -194,7 +197,9 @@ def _segments(found: Missions, name: str) -> list[dict[str, Any]]:
                 "distance": float(np.sum(mine["distance_m"])),
                 "peak": float(np.max(mine["peak_current_A"])),
                 "hottest": float(np.max(mine["winding_peak_C"])),
-                "ends": ", ".join(words.short(s) + (f" ({n})" if source.cycles > 1 else "") for s, n in ends.items()),
+                "ends": ", ".join(
+                    words.short_status(s) + (f" ({n})" if source.cycles > 1 else "") for s, n in ends.items()
+                ),
                 "flags": ", ".join(words.FLAGS[f] for f in flags),
             }
         )

@@ -21,11 +21,18 @@ from mmrjax.model.channels import Channel
 from mmrjax.model.robot import Robot
 from sweeps import capabilities
 from sweeps.pages import words
-from sweeps.pages.figure_style import NARROW, can_stack, fit_for_phones, has_colour_scale, style, svg
+from sweeps.pages.figure_style import (
+    NARROW,
+    can_stack,
+    figure_as_svg,
+    figure_settings,
+    fit_for_phones,
+    has_colour_scale,
+)
 from sweeps.pages.time_overlay import TimeOverlay
 from sweeps.report.document import PAGE_ROWS as ROWS
-from sweeps.report.document import Column, Note, Section, Table, tone
-from sweeps.report.markup import download, marked
+from sweeps.report.document import Column, Note, Section, Table, cell_tone
+from sweeps.report.markup import download_link, marked_html
 
 
 class Album:
@@ -43,16 +50,16 @@ class Album:
         Args:
             draw: returns the figure, alone or followed by numbers, which are returned; or an overlay over time.
         """
-        with style():
+        with figure_settings():
             drawn = draw()
             if isinstance(drawn, TimeOverlay):
                 return self.add_overlay(name, drawn)
             figure, *numbers = drawn if isinstance(drawn, tuple) else (drawn,)
-            text, narrow = svg(figure), ""
+            text, narrow = figure_as_svg(figure), ""
         if can_stack(figure):
-            with style(NARROW):
+            with figure_settings(NARROW):
                 drawn = draw()
-                narrow = svg(fit_for_phones(drawn[0] if isinstance(drawn, tuple) else drawn))
+                narrow = figure_as_svg(fit_for_phones(drawn[0] if isinstance(drawn, tuple) else drawn))
         write_text(self.folder / f"{name}.svg", text)
         looks = "scale " * has_colour_scale(figure)
         picture = _inline(text, name, looks + ("wide" if narrow else "only"))
@@ -79,14 +86,14 @@ def _inline(svg: str, name: str, looks: str) -> str:
     return re.sub(r'((?:href="|url\()#)(?=[^")]+)', rf"\g<1>{name}-", element)
 
 
-def named(file: RobotFile) -> dict[str, Any]:
+def robot_section(file: RobotFile) -> dict[str, Any]:
     """The `robot`'s name and its section of a page (`about_robot`), with its remarks and unnamed curves.
 
     A packaged robot with other parameters is called changed.
     """
     from mmrjax.model.paper_robots import ROBOTS
 
-    about = {"robot": capabilities.shown_name(file), "curves": curves(file.robot), "remarks": file.remarks}
+    about = {"robot": capabilities.shown_name(file), "curves": unnamed_curves(file.robot), "remarks": file.remarks}
     return about | {"about_robot": _section(file, ROBOTS["nominal"]())}
 
 
@@ -97,7 +104,7 @@ def _section(file: RobotFile, nominal: Robot) -> Section:
     if not file.robot.rig.inherits:
         columns = (first, Column("value", form=value), *end, Column("source"))
         text = "Its parameters (SI units). A loss or limit that its file does not state is absent."
-        rows, table = capabilities.parameters(file), "own"
+        rows, table = capabilities.rig_parameters(file), "own"
     else:
         columns = (first, Column("this robot", form=value), Column("nominal", form=value), *end)
         text = "Parameters that differ from the nominal robot's (SI units):"
@@ -109,16 +116,16 @@ def _section(file: RobotFile, nominal: Robot) -> Section:
     )
 
 
-def curves(robot: Robot) -> list[str]:
+def unnamed_curves(robot: Robot) -> list[str]:
     """Curves of a robot for what is missing without a name."""
     return [e.name for e in robot.effects if e.name in effects.UNNAMED]
 
 
-def label(table: dict[str, np.ndarray], row: int) -> str:
+def conditions_in_words(table: dict[str, np.ndarray], row: int) -> str:
     """The conditions of a row in words: what is imposed, and on a vehicle payload, slope and a rig's surface."""
     parts = [str(table["configuration"][row])]
     if "supply_voltage_V" in table:
-        parts.append(supply(table["supply_voltage_V"][row]))
+        parts.append(printed_supply(table["supply_voltage_V"][row]))
     elif "motor_speed_rpm" in table:
         parts.append(f"{table['motor_speed_rpm'][row]:g} rpm")
     elif "motor_current_A" in table and "simulated_motor_current_A" not in table:
@@ -132,7 +139,7 @@ def label(table: dict[str, np.ndarray], row: int) -> str:
     return ", ".join(parts)
 
 
-def columns(shown: Iterable[Channel]) -> dict[str, str]:
+def channel_columns(shown: Iterable[Channel]) -> dict[str, str]:
     """Column of each channel, as in the tables of runs."""
     return {c.name: c.column for c in shown}
 
@@ -142,18 +149,18 @@ def first_rows(table: dict[str, np.ndarray]) -> list[dict[str, Any]]:
     return [{k: v[i] for k, v in table.items()} for i in range(min(len(next(iter(table.values()))), ROWS))]
 
 
-def statuses(table: dict[str, np.ndarray]) -> list[dict[str, Any]]:
+def status_rows(table: dict[str, np.ndarray]) -> list[dict[str, Any]]:
     """Count, share and meaning of each status that a table has, in the order of `words`."""
     known = [*words.STATUSES, *(set(map(str, table["status"])) - set(words.STATUSES))]
     total = len(table["status"])
     return [
-        {"name": s, "count": n, "percent": 100 * n / total, "meaning": words.meaning(s)}
+        {"name": s, "count": n, "percent": 100 * n / total, "meaning": words.status_meaning(s)}
         for s in known
         if (n := int((table["status"] == s).sum()))
     ]
 
 
-def number(value: Any, form: str = "{:.2f}") -> str:
+def printed_number(value: Any, form: str = "{:.2f}") -> str:
     """A number as a page prints it, nothing without a sign; what is not finite is a dash."""
     if isinstance(value, int | float | np.number):
         text = form.format(float(value)) if math.isfinite(float(value)) else "–"
@@ -161,25 +168,25 @@ def number(value: Any, form: str = "{:.2f}") -> str:
     return str(value)
 
 
-def winding(value: Any) -> str:
+def printed_winding(value: Any) -> str:
     """A winding's temperature after long running [°C] as a page prints it."""
-    return words.NONE_SETTLES if math.isinf(float(value)) else number(value, "{:.0f}")
+    return words.NONE_SETTLES if math.isinf(float(value)) else printed_number(value, "{:.0f}")
 
 
-def supply(value: Any) -> str:
+def printed_supply(value: Any) -> str:
     """A supply voltage [V] as a page prints it; runs on the battery have none."""
     return "battery" if math.isnan(float(value)) else f"{float(value):g} V"
 
 
-def reading(value: Any, channel: str) -> str:
+def printed_reading(value: Any, channel: str) -> str:
     """A reading with one digit less than its channel's resolution."""
     digits = max(channels.find_channel(channel).resolution - 1, 0)
-    return number(value, f"{{:.{digits}f}}")
+    return printed_number(value, f"{{:.{digits}f}}")
 
 
-def error(value: Any, channel: str) -> str:
+def printed_error(value: Any, channel: str) -> str:
     """A difference of readings, with its sign, with a digit more than they."""
-    return number(value, f"{{:+.{channels.find_channel(channel).resolution}f}}")
+    return printed_number(value, f"{{:+.{channels.find_channel(channel).resolution}f}}")
 
 
 def _grade(value: Any) -> str:
@@ -188,7 +195,7 @@ def _grade(value: Any) -> str:
     return "none" if not math.isfinite(size) else "good" if size <= 5 else "fair" if size <= 10 else "bad"
 
 
-def render(
+def render_page(
     folder: Path,
     template: str,
     album: Album,
@@ -204,7 +211,7 @@ def render(
     that scroll.
 
     Args:
-        curves: unnamed curves of the robot, for a warning (see `curves`).
+        curves: unnamed curves of the robot, for a warning (see `unnamed_curves`).
         remarks: further warnings about the robot.
         of_channels: channels of the page.
     """
@@ -216,8 +223,14 @@ def render(
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"number": number, "reading": reading, "grade": _grade, "error": error, "winding": winding}
-    environment.filters |= {"marked": marked, "download": download, "tone": tone}
+    environment.filters |= {
+        "number": printed_number,
+        "reading": printed_reading,
+        "grade": _grade,
+        "error": printed_error,
+        "winding": printed_winding,
+    }
+    environment.filters |= {"marked": marked_html, "download": download_link, "tone": cell_tone}
     environment.globals |= {
         "page_rows": ROWS,
         "channels": {c.name: (c.label, c.unit) for c in of_channels},

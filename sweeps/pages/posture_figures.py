@@ -12,7 +12,7 @@ from scipy.spatial import ConvexHull
 
 from mmrjax.climbing.resting_posture import BELTS, FRONT_AXLE, REAR_AXLE, Outline
 from mmrjax.model.quantities import MM
-from sweeps.pages.figure_style import BLUE, INK, ORANGE, VERMILION, figure
+from sweeps.pages.figure_style import BLUE, INK, ORANGE, VERMILION, new_figure
 from sweeps.results.posture_results import Drawn, Postures, StepMap
 
 _GROUND = "#d9cfbf"
@@ -20,7 +20,7 @@ _ROUND = np.linspace(0.0, 2 * np.pi, 181)
 _CIRCLE = np.stack([np.cos(_ROUND), np.sin(_ROUND)], 1)
 
 
-def around(side: Outline, belt: tuple[int, int]) -> np.ndarray:
+def belt_outline(side: Outline, belt: tuple[int, int]) -> np.ndarray:
     """Corners of the belt around a pair of circles, over its grousers [m]."""
     wide = [float(side.belt) if k in (REAR_AXLE, FRONT_AXLE) else float(side.radius[k]) for k in belt]
     at = [np.array([float(side.forward[k]), float(side.up[k])]) for k in belt]
@@ -28,7 +28,7 @@ def around(side: Outline, belt: tuple[int, int]) -> np.ndarray:
     return points[ConvexHull(points).vertices]
 
 
-def silhouette(axes: Axes, shown: Drawn, title: str) -> None:
+def draw_silhouette(axes: Axes, shown: Drawn, title: str) -> None:
     """Draw a robot on its ground, uphill and forward to the right [mm]; its centre of mass with gravity's line."""
     side, cosine, sine = shown.side, np.cos(shown.slope), np.sin(shown.slope)
     tilt = np.array([[cosine, sine], [-sine, cosine]])
@@ -43,13 +43,15 @@ def silhouette(axes: Axes, shown: Drawn, title: str) -> None:
     colours = {BELTS[0]: ORANGE, BELTS[1]: BLUE, BELTS[2]: ORANGE}
     for belt, colour in colours.items():
         if belt == BELTS[1] or float(side.tracked) > 0.5:
-            axes.add_patch(Polygon(page(around(side, belt)), facecolor=colour, alpha=0.45, edgecolor=INK, lw=1.0))
+            axes.add_patch(
+                Polygon(page(belt_outline(side, belt)), facecolor=colour, alpha=0.45, edgecolor=INK, lw=1.0)
+            )
     for x, z, r in zip(side.forward, side.up, side.radius, strict=True):
         axes.plot(*page(np.array([x, z]) + float(r) * _CIRCLE).T, color=INK, lw=0.7)
     mass = page(np.array([[side.centre_forward, side.centre_up]]))[0]
     axes.plot(*mass, "o", color=VERMILION, ms=6)
     axes.plot([mass[0]] * 2, [mass[1], mass[1] - (float(side.centre_up) - high) / MM], color=VERMILION, lw=1, ls="--")
-    every = np.concatenate([page(around(side, belt)) for belt in colours])
+    every = np.concatenate([page(belt_outline(side, belt)) for belt in colours])
     (left, low), (right, high) = every.min(0) - 40, every.max(0) + 40
     axes.set(title=title, aspect="equal", xlim=(left, right), ylim=(low, high), xlabel="mm", ylabel="mm")
 
@@ -60,10 +62,10 @@ ASKED = {"step_mm": "On its highest step", "gap_mm": "Flush over a gap", "length
 
 def asked_about(drawn: Mapping[str, tuple[Drawn, float, float]]) -> Figure:
     """A robot as requirements of its geometry ask about it."""
-    fig, grid = figure(1, max(len(drawn), 2), 3.6)
+    fig, grid = new_figure(1, max(len(drawn), 2), 3.6)
     for axes, (name, (shown, front, rear)) in zip(grid[0], drawn.items(), strict=False):
         step = f": {shown.step / MM:.0f} mm" if shown.step else ""
-        silhouette(axes, shown, f"{ASKED[name]}{step}\nfront {front:.0f}°, rear {rear:.0f}°")
+        draw_silhouette(axes, shown, f"{ASKED[name]}{step}\nfront {front:.0f}°, rear {rear:.0f}°")
     for axes in grid[0][len(drawn) :]:
         axes.axis("off")
     return fig
@@ -71,17 +73,17 @@ def asked_about(drawn: Mapping[str, tuple[Drawn, float, float]]) -> Figure:
 
 def rest_and_step(found: Postures) -> Figure:
     """The first run at rest on its slope, and where its centre of mass is over the edge of its highest step."""
-    fig, grid = figure(1, 2, 3.6)
+    fig, grid = new_figure(1, 2, 3.6)
     pitch, contact, step = (found.table[c][0] for c in ("pitch_deg", "contact_mm", "highest_step_mm"))
-    silhouette(grid[0, 0], found.rest, f"At rest: pitch {pitch:.1f}°, contact {contact:.0f} mm")
-    silhouette(grid[0, 1], found.step, f"Highest step of this posture: {step:.0f} mm")
+    draw_silhouette(grid[0, 0], found.rest, f"At rest: pitch {pitch:.1f}°, contact {contact:.0f} mm")
+    draw_silhouette(grid[0, 1], found.step, f"Highest step of this posture: {step:.0f} mm")
     return fig
 
 
-def steps(over: StepMap) -> Figure:
+def draw_highest_steps(over: StepMap) -> Figure:
     """Highest step and margin of tipping over the angles of front and rear levers, the run's own marked, and the
     posture of the highest step."""
-    fig, grid = figure(2, 2, 7.6)
+    fig, grid = new_figure(2, 2, 7.6)
     maps = ((over.step_mm, "highest step [mm]"), (over.margin_mm, "margin of tipping at rest [mm]"))
     for axes, (values, label) in zip(grid[:, 0], maps, strict=True):
         drawn = axes.contourf(over.angles_deg, over.angles_deg, values, levels=12, cmap="cividis")
@@ -96,5 +98,5 @@ def steps(over: StepMap) -> Figure:
     grid[0, 0].legend(loc="upper right", labelcolor=INK, facecolor="white", frameon=True)
     grid[1, 1].axis("off")
     best = f"Highest: {over.step_mm.max():.0f} mm, front {over.front_deg:g}°, rear {over.rear_deg:g}°"
-    silhouette(grid[0, 1], over.best, best)
+    draw_silhouette(grid[0, 1], over.best, best)
     return fig

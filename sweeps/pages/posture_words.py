@@ -24,7 +24,7 @@ COLUMNS = {
 ROWS = 20
 
 
-def table(found: Postures) -> dict[str, Any]:
+def posture_table(found: Postures) -> dict[str, Any]:
     """Headings and rows of the page's table."""
     shown = {c: about for c, about in COLUMNS.items() if c in found.table}
     rows = range(min(ROWS, len(found.table["pitch_deg"])))
@@ -32,7 +32,7 @@ def table(found: Postures) -> dict[str, Any]:
     return {"headings": [heading for heading, _ in shown.values()], "rows": cells}
 
 
-def stands(found: Postures) -> str:
+def posture_sentences(found: Postures) -> str:
     """One or two sentences on the posture of the first run and its geometric limits."""
     one, most = {c: values[0] for c, values in found.table.items()}, found.over.step_mm.max()
     return (
@@ -44,7 +44,7 @@ def stands(found: Postures) -> str:
     )
 
 
-def remarks(found: Postures) -> list[str]:
+def tipping_remarks(found: Postures) -> list[str]:
     """Remarks on runs that would tip over, which the numbers of straight travel do not show."""
     over = np.flatnonzero(found.table["margin_mm"] < 0)
     if not over.size:

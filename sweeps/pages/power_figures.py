@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 from matplotlib.figure import Figure
 
-from sweeps.pages.figure_style import BLUE, GREEN, INK, ORANGE, PURPLE, SKY, figure, legend_columns
+from sweeps.pages.figure_style import BLUE, GREEN, INK, ORANGE, PURPLE, SKY, legend_columns, new_figure
 
 #: Where power goes, with its colour: losses in the order of the chain, then what is left.
 ITEMS = {
@@ -21,7 +21,7 @@ ITEMS = {
 _DARK = (PURPLE, BLUE, GREEN, INK)
 
 
-def split(runs: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def power_by_item(runs: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Power [W] of each item, of every run, out of the powers of `runs.csv`.
 
     Rolling resistance holds the acceleration where a run has not settled.
@@ -32,14 +32,14 @@ def split(runs: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return dict(zip(ITEMS, [*losses, *ends], strict=True))
 
 
-def sources(runs: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+def power_sources(runs: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Power [W] that the supply gives, and that the slope gives a run downhill."""
     return np.maximum(runs["power_supply_W"], 0.0), np.maximum(-runs["power_lift_W"], 0.0)
 
 
-def drawable(runs: dict[str, np.ndarray]) -> np.ndarray:
+def drawable_runs(runs: dict[str, np.ndarray]) -> np.ndarray:
     """Mask of runs with numbers and without negative losses."""
-    parts, given = np.stack(list(split(runs).values())), sum(sources(runs))
+    parts, given = np.stack(list(power_by_item(runs).values())), sum(power_sources(runs))
     return np.isfinite(parts).all(0) & (parts >= -1e-6 * np.maximum(given, 1.0)).all(0) & (given > 0)
 
 
@@ -47,12 +47,12 @@ def drawable(runs: dict[str, np.ndarray]) -> np.ndarray:
 ON_SHAFT = {"track and slip": "load"}
 
 
-def chain(runs: dict[str, np.ndarray], names: list[str], has_ground: bool = True) -> Figure:
+def draw_power_chain(runs: dict[str, np.ndarray], names: list[str], has_ground: bool = True) -> Figure:
     """A bar a run [W], from the motor's losses to the power that lifts the robot, or that the load takes."""
-    fig, grid = figure(1, 1, 1.15 + 0.42 * len(names))
-    axes, parts = grid[0, 0], split(runs)
+    fig, grid = new_figure(1, 1, 1.15 + 0.42 * len(names))
+    axes, parts = grid[0, 0], power_by_item(runs)
     said = {} if has_ground else ON_SHAFT
-    supply, slope = sources(runs)
+    supply, slope = power_sources(runs)
     total = supply + slope
     left = np.zeros(len(names))
     place = np.arange(len(names), dtype=float)

@@ -11,8 +11,8 @@ from matplotlib.patches import Rectangle
 from mmrjax.model.quantities import MM
 from mmrjax.undercarriage.ripple_peaks import MATTERS, SIGNALS, strongest_resonances
 from sweeps.pages import words
-from sweeps.pages.figure_style import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, SKY, VERMILION, figure
-from sweeps.results.resonance_results import ResonanceResult, percent
+from sweeps.pages.figure_style import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, SKY, VERMILION, new_figure
+from sweeps.results.resonance_results import ResonanceResult, ripple_percent
 
 ORDERS = 8  # lines of the Campbell diagram
 MAPS = ("reaction", "current", "speed")
@@ -26,8 +26,8 @@ def resonance_map(found: ResonanceResult) -> Figure:
     """Natural frequencies against harmonics of what passes; below, ripple at every speed and payload."""
     rows = len(found.modes)
     heights = [4.4, *(0.5 + 0.2 * rows for _ in MAPS)]
-    fig, grid = figure(4, 1, sum(heights) + 0.6, sharex=True, height_ratios=heights)
-    campbell(grid[0, 0], found)
+    fig, grid = new_figure(4, 1, sum(heights) + 0.6, sharex=True, height_ratios=heights)
+    draw_campbell_diagram(grid[0, 0], found)
     for axes, name in zip(grid[1:, 0], MAPS, strict=True):
         ripple_map(axes, found, name)
     grid[-1, 0].set_xlabel("speed of the robot [mm/s]")
@@ -48,7 +48,7 @@ def _top(found: ResonanceResult) -> float:
     return 1.15 * max([seen, *bands, 10.0])
 
 
-def campbell(axes: Axes, found: ResonanceResult) -> None:
+def draw_campbell_diagram(axes: Axes, found: ResonanceResult) -> None:
     """Lines n × V / S, bands of natural frequencies, and the strongest line of each run, larger for more ripple."""
     table, what, top = found.table, found.passing, _top(found)
     fastest = float(np.nanmax(table["speed_mean_mm_s"]))
@@ -71,7 +71,7 @@ def campbell(axes: Axes, found: ResonanceResult) -> None:
         axes.scatter(
             table["speed_mean_mm_s"][found.read], table[f"{name}_frequency_Hz"][found.read],
             s=4 + 60 * (ripple / max(float(np.nanmax(ripple)), 1e-9)) ** 2, marker=marker, color=colour, alpha=0.55,
-            lw=0, zorder=3, label=f"{SIGNALS[name].label}, up to {percent(float(np.nanmax(ripple)))}",
+            lw=0, zorder=3, label=f"{SIGNALS[name].label}, up to {ripple_percent(float(np.nanmax(ripple)))}",
         )  # fmt: skip
     strong = _strong(found)
     hits = [p for p in found.peaks if p.mode and (p.mode, p.order, p.signal) in strong]
@@ -159,7 +159,7 @@ def ripple_map(axes: Axes, found: ResonanceResult, name: str) -> None:
     axes.set_yticks(range(len(payloads)), [f"{p:g}" for p in payloads])
     axes.grid(False)
     others = [s for s in dict.fromkeys(map(str, table["status"])) if s != "converged"]
-    kinds = "; ".join(f"{_UNREAD.get(s, '·').replace('_', '–')} {words.short(s)}" for s in others)
+    kinds = "; ".join(f"{_UNREAD.get(s, '·').replace('_', '–')} {words.short_status(s)}" for s in others)
     label = SIGNALS[name].label
     remarks = [] if most >= 100 * MATTERS else [f"under {100 * MATTERS:g} %: no speed to avoid for it"]
     remarks += [kinds] if kinds else []

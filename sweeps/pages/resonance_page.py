@@ -12,16 +12,16 @@ from calibration.data.robot_file import RobotFile
 from mmrjax.model.quantities import MM
 from mmrjax.undercarriage.ripple_peaks import MATTERS, PERIODS, SIGNALS, TAIL, strongest_resonances
 from sweeps.pages import resonance_figures, words
-from sweeps.pages.page import Album, named, render
+from sweeps.pages.page import Album, render_page, robot_section
 from sweeps.results.resonance_results import ResonanceResult
 
 
-def write(folder: Path, found: ResonanceResult, file: RobotFile) -> Path:
+def write_resonance_page(folder: Path, found: ResonanceResult, file: RobotFile) -> Path:
     """Write `report.html` and `figures/` of a map; returns the path of the page."""
     album = Album(folder)
     if found.read.any():
         album.add("map", partial(resonance_figures.resonance_map, found))
-    return render(
+    return render_page(
         folder,
         "resonance.html.j2",
         album,
@@ -34,7 +34,7 @@ def write(folder: Path, found: ResonanceResult, file: RobotFile) -> Path:
         periods=PERIODS,
         tail=100 * TAIL,
         matters=100 * MATTERS,
-        **named(file),
+        **robot_section(file),
     )
 
 
@@ -84,7 +84,7 @@ def _points(found: ResonanceResult) -> list[dict[str, Any]]:
             "payload": f"{table['payload_kg'][k]:g}",
             "speed": table["speed_mean_mm_s"][k],
             "ripple": [table[f"{name}_ripple_percent"][k] for name in SIGNALS],
-            "status": words.short(str(table["status"][k])),
+            "status": words.short_status(str(table["status"][k])),
             "to_avoid": found.to_avoid(k),
         }
         for k in np.flatnonzero(table["table8"])
@@ -93,7 +93,7 @@ def _points(found: ResonanceResult) -> list[dict[str, Any]]:
 
 def _statuses(found: ResonanceResult) -> list[dict[str, Any]]:
     return [
-        {"name": name, "count": count, "meaning": words.meaning(name)}
+        {"name": name, "count": count, "meaning": words.status_meaning(name)}
         for name, count in found.statuses.items()
         if count
     ]

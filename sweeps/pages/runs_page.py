@@ -17,9 +17,18 @@ from mmrjax.model.robot import Robot
 from sweeps import capabilities
 from sweeps.pages import posture_words, power_figures, words
 from sweeps.pages.history_figures import Start
-from sweeps.pages.page import Album, columns, first_rows, label, named, reading, render, statuses
+from sweeps.pages.page import (
+    Album,
+    channel_columns,
+    conditions_in_words,
+    first_rows,
+    printed_reading,
+    render_page,
+    robot_section,
+    status_rows,
+)
 from sweeps.points.imposed import UNLIMITED
-from sweeps.report.condition_columns import conditions
+from sweeps.report.condition_columns import condition_formats
 from sweeps.results.posture_results import Postures
 
 #: What the table of runs shows beside conditions and channels: heading, factor, format.
@@ -32,7 +41,7 @@ FURTHER = {
 HISTORIES, CHAINS, GEARS = 4, 12, 2  # runs that a figure has room for
 
 
-def write(
+def write_runs_page(
     folder: Path,
     file: RobotFile,
     *,
@@ -55,25 +64,27 @@ def write(
         The path of the page.
     """
     album, robot = Album(folder), file.robot
-    names = labels(runs)
+    names = run_headings(runs)
     known: dict[str, Any] = {"shown": 0, "ripple": [], "averaged": 0.0, "courses": [], "starts": [], "posture": None}
     if histories is not None:
         known |= _histories(album, robot, runs, names, histories)
     if stands is not None:
         from sweeps.pages import posture_figures
 
-        known["posture"] = posture_words.table(stands)
+        known["posture"] = posture_words.posture_table(stands)
         album.add("posture", lambda: posture_figures.rest_and_step(stands))
         if len(names) == 1:
-            album.add("steps", lambda: posture_figures.steps(stands.over))
-    chain = np.flatnonzero(power_figures.drawable(runs) & np.isin(runs["status"], words.SETTLED))[:CHAINS]
+            album.add("steps", lambda: posture_figures.draw_highest_steps(stands.over))
+    chain = np.flatnonzero(power_figures.drawable_runs(runs) & np.isin(runs["status"], words.SETTLED))[:CHAINS]
     if chain.size:
         picked = {key: value[chain] for key, value in runs.items()}
-        album.add("power", lambda: power_figures.chain(picked, [names[k] for k in chain], robot.has_ground))
+        album.add(
+            "power", lambda: power_figures.draw_power_chain(picked, [names[k] for k in chain], robot.has_ground)
+        )
     single = len(names) == 1
     shown = capabilities.without_idle(robot, runs)
-    used = limits(robot, {key: value[0] for key, value in runs.items()}, known["starts"]) if single else []
-    return render(
+    used = limits_used(robot, {key: value[0] for key, value in runs.items()}, known["starts"]) if single else []
+    return render_page(
         folder,
         "runs.html.j2",
         album,
@@ -82,28 +93,28 @@ def write(
         model=model,
         total=len(names),
         rows=[{"label": name, **row} for name, row in zip(names, first_rows(runs), strict=False)],
-        statuses=statuses(runs),
+        statuses=status_rows(runs),
         limits=used,
-        answer=answer(runs, robot.channels, used),
+        answer=runs_answer(runs, robot.channels, used),
         within=not any(limit["percent"] is not None and limit["percent"] > 100 for limit in used),
         chained=len(chain),
         most=CHAINS,
-        columns=columns(robot.channels),
-        about=conditions(runs, mass=True),
+        columns=channel_columns(robot.channels),
+        about=condition_formats(runs, mass=True),
         further={c: about for c, about in FURTHER.items() if c in shown},
         heat="winding_settled_C" in shown,
         has_ground=robot.has_ground,
-        unknown=[] if robot.knows(VOLTAGE) else capabilities.unknown(robot),
+        unknown=[] if robot.knows(VOLTAGE) else capabilities.unknown_numbers_sentence(robot),
         **known,
-        **named(file),
+        **robot_section(file),
     )
 
 
-def answer(runs: dict[str, np.ndarray], channels: Sequence[Channel], used: Sequence[Mapping[str, Any]]) -> str:
+def runs_answer(runs: dict[str, np.ndarray], channels: Sequence[Channel], used: Sequence[Mapping[str, Any]]) -> str:
     """One sentence: readings of a single run and its most used limit, or how many of several runs settle.
 
     Args:
-        used: limits of a single run, as `limits` returns them.
+        used: limits of a single run, as `limits_used` returns them.
     """
     settled = np.isin(runs["status"], words.SETTLED)
     if len(settled) > 1:
@@ -112,8 +123,8 @@ def answer(runs: dict[str, np.ndarray], channels: Sequence[Channel], used: Seque
         rest = f"; {beyond if over else 'all within every limit'}" if settled.any() else ""
         return f"{settled.sum()} of {len(settled)} runs have an operating point{rest}."
     if not settled[0]:
-        return f"No operating point: {words.meaning(str(runs['status'][0]))}."
-    readings = ", ".join(f"{c.label} {reading(runs[c.column][0], c.name)} {c.unit}" for c in channels)
+        return f"No operating point: {words.status_meaning(str(runs['status'][0]))}."
+    readings = ", ".join(f"{c.label} {printed_reading(runs[c.column][0], c.name)} {c.unit}" for c in channels)
     judged = [limit for limit in used if limit["percent"] is not None]
     readings = readings[0].upper() + readings[1:]
     if not judged:
@@ -123,9 +134,9 @@ def answer(runs: dict[str, np.ndarray], channels: Sequence[Channel], used: Seque
     return f"{readings}; {nearest['words']} {verb} ({nearest['percent']:.0f} % of {nearest['limit']})."
 
 
-def labels(runs: dict[str, np.ndarray]) -> list[str]:
+def run_headings(runs: dict[str, np.ndarray]) -> list[str]:
     """A heading for each run: its name where it has one, and its conditions."""
-    found = [label(runs, k) for k in range(len(runs["status"]))]
+    found = [conditions_in_words(runs, k) for k in range(len(runs["status"]))]
     return [f"{runs['run_id'][k]}: {at}" for k, at in enumerate(found)] if "run_id" in runs else found
 
 
@@ -140,10 +151,10 @@ def _histories(
     if not robot.has_ground:
         if not any(c.over_time for c in robot.channels):
             return {}
-        shown = history_figures.courses(robot.channels, history, status, names[:HISTORIES])
+        shown = history_figures.members_as_read(robot.channels, history, status, names[:HISTORIES])
         album.add("courses", lambda: history_figures.over_time(shown))
         return {"shown": len(shown), "courses": shown, "starts": []}
-    starts = history_figures.starts(robot, history, status, which, names[:HISTORIES])
+    starts = history_figures.members_from_standstill(robot, history, status, which, names[:HISTORIES])
     album.add("history", lambda: history_figures.from_standstill(starts))
     album.add("slip", lambda: history_figures.slip_over_start(starts))
     known: dict[str, Any] = {"shown": len(starts), "starts": starts}
@@ -152,21 +163,22 @@ def _histories(
 
         known["averaged"] = 1e3 * float(history.time[0, 1] - history.time[0, 0])
         share = np.asarray(histories.columns["guide_share"])
-        gears = gear_figures.gears(robot, history, status, share, which, names[:GEARS])
+        gears = gear_figures.members_with_gear(robot, history, status, share, which, names[:GEARS])
         # A ripple is of steady travel: the contacts have stopped sliding before the part that is looked at.
         ripples = [g for g, s in zip(gears, starts, strict=False) if s.gets_under_way and g.settled_since(s.slipping)]
         if ripples:
             known["ripple"] = album.add("ripple", lambda: gear_figures.current_ripple(ripples))
-            album.add("reactions", lambda: gear_figures.reactions(ripples))
+            album.add("reactions", lambda: gear_figures.draw_reactions(ripples))
             tracked = [g for g in ripples if g.on_tracks]
             if tracked:
                 album.add(
-                    "touchdown", lambda: gear_figures.touchdown(tracked[0], f"{tracked[0].name}: touchdowns dotted")
+                    "touchdown",
+                    lambda: gear_figures.draw_touchdowns(tracked[0], f"{tracked[0].name}: touchdowns dotted"),
                 )
     return known
 
 
-def limits(robot: Robot, run: dict[str, Any], starts: Sequence[Start] = ()) -> list[dict[str, Any]]:
+def limits_used(robot: Robot, run: dict[str, Any], starts: Sequence[Start] = ()) -> list[dict[str, Any]]:
     """Use of each limit by a run: words, its value, the limit, and the share of it [%].
 
     A winding has the share of its permissible temperature rise. An inrush without a stated limit has no share.
@@ -199,7 +211,7 @@ def limits(robot: Robot, run: dict[str, Any], starts: Sequence[Start] = ()) -> l
     found = [
         {"words": name, "value": words.NONE_SETTLES if math.isinf(value) else form.format(value) + unit,
          "limit": form.format(limit) + unit,
-         "percent": warmed(value, limit, ambient) if unit == " °C" else 100 * abs(value) / limit}
+         "percent": warming_share(value, limit, ambient) if unit == " °C" else 100 * abs(value) / limit}
         for name, value, limit, form, unit in asked
         if not (math.isnan(value) or math.isnan(limit) or limit >= UNLIMITED)
     ]  # fmt: skip
@@ -215,7 +227,7 @@ def limits(robot: Robot, run: dict[str, Any], starts: Sequence[Start] = ()) -> l
     return found
 
 
-def warmed(value: float, limit: float, ambient: float) -> float:
+def warming_share(value: float, limit: float, ambient: float) -> float:
     """Share of what a winding may warm up by above the surroundings [%]."""
     return 100 * (value - ambient) / max(limit - ambient, 1.0)
 

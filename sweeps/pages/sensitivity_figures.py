@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from calibration.sensitivity.replicates import Estimate
 from calibration.sensitivity.result import NEGLIGIBLE, NextRuns, OutputStudy, SensitivityResult
 from mmrjax.errors import count_noun
-from sweeps.pages.figure_style import BLUE, GREEN, INK, ORANGE, PURPLE, VERMILION, figure, note
+from sweeps.pages.figure_style import BLUE, GREEN, INK, ORANGE, PURPLE, VERMILION, corner_note, new_figure
 from sweeps.pages.words import short_name
 
 #: Inputs that a figure shows at most, and operating points of a tornado.
@@ -17,19 +17,19 @@ SHOWN, TALLEST, PANELS = 8, 10, 4
 _MAP = "Blues"
 
 
-def ranked(share: np.ndarray, most: int = SHOWN) -> np.ndarray:
+def leading_inputs(share: np.ndarray, most: int = SHOWN) -> np.ndarray:
     """Indices of the inputs with the largest share, none that is negligible unless all are."""
     order = np.argsort(-share, kind="stable")
     kept = [k for k in order[:most] if share[k] >= NEGLIGIBLE]
     return np.array(kept or order[:1], int)
 
 
-def overview(found: SensitivityResult) -> Figure:
+def draw_input_shares(found: SensitivityResult) -> Figure:
     """Share of every input in every output, over all operating points together."""
     shares = np.stack([study.overall_share for study in found.outputs.values()], 1)
     rows = [k for k in np.argsort(-shares.max(1), kind="stable") if shares[k].max() >= NEGLIGIBLE][:14]
     rows = rows or [int(np.argmax(shares.max(1)))]
-    fig, axes = figure(1, 1, 0.9 + 0.29 * len(rows))
+    fig, axes = new_figure(1, 1, 0.9 + 0.29 * len(rows))
     ax: Axes = axes[0, 0]
     _cells(ax, shares[rows], 12)
     ax.set_yticks(range(len(rows)), [short_name(found.names[k]) for k in rows])
@@ -54,7 +54,7 @@ def _cells(ax: Axes, shares: np.ndarray, labelled: int) -> None:
                 ax.text(j, i, f"{100 * x:.0f}", ha="center", va="center", fontsize=8.5, color=ink)
 
 
-def panels(study: OutputStudy, found: SensitivityResult) -> list[int]:
+def tornado_points(study: OutputStudy, found: SensitivityResult) -> list[int]:
     """Operating points of a tornado: of each configuration the gentlest and the hardest that it runs, or between."""
     points = found.points
     kinds = list(dict.fromkeys(map(str, points.configuration)))
@@ -68,15 +68,15 @@ def panels(study: OutputStudy, found: SensitivityResult) -> list[int]:
     return chosen[:PANELS]
 
 
-def tornado(study: OutputStudy, found: SensitivityResult) -> Figure:
+def draw_tornado(study: OutputStudy, found: SensitivityResult) -> Figure:
     """The output with each input alone at the ends of its 95 % interval, at a few operating points."""
-    where = panels(study, found)
+    where = tornado_points(study, found)
     unit, factor = study.row.unit, study.row.factor
     swing, value = study.swing[:, where] / factor, study.value[where] / factor
     reach = np.nanmax(np.abs(swing - value[:, None]), 0, initial=0.0, where=np.isfinite(swing))
     relative = (reach / np.maximum(reach.max(1, keepdims=True), 1e-300)).sum(0)
     top = [i for i in np.argsort(-relative, kind="stable")[:TALLEST] if relative[i] > 0.03]
-    fig, axes = figure(1, max(len(where), 1), 0.9 + 0.26 * len(top), sharey=True)
+    fig, axes = new_figure(1, max(len(where), 1), 0.9 + 0.26 * len(top), sharey=True)
     for n, ax in enumerate(axes[0]):
         for place, i in enumerate(top):
             for end, colour in ((swing[0, n, i], VERMILION), (swing[1, n, i], BLUE)):
@@ -100,11 +100,11 @@ def _split(label: str) -> str:
     return f"{first}\n{', '.join(rest)}"
 
 
-def indices(study: OutputStudy, found: SensitivityResult) -> Figure:
+def draw_indices(study: OutputStudy, found: SensitivityResult) -> Figure:
     """Indices over all points with their 95 % intervals, and the share of each input at every point."""
     share = study.overall_share
-    top = ranked(share)
-    fig, axes = figure(1, 2, 1.0 + 0.3 * max(len(top), 3), width_ratios=(1.0, 1.7))
+    top = leading_inputs(share)
+    fig, axes = new_figure(1, 2, 1.0 + 0.3 * max(len(top), 3), width_ratios=(1.0, 1.7))
     left, right = axes[0]
     _bars(left, study, found, top)
     _over_points(right, study, found, top)
@@ -176,14 +176,14 @@ def _range(values: np.ndarray) -> str:
     return f"{values.min():g}-{values.max():g}"
 
 
-def convergence(found: SensitivityResult) -> Figure:
+def draw_convergence(found: SensitivityResult) -> Figure:
     """The main index of the leading inputs of each output against the model evaluations spent."""
     shown = [s for s in found.outputs.values() if s.convergence][:6]
     rows = -(-len(shown) // 3)
-    fig, axes = figure(rows, min(3, len(shown)), 2.1 * rows + 0.4)
+    fig, axes = new_figure(rows, min(3, len(shown)), 2.1 * rows + 0.4)
     for ax, study in zip(axes.ravel(), shown, strict=False):
         counts = np.array([count for count, _ in study.convergence])
-        for k, colour in zip(ranked(study.overall_share, 3), (BLUE, VERMILION, GREEN), strict=False):
+        for k, colour in zip(leading_inputs(study.overall_share, 3), (BLUE, VERMILION, GREEN), strict=False):
             series = [e[k] for _, e in study.convergence]
             low, high = np.array([e.low for e in series]), np.array([e.high for e in series])
             ax.fill_between(counts, low, high, color=colour, alpha=0.18, linewidth=0)
@@ -212,7 +212,7 @@ def next_runs(runs: NextRuns, found: SensitivityResult) -> Figure:
     """Remaining share of each input's sd after each proposed run."""
     left = runs.sd[-1]
     moving = [k for k in np.argsort(left, kind="stable") if left[k] < 0.99][:10]
-    fig, axes = figure(1, 1, 0.8 + 0.28 * max(len(moving), 2))
+    fig, axes = new_figure(1, 1, 0.8 + 0.28 * max(len(moving), 2))
     ax = axes[0, 0]
     for place, k in enumerate(moving):
         ax.barh(-place, 1.0, color="#e9ecef", height=0.66)
@@ -225,5 +225,5 @@ def next_runs(runs: NextRuns, found: SensitivityResult) -> Figure:
     )
     ax.grid(axis="y", visible=False)
     if not moving:
-        note(ax, "these runs give no information on these inputs")
+        corner_note(ax, "these runs give no information on these inputs")
     return fig

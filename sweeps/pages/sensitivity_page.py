@@ -11,14 +11,14 @@ import numpy as np
 from calibration.data.robot_file import RobotFile
 from calibration.sensitivity.result import NEGLIGIBLE, OutputStudy, SensitivityResult, interactions
 from sweeps.pages import sensitivity_figures
-from sweeps.pages.page import Album, named, number, render
+from sweeps.pages.page import Album, printed_number, render_page, robot_section
 from sweeps.report.words import sensitivity_words
 
 #: Pairs of a table of interactions.
 PAIRS = 5
 
 
-def write(folder: Path, found: SensitivityResult, file: RobotFile) -> Path:
+def write_sensitivity_page(folder: Path, found: SensitivityResult, file: RobotFile) -> Path:
     """Write `report.html` and `figures/` of a finished study; returns the path of the page.
 
     Args:
@@ -26,14 +26,14 @@ def write(folder: Path, found: SensitivityResult, file: RobotFile) -> Path:
         file: of the robot that was studied.
     """
     album = Album(folder)
-    album.add("overview", partial(sensitivity_figures.overview, found))
+    album.add("overview", partial(sensitivity_figures.draw_input_shares, found))
     sections = []
     for name, study in found.outputs.items():
         has_numbers = bool(study.studied.any()) and bool(np.isfinite(study.value).any()) and _decided(study)
         pairs = _pairs(study, found)
         if has_numbers:
-            album.add(f"tornado_{name}", partial(sensitivity_figures.tornado, study, found))
-            album.add(f"indices_{name}", partial(sensitivity_figures.indices, study, found))
+            album.add(f"tornado_{name}", partial(sensitivity_figures.draw_tornado, study, found))
+            album.add(f"indices_{name}", partial(sensitivity_figures.draw_indices, study, found))
         sections.append(
             {
                 "name": name,
@@ -45,10 +45,10 @@ def write(folder: Path, found: SensitivityResult, file: RobotFile) -> Path:
             }
         )
     if any(study.convergence for study in found.outputs.values()):
-        album.add("convergence", partial(sensitivity_figures.convergence, found))
+        album.add("convergence", partial(sensitivity_figures.draw_convergence, found))
     if found.next_runs is not None:
         album.add("next_runs", partial(sensitivity_figures.next_runs, found.next_runs, found))
-    return render(
+    return render_page(
         folder,
         "sensitivity.html.j2",
         album,
@@ -61,7 +61,7 @@ def write(folder: Path, found: SensitivityResult, file: RobotFile) -> Path:
         negligible=100 * NEGLIGIBLE,
         ranges=_ranges(found),
         bounds=_bounds(found),
-        **named(file),
+        **robot_section(file),
     )
 
 
@@ -75,8 +75,8 @@ def _sentence(study: OutputStudy, found: SensitivityResult) -> str:
     share, row = study.overall_share, study.row
     if not _decided(study):
         return "No number at any of these operating points, or nothing changes it."
-    top = sensitivity_figures.ranked(share, 3)
-    who = ", ".join(f"{sensitivity_words.meaning(found, found.names[k])} {100 * share[k]:.0f} %" for k in top)
+    top = sensitivity_figures.leading_inputs(share, 3)
+    who = ", ".join(f"{sensitivity_words.input_in_words(found, found.names[k])} {100 * share[k]:.0f} %" for k in top)
     value, sd = study.value / row.factor, study.sd / row.factor
     finite = np.isfinite(value) & np.isfinite(sd)
     unit = "" if row.unit == "-" else f" {row.unit}"
@@ -143,7 +143,8 @@ def _next_runs(found: SensitivityResult) -> dict[str, Any] | None:
     return {
         "rows": [
             {
-                "configuration": str(points.configuration[k]), "imposed": number(points.imposed[1][k], "{:g}"),
+                "configuration": str(points.configuration[k]),
+                "imposed": printed_number(points.imposed[1][k], "{:g}"),
                 "payload": f"{points.payload[k]:g}", "slope": f"{points.slope_deg[k]:g}", "gain": f"{n.gain[k]:.1f}",
             }
             for k in range(len(points))

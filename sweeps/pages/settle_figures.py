@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
-from calibration.data.courses import applied
+from calibration.data.courses import applied_drive
 from calibration.data.settling import Settled
-from sweeps.pages.figure_style import BLUE, FAINT, INK, VERMILION, figure
+from sweeps.pages.figure_style import BLUE, FAINT, INK, VERMILION, new_figure
 from sweeps.report.settle_report import IMPOSED
 
 #: Most points of a line of a figure, in pairs of the least and the greatest of as many samples.
@@ -26,12 +26,12 @@ def over_log(found: Settled) -> Figure:
         clock[mine] = begin + runs["time_s"][mine] - runs["time_s"][mine[0]]
         begin = float(clock[mine[-1]])
     order = every[np.argsort(clock[every], kind="stable")]
-    lines = [("{}\n[{}]".format(*IMPOSED[runs.layout.imposed]), applied(runs))]
+    lines = [("{}\n[{}]".format(*IMPOSED[runs.layout.imposed]), applied_drive(runs))]
     lines += [
         (f"{s.channel.label}\n[{s.channel.unit}]", s.shown if len(s.angle) else runs[s.channel.column])
         for s in found.signals
     ]
-    fig, grid = figure(len(lines), 1, 1.9 * len(lines), sharex=True)
+    fig, grid = new_figure(len(lines), 1, 1.9 * len(lines), sharex=True)
     for axes, (label, values), signal in zip(grid[:, 0], lines, (None, *found.signals), strict=True):
         axes.plot(*_thinned(clock[order], values[order]), color=FAINT, lw=0.8)
         for s in found.stretches:

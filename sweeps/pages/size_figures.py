@@ -9,15 +9,15 @@ from matplotlib.patches import Patch, Rectangle
 
 from calibration.sizing.chart import LIMITS, Chart
 from calibration.sizing.design import OBJECTIVES
-from sweeps.pages.figure_style import BLUE, GREEN, INK, ORANGE, PURPLE, SKY, VERMILION, figure, legend_columns
+from sweeps.pages.figure_style import BLUE, GREEN, INK, ORANGE, PURPLE, SKY, VERMILION, legend_columns, new_figure
 from sweeps.results.size_results import SizeResult
 
 _COLOURS = dict(zip(LIMITS, (BLUE, "#555555", VERMILION, PURPLE, ORANGE, "#8c564b", SKY, GREEN), strict=True))
 
 
-def limits(found: SizeResult, charts: dict[str, Chart]) -> Figure:
+def draw_nearest_limits(found: SizeResult, charts: dict[str, Chart]) -> Figure:
     """One panel a robot: the colour says which limit is nearest, the line where it is reached."""
-    fig, axes = figure(1, len(charts), 4.6, sharex=True, sharey=True)
+    fig, axes = new_figure(1, len(charts), 4.6, sharex=True, sharey=True)
     e = found.asked.envelope
     palette = ListedColormap([_COLOURS[name] for name in LIMITS])
     seen: set[int] = set()
@@ -49,10 +49,10 @@ def limits(found: SizeResult, charts: dict[str, Chart]) -> Figure:
     return fig
 
 
-def front(found: SizeResult) -> Figure:
+def draw_pareto_front(found: SizeResult) -> Figure:
     """The Pareto front of two objectives, its motors named."""
     first, second = found.objectives
-    fig, axes = figure(1, 1, 3.8)
+    fig, axes = new_figure(1, 1, 3.8)
     ax = axes[0, 0]
     x, y = (np.array([f.objectives[name] for f in found.sizing.front]) for name in (first, second))
     ax.step(x, y, where="post", color="#bbbbbb", linewidth=1.2)

@@ -13,8 +13,8 @@ from matplotlib.ticker import MaxNLocator
 
 from mmrjax.model.channels import Channel
 from sweeps.pages import words
-from sweeps.pages.figure_style import FAINT, INK, axis_label, figure, note
-from sweeps.pages.page import reading
+from sweeps.pages.figure_style import FAINT, INK, axis_label, corner_note, new_figure
+from sweeps.pages.page import printed_reading
 
 _PANELS = 3  # voltages drawn of a configuration
 _CELLS = 12  # along an axis up to which cells are labelled
@@ -27,7 +27,7 @@ UNITS = {"supply_voltage_V": "V", "motor_speed_rpm": "rpm", "motor_current_A": "
 PLURAL = {"supply_voltage_V": "voltages", "motor_speed_rpm": "motor speeds", "motor_current_A": "motor currents"}
 
 
-def imposed(runs: dict[str, np.ndarray]) -> str:
+def imposed_column(runs: dict[str, np.ndarray]) -> str:
     """Column of what is imposed in runs: conditions stand before readings."""
     return next(column for column in runs if column in UNITS)
 
@@ -37,7 +37,7 @@ def on_ground(runs: dict[str, np.ndarray]) -> bool:
     return "slope_deg" in runs and "payload_kg" in runs
 
 
-def panels(voltages: np.ndarray, column: str = "supply_voltage_V") -> list[tuple[str, np.ndarray]]:
+def panels_by_imposed(voltages: np.ndarray, column: str = "supply_voltage_V") -> list[tuple[str, np.ndarray]]:
     """Panels of a figure by imposed quantity: a title and a mask for each of at most three panels.
 
     Up to three voltages each have a panel. A grid with more has the least, a middle and the greatest. If nearly every
@@ -60,27 +60,27 @@ def is_map(runs: dict[str, np.ndarray]) -> bool:
     return on_ground(runs) and np.unique(runs["slope_deg"]).size > 1 and np.unique(runs["payload_kg"]).size > 1
 
 
-def settled(runs: dict[str, np.ndarray], channel: Channel) -> np.ndarray:
+def runs_with_number(runs: dict[str, np.ndarray], channel: Channel) -> np.ndarray:
     """Mask of runs with a settled number; `drive` also leaves instantaneous numbers with other statuses."""
     return np.isin(runs["status"], words.SETTLED) & np.isfinite(runs[channel.column])
 
 
-def sweep(runs: dict[str, np.ndarray], channel: Channel) -> Figure:
+def draw_sweep(runs: dict[str, np.ndarray], channel: Channel) -> Figure:
     """One channel over slope and payload, a panel for each voltage and configuration.
 
     With a single slope or payload the panels are lines over the other. A cell that did not settle is hatched
     and names the reason. Several runs in one cell are shown by their median.
     """
     kinds = list(dict.fromkeys(map(str, runs["configuration"])))
-    volts = panels(runs[imposed(runs)], imposed(runs))
+    volts = panels_by_imposed(runs[imposed_column(runs)], imposed_column(runs))
     if not is_map(runs):
         return _lines(runs, channel, kinds)
-    readings = runs[channel.column][settled(runs, channel)]
+    readings = runs[channel.column][runs_with_number(runs, channel)]
     low, high = (float(readings.min()), float(readings.max())) if readings.size else (0.0, 1.0)
     norm = colors.Normalize(low, high if high > low else low + 1.0)
     payloads = np.unique(runs["payload_kg"])
     tall = min(0.3 * payloads.size, 2.2) + 1.0
-    fig, grid = figure(len(kinds), len(volts), max(2.0, tall) * len(kinds) + 0.5)
+    fig, grid = new_figure(len(kinds), len(volts), max(2.0, tall) * len(kinds) + 0.5)
     for row, kind in zip(grid, kinds, strict=True):
         for axes, (volt, mask) in zip(row, volts, strict=True):
             _map(axes, runs, np.nonzero((runs["configuration"] == kind) & mask)[0], channel, norm)
@@ -96,14 +96,14 @@ def sweep(runs: dict[str, np.ndarray], channel: Channel) -> Figure:
 def _map(axes: Axes, runs: dict[str, np.ndarray], index: np.ndarray, channel: Channel, norm: Any) -> None:
     axes.grid(False)
     if not index.size:
-        note(axes, "no runs")
+        corner_note(axes, "no runs")
         return
     slopes, at_slope = np.unique(runs["slope_deg"][index], return_inverse=True)
     payloads, at_payload = np.unique(runs["payload_kg"][index], return_inverse=True)
     if slopes.size * payloads.size > 4 * index.size:  # scattered, no grid
         _scatter(axes, runs, index, channel, norm)
         return
-    cell, has_number = at_payload * slopes.size + at_slope, settled(runs, channel)[index]
+    cell, has_number = at_payload * slopes.size + at_slope, runs_with_number(runs, channel)[index]
     image = np.full((payloads.size, slopes.size), np.nan)
     shown, medians = _medians(cell[has_number], runs[channel.column][index][has_number])
     image.flat[shown] = medians
@@ -117,7 +117,7 @@ def _map(axes: Axes, runs: dict[str, np.ndarray], index: np.ndarray, channel: Ch
         for j, i in zip(*np.nonzero(np.isfinite(image)), strict=True):
             shade = colormaps["viridis"](norm(image[j, i]))
             ink = "white" if 0.299 * shade[0] + 0.587 * shade[1] + 0.114 * shade[2] < 0.52 else INK
-            axes.text(i, j, reading(image[j, i], channel.name), color=ink, fontsize=7.5, **_INSIDE)
+            axes.text(i, j, printed_reading(image[j, i], channel.name), color=ink, fontsize=7.5, **_INSIDE)
     for i, j, wide, tall in _blocks(set(missing), joined=not labelled):
         axes.add_patch(Rectangle((i - 0.5, j - 0.5), wide, tall, fc="#f4f4f4", ec="#b5b5b5", hatch="////", lw=0.4))
     _say_missing(axes, missing, labelled)
@@ -156,14 +156,14 @@ def _say_missing(axes: Axes, missing: dict[tuple[int, int], str], each: bool) ->
     box = {"fc": "white", "ec": "none", "pad": 0.6, "alpha": 0.85}
     if each:
         for (i, j), status in missing.items():
-            axes.text(i, j, words.short(str(status)), fontsize=6.8, bbox=box, **_INSIDE)
+            axes.text(i, j, words.short_status(str(status)), fontsize=6.8, bbox=box, **_INSIDE)
         return
     for status in sorted(set(missing.values())):
         places = np.array([p for p, s in missing.items() if s == status], float)
         i, j = places[np.argmin(((places - places.mean(0)) ** 2).sum(1))]
         edge = axes.get_xlim()[1]
         side = "right" if i > 0.88 * edge else "left" if i < 0.12 * edge else "center"
-        axes.text(i, j, words.short(str(status)), ha=side, va="center", fontsize=8.5, bbox=box)
+        axes.text(i, j, words.short_status(str(status)), ha=side, va="center", fontsize=8.5, bbox=box)
 
 
 def _ticks(setter: Any, levels: np.ndarray) -> None:
@@ -179,19 +179,19 @@ def _ticks(setter: Any, levels: np.ndarray) -> None:
 
 def _scatter(axes: Axes, runs: dict[str, np.ndarray], index: np.ndarray, channel: Channel, norm: Any) -> None:
     values = runs[channel.column][index]
-    settles = settled(runs, channel)[index]
+    settles = runs_with_number(runs, channel)[index]
     x, y = runs["slope_deg"][index], runs["payload_kg"][index]
     axes.scatter(x[settles], y[settles], c=values[settles], cmap="viridis", norm=norm, s=8, rasterized=True)
     for status in np.unique(runs["status"][index][~settles]):
         pick = ~settles & (runs["status"][index] == status)
-        axes.plot(x[pick], y[pick], "x", ms=3, color=FAINT, rasterized=True, label=words.short(str(status)))
+        axes.plot(x[pick], y[pick], "x", ms=3, color=FAINT, rasterized=True, label=words.short_status(str(status)))
     if not settles.all():
         axes.legend(loc="upper right", fontsize=7.5, frameon=True, markerscale=1.5)
 
 
 def _lines(runs: dict[str, np.ndarray], channel: Channel, kinds: list[str]) -> Figure:
-    column, settles = channel.column, settled(runs, channel)
-    over = own = imposed(runs)
+    column, settles = channel.column, runs_with_number(runs, channel)
+    over = own = imposed_column(runs)
     if on_ground(runs):
         over = "payload_kg" if np.unique(runs["payload_kg"]).size > 1 else "slope_deg"
         if np.unique(runs[over]).size == 1 and np.unique(runs[own]).size > 1:
@@ -200,10 +200,10 @@ def _lines(runs: dict[str, np.ndarray], channel: Channel, kinds: list[str]) -> F
         "payload_kg": "payload [kg]", "slope_deg": "slope [°]", "supply_voltage_V": "supply voltage [V]",
         "motor_speed_rpm": "motor speed [rpm]",
     }[over]  # fmt: skip
-    fig, grid = figure(1, len(kinds), 3.2, sharey=True)
+    fig, grid = new_figure(1, len(kinds), 3.2, sharey=True)
     for axes, kind in zip(grid[0], kinds, strict=True):
         mine = runs["configuration"] == kind
-        volts = [("", mine)] if over == own else panels(runs[own], own)
+        volts = [("", mine)] if over == own else panels_by_imposed(runs[own], own)
         for k, (volt, mask) in enumerate(volts):
             pick = np.nonzero(mine & mask)[0]
             pick = pick[np.argsort(runs[over][pick], kind="stable")]
@@ -231,7 +231,7 @@ def _lines(runs: dict[str, np.ndarray], channel: Channel, kinds: list[str]) -> F
                     clip_on=False,
                 )
                 axes.annotate(
-                    words.short(str(status)),
+                    words.short_status(str(status)),
                     (runs[over][at[0]], 0.03 + 0.05 * k),
                     xycoords=axes.get_xaxis_transform(),
                     xytext=(6, 4),

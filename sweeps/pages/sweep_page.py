@@ -15,7 +15,7 @@ from mmrjax.errors import count_noun
 from mmrjax.model.channels import Channel
 from sweeps import capabilities
 from sweeps.pages import sweep_figures, words
-from sweeps.pages.page import Album, named, render, statuses
+from sweeps.pages.page import Album, render_page, robot_section, status_rows
 
 Table = dict[str, np.ndarray]
 _AXES = {
@@ -28,7 +28,7 @@ _AXES = {
 }
 
 
-def write(folder: Path, file: RobotFile, *, model: str, runs: Table) -> Path:
+def write_sweep_page(folder: Path, file: RobotFile, *, model: str, runs: Table) -> Path:
     """Write `report.html` and `figures/` for a finished sweep.
 
     Args:
@@ -42,22 +42,22 @@ def write(folder: Path, file: RobotFile, *, model: str, runs: Table) -> Path:
     """
     album, robot = Album(folder), file.robot
     for channel in robot.channels:
-        album.add(f"sweep_{channel.name}", partial(sweep_figures.sweep, runs, channel))
-    return render(
+        album.add(f"sweep_{channel.name}", partial(sweep_figures.draw_sweep, runs, channel))
+    return render_page(
         folder,
         "sweep.html.j2",
         album,
         of_channels=robot.channels,
         title=f"Sweep of {count_noun(len(runs['status']), 'run')}",
         model=model,
-        answer=answer(runs),
-        counts=counts(capabilities.without_idle(robot, runs), robot.channels),
+        answer=sweep_answer(runs),
+        counts=sweep_counts(capabilities.without_idle(robot, runs), robot.channels),
         volts_drawn=_drawn(runs),
-        **named(file),
+        **robot_section(file),
     )
 
 
-def answer(runs: Table) -> str:
+def sweep_answer(runs: Table) -> str:
     """One sentence: runs that have an operating point, and how many of them stay within every limit."""
     total = len(runs["status"])
     settled = np.isin(runs["status"], words.SETTLED)
@@ -74,9 +74,9 @@ def answer(runs: Table) -> str:
     )
 
 
-def counts(runs: Table, channels: Sequence[Channel]) -> dict[str, Any]:
+def sweep_counts(runs: Table, channels: Sequence[Channel]) -> dict[str, Any]:
     """Counts of a finished sweep per status and limit, its axes in words, and the extremes of the settled runs."""
-    status = statuses(runs)
+    status = status_rows(runs)
     for s in status:
         s["over"] = int(((runs["status"] == s["name"]) & (runs["flags"] != "")).sum())
         s["where"] = "" if s["name"] in words.SETTLED else _where(runs, runs["status"] == s["name"])
@@ -122,7 +122,7 @@ def _where(runs: Table, pick: np.ndarray) -> str:
         mine = pick & (runs["configuration"] == kind)
         if mine.any():
             ranges = []
-            axes = [c for c in ("slope_deg", sweep_figures.imposed(runs)) if c in runs]
+            axes = [c for c in ("slope_deg", sweep_figures.imposed_column(runs)) if c in runs]
             for column, unit in ((c, _AXES[c][1]) for c in axes):
                 levels = np.unique(runs[column][mine])
                 if np.isnan(levels).all():
@@ -160,8 +160,8 @@ def _extremes(runs: Table, channels: Sequence[Channel]) -> list[dict[str, str]]:
 def _drawn(runs: Table) -> str:
     if not sweep_figures.on_ground(runs):
         return ""
-    imposed = sweep_figures.imposed(runs)
-    shown = sweep_figures.panels(runs[imposed], imposed)
+    imposed = sweep_figures.imposed_column(runs)
+    shown = sweep_figures.panels_by_imposed(runs[imposed], imposed)
     if sum(int(mask.sum()) for _, mask in shown) == len(runs["status"]):
         return ""
     return (

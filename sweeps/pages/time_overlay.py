@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from mmrjax.model.channels import Channel
-from sweeps.pages.figure_style import BLUE, FAINT, INK, ORANGE, axis_label, figure
+from sweeps.pages.figure_style import BLUE, FAINT, INK, ORANGE, axis_label, new_figure
 
 #: Readings on a page, shared by all its runs and channels; a page stays below 1.5 MB.
 POINTS = 24_000
@@ -57,7 +57,7 @@ class TimeOverlay:
         rows = self._thinned(self.rows[name], POINTS // (4 * len(self.channels)))
         time = self.table["time_s"][rows]
         count = len(self.channels)
-        fig, grid = figure(2 * count, 1, 2.9 * count, sharex=True, height_ratios=[3, 1] * count)
+        fig, grid = new_figure(2 * count, 1, 2.9 * count, sharex=True, height_ratios=[3, 1] * count)
         for k, channel in enumerate(self.channels):
             above, below = grid[2 * k, 0], grid[2 * k + 1, 0]
             above.plot(

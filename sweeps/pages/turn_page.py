@@ -15,10 +15,10 @@ from calibration.data.robot_file import RobotFile
 from mmrjax.fidelities.base import History
 from mmrjax.model.quantities import MM, RPM
 from mmrjax.model.robot import Robot
-from sweeps.pages.figure_style import BLUE, FAINT, INK, VERMILION, figure
-from sweeps.pages.page import Album, columns, named, render
+from sweeps.pages.figure_style import BLUE, FAINT, INK, VERMILION, new_figure
+from sweeps.pages.page import Album, channel_columns, render_page, robot_section
 from sweeps.pages.turn_words import FULL, Turn
-from sweeps.report.condition_columns import conditions
+from sweeps.report.condition_columns import condition_formats
 
 SIDES = (("left", BLUE), ("right", VERMILION))
 #: Settled turns of a larger radius are drawn as an arc of so many lengths of the robot.
@@ -27,7 +27,7 @@ ARC = 20.0
 BEND = 0.05
 
 
-def write(
+def write_turn_page(
     folder: Path,
     file: RobotFile,
     *,
@@ -48,16 +48,16 @@ def write(
     """
     album, robot = Album(folder), file.robot
     row = {name: values[0] for name, values in run.items()}
-    imposed = {name: values for name, values in run.items() if name not in columns(robot.channels).values()}
+    imposed = {name: values for name, values in run.items() if name not in channel_columns(robot.channels).values()}
     if history is None:
-        album.add("path", lambda: circle(robot, row))
+        album.add("path", lambda: draw_turn_circle(robot, row))
     else:
         place = {c: np.asarray(history.reading[c])[0] for c in ("place_x", "place_y", "yaw")}
-        album.add("path", lambda: path(robot, row, place["place_x"], place["place_y"], place["yaw"]))
-        album.add("course", lambda: course(history))
+        album.add("path", lambda: draw_path(robot, row, place["place_x"], place["place_y"], place["yaw"]))
+        album.add("course", lambda: draw_turn_course(history))
     if turns is not None:
         album.add("turns", lambda: over_yaw_rate(turns, row))
-    return render(
+    return render_page(
         folder,
         "turn.html.j2",
         album,
@@ -65,9 +65,9 @@ def write(
         title=facts.answer,
         model=model,
         facts=facts,
-        about={heading: form.format(row[c]) for c, (heading, form) in conditions(imposed, mass=True).items()},
+        about={heading: form.format(row[c]) for c, (heading, form) in condition_formats(imposed, mass=True).items()},
         settled=history is None,
-        **named(file),
+        **robot_section(file),
     )
 
 
@@ -90,10 +90,10 @@ def _plan(axes: Axes) -> None:
     axes.set_ylabel("uphill, or ahead of the start [m]", color=INK)
 
 
-def circle(robot: Robot, row: Mapping[str, Any]) -> Figure:
+def draw_turn_circle(robot: Robot, row: Mapping[str, Any]) -> Figure:
     """The circle of a settled turn from above, or an arc of it, with the robot and the centre of rotation."""
     rate, speed, across = (float(row[c]) for c in ("yaw_rate_rad_s", "speed_mm_s", "lateral_speed_mm_s"))
-    fig, grid = figure(1, 1, 4.6)
+    fig, grid = new_figure(1, 1, 4.6)
     axes = grid[0, 0]
     length = float(robot.running_gear.wheelbase)
     velocity = np.array([speed, across]) * MM
@@ -119,7 +119,7 @@ def circle(robot: Robot, row: Mapping[str, Any]) -> Figure:
     return fig
 
 
-def arcs(
+def path_arcs(
     x: np.ndarray, y: np.ndarray, yaw: np.ndarray
 ) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, " points"]]:
     """A path between places, each stretch at a speed and yaw rate of its own: an arc; steps of a run may be long.
@@ -137,13 +137,13 @@ def arcs(
     return whole.real, whole.imag
 
 
-def path(robot: Robot, row: Mapping[str, Any], x: np.ndarray, y: np.ndarray, yaw: np.ndarray) -> Figure:
+def draw_path(robot: Robot, row: Mapping[str, Any], x: np.ndarray, y: np.ndarray, yaw: np.ndarray) -> Figure:
     """A path from above, the robot at its beginning and its end, and between."""
     finite = np.isfinite(x)
     x, y, yaw = x[finite], y[finite], yaw[finite]
-    fig, grid = figure(1, 1, 4.6)
+    fig, grid = new_figure(1, 1, 4.6)
     axes = grid[0, 0]
-    ahead, aside = arcs(x, y, yaw)
+    ahead, aside = path_arcs(x, y, yaw)
     axes.plot(-aside, ahead, color=BLUE)
     for k, color in ((0, FAINT), (len(x) // 2, FAINT), (len(x) - 1, INK)):
         _outline(axes, robot, row, x[k], y[k], yaw[k], color)
@@ -151,11 +151,11 @@ def path(robot: Robot, row: Mapping[str, Any], x: np.ndarray, y: np.ndarray, yaw
     return fig
 
 
-def course(history: History) -> Figure:
+def draw_turn_course(history: History) -> Figure:
     """Currents and motor speeds of both sides, and the yaw rate, over time."""
     time = np.asarray(history.time)[0]
     read = {name: np.asarray(values)[0] for name, values in history.reading.items()}
-    fig, grid = figure(3, 1, 6.0, sharex=True)
+    fig, grid = new_figure(3, 1, 6.0, sharex=True)
     for side, color in SIDES:
         for axes, name, factor in ((grid[0, 0], "motor_current", 1.0), (grid[1, 0], "motor_speed", RPM)):
             axes.plot(time, read[f"{name}_{side}"] / factor, color=color, label=side)
@@ -172,7 +172,7 @@ def course(history: History) -> Figure:
 
 def over_yaw_rate(turns: dict[str, np.ndarray], row: Mapping[str, Any]) -> Figure:
     """Current of either side and power over the yaw rate of settled turns, the one asked for marked."""
-    fig, grid = figure(1, 2, 3.4)
+    fig, grid = new_figure(1, 2, 3.4)
 
     def rate(motion: Mapping[str, Any]) -> np.ndarray:
         # On the spot the curvature is without limit, the yaw rate is not.

@@ -41,7 +41,7 @@ class Turn:
     notes: list[str]
 
 
-def unlike(name: str, effects: Sequence[str], turns: str) -> str:
+def unlike_sides_note(name: str, effects: Sequence[str], turns: str) -> str:
     """Remark on effects that differ between the sides and that runs without a turn do not show."""
     return f"{name}: {STRAIGHT} ({', '.join(effects)}); {turns}"
 
@@ -67,7 +67,7 @@ def by_itself(robot: Robot, found: Result, value: float) -> str:
     return f"{alike}, it turns: {'; '.join(told)} ({states} show it)" if told else ""
 
 
-def reach(speed: float, rate: float, speeds: np.ndarray, rates: np.ndarray) -> str:
+def turn_not_found_reason(speed: float, rate: float, speeds: np.ndarray, rates: np.ndarray) -> str:
     """Reason for a missing turn: the limit at full voltage, or no steady turn under friction.
 
     Args:
@@ -89,7 +89,7 @@ def reach(speed: float, rate: float, speeds: np.ndarray, rates: np.ndarray) -> s
     return f"with which it reaches {' and '.join(told)}"
 
 
-def turn(robot: Robot, row: Mapping[str, Any], ended: Mapping[str, float] | None) -> Turn:
+def turn_in_words(robot: Robot, row: Mapping[str, Any], ended: Mapping[str, float] | None) -> Turn:
     """A turn in words.
 
     Args:

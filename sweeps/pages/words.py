@@ -178,7 +178,7 @@ SETTLED = ("converged", "reverses")
 UNDER_WAY = (*SETTLED, "rolls_back", "not_settled")
 
 
-def solved(counted: Mapping[str, int]) -> bool:
+def every_run_solved(counted: Mapping[str, int]) -> bool:
     """True if the solver gave an answer for every run, from counts by status."""
     return not counted.get("failed")
 
@@ -193,17 +193,17 @@ OUTCOMES = {
 NO_TURN = "no settled turn, as where friction falls with sliding; simulate --model drive follows it over time"
 
 
-def why(outcome: str) -> str:
+def reason_without_value(outcome: str) -> str:
     """In one line why a quantity has no value."""
     return STATUSES[outcome].why if outcome in STATUSES else OUTCOMES[outcome]
 
 
-def short(status: str) -> str:
+def short_status(status: str) -> str:
     """A status as figures show it."""
     return STATUSES[status].short if status in STATUSES else status
 
 
-def meaning(status: str) -> str:
+def status_meaning(status: str) -> str:
     """A status for the reader of a report."""
     return STATUSES[status].meaning if status in STATUSES else ""
 

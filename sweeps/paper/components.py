@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from mmrjax.model.paper_tables import TRACKED, WHEELED
 from mmrjax.model.robot import Robot
-from sweeps.pages.figure_style import FAINT, INK, PURPLE, figure, label_end, note
+from sweeps.pages.figure_style import FAINT, INK, PURPLE, corner_note, label_end, new_figure
 from sweeps.pages.words import words_shown
 from sweeps.paper import data
 from sweeps.paper.look import CONFIGURATION, MODEL
@@ -21,7 +21,7 @@ _GEAR_SPEEDS = {"15 V": 5000.0, "33 V": 11_500.0}  # motor speeds of the measure
 
 def gearbox_efficiency(robots: dict[str, Robot], rows: data.Rows | None) -> Figure:
     """Fig. 5a: efficiency over output torque; the first robot at two speeds, the others where they differ."""
-    fig, grid = figure(1, 1, 3.9)
+    fig, grid = new_figure(1, 1, 3.9)
     axes = grid[0, 0]
     name, robot = next(iter(robots.items()))
     colour = MODEL.get(name, PURPLE)
@@ -113,11 +113,11 @@ def _mark_rows(axes: Axes, robot: Robot, rows: data.Rows) -> None:
         )
 
 
-def battery(robots: dict[str, Robot]) -> Figure:
+def draw_battery(robots: dict[str, Robot]) -> Figure:
     """Fig. 10: cell voltage over load current (a), no-load voltage over discharge (b) with the capacity."""
     from mmrjax.model.power import COULOMB_PER_MAH
 
-    fig, grid = figure(1, 2, 3.7)
+    fig, grid = new_figure(1, 2, 3.7)
     name, robot = next(iter(robots.items()))
     colour = MODEL.get(name, PURPLE)
     capacity = float(robot.battery.capacity) / COULOMB_PER_MAH
@@ -165,7 +165,7 @@ def battery(robots: dict[str, Robot]) -> Figure:
 
 def motor_friction(robots: dict[str, Robot]) -> Figure:
     """Fig. 11: motor friction torque over speed, with the maker's no-load point."""
-    fig, grid = figure(1, 1, 3.4)
+    fig, grid = new_figure(1, 1, 3.4)
     axes = grid[0, 0]
     speed = np.linspace(0, 12_500, 60)
     drawn: set[bytes] = set()
@@ -199,13 +199,13 @@ def motor_friction(robots: dict[str, Robot]) -> Figure:
 
 def idle_track(robots: dict[str, Robot]) -> tuple[Figure, dict[str, float]]:
     """Fig. 18: current of one motor that turns a lifted side, over pulley speed, and R² of a line through it."""
-    fig, grid = figure(1, 1, 3.6)
+    fig, grid = new_figure(1, 1, 3.6)
     axes = grid[0, 0]
     name, robot = next(iter(robots.items()))
     speed = np.linspace(0.5, 26.0, 60)
     certainty = {}
     known = {TRACKED: "three tracks a side", WHEELED: "one track a side"}
-    for kind in data.kinds(robot):
+    for kind in data.shown_configurations(robot):
         words = f"{known[kind]} ({kind})" if kind in known else kind
         current = data.idle_current(robot, kind, speed)
         line, certainty[kind] = data.fit_line(speed, current)
@@ -220,5 +220,5 @@ def idle_track(robots: dict[str, Robot]) -> tuple[Figure, dict[str, float]]:
                 label_end(axes, speed, flat, f"{words_shown(other)}, three tracks", MODEL[other])
     axes.set(xlabel="pulley speed [rad/s]", ylabel="current of one motor [A]", xlim=(0, 26))
     axes.set_ylim(bottom=0)
-    note(axes, f"dots: {words_shown(name)}; lines: straight fits")
+    corner_note(axes, f"dots: {words_shown(name)}; lines: straight fits")
     return fig, certainty

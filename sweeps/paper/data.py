@@ -31,17 +31,17 @@ FIG_23, FIG_24 = "Fig. 23: total current", r"Fig. 24: $V_x$ and $V_{x\,teor}$"  
 MODES = {1: (15.0, 0.0), 2: (33.0, 0.0), 3: (33.0, 5.0), 4: (33.0, 8.0)}
 
 
-def shared(robot: Robot) -> tuple[str, ...]:
+def shared_configurations(robot: Robot) -> tuple[str, ...]:
     """The paper's configurations that a robot has; its runs on the bench can be set against these alone."""
     return tuple(c for c in CONFIGURATIONS if c in robot.configurations)
 
 
-def kinds(robot: Robot) -> tuple[str, ...]:
+def shown_configurations(robot: Robot) -> tuple[str, ...]:
     """The configurations that are shown of a robot: the paper's, or where it has none of them its own."""
-    return shared(robot) or robot.configurations.names
+    return shared_configurations(robot) or robot.configurations.names
 
 
-def conditions(robot: Robot, configuration: Any, **given: Any) -> Conditions:
+def batch_conditions(robot: Robot, configuration: Any, **given: Any) -> Conditions:
     """A batch of conditions with configurations by name; the total mass, if not given, is the robot's own."""
     made = Conditions(np.asarray(configuration), **given).resolved(robot)
     if made.total_mass is not None:
@@ -68,11 +68,11 @@ def operating_points(robot: Robot, asked: Conditions) -> Columns:
 
 def channels_of_paper() -> tuple[Channel, ...]:
     """The channels that the paper's tables have."""
-    table = runs.read("measured")
+    table = runs.read_runs("measured")
     return tuple(c for c in table.channels if table.has(c.column))
 
 
-def stacked(table: Columns) -> np.ndarray:
+def stack_channels(table: Columns) -> np.ndarray:
     """The paper's channels of a table, in their columns' units, shape (rows, channels)."""
     return np.stack([np.asarray(table[c.column], float) for c in channels_of_paper()], 1)
 
@@ -103,16 +103,16 @@ class Rows:
         return np.array([self.ratio[c] for c in self.conditions["configuration"]])
 
 
-def rows(robot: Robot) -> Rows | None:
+def simulate_measured_rows(robot: Robot) -> Rows | None:
     """Simulate the measured rows with `robot`: as it is, with adhesion raised, and with its own mass.
 
     None where the robot has none of their configurations.
     """
-    if not shared(robot):
+    if not shared_configurations(robot):
         return None
     table, paper = (
-        table.where(np.isin(table["configuration"], shared(robot)))
-        for table in map(runs.read, ("measured", "simulated_by_paper"))
+        table.where(np.isin(table["configuration"], shared_configurations(robot)))
+        for table in map(runs.read_runs, ("measured", "simulated_by_paper"))
     )
     kind = table["configuration"]
     asked: dict[str, Any] = {
@@ -122,16 +122,16 @@ def rows(robot: Robot) -> Rows | None:
         "slope_deg": table["slope_deg"],
     }
     mass = table["total_mass_kg"]
-    plain = operating_points(robot, conditions(robot, total_mass=mass, **asked))
+    plain = operating_points(robot, batch_conditions(robot, total_mass=mass, **asked))
     ratio = {}
-    for c in shared(robot):
+    for c in shared_configurations(robot):
         largest = float(np.max(np.abs(plain["adhesion_used"][kind == c])))
         listed = adhesion_ratio(RAISED_SURFACE, c == TRACKED)
         ratio[c] = max(listed, RAISED_MARGIN * largest) if largest > 1 else 1.0
     adhesion = np.array([ratio[c] for c in kind])
-    raised = operating_points(robot, conditions(robot, total_mass=mass, adhesion=adhesion, **asked))
-    weighed = operating_points(robot, conditions(robot, adhesion=adhesion, **asked))
-    return Rows(table, stacked(table.columns), stacked(paper.columns), plain, raised, weighed, ratio)
+    raised = operating_points(robot, batch_conditions(robot, total_mass=mass, adhesion=adhesion, **asked))
+    weighed = operating_points(robot, batch_conditions(robot, adhesion=adhesion, **asked))
+    return Rows(table, stack_channels(table.columns), stack_channels(paper.columns), plain, raised, weighed, ratio)
 
 
 def raised_words(robot: Robot, ratio: dict[str, float]) -> str:
@@ -149,9 +149,9 @@ def raised_words(robot: Robot, ratio: dict[str, float]) -> str:
     return "; ".join(parts)
 
 
-def errors(simulated: Columns, measured: np.ndarray) -> np.ndarray:
+def channel_percent_errors(simulated: Columns, measured: np.ndarray) -> np.ndarray:
     """Errors (35) of the paper's channels [%], shape (rows, channels); NaN where there is no number."""
-    return simulation_errors.relative_error(stacked(simulated), measured)
+    return simulation_errors.relative_error(stack_channels(simulated), measured)
 
 
 # --- components ---------------------------------------------------------------------------------------
@@ -195,7 +195,7 @@ def idle_current(robot: Robot, configuration: str, speed_wheel: np.ndarray) -> n
     from mmrjax.model import balances
     from mmrjax.model.signals import State
 
-    asked = conditions(robot, np.full(speed_wheel.shape, configuration))
+    asked = batch_conditions(robot, np.full(speed_wheel.shape, configuration))
     chassis = robot.configurations[configuration]
     wheel = jnp.asarray(speed_wheel)
     zero = jnp.zeros_like(wheel)
@@ -221,12 +221,14 @@ def fit_line(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, float]:
 # --- runs ---------------------------------------------------------------------------------------------
 
 
-def starts(robot: Robot, voltage: float = 33.0, seconds: float = 1.5) -> list[Start]:
+def simulate_starts(robot: Robot, voltage: float = 33.0, seconds: float = 1.5) -> list[Start]:
     """From standstill on the flat with `drive`, each of the paper's configurations."""
     from mmrjax.fidelities.drive import drive_batch
 
     times = np.concatenate([np.linspace(0, 0.04, 161), np.linspace(0.04, seconds, 440)[1:]])
-    run = drive_batch(robot, conditions(robot, kinds(robot), voltage=voltage), jnp.asarray(times))
+    run = drive_batch(
+        robot, batch_conditions(robot, shown_configurations(robot), voltage=voltage), jnp.asarray(times)
+    )
     return starts_of(robot, History(run.time, run.distance, run.signals, {}), run.result.status)
 
 
@@ -236,8 +238,10 @@ def starts_of(robot: Robot, history: Any, status: Any) -> list[Start]:
     Args:
         history: time, signals and reactions (None where contacts are not resolved); status: codes of how runs ended.
     """
-    names = kinds(robot)
-    return history_figures.starts(robot, history, status, [robot.configurations.index(c) for c in names], names)
+    names = shown_configurations(robot)
+    return history_figures.members_from_standstill(
+        robot, history, status, [robot.configurations.index(c) for c in names], names
+    )
 
 
 def current_over_slope(robot: Robot, ratio: dict[str, float], slopes: np.ndarray) -> dict[tuple[str, int], Any]:
@@ -246,7 +250,7 @@ def current_over_slope(robot: Robot, ratio: dict[str, float], slopes: np.ndarray
     kind, voltage, payload, adhesion = (
         np.repeat(np.array(v), len(slopes)) for v in zip(*((c, *MODES[mode], r) for c, mode, r in asked), strict=True)
     )
-    at = conditions(
+    at = batch_conditions(
         robot,
         kind,
         voltage=voltage.astype(float),
@@ -270,7 +274,7 @@ def supply_errors(robot: Robot, ratio: float, rows_of: Rows, battery: bool) -> d
         if battery and mode == 1:
             continue
         picked = table.where(pick)
-        at = conditions(
+        at = batch_conditions(
             robot,
             picked["configuration"],
             voltage=voltage,
@@ -280,7 +284,7 @@ def supply_errors(robot: Robot, ratio: float, rows_of: Rows, battery: bool) -> d
             adhesion=ratio,
             battery=float(battery),
         )
-        answer[mode] = errors(operating_points(robot, at), rows_of.measured[pick])
+        answer[mode] = channel_percent_errors(operating_points(robot, at), rows_of.measured[pick])
     return answer
 
 
@@ -324,7 +328,7 @@ def energy_split(robot: Robot, asked: Conditions) -> tuple[Columns, Columns]:
     return points, split
 
 
-def table(rows: Rows) -> Columns:
+def paper_rows_table(rows: Rows) -> Columns:
     """The paper's rows side by side: measured, the paper's simulation, and the robot three ways."""
     asked = rows.conditions
     columns = {key: asked[key] for key in ("configuration", *runs.CONDITIONS)}
@@ -336,9 +340,11 @@ def table(rows: Rows) -> Columns:
     return columns | {"status": rows.plain["status"]}
 
 
-def summary(rows: Rows) -> dict[str, dict[str, Any]]:
+def bench_error_summary(rows: Rows) -> dict[str, dict[str, Any]]:
     """Errors (35) of every channel against the bench: of the robot three ways, and of the paper's simulation."""
-    ways = {name: errors(getattr(rows, name), rows.measured) for name in ("plain", "raised", "weighed")}
+    ways = {
+        name: channel_percent_errors(getattr(rows, name), rows.measured) for name in ("plain", "raised", "weighed")
+    }
     ways["paper"] = simulation_errors.relative_error(rows.paper, rows.measured)
     return {
         way: {c.name: simulation_errors.error_summary(values[:, k]) for k, c in enumerate(channels_of_paper())}

@@ -12,11 +12,11 @@ from calibration.inference import simulation_errors
 from mmrjax.model.paper_tables import CONFIGURATIONS, TRACKED, WHEELED
 from mmrjax.model.quantities import MM, RPM
 from mmrjax.model.robot import Robot
-from sweeps.pages.page import reading
+from sweeps.pages.page import printed_reading
 from sweeps.paper import data
 
 
-def errors(variants: dict[str, np.ndarray], rows: data.Rows) -> list[dict[str, Any]]:
+def variant_errors(variants: dict[str, np.ndarray], rows: data.Rows) -> list[dict[str, Any]]:
     """Rms and worst error (35) of each variant (errors of shape (rows, channels)), all rows and by group."""
     kind = rows.conditions["configuration"]
     answer = []
@@ -30,8 +30,8 @@ def errors(variants: dict[str, np.ndarray], rows: data.Rows) -> list[dict[str, A
     return answer
 
 
-def answer(every: list[dict[str, Any]]) -> str:
-    """Sentence on the rms errors (35) over all rows, from `errors`: the robot's, and the paper's own simulation's."""
+def error_answer(every: list[dict[str, Any]]) -> str:
+    """Sentence on the rms errors (35) over all rows, from `variant_errors`: the robot's and the paper's."""
     own, _, raised, *_, paper = (e for e in every if e["group"] == "all")
     labels = [c.label for c in data.channels_of_paper()]
     mine, theirs = (
@@ -55,8 +55,8 @@ def implied_resistance(robot: Robot, table: runs.Runs) -> np.ndarray:
 def row_by_row(nominal: Robot, rows: data.Rows) -> list[dict[str, Any]]:
     """The 20 rows: bench, the paper's simulation, the nominal robot three ways, and letters that say why."""
     table = rows.conditions
-    own, raised, weighed = (data.stacked(t) for t in (rows.plain, rows.raised, rows.weighed))
-    resistance = implied_resistance(nominal, runs.read("simulated_by_paper"))
+    own, raised, weighed = (data.stack_channels(t) for t in (rows.plain, rows.raised, rows.weighed))
+    resistance = implied_resistance(nominal, runs.read_runs("simulated_by_paper"))
     limit = float(nominal.motor.resistance)
     answer = []
     for k in range(len(table)):
@@ -111,11 +111,11 @@ def _same_mode(table: runs.Runs, k: int) -> np.ndarray:
 def _cells(channel: str, measured: float, paper: float, own: float, raised: float, weighed: float) -> dict[str, Any]:
     """Texts of one channel in a row; differences by (35) of the nominal (raised, own mass) from paper and bench."""
     return {
-        "measured": reading(measured, channel),
-        "paper": reading(paper, channel),
-        "own": reading(own, channel) if np.isfinite(own) else "slides",
-        "raised": reading(raised, channel) if np.isfinite(raised) else "no number",
-        "weighed": reading(weighed, channel) if np.isfinite(weighed) else "no number",
+        "measured": printed_reading(measured, channel),
+        "paper": printed_reading(paper, channel),
+        "own": printed_reading(own, channel) if np.isfinite(own) else "slides",
+        "raised": printed_reading(raised, channel) if np.isfinite(raised) else "no number",
+        "weighed": printed_reading(weighed, channel) if np.isfinite(weighed) else "no number",
         "to_paper": float(simulation_errors.relative_error(np.array(raised), np.array(paper))),
         "to_paper_weighed": float(simulation_errors.relative_error(np.array(weighed), np.array(paper))),
         "to_measured": float(simulation_errors.relative_error(np.array(raised), np.array(measured))),
@@ -123,10 +123,10 @@ def _cells(channel: str, measured: float, paper: float, own: float, raised: floa
     }
 
 
-def facts(nominal: Robot, rows: data.Rows) -> dict[str, Any]:
+def row_by_row_facts(nominal: Robot, rows: data.Rows) -> dict[str, Any]:
     """The numbers behind the letters of `row_by_row`, for the page to put into words."""
     measured = rows.conditions
-    of_paper = implied_resistance(nominal, runs.read("simulated_by_paper"))
+    of_paper = implied_resistance(nominal, runs.read_runs("simulated_by_paper"))
     tracked = measured["configuration"] == TRACKED
     slow, slope = measured["supply_voltage_V"] == 15.0, measured["slope_deg"]
     used = rows.plain["adhesion_used"]

@@ -17,7 +17,7 @@ from sweeps.pages.words import words_shown
 from sweeps.paper import components, data, error_tables, run_figures
 
 
-def write(folder: Path, file: RobotFile, *, model: str, gear: bool) -> tuple[Path, data.Rows | None]:
+def write_paper_page(folder: Path, file: RobotFile, *, model: str, gear: bool) -> tuple[Path, data.Rows | None]:
     """Write `report.html` and `figures/` for a robot and its nominal fellows.
 
     Args:
@@ -29,30 +29,32 @@ def write(folder: Path, file: RobotFile, *, model: str, gear: bool) -> tuple[Pat
         The path of the page, and the robot's results for the paper's rows; None without one of their configurations.
     """
     nominal = ROBOTS["nominal"]()
-    robot, shown = file.robot, page.named(file)
+    robot, shown = file.robot, page.robot_section(file)
     name = file.name if shown["robot"] == words_shown(file.name) else shown["robot"]
     robots = {name: robot} | {n: make() for n, make in ROBOTS.items() if n != name}
     album = page.Album(folder)
     known: dict[str, Any] = {"gear": None, "errors": [], "sliding": [], "measured": 0, "raised": ""}
-    rows = {n: r for n, r in ((n, data.rows(member)) for n, member in robots.items()) if r is not None}
+    rows = {
+        n: r for n, r in ((n, data.simulate_measured_rows(member)) for n, member in robots.items()) if r is not None
+    }
     mine = rows.get(name)
-    ratio = dict.fromkeys(data.kinds(robot), 1.0) if mine is None else mine.ratio
+    ratio = dict.fromkeys(data.shown_configurations(robot), 1.0) if mine is None else mine.ratio
     if mine is not None:
         known |= _against_the_bench(album, robots, rows, name)
-    starts = data.starts(robot)
+    starts = data.simulate_starts(robot)
     album.add("fig23_24_from_standstill", lambda: history_figures.from_standstill(starts, data.FIG_23, data.FIG_24))
     if gear:
         from sweeps.paper import running_gear_figures
 
-        known["gear"] = running_gear_figures.draw(album, robot)
-    known["energy"] = album.add("energy_split", lambda: run_figures.energy(robot, ratio))
+        known["gear"] = running_gear_figures.draw_running_gear(album, robot)
+    known["energy"] = album.add("energy_split", lambda: run_figures.draw_energy(robot, ratio))
     album.add("fig05a_gearbox_efficiency", lambda: components.gearbox_efficiency(robots, mine))
-    album.add("fig10_battery", lambda: components.battery(robots))
+    album.add("fig10_battery", lambda: components.draw_battery(robots))
     album.add("fig11_motor_friction", lambda: components.motor_friction(robots))
     known["idle"] = album.add("fig18_idle_track", lambda: components.idle_track(robots))
     known |= {
         "rows": error_tables.row_by_row(nominal, rows["nominal"]),
-        "facts": error_tables.facts(nominal, rows["nominal"]),
+        "facts": error_tables.row_by_row_facts(nominal, rows["nominal"]),
         "raised_nominal": data.raised_words(nominal, rows["nominal"].ratio),
         "starts": starts,
         "split": data.SPLIT,
@@ -60,7 +62,7 @@ def write(folder: Path, file: RobotFile, *, model: str, gear: bool) -> tuple[Pat
         "paper_idle_r2": components.PAPER_IDLE_R2,
     }
     title = f"The paper's figures and tables: {shown['robot']}"
-    return page.render(folder, "paper.html.j2", album, title=title, model=model, **shown, **known), mine
+    return page.render_page(folder, "paper.html.j2", album, title=title, model=model, **shown, **known), mine
 
 
 def _against_the_bench(
@@ -71,9 +73,9 @@ def _against_the_bench(
     certainty = album.add("fig28_current_over_slope", lambda: run_figures.current_over_slope(robot, mine))
     if TRACKED in mine.ratio:
         album.add("fig29_model_errors", lambda: run_figures.model_errors(robots, rows))
-    errors = error_tables.errors(_variants(name, rows), mine)
+    errors = error_tables.variant_errors(_variants(name, rows), mine)
     return {
-        "answer": error_tables.answer(errors),
+        "answer": error_tables.error_answer(errors),
         "certainty": certainty,
         "errors": errors,
         "raised": data.raised_words(robot, mine.ratio),
@@ -85,7 +87,7 @@ def _against_the_bench(
 def _variants(name: str, rows: dict[str, data.Rows]) -> dict[str, np.ndarray]:
     """Errors of the rows under the names that the table of errors shows."""
     mine = rows[name]
-    error = data.errors
+    error = data.channel_percent_errors
     answer = {
         f"{words_shown(name)}: own adhesion, mass as printed": error(mine.plain, mine.measured),
         f"{words_shown(name)}: adhesion raised, mass as printed": error(mine.raised, mine.measured),

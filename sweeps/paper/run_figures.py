@@ -20,10 +20,10 @@ from sweeps.pages.figure_style import (
     SKY,
     VERMILION,
     axis_label,
-    figure,
+    corner_note,
     label_end,
     legend_columns,
-    note,
+    new_figure,
 )
 from sweeps.pages.words import words_shown
 from sweeps.paper import data
@@ -36,7 +36,7 @@ def current_over_slope(robot: Robot, rows: data.Rows) -> tuple[Figure, list[dict
     """Fig. 28: total current over slope in four loading modes, with the measured points and R² (A1)."""
     slopes = np.linspace(0, 20, 81)
     lines = data.current_over_slope(robot, rows.ratio, slopes)
-    fig, grid = figure(1, len(rows.ratio), 4.4, sharey=True)
+    fig, grid = new_figure(1, len(rows.ratio), 4.4, sharey=True)
     certainty = []
     for axes, kind in zip(grid[0], rows.ratio, strict=True):
         for mode, (voltage, payload) in data.MODES.items():
@@ -73,7 +73,7 @@ def current_over_slope(robot: Robot, rows: data.Rows) -> tuple[Figure, list[dict
         axes.set_title(kind)
         fits = [r for r in certainty if r["configuration"] == kind]
         texts = [f"mode {r['mode']}: R² {r['weighed']:.3f} (straight fit {r['straight']:.3f})" for r in fits]
-        note(axes, "markers: measured\n" + "\n".join(texts), fontsize=8.5)
+        corner_note(axes, "markers: measured\n" + "\n".join(texts), fontsize=8.5)
     grid[0, 0].set_ylim(0, 1.2 * grid[0, 0].dataLim.y1 if np.isfinite(grid[0, 0].dataLim.y1) else 1.0)
     grid[0, 0].set_ylabel("total current [A]")
     modes = "     ".join(f"{m}: {u:g} V, {p:g} kg" for m, (u, p) in data.MODES.items())
@@ -86,7 +86,7 @@ def current_over_slope(robot: Robot, rows: data.Rows) -> tuple[Figure, list[dict
 
 def model_errors(robots: dict[str, Robot], rows: dict[str, data.Rows]) -> tuple[Figure, dict[str, Any]]:
     """Fig. 29: errors (35) in current and speed over slope, 6T2A, modes 1 and 2, adhesion raised."""
-    fig, grid = figure(2, 2, 6.2, sharex=True)
+    fig, grid = new_figure(2, 2, 6.2, sharex=True)
     slopes = np.array([0.0, 5.0, 10.0, 15.0, 20.0])
     errors: dict[str, Any] = {}
     for name, robot in robots.items():
@@ -124,7 +124,9 @@ def model_errors(robots: dict[str, Robot], rows: dict[str, data.Rows]) -> tuple[
         grid[row, 0].set_ylabel(label)
     grid[0, 0].set_title("mode 1: 15 V, 0 kg")
     grid[0, 1].set_title("mode 2: 33 V, 8 kg")
-    note(grid[0, 0], "shaded: ±7 %, the paper's claim", x=0.02, y=0.04, va="bottom", fontsize=8, color="#447744")
+    corner_note(
+        grid[0, 0], "shaded: ±7 %, the paper's claim", x=0.02, y=0.04, va="bottom", fontsize=8, color="#447744"
+    )
     for axes in grid[1]:
         axes.set_xlabel("slope [°]")
     labels = [str(h.get_label()) for h in handles]
@@ -144,7 +146,7 @@ _SPLIT_COLOURS = {
 }
 
 
-def energy(robot: Robot, ratio: dict[str, float]) -> tuple[Figure, list[dict[str, Any]]]:
+def draw_energy(robot: Robot, ratio: dict[str, float]) -> tuple[Figure, list[dict[str, Any]]]:
     """Use of the supply's power at twelve operating points, in percent, with watts at the end."""
     asked = [(c, u, p, s) for c in ratio for u, p in ((15.0, 0.0), (33.0, 8.0)) for s in (0.0, 10.0, 20.0)]
     kind, voltage, payload, slope = (np.array(v) for v in zip(*asked, strict=True))
@@ -152,13 +154,13 @@ def energy(robot: Robot, ratio: dict[str, float]) -> tuple[Figure, list[dict[str
     def at(adhesion: np.ndarray) -> tuple[data.Columns, data.Columns]:
         return data.energy_split(
             robot,
-            data.conditions(robot, kind, voltage=voltage, payload=payload, slope_deg=slope, adhesion=adhesion),
+            data.batch_conditions(robot, kind, voltage=voltage, payload=payload, slope_deg=slope, adhesion=adhesion),
         )
 
     points, _ = at(np.ones(len(asked)))
     slides = points["status"] == "slides"
     lifted_points, lifted = at(np.where(slides, [ratio[k] for k in kind], 1.0))
-    fig, grid = figure(1, 1, 5.2)
+    fig, grid = new_figure(1, 1, 5.2)
     axes = grid[0, 0]
     table = []
     height = [float(k) + 0.6 * (k // 3) for k in range(len(asked))]
@@ -187,7 +189,7 @@ def energy(robot: Robot, ratio: dict[str, float]) -> tuple[Figure, list[dict[str
     for k, (c, u, _p, s) in enumerate(asked):
         labels.append(f"{c}  {u:.0f} V  {_p:.0f} kg  {s:.0f}°" + (" *" if slides[k] else ""))
         alive = np.isfinite(total[k])
-        text = f"{total[k]:.0f} W" if alive else words.short(str(lifted_points["status"][k]))
+        text = f"{total[k]:.0f} W" if alive else words.short_status(str(lifted_points["status"][k]))
         axes.text(101 if alive else 1, height[k], text, va="center", fontsize=8.5)
         table.append(
             {"point": labels[-1], "total": float(total[k])}
@@ -209,9 +211,9 @@ def energy(robot: Robot, ratio: dict[str, float]) -> tuple[Figure, list[dict[str
 def row_parity(rows: data.Rows, name: str) -> Figure:
     """Simulated over measured for the rows, every channel, adhesion raised, both masses for 4W2T."""
     shown = data.channels_of_paper()
-    fig, grid = figure(1, len(shown), 3.7)
+    fig, grid = new_figure(1, len(shown), 3.7)
     kind = rows.conditions["configuration"]
-    raised, weighed = data.stacked(rows.raised), data.stacked(rows.weighed)
+    raised, weighed = data.stack_channels(rows.raised), data.stack_channels(rows.weighed)
     moved = (kind == WHEELED) & (np.abs(rows.raised["total_mass_kg"] - rows.weighed["total_mass_kg"]) > 0.05)
     slides = rows.plain["status"] == "slides"
     for k, (axes, channel) in enumerate(zip(grid[0], shown, strict=True)):
@@ -248,7 +250,7 @@ def row_parity(rows: data.Rows, name: str) -> Figure:
         axes.set_xlim(*span)
         axes.set_ylim(*span)
         axes.locator_params(nbins=5)
-    note(grid[0, 0], f"{words_shown(name)}; band ±5 %", fontsize=8.5)
+    corner_note(grid[0, 0], f"{words_shown(name)}; band ±5 %", fontsize=8.5)
     fig.legend(
         *grid[0, 0].get_legend_handles_labels(),
         loc="outside lower center",

@@ -19,20 +19,20 @@ SECONDS = 1.5  # of a run
 SAMPLE = 5e-4  # of its record [s]
 
 
-def runs(robot: Robot) -> Trajectory:
+def simulate_gear_runs(robot: Robot) -> Trajectory:
     """The paper's configurations from standstill on the flat at 33 V without payload, in NumPy.
 
     A robot too stiff for the model's usual step is run with a smaller one.
     """
     import jax
 
-    conditions = data.conditions(robot, data.kinds(robot), voltage=33.0)
+    conditions = data.batch_conditions(robot, data.shown_configurations(robot), voltage=33.0)
     step = min(STEP, float(largest_step(robot, conditions).min()))
     step = SAMPLE / math.ceil(SAMPLE / step * (1 - 1e-9))
     return jax.device_get(track_batch(robot, conditions, duration=SECONDS, sample=SAMPLE, step=step))
 
 
-def draw(album: Album, robot: Robot) -> dict[str, Any]:
+def draw_running_gear(album: Album, robot: Robot) -> dict[str, Any]:
     """Draw the figures.
 
     Returns:
@@ -40,25 +40,27 @@ def draw(album: Album, robot: Robot) -> dict[str, Any]:
         robot's `share`. `currents` [A] are by `steady` at that share and with the share resolved; None without a
         tracked configuration. If runs did not settle: `left_out`, the statuses of all, and no figures.
     """
-    run, names = runs(robot), data.kinds(robot)
+    run, names = simulate_gear_runs(robot), data.shown_configurations(robot)
     which = [robot.configurations.index(c) for c in names]
     status, share = np.asarray(run.result.status), np.asarray(run.steady.guide_share)
-    gears = gear_figures.gears(robot, run, status, share, which, names)
+    gears = gear_figures.members_with_gear(robot, run, status, share, which, names)
     if not all(gear.rolls for gear in gears):
-        return {"left_out": ", ".join(f"{g.name}: {words.short(g.status)}" for g in gears)}
+        return {"left_out": ", ".join(f"{g.name}: {words.short_status(g.status)}" for g in gears)}
     starts = data.starts_of(robot, run, run.result.status)
     album.add(
         "track_fig23_24_from_standstill",
         lambda: history_figures.from_standstill(starts, data.FIG_23, data.FIG_24),
     )
     facts = album.add("track_fig25_ripple", lambda: gear_figures.current_ripple(gears, "Fig. 25: {}"))
-    album.add("track_fig27_reactions", lambda: gear_figures.reactions(gears, "Fig. 27: {}, one side"))
+    album.add("track_fig27_reactions", lambda: gear_figures.draw_reactions(gears, "Fig. 27: {}, one side"))
     known = {"left_out": None, "rows": facts, "currents": None}
     if TRACKED not in names:
         return known
     k = names.index(TRACKED)
-    album.add("track_fig26_touchdown", lambda: gear_figures.touchdown(gears[k], "Fig. 26: grousers land (dotted)"))
-    lumped = data.operating_points(robot, data.conditions(robot, np.array([TRACKED]), voltage=33.0))
+    album.add(
+        "track_fig26_touchdown", lambda: gear_figures.draw_touchdowns(gears[k], "Fig. 26: grousers land (dotted)")
+    )
+    lumped = data.operating_points(robot, data.batch_conditions(robot, np.array([TRACKED]), voltage=33.0))
     track = robot.configurations[TRACKED].track
     return known | {
         "share": float(track.guide_share),

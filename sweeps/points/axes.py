@@ -76,7 +76,7 @@ class Plan:
         return Conditions(which, **{k: v for k, v in self.conditions.items() if k != CONFIGURATION})
 
 
-def plan(config: Campaign, robot: Robot, where: str) -> Plan:
+def plan_design(config: Campaign, robot: Robot, where: str) -> Plan:
     """The design of a configuration, checked.
 
     Args:
@@ -113,7 +113,7 @@ def plan(config: Campaign, robot: Robot, where: str) -> Plan:
                 raise BadConfiguration(f"{where}, {levers[0]}: {why}")
     own = AXIS[robot.rig.imposed]
     if not robot.rig.inherits and own not in {*fixed, *design.names} and fixed.get("battery", 0.0) <= 0.5:
-        level = imposed.default(robot, f"{where}, conditions.{own}")
+        level = imposed.imposed_default(robot, f"{where}, conditions.{own}")
         fixed[own] = level * OF_IMPOSED[own][1]
     if surface is not None and "adhesion" in {*fixed, *design.names}:
         raise BadConfiguration(f"{where}, conditions.surface: got {surface} beside adhesion; expected one of the two")
@@ -146,7 +146,7 @@ def _acting(names: set[str], robot: Robot, where: str, surface: str | None) -> N
         )
 
 
-def adhesions(robot: Robot, surface: str) -> tuple[float, ...]:
+def adhesion_ratios(robot: Robot, surface: str) -> tuple[float, ...]:
     """Adhesion of each of the robot's configurations on a surface, as a ratio to the bench's."""
     return tuple(adhesion_ratio(surface, float(c.on_tracks) > 0.5) for c in robot.configurations.members)
 
@@ -195,7 +195,7 @@ def _axis(name: str, stated: Any, robot: Robot, where: str, extra: Mapping[str, 
     elif isinstance(stated, Mapping):
         values = _range(stated, where)
     elif isinstance(stated, str):
-        values = np.array(configuration.axis(where, stated))
+        values = np.array(configuration.parse_axis(where, stated))
     else:
         values = np.array([_value(name, v, where) for v in (stated if isinstance(stated, list) else [stated])])
     if not len(values):
@@ -301,7 +301,7 @@ def _posterior(stated: Any, robot: Robot, where: str, data: list[str]) -> Joint:
         raise BadConfiguration(f"{where}: got {stated!r}; expected a run folder of calibrate or loop")
     path = Path(stated)
     path = path / posterior_file.FILE if path.is_dir() else path
-    found = posterior_file.read(path)
+    found = posterior_file.read_posterior(path)
     found.check(robot, where)
     data.append(str(path))
     return found

@@ -57,13 +57,13 @@ OUTPUTS: dict[str, tuple[str, str]] = {
 }
 
 
-def axis(obstacle: Obstacle) -> Axis:
+def obstacle_axis(obstacle: Obstacle) -> Axis:
     """Axis of the obstacle's size."""
     meaning = {"step": "height of the step", "stairs": "rise of each stair", "gap": "width of the trench"}
     return Axis(SIZE, "mm", meaning[obstacle.kind], (1.0, 5000.0), None)
 
 
-def attributes(obstacle: Obstacle) -> dict[str, dict[str, Any]]:
+def climb_attributes(obstacle: Obstacle) -> dict[str, dict[str, Any]]:
     """Outputs that a point has, by name, with their attributes in a store."""
     names = (VERDICT, LARGEST) if obstacle.find else tuple(name for name in OUTPUTS if name != LARGEST)
     found: dict[str, dict[str, Any]] = {
@@ -85,7 +85,9 @@ def terrains_of(obstacle: Obstacle, sizes: np.ndarray) -> Terrain:
     return jax.vmap(make[obstacle.kind])(jnp.asarray(sizes) / 1000)
 
 
-def further(obstacle: Obstacle, varied: Mapping[str, np.ndarray], robot: Robot, where: str) -> dict[str, float]:
+def further_variation(
+    obstacle: Obstacle, varied: Mapping[str, np.ndarray], robot: Robot, where: str
+) -> dict[str, float]:
     """Further conditions: a low voltage, if a sweep of climbs states none.
 
     Args:
@@ -95,7 +97,7 @@ def further(obstacle: Obstacle, varied: Mapping[str, np.ndarray], robot: Robot, 
         BadConfiguration: a robot that cannot climb; no size, or a size and a search; angles and a sequence of angles;
             angles beyond the levers' range or that begin below the ground.
     """
-    if (why := refused(robot)) is not None:
+    if (why := climb_refusal(robot)) is not None:
         raise BadConfiguration(f"{where}, obstacle: {why}")
     if obstacle.find == (SIZE in varied):
         wants = "find looks for it" if obstacle.find else f"expected an axis {SIZE}, or find = true"
@@ -111,12 +113,12 @@ def further(obstacle: Obstacle, varied: Mapping[str, np.ndarray], robot: Robot, 
         if name in varied and one is not None and one.begins is None:
             raise BadConfiguration(f"{where}, {name}: {obstacle.sequence} states all angles; expected one of the two")
         for angle in varied.get(name, ()):
-            if why := terrains.beyond(robot, angle) or terrains.below(robot, angle):
+            if why := terrains.lever_angle_refusal(robot, angle) or terrains.lever_start_refusal(robot, angle):
                 raise BadConfiguration(f"{where}, {name}: {why}")
     return {} if "voltage" in varied or np.all(varied.get("battery", 0.0) > 0.5) else {"voltage": SLOW}
 
 
-def refused(robot: Robot) -> str | None:
+def climb_refusal(robot: Robot) -> str | None:
     """Why a robot cannot climb; None: it can."""
     if not robot.has_ground:
         return "the robot's load is a shaft; expected one with ground under it"
@@ -129,7 +131,7 @@ def refused(robot: Robot) -> str | None:
     return None
 
 
-def computed(
+def compute_climbs(
     obstacle: Obstacle,
     variation: Variation,
     conditions: Conditions,

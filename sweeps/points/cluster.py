@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from calibration.data.input_errors import BadConfiguration, InputError
-from sweeps.points.identity import code, differences, versions
+from sweeps.points.identity import identity_differences, installed_versions, module_hashes
 from sweeps.points.scale import Job, Produced
 from sweeps.store import PACKAGES
 
@@ -65,14 +65,14 @@ class Pool:
 
         work, left = _packed(job), iter(chunks)
         name = hashlib.sha256(work).hexdigest()[:16]
-        expected = {**program(), "device": {"device": self.device}}
+        expected = {**program_identity(), "device": {"device": self.device}}
         tried: dict[int, int] = {}
         numbers: dict[str, int] = {}
 
         def submit(chunk: int) -> Any:
             tried[chunk] = tried.get(chunk, 0) + 1
             key = f"chunk-{chunk}-{tried[chunk]}-{name}"
-            future = self.client.submit(compute, work, name, chunk, expected, key=key, retries=RETRIES)
+            future = self.client.submit(compute_on_worker, work, name, chunk, expected, key=key, retries=RETRIES)
             numbers[future.key] = chunk
             return future
 
@@ -168,7 +168,7 @@ def _packed(job: Job) -> bytes:
             cloudpickle.unregister_pickle_by_value(module)
 
 
-def connect(address: str) -> Pool:
+def connect_workers(address: str) -> Pool:
     """A scheduler's workers, of one program and one kind of device.
 
     Raises:
@@ -186,9 +186,9 @@ def connect(address: str) -> Pool:
                 f"--scheduler: {address} has no workers; start one for each device, as dask worker {address} "
                 "--nthreads 1"
             ) from None
-        here, kinds = program(), set()
-        for worker, (host, device) in client.run(introduce).items():
-            differ = differences(here, host)
+        here, kinds = program_identity(), set()
+        for worker, (host, device) in client.run(introduce_worker).items():
+            differ = identity_differences(here, host)
             if differ:
                 raise BadConfiguration(f"--scheduler: {worker} has another program; it differs in {differ}")
             kinds.add(device)
@@ -253,9 +253,9 @@ _lock = threading.Lock()
 _compiled: dict[str, Any] = {}
 
 
-def program() -> dict[str, dict[str, str]]:
+def program_identity() -> dict[str, dict[str, str]]:
     """Hash of each module, and the versions that numbers depend on."""
-    return {"code": code(), "versions": versions(PACKAGES)}
+    return {"code": module_hashes(), "versions": installed_versions(PACKAGES)}
 
 
 @functools.cache
@@ -266,15 +266,15 @@ def _start() -> None:
     compilation_cache.keep_programs()
 
 
-def introduce() -> tuple[dict[str, dict[str, str]], str]:
+def introduce_worker() -> tuple[dict[str, dict[str, str]], str]:
     """Software of a worker and its device."""
     _start()
     from sweeps.points.scale import device_kind
 
-    return program(), device_kind()
+    return program_identity(), device_kind()
 
 
-def compute(work: bytes, name: str, chunk: int, expected: dict[str, Any]) -> dict[str, np.ndarray]:
+def compute_on_worker(work: bytes, name: str, chunk: int, expected: dict[str, Any]) -> dict[str, np.ndarray]:
     """A chunk on this worker's devices; a job is unpacked and compiled once.
 
     Args:
@@ -283,16 +283,16 @@ def compute(work: bytes, name: str, chunk: int, expected: dict[str, Any]) -> dic
     Raises:
         BadConfiguration: this worker, which has come later than the others, is not like them.
     """
-    host, device = introduce()
-    differ = differences(expected, {**host, "device": {"device": device}})
+    host, device = introduce_worker()
+    differ = identity_differences(expected, {**host, "device": {"device": device}})
     if differ:
         raise BadConfiguration(f"--scheduler: a worker that came later has another program or device: {differ}")
     from mmrjax.compile.precision import double_precision
-    from sweeps.points.scale import Compiled, fetched
+    from sweeps.points.scale import Compiled, fetch_values
 
     with _lock, double_precision():  # of a worker that may have other work, in its user's own precision
         if name not in _compiled:
             _compiled.clear()
             _compiled[name] = Compiled(pickle.loads(work))
         compiled = _compiled[name]
-        return fetched(compiled(compiled.points(chunk)), compiled.job.blocks.count(chunk))
+        return fetch_values(compiled(compiled.points(chunk)), compiled.job.blocks.count(chunk))

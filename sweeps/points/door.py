@@ -11,7 +11,7 @@ from mmrjax.fidelities.results import Results
 from mmrjax.fidelities.simulation import simulate
 from mmrjax.model.robot import Robot
 from sweeps.config import GridPart
-from sweeps.points.grid import grid
+from sweeps.points.grid import grid_conditions
 
 #: One value of an axis, or several.
 Axis = Sequence[float] | np.ndarray | float | None
@@ -56,7 +56,7 @@ def sweep(
         motor_currents_A=_axis(motor_currents_A), payloads_kg=_axis(payloads),
         slopes_deg=_axis(slopes_deg), surface=surface, load_torques_Nm=_axis(load_torques),
     )  # fmt: skip
-    runs = grid(config, robot, battery)
+    runs = grid_conditions(config, robot, battery)
     return simulate(robot, runs.conditions(robot, battery=float(battery), discharge=discharge), model, **options)
 
 

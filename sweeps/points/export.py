@@ -30,7 +30,7 @@ COLUMNS = {
 }
 
 
-def export(kind: str, folder: Path, layout: Layout) -> Path:
+def export_runs(kind: str, folder: Path, layout: Layout) -> Path:
     """Write `runs.csv` or `runs.parquet` into a finished run folder; returns its path.
 
     A row a point, in the order of the points; what is not finite is empty.
@@ -38,14 +38,14 @@ def export(kind: str, folder: Path, layout: Layout) -> Path:
     path = folder / f"runs.{kind}"
     aside = path.with_name(path.name + ".writing")
     try:
-        _WRITERS[kind](aside, tables(folder / STORE, layout))
+        _WRITERS[kind](aside, chunk_tables(folder / STORE, layout))
         os.replace(aside, path)
     finally:
         aside.unlink(missing_ok=True)
     return path
 
 
-def tables(store: Path, layout: Layout) -> Iterator[Any]:
+def chunk_tables(store: Path, layout: Layout) -> Iterator[Any]:
     """The points of each chunk as an Arrow table."""
     import pyarrow as pa
     import zarr

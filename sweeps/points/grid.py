@@ -31,7 +31,7 @@ ON_GROUND, ON_SHAFT = ("payloads_kg", "slopes_deg", "surface"), ("load_torques_N
 AXIS = {"voltage": "voltages_V", "motor_speed": "motor_speeds_rpm", "motor_current": "motor_currents_A"}
 
 
-def resolved(config: G, robot: Robot, battery: bool = False, notes: list[str] | None = None) -> G:
+def resolve_grid(config: G, robot: Robot, battery: bool = False, notes: list[str] | None = None) -> G:
     """The grid with every axis of the robot stated.
 
     The packaged robot takes imposed quantities, payloads and slopes of Table 8. A rig takes thirds of its limit
@@ -46,13 +46,13 @@ def resolved(config: G, robot: Robot, battery: bool = False, notes: list[str] | 
             unknown surface or configuration.
     """
     layout = Layout.of(robot)
-    check(config, robot)
+    check_axes(config, robot)
     own = AXIS[layout.imposed]
-    update: dict[str, object] = {"configurations": configurations(config, robot)}
+    update: dict[str, object] = {"configurations": grid_configurations(config, robot)}
     if battery:
         imposed.check_battery(robot)
     elif getattr(config, own) is None:
-        update[own] = imposed.levels(robot, OPTIONS[own], notes)
+        update[own] = imposed.imposed_levels(robot, OPTIONS[own], notes)
     if robot.has_ground:
         table8 = robot.rig.inherits
         update |= {
@@ -63,7 +63,7 @@ def resolved(config: G, robot: Robot, battery: bool = False, notes: list[str] | 
     return config.model_copy(update=update)
 
 
-def check(config: GridPart, robot: Robot) -> None:
+def check_axes(config: GridPart, robot: Robot) -> None:
     """Refuse axes that a robot does not have.
 
     Raises:
@@ -72,7 +72,7 @@ def check(config: GridPart, robot: Robot) -> None:
     layout = Layout.of(robot)
     for key in AXIS.values():
         if key != AXIS[layout.imposed] and getattr(config, key) is not None:
-            raise BadConfiguration(imposed.refused(robot, OPTIONS[key], OPTIONS[AXIS[layout.imposed]]))
+            raise BadConfiguration(imposed.option_refusal(robot, OPTIONS[key], OPTIONS[AXIS[layout.imposed]]))
     ground, shaft = (
         [OPTIONS[key] for key in keys if getattr(config, key) is not None] for keys in (ON_GROUND, ON_SHAFT)
     )
@@ -82,35 +82,35 @@ def check(config: GridPart, robot: Robot) -> None:
         raise BadConfiguration(f"{OPTIONS['surface']}: got {surface!r}; {allowed_words(surface, SURFACES)}")
 
 
-def axes(config: GridPart, robot: Robot, battery: bool = False) -> dict[str, tuple[object, ...]]:
+def grid_axes(config: GridPart, robot: Robot, battery: bool = False) -> dict[str, tuple[object, ...]]:
     """Values of each axis of a grid by the column of a table, the slope last.
 
     Args:
-        config: as `resolved` makes it; battery: whether the runs are on the battery.
+        config: as `resolve_grid` makes it; battery: whether the runs are on the battery.
 
     Raises:
         BadConfiguration: a configuration that the robot does not have.
     """
     layout = Layout.of(robot)
     found: dict[str, tuple[object, ...]] = {
-        "configuration": configurations(config, robot),
+        "configuration": grid_configurations(config, robot),
         layout.imposed_column: (math.nan,) if battery else getattr(config, AXIS[layout.imposed]),
     }
     loads = {LOAD: config.load_torques_Nm, "payload_kg": config.payloads_kg, "slope_deg": config.slopes_deg}
     return found | {column: values for column, values in loads.items() if values}
 
 
-def grid(config: GridPart, robot: Robot, battery: bool = False) -> Runs:
+def grid_conditions(config: GridPart, robot: Robot, battery: bool = False) -> Runs:
     """Every combination of the axes as a table of conditions, slope varying fastest.
 
     Args:
-        config: as `resolved` makes it, or not yet; battery: whether the runs are on the battery.
+        config: as `resolve_grid` makes it, or not yet; battery: whether the runs are on the battery.
 
     Raises:
-        BadConfiguration: as `resolved`.
+        BadConfiguration: as `resolve_grid`.
     """
-    config = resolved(config, robot, battery)
-    values = axes(config, robot, battery)
+    config = resolve_grid(config, robot, battery)
+    values = grid_axes(config, robot, battery)
     points = list(itertools.product(*values.values()))
     columns = {name: np.array(column) for name, column in zip(values, zip(*points, strict=True), strict=True)}
     if config.surface is not None:
@@ -118,7 +118,7 @@ def grid(config: GridPart, robot: Robot, battery: bool = False) -> Runs:
     return Runs(source="the grid", columns=columns, layout=Layout.of(robot))
 
 
-def configurations(config: GridPart, robot: Robot) -> tuple[str, ...]:
+def grid_configurations(config: GridPart, robot: Robot) -> tuple[str, ...]:
     """Configurations of a grid: the stated ones, or all of the robot's.
 
     Raises:

@@ -13,7 +13,7 @@ from calibration.data.input_errors import BadConfiguration
 from mmrjax.model import params
 from mmrjax.model.robot import Robot
 from sweeps.config import Part
-from sweeps.store import PACKAGES, digest
+from sweeps.store import PACKAGES, sha256_hex
 
 #: Packages besides those of every result whose version is part of a sweep's identity.
 FURTHER = ("scipy", "zarr")
@@ -21,7 +21,7 @@ FURTHER = ("scipy", "zarr")
 Identity = dict[str, dict[str, str]]
 
 
-def identity(config: Part, robot: Robot, files: Iterable[str], device: str) -> Identity:
+def job_identity(config: Part, robot: Robot, files: Iterable[str], device: str) -> Identity:
     """Sections, each of words by key: configuration, data, code, versions, device.
 
     Args:
@@ -35,13 +35,13 @@ def identity(config: Part, robot: Robot, files: Iterable[str], device: str) -> I
     return {
         "configuration": configuration,
         "data": {file: _hash(file) for file in files},
-        "code": code(),
-        "versions": {"python": platform.python_version(), **versions((*PACKAGES, *FURTHER))},
+        "code": module_hashes(),
+        "versions": {"python": platform.python_version(), **installed_versions((*PACKAGES, *FURTHER))},
         "device": {"device": device},
     }
 
 
-def versions(packages: Iterable[str]) -> dict[str, str]:
+def installed_versions(packages: Iterable[str]) -> dict[str, str]:
     """Installed versions by package."""
     return {name: importlib.metadata.version(name) for name in packages}
 
@@ -50,17 +50,17 @@ def versions(packages: Iterable[str]) -> dict[str, str]:
 def _code() -> tuple[tuple[str, str], ...]:
     root = Path(__file__).resolve().parents[2]
     files = sorted(file for package in ("mmrjax", "calibration", "sweeps") for file in (root / package).rglob("*.py"))
-    return tuple((str(file.relative_to(root)), digest(file.read_bytes())[:16]) for file in files)
+    return tuple((str(file.relative_to(root)), sha256_hex(file.read_bytes())[:16]) for file in files)
 
 
-def code() -> dict[str, str]:
+def module_hashes() -> dict[str, str]:
     """Hash of each module of this program."""
     return dict(_code())
 
 
 def _hash(file: str) -> str:
     try:
-        return digest(Path(file).read_bytes())
+        return sha256_hex(Path(file).read_bytes())
     except OSError as error:
         raise BadConfiguration(f"{file}: cannot be read ({error.strerror})") from error
 
@@ -75,7 +75,9 @@ def _flat(content: Mapping[str, Any], prefix: str) -> dict[str, str]:
     return found
 
 
-def differences(stored: Mapping[str, Mapping[str, str]], now: Mapping[str, Mapping[str, str]], most: int = 3) -> str:
+def identity_differences(
+    stored: Mapping[str, Mapping[str, str]], now: Mapping[str, Mapping[str, str]], most: int = 3
+) -> str:
     """In which sections two identities differ, with the first keys; empty where they do not."""
     said = []
     for section in dict.fromkeys((*now, *stored)):

@@ -43,7 +43,7 @@ SAID = {
 }
 
 
-def limit(robot: Robot) -> float | None:
+def imposed_limit(robot: Robot) -> float | None:
     """Largest value to impose: supply voltage [V] or motor speed [rpm]; None: not stated, as for a current."""
     if robot.rig.imposed == "motor_current":
         return None
@@ -59,7 +59,7 @@ def _digits(value: float) -> float:
     return float(np.round(math.floor(value / size + 1e-9) * size, 9))
 
 
-def default(robot: Robot, option: str) -> float:
+def imposed_default(robot: Robot, option: str) -> float:
     """Default of the imposed quantity of a single run: the limit; for the paper's robot `VOLTAGE`.
 
     Raises:
@@ -67,21 +67,21 @@ def default(robot: Robot, option: str) -> float:
     """
     if Layout.of(robot).table8:
         return VOLTAGE
-    most = limit(robot)
+    most = imposed_limit(robot)
     if most is None:
         raise BadConfiguration(_missing(robot, option, SAID[robot.rig.imposed].one))
     return most if robot.rig.imposed == "voltage" else _digits(most)
 
 
-def usual(robot: Robot) -> float:
-    """Imposed value of an example; `default` if the file states a limit [V, rpm]."""
+def imposed_example(robot: Robot) -> float:
+    """Imposed value of an example; `imposed_default` if the file states a limit [V, rpm]."""
     try:
-        return default(robot, "")
+        return imposed_default(robot, "")
     except BadConfiguration:
         return float(SAID[robot.rig.imposed].one)
 
 
-def levels(robot: Robot, option: str, notes: list[str] | None = None) -> tuple[float, ...]:
+def imposed_levels(robot: Robot, option: str, notes: list[str] | None = None) -> tuple[float, ...]:
     """Default of the imposed quantity of a grid: a third, two thirds and all of the limit, or Table 8's.
 
     Args:
@@ -92,7 +92,7 @@ def levels(robot: Robot, option: str, notes: list[str] | None = None) -> tuple[f
     """
     if Layout.of(robot).table8:
         return VOLTAGES_V
-    most = limit(robot)
+    most = imposed_limit(robot)
     if most is None:
         raise BadConfiguration(_missing(robot, option, SAID[robot.rig.imposed].several))
     found = tuple(_digits(share * most) for share in SHARES)
@@ -116,7 +116,7 @@ def _missing(robot: Robot, option: str, example: str) -> str:
     )
 
 
-def refused(robot: Robot, option: str, instead: str) -> str:
+def option_refusal(robot: Robot, option: str, instead: str) -> str:
     """Why an option of what is not imposed is refused."""
     said = SAID[robot.rig.imposed]
     if robot.rig.imposed != "voltage":
@@ -147,7 +147,7 @@ def check_battery(robot: Robot) -> None:
     if robot.rig.imposed != "voltage":
         what = SAID[robot.rig.imposed].words
         raise BadConfiguration(f"--battery: the {what} is imposed on this robot, whatever feeds them; leave it out")
-    if not capabilities.battery(robot):
+    if not capabilities.has_battery(robot):
         raise BadConfiguration("--battery: the robot's file states no battery; add [battery], or state --voltage")
 
 

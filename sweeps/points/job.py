@@ -21,7 +21,7 @@ from mmrjax.model.robot import Robot
 from mmrjax.model.signals import STATUSES
 from sweeps import capabilities
 from sweeps.config_campaign import Campaign
-from sweeps.console import tell
+from sweeps.console import print_message
 from sweeps.points import axes, scale
 from sweeps.points.sampled_design import Blocks
 from sweeps.points.tasks import Task, task_of
@@ -36,7 +36,7 @@ def showing_turns(robot: Robot, conditions: Collection[str]) -> Robot:
     return robot if set(OF_TURNS).isdisjoint(conditions) else robot.showing_turns()
 
 
-def prepare(config: Campaign, robot: Robot, plan: axes.Plan, where: str) -> scale.Job:
+def prepare_job(config: Campaign, robot: Robot, plan: axes.Plan, where: str) -> scale.Job:
     """The job of a resolved configuration.
 
     Raises:
@@ -69,13 +69,13 @@ def _profile(name: str, robot: Robot, plan: axes.Plan, where: str) -> Profile:
     """The profile that every point follows.
 
     Raises:
-        BadData: as `profiles.read`.
+        BadData: as `profiles.read_profile`.
         BadConfiguration: it states what the plan states too, a supply voltage where a point is on the battery, or
             surfaces.
     """
-    source = profiles.read(name)
+    source = profiles.read_profile(name)
     for note in source.notes:
-        tell(note)
+        print_message(note)
     if source.surface is not None:
         raise BadConfiguration(
             f"{where}, profile: got {source.source} with the column surface; expected the surface in conditions"

@@ -28,7 +28,7 @@ from mmrjax.model.signals import FLAGS, STATUSES
 from sweeps import capabilities, skeleton
 from sweeps import config as configuration
 from sweeps.config import FidelityPart, Part, SupplyPart
-from sweeps.console import progress as bar
+from sweeps.console import progress_bar as bar
 from sweeps.pages import words
 from sweeps.points import scale
 from sweeps.points.axes import Plan
@@ -61,7 +61,7 @@ class SimulationResult:
     @property
     def statuses(self) -> dict[str, int]:
         """Number of runs by status; every status is included."""
-        return counts(self.table)
+        return runs_by_status(self.table)
 
     @property
     def flags(self) -> dict[str, int]:
@@ -80,13 +80,13 @@ class SimulationResult:
         }
 
 
-def ended(robot: Robot, batch: Run) -> dict[str, np.ndarray]:
+def ending_columns(robot: Robot, batch: Run) -> dict[str, np.ndarray]:
     """The columns of how a batch of runs ended, with those of its fidelity alone."""
     result, further = jax.device_get((batch.result, batch.columns))
     return outputs.output_columns(result, robot.channels, further)
 
 
-def refuse(robot: Robot, conditions: Conditions, config: FidelityPart) -> None:
+def check_runs_bearable(robot: Robot, conditions: Conditions, config: FidelityPart) -> None:
     """Refuse what some run could not bear, before the first is simulated.
 
     Raises:
@@ -98,14 +98,14 @@ def refuse(robot: Robot, conditions: Conditions, config: FidelityPart) -> None:
         raise BadConfiguration(f"--model {config.model}: {error}") from error
 
 
-def commanded(robot: Robot, runs: Runs, config: Part) -> Conditions:
+def conditions_of_runs(robot: Robot, runs: Runs, config: Part) -> Conditions:
     """The conditions of the runs, fed as the configuration says; without a say by the external supply."""
     if not isinstance(config, SupplyPart):
         return runs.conditions(robot)
     return runs.conditions(robot, battery=float(config.battery), discharge=config.discharge_mAh * COULOMB_PER_MAH)
 
 
-def computed(
+def compute_chunks(
     job: Job,
     folder: RunFolder | None,
     name: str,
@@ -130,7 +130,7 @@ def computed(
             folder.keep_chunk(files[chunk], found[chunk])
 
     if left:
-        scale.run(keep, job, scale.produce(scale.Compiled(job), left, times, advance), advance, times)
+        scale.write_chunks(keep, job, scale.produce_chunks(scale.Compiled(job), left, times, advance), advance, times)
     every = [found.pop(k) for k in chunks]
     return {column: np.concatenate([part.pop(column) for part in every]) for column in tuple(every[0])}
 
@@ -141,8 +141,8 @@ def job_of(robot: Robot, runs: Runs, config: FidelityPart, samples: Drawn | None
     Raises:
         BadConfiguration: a run that the fidelity could not bear.
     """
-    rows = commanded(robot, runs, config)
-    refuse(robot, rows, config)
+    rows = conditions_of_runs(robot, runs, config)
+    check_runs_bearable(robot, rows, config)
     plan = Plan.of_rows(jax.tree.map(np.asarray, rows), samples)
     wanted = (*outputs.output_names(robot.channels), FLAGS_CODE, *fidelities.get_fidelity(config.model).columns)
     task = of_fidelity(config.model, config.options, robot)
@@ -151,7 +151,7 @@ def job_of(robot: Robot, runs: Runs, config: FidelityPart, samples: Drawn | None
     return Job(robot, task, plan, wanted, "float64", blocks)
 
 
-def evaluate(
+def evaluate_runs(
     robot: Robot,
     runs: Runs,
     config: FidelityPart,
@@ -169,13 +169,18 @@ def evaluate(
     job = job_of(robot, runs, config)
     slow = fidelities.fidelity_facts(config.model).slow or len(job.blocks) > 1
     with bar(len(runs), quiet=not slow or advance is not None) as own:
-        found = computed(job, folder, "chunk", advance or own)
+        found = compute_chunks(job, folder, "chunk", advance or own)
     columns = {row.column: found[row.name] for row in outputs.output_table(robot.channels)}
     further = {name: found[name] for name in fidelities.get_fidelity(config.model).columns}
-    return {**conditions(robot, runs), **columns, **outputs.status_words(found[STATUS], found[FLAGS_CODE]), **further}
+    return {
+        **condition_table(robot, runs),
+        **columns,
+        **outputs.status_words(found[STATUS], found[FLAGS_CODE]),
+        **further,
+    }
 
 
-def followed(robot: Robot, runs: Runs, model: str | None) -> Table:
+def follow_histories(robot: Robot, runs: Runs, model: str | None) -> Table:
     """Conditions and simulated outputs at every row of a table of time histories.
 
     Args:
@@ -188,7 +193,7 @@ def followed(robot: Robot, runs: Runs, model: str | None) -> Table:
         _observed(observers.observer_kind(runs).of(runs, robot, model), params.without_weak_types(robot))
     )
     columns = {c.column: seen.reading[:, k] / c.factor for k, c in enumerate(robot.channels)}
-    return {**conditions(robot, runs), **columns, **outputs.status_words(seen.status, seen.flags)}
+    return {**condition_table(robot, runs), **columns, **outputs.status_words(seen.status, seen.flags)}
 
 
 @compiled
@@ -196,7 +201,7 @@ def _observed(observe: observers.Observer, robot: Robot) -> Observation:
     return observe(robot)
 
 
-def conditions(robot: Robot, runs: Runs) -> dict[str, np.ndarray]:
+def condition_table(robot: Robot, runs: Runs) -> dict[str, np.ndarray]:
     """The condition columns of a table, with the robot's total mass if the table has none."""
     columns = dict(runs.columns)
     if "total_mass_kg" in runs.layout.axes and "total_mass_kg" not in columns:
@@ -206,12 +211,12 @@ def conditions(robot: Robot, runs: Runs) -> dict[str, np.ndarray]:
     return {key: columns[key] for key in shown if key in columns}
 
 
-def counts(table: dict[str, np.ndarray]) -> dict[str, int]:
+def runs_by_status(table: dict[str, np.ndarray]) -> dict[str, int]:
     """Number of runs by status; every status is included."""
     return {status: int(np.sum(table["status"] == status)) for status in STATUSES}
 
 
-def leave(
+def write_run_folder(
     folder: RunFolder,
     config: configuration.Simulate | configuration.Sweep | configuration.Compare,
     result: SimulationResult,
@@ -223,7 +228,11 @@ def leave(
         folder: of the command; config: its configuration, with the robot's name; page: its page.
     """
     folder.write_table("runs.csv", capabilities.without_idle(result.robot, result.table))
-    robot_file.write(result.robot, folder.partial / "robot.toml", note=f"the robot of this run, from {config.robot}")
+    robot_file.write_robot(
+        result.robot, folder.partial / "robot.toml", note=f"the robot of this run, from {config.robot}"
+    )
     folder.write_json("result.json", result.to_json())
     manifest = {"seed": None, "statuses": result.statuses}
-    return skeleton.leave(folder, config, manifest, solved=words.solved(result.statuses), page=page, runs=result.runs)
+    return skeleton.finish_run_folder(
+        folder, config, manifest, solved=words.every_run_solved(result.statuses), page=page, runs=result.runs
+    )

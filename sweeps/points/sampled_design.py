@@ -242,7 +242,7 @@ def _key(seed: int, dimension: int, use: str) -> int:
     return int.from_bytes(hashlib.blake2b(f"{seed} {dimension} {use}".encode(), digest_size=16).digest(), "little")
 
 
-def uniform(key: int, first: int, count: int) -> Float[np.ndarray, " points"]:
+def philox_uniform(key: int, first: int, count: int) -> Float[np.ndarray, " points"]:
     """Numbers in (0, 1) of a counter-based generator (Philox 4 x 64, Salmon et al. 2011), from number `first` on."""
     generator = np.random.Philox(key=key)
     generator.advance(first // 4)  # each step of its counter gives four words
@@ -250,9 +250,9 @@ def uniform(key: int, first: int, count: int) -> Float[np.ndarray, " points"]:
     return ((words >> np.uint64(11)).astype(float) + 0.5) * 2.0**-53
 
 
-def random(seed: int, number: int, dimensions: int, first: int, count: int) -> Unit:
+def random_points(seed: int, number: int, dimensions: int, first: int, count: int) -> Unit:
     """Independent points."""
-    return np.array([uniform(_key(seed, d, "random"), first, count) for d in range(dimensions)])
+    return np.array([philox_uniform(_key(seed, d, "random"), first, count) for d in range(dimensions)])
 
 
 def latin_hypercube(seed: int, number: int, dimensions: int, first: int, count: int) -> Unit:
@@ -262,9 +262,9 @@ def latin_hypercube(seed: int, number: int, dimensions: int, first: int, count: 
     """
     unit = np.empty((dimensions, count))
     for d in range(dimensions):
-        jitter = uniform(_key(seed, d, "jitter"), first, count)
+        jitter = philox_uniform(_key(seed, d, "jitter"), first, count)
         points = np.minimum(np.arange(first, first + count, dtype=np.uint64), np.uint64(number - 1))
-        slices = permutation(_key(seed, d, "slices"), number, points)
+        slices = keyed_permutation(_key(seed, d, "slices"), number, points)
         unit[d] = (slices + jitter) / number
     return np.clip(unit, 2.0**-54, 1 - 2.0**-53)
 
@@ -275,7 +275,7 @@ ROUNDS = 8
 CACHED = 65_536
 
 
-def permutation(key: int, number: int, points: UInt64[np.ndarray, " points"]) -> UInt64[np.ndarray, " points"]:
+def keyed_permutation(key: int, number: int, points: UInt64[np.ndarray, " points"]) -> UInt64[np.ndarray, " points"]:
     """A keyed pseudo-random permutation of 0 .. number - 1 at some points.
 
     A Feistel network on a x b >= number with additions modulo a and b in turn (Black and Rogaway 2002, FE2-like);
@@ -377,5 +377,5 @@ def _directions(seed: int, dimensions: int) -> tuple[np.ndarray, np.ndarray]:
 DESIGNS: dict[str, Callable[[int, int, int, int, int], Unit]] = {
     "latin_hypercube": latin_hypercube,
     "sobol": sobol,
-    "random": random,
+    "random": random_points,
 }

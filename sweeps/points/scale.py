@@ -31,7 +31,7 @@ from mmrjax.fidelities.variation import FLAGS, STATUS, Variation, evaluate_point
 from mmrjax.missions.profile import Profile
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.robot import Robot
-from sweeps.points.axes import Plan, adhesions
+from sweeps.points.axes import Plan, adhesion_ratios
 from sweeps.points.climbs import VERDICT
 from sweeps.points.sampled_design import ROW, Blocks
 from sweeps.points.tasks import Task
@@ -105,7 +105,7 @@ class Compiled:
         self._variation, self._fixed = _placed((job.plan.varied(job.robot), job.plan.fixed()), everywhere)
         self._split = NamedSharding(self.mesh, PartitionSpec(POINTS))
         factors = {row.name: row.factor for row in outputs.output_table(job.robot.channels)}
-        surface = None if job.plan.surface is None else adhesions(job.robot, job.plan.surface)
+        surface = None if job.plan.surface is None else adhesion_ratios(job.robot, job.plan.surface)
         self._asked = _Asked(
             job.task.model, tuple(job.task.options.items()), tuple((n, factors.get(n, 1.0)) for n in job.outputs),
             job.storage, surface,
@@ -251,11 +251,13 @@ class Piece:
 
 Produced = Iterator[Piece]
 Advance = Callable[[float], None]
-#: Keeps a chunk by its number: values of its points by variable, and of its samples as `drawn` gives them.
+#: Keeps a chunk by its number: values of its points by variable, and of its samples as `drawn_samples` gives them.
 Keep = Callable[[int, dict[str, np.ndarray], np.ndarray | None], Any]
 
 
-def produce(compiled: Compiled, chunks: Iterable[int], times: Times, advance: Advance | None = None) -> Produced:
+def produce_chunks(
+    compiled: Compiled, chunks: Iterable[int], times: Times, advance: Advance | None = None
+) -> Produced:
     """Compute chunks on the local devices, in order, the points of the next being made meanwhile.
 
     Args:
@@ -279,7 +281,7 @@ def _started(
     made = time.perf_counter()
     if compiled.in_parts and advance is not None:
         count = compiled.job.blocks.count(chunk)
-        told = shares(advance, count)
+        told = share_counter(advance, count)
         piece = Piece(chunk, compiled(values, told), values, count)
         told(1.0)
     else:
@@ -289,7 +291,7 @@ def _started(
     return piece
 
 
-def shares(advance: Advance, count: int) -> Callable[[float], None]:
+def share_counter(advance: Advance, count: int) -> Callable[[float], None]:
     """A function to be told what share of `count` runs is done so far, which passes on how many that adds."""
     so_far = 0.0
 
@@ -301,12 +303,12 @@ def shares(advance: Advance, count: int) -> Callable[[float], None]:
     return told
 
 
-def fetched(arrays: Mapping[str, Any], count: int) -> dict[str, np.ndarray]:
+def fetch_values(arrays: Mapping[str, Any], count: int) -> dict[str, np.ndarray]:
     """The first `count` values of each array, on this machine."""
     return {name: np.asarray(values)[:count] for name, values in jax.device_get(dict(arrays)).items()}
 
 
-def drawn(job: Job, piece: Piece) -> Float[np.ndarray, "names points"] | None:
+def drawn_samples(job: Job, piece: Piece) -> Float[np.ndarray, "names points"] | None:
     """Sample values along a chunk, a row a name; None if another chunk writes them."""
     design, samples = job.plan.design, job.plan.design.samples
     if samples is None or any(job.blocks.place(piece.chunk)[:-1]):
@@ -317,7 +319,7 @@ def drawn(job: Job, piece: Piece) -> Float[np.ndarray, "names points"] | None:
     return samples.values(along.start, along.stop - along.start)
 
 
-def run(keep: Keep, job: Job, chunks: Produced, advance: Advance, times: Times) -> None:
+def write_chunks(keep: Keep, job: Job, chunks: Produced, advance: Advance, times: Times) -> None:
     """Write chunks as they come, in a thread of its own, so that the next is computed meanwhile.
 
     Args:
@@ -335,11 +337,11 @@ def run(keep: Keep, job: Job, chunks: Produced, advance: Advance, times: Times) 
         jax.block_until_ready(list(piece.arrays.values()))
         computed = time.perf_counter()
         count = job.blocks.count(piece.chunk)
-        here = fetched(piece.arrays, count)
+        here = fetch_values(piece.arrays, count)
         transferred = time.perf_counter()
         if stop.is_set():  # interrupted while it was computed
             return
-        keep(piece.chunk, here, drawn(job, piece))
+        keep(piece.chunk, here, drawn_samples(job, piece))
         times.compute += computed - start
         times.transfer += transferred - computed
         times.write += time.perf_counter() - transferred

@@ -36,7 +36,7 @@ class Task:
         slow: whether a call takes long and reports progress; at_once: points in one, on processors or accelerators.
         axes: names that may vary and are neither a condition nor a parameter of the robot.
         further: returns conditions in addition to the varied and stated ones; refuses impossible points.
-        run: computes points, see `climbs.computed`; None: a program of the fidelity does.
+        run: computes points, see `climbs.compute_climbs`; None: a program of the fidelity does.
     """
 
     model: str
@@ -54,11 +54,11 @@ def task_of(config: Campaign, robot: Robot, turns: bool = False) -> Task:
     """The task that a configuration states; `turns`: whether its profile drives the sides apart."""
     if config.obstacle is None:
         return of_fidelity(config.model, config.options, robot, config.profile is not None, turns)
-    obstacle, known = config.obstacle, climbs.attributes(config.obstacle)
+    obstacle, known = config.obstacle, climbs.climb_attributes(config.obstacle)
     own = (
-        {SIZE: climbs.axis(obstacle)},
-        functools.partial(climbs.further, obstacle),
-        functools.partial(climbs.computed, obstacle),
+        {SIZE: climbs.obstacle_axis(obstacle)},
+        functools.partial(climbs.further_variation, obstacle),
+        functools.partial(climbs.compute_climbs, obstacle),
     )
     return Task("climb", {}, known, tuple(known), True, climbs.AT_ONCE, *own)
 

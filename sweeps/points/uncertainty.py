@@ -15,7 +15,7 @@ from mmrjax.model.channels import Channel
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import DONE
 from sweeps.config import FidelityPart
-from sweeps.console import progress, say
+from sweeps.console import print_output, progress_bar
 from sweeps.points import run
 from sweeps.points.sampled_design import Drawn
 from sweeps.store import RunFolder
@@ -34,7 +34,7 @@ class Intervals:
     """Intervals of every run from draws of a posterior.
 
     Attributes:
-        columns: as `intervals` names them; arrays of shape (runs,).
+        columns: as `simulate_draws` names them; arrays of shape (runs,).
         draws: their number; channels: of the robot.
     """
 
@@ -47,7 +47,7 @@ class Intervals:
         return self.columns[column + SD]
 
 
-def intervals(
+def simulate_draws(
     robot: Robot, posterior: Posterior, runs: Runs, config: FidelityPart, draws: int, folder: RunFolder | None = None
 ) -> Intervals:
     """Simulate every run with so many robots drawn from the posterior: a sweep of the runs crossed with the draws.
@@ -68,8 +68,8 @@ def intervals(
         return _summary({o.column: seen[o.name] for o in outputs.output_table(robot.channels)}, counts)
 
     whole = job.blocks.size[-1] == draws  # of a run all draws are in one chunk, which is kept in short
-    with progress(draws, quiet=not slow, doing="draws") as advance:
-        found = run.computed(
+    with progress_bar(draws, quiet=not slow, doing="draws") as advance:
+        found = run.compute_chunks(
             job, folder, "draws", lambda points: advance(points / len(runs)), summary if whole else dict
         )
     return Intervals(found if whole else summary(found), draws, robot.channels)
@@ -96,14 +96,14 @@ def say_intervals(table: dict[str, np.ndarray], found: Intervals) -> None:
     first = found.channels[0].column
     finite = np.isfinite(found.sd(first)) & np.isfinite(table[first])
     if finite.any():
-        say(f"± one sd over {found.draws} robots drawn from the posterior; 95 % intervals are in the table")
+        print_output(f"± one sd over {found.draws} robots drawn from the posterior; 95 % intervals are in the table")
     for c in found.channels:
         value, sd = table[c.column], found.sd(c.column)
         if finite.any():
             rows = np.flatnonzero(finite)
             least, most = rows[np.argmin(value[rows])], rows[np.argmax(value[rows])]
             ends = [with_sd(value[k], sd[k], c.resolution) for k in dict.fromkeys((int(least), int(most)))]
-            say(f"{c.label}: {' to '.join(ends)} {c.unit}")
+            print_output(f"{c.label}: {' to '.join(ends)} {c.unit}")
     say_lost(found)
 
 
@@ -112,7 +112,7 @@ def say_lost(found: Intervals) -> None:
     lost = found.columns[SHARE] < 1
     if lost.any():
         share = 100 * (1 - found.columns[SHARE].min())
-        say(
+        print_output(
             f"at {int(lost.sum())} of {len(lost)} runs up to {share:.0f} % of the draws do not converge; intervals "
             "are from the others"
         )

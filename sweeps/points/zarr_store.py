@@ -26,10 +26,10 @@ import numpy as np
 from calibration.data.input_errors import BadConfiguration, BadData
 from mmrjax.fidelities.variation import STATUS
 from mmrjax.model.signals import STATUSES
-from sweeps.console import tell
-from sweeps.points.identity import Identity, differences
+from sweeps.console import print_message
+from sweeps.points.identity import Identity, identity_differences
 from sweeps.points.sampled_design import SAMPLE, Blocks, Design
-from sweeps.store import LOCK, Folder, contents, lockable, marked, share_at_work, unfinished
+from sweeps.store import LOCK, Folder, interrupted_run, listed_names, lock_text, share_at_work, try_to_lock
 
 STORE = "results.zarr"
 #: The command that a store's folder is marked with: a sweep into a table leaves other files.
@@ -141,8 +141,8 @@ class SweepStore(Folder):
             raise BadConfiguration(
                 f"--out: {self.path} cannot be written ({error.strerror}); choose another path"
             ) from error
-        mark = unfinished(self.partial)
-        if mark is not None and mark["command"] not in ("", COMMAND) and not lockable(self._lock):
+        mark = interrupted_run(self.partial)
+        if mark is not None and mark["command"] not in ("", COMMAND) and not try_to_lock(self._lock):
             raise BadConfiguration(
                 f"--out: another process is at work on {self.partial}; wait for it, or choose another path"
             )
@@ -153,7 +153,7 @@ class SweepStore(Folder):
         return True
 
     def _is_finished(self) -> bool:
-        return contents(self.path) is not None and (self.path / "identity.json").is_file()
+        return listed_names(self.path) is not None and (self.path / "identity.json").is_file()
 
     def _present(self) -> bool:
         """True if the folder is still the one that this process opened, neither removed nor moved."""
@@ -190,7 +190,7 @@ class SweepStore(Folder):
     def _differs(self, folder: Path) -> str:
         try:
             stored = json.loads((folder / "identity.json").read_text(encoding="utf-8"))
-            return differences(stored, self._identity)
+            return identity_differences(stored, self._identity)
         except (ValueError, AttributeError, TypeError, RecursionError):
             return "identity.json"
 
@@ -232,16 +232,16 @@ class SweepStore(Folder):
         if share is not None:
             raise self._busy(share)
         self._clear()
-        (self.partial / LOCK).write_text(marked(COMMAND), encoding="utf-8")
+        (self.partial / LOCK).write_text(lock_text(COMMAND), encoding="utf-8")
         (self.partial / "journal").mkdir()
         (self.partial / ASIDE).mkdir()
-        create(self.partial / STORE, self.layout)
+        create_store(self.partial / STORE, self.layout)
         write_file(self.partial / "identity.json", json.dumps(self._identity, indent=1).encode(), self._aside)
 
     def _altered(self, folder: Path) -> dict[Path, bytes]:
-        """Files of metadata and axes that are not as `create` writes them, with what they should hold."""
+        """Files of metadata and axes that are not as `create_store` writes them, with what they should hold."""
         with tempfile.TemporaryDirectory() as place:
-            create(Path(place) / STORE, self.layout)
+            create_store(Path(place) / STORE, self.layout)
             whole = {p.relative_to(place): p.read_bytes() for p in Path(place).rglob("*") if p.is_file()}
         found = {folder / name: content for name, content in whole.items()}
         return {p: content for p, content in found.items() if not p.is_file() or p.read_bytes() != content}
@@ -249,7 +249,7 @@ class SweepStore(Folder):
     def _mend_layout(self) -> None:
         """Write what is damaged of metadata and axes anew, with a note."""
         for file, content in self._altered(self.partial).items():
-            tell(f"{file}: damaged; written again")
+            print_message(f"{file}: damaged; written again")
             file.parent.mkdir(parents=True, exist_ok=True)
             write_file(file, content, self._aside)
 
@@ -286,7 +286,7 @@ class SweepStore(Folder):
                 )
             self._same(self.partial)
             journal = file.open("a+", encoding="utf-8")
-            if not lockable(journal):
+            if not try_to_lock(journal):
                 journal.close()
                 raise self._busy(name)
             self._journal, self._share = journal, file
@@ -314,7 +314,7 @@ class SweepStore(Folder):
                 self._sound[chunk] = sound
             elif chunk not in self._damaged and not self.finished:
                 self._damaged.add(chunk)
-                tell(f"{self._wrong_file(records[-1])}: damaged; computed again")
+                print_message(f"{self._wrong_file(records[-1])}: damaged; computed again")
         return dict(sorted(self._sound.items()))
 
     def _records(self) -> dict[int, list[Done]]:
@@ -360,7 +360,9 @@ class SweepStore(Folder):
         checks = {}
         for variable in layout.variables:
             values = np.asarray(arrays[variable.name], variable.dtype).reshape(shape)
-            checks[variable.name] = self._chunk(files[variable.name], values, layout.blocks.size, fill(variable))
+            checks[variable.name] = self._chunk(
+                files[variable.name], values, layout.blocks.size, fill_value(variable)
+            )
         samples = layout.design.samples
         if samples is not None and drawn is not None:
             for name, values in zip(samples.names, drawn, strict=True):
@@ -463,7 +465,7 @@ def _compressed(content: Any) -> bytes:
 ZSTD: dict[str, Any] = {"level": 1, "checksum": False}
 
 
-def create(path: Path, layout: Layout) -> None:
+def create_store(path: Path, layout: Layout) -> None:
     """Metadata of every array of a store, and the values of its axes."""
     import zarr
     from zarr.codecs import ZstdCodec
@@ -475,7 +477,7 @@ def create(path: Path, layout: Layout) -> None:
     further = {"coordinates": " ".join(drawn)} if drawn else {}
     for v in layout.variables:
         group.create_array(
-            v.name, shape=design.shape, chunks=blocks.size, dtype=v.dtype, fill_value=fill(v),
+            v.name, shape=design.shape, chunks=blocks.size, dtype=v.dtype, fill_value=fill_value(v),
             compressors=compressors, dimension_names=design.dimensions, attributes={**v.attributes, **further},
         )  # fmt: skip
     for name, values in design.axes.items():
@@ -496,7 +498,7 @@ def create(path: Path, layout: Layout) -> None:
         zarr.consolidate_metadata(path)
 
 
-def fill(variable: Variable) -> Any:
+def fill_value(variable: Variable) -> Any:
     """Value of points that have not been simulated."""
     return math.nan if np.dtype(variable.dtype).kind == "f" else ABSENT
 

@@ -4,11 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from calibration.data.input_errors import rounded
+from calibration.data.input_errors import three_digits
 from calibration.sizing.sheet import Change, Outcome
 from mmrjax.model.paper_tables import COULOMB_PER_MAH
-from sweeps.report.document import Block, Cell, Column, Document, Figure, Note, Section, Table, drawing
-from sweeps.results.check_results import CheckResult, corner, label, reached, wanted
+from sweeps.report.document import Block, Cell, Column, Document, Figure, Note, Section, Table, deferred_drawing
+from sweeps.results.check_results import (
+    CheckResult,
+    reached_value_text,
+    required_value_text,
+    requirement_label,
+    worst_corner_text,
+)
 
 #: Changes that the terminal shows of each missed requirement.
 SHOWN = 3
@@ -34,18 +40,20 @@ _CHANGES = (
 )
 
 
-def document(found: CheckResult, robot_name: str, changes: bool = True) -> Document:
+def check_document(found: CheckResult, robot_name: str, changes: bool = True) -> Document:
     """The report; `changes`: True where changes were searched for."""
     lead = f"Robot: **{robot_name}**. Requirements: **{found.asked.source}**."
-    margins = Figure("margins", found.statement(), _MARGINS, drawing("check_figures.margins", found))
-    sections = [Section("Requirements", (Note(_CORNERS, terminal=False), sheet(found.outcomes)), "sheet")]
+    margins = Figure("margins", found.statement(), _MARGINS, deferred_drawing("check_figures.draw_margins", found))
+    sections = [
+        Section("Requirements", (Note(_CORNERS, terminal=False), requirements_sheet(found.outcomes)), "sheet")
+    ]
     if changes and found.missed:
         sections.append(Section("Changes that would meet them", _changes(found), "changes"))
     blocks: tuple[Block, ...] = (Note(lead, "lead", terminal=False), margins, *_postures(found))
     return Document("Requirements", found.statement(), blocks, tuple(sections))
 
 
-def sheet(outcomes: Sequence[Outcome], terminal: bool = True) -> Table:
+def requirements_sheet(outcomes: Sequence[Outcome], terminal: bool = True) -> Table:
     """Requirements with required and reached values, margins and worst corners."""
     columns = (
         Column(""), Column("requirement"), *(Column(name, form="{}") for name in ("required", "value", "margin")),
@@ -53,8 +61,9 @@ def sheet(outcomes: Sequence[Outcome], terminal: bool = True) -> Table:
     )  # fmt: skip
     rows = [
         (
-            Cell(*(("met", "good") if o.met else ("missed", "bad"))), label(o), wanted(o), reached(o), _margin(o),
-            corner(o), f"{o.at['configuration']}, {o.at['surface'].replace('_', ' ')}", o.requirement.source,
+            Cell(*(("met", "good") if o.met else ("missed", "bad"))), requirement_label(o),
+            required_value_text(o), reached_value_text(o), _margin(o), worst_corner_text(o),
+            f"{o.at['configuration']}, {o.at['surface'].replace('_', ' ')}", o.requirement.source,
         )
         for o in outcomes
     ]  # fmt: skip
@@ -64,8 +73,10 @@ def sheet(outcomes: Sequence[Outcome], terminal: bool = True) -> Table:
 def _postures(found: CheckResult) -> tuple[Figure, ...]:
     if not found.drawn:
         return ()
-    names = ", ".join(f"{label(o)} {reached(o)}" for o in found.outcomes if o.requirement.name in found.drawn)
-    draw = drawing("posture_figures.asked_about", found.drawn)
+    names = ", ".join(
+        f"{requirement_label(o)} {reached_value_text(o)}" for o in found.outcomes if o.requirement.name in found.drawn
+    )
+    draw = deferred_drawing("posture_figures.asked_about", found.drawn)
     return (Figure("postures", f"The robot from the side: {names}", _POSTURES, draw),)
 
 
@@ -78,8 +89,8 @@ def _changes(found: CheckResult) -> tuple[Note | Table, ...]:
     brief: list[int] = []
     for o in found.missed:
         brief += range(len(rows), len(rows) + min(len(o.change), SHOWN))
-        rows += [(f"{label(o)} {wanted(o)}", *_change(c)) for c in o.change]
-    hopeless = [f"{label(o)} {wanted(o)}" for o in found.missed if not o.change]
+        rows += [(f"{requirement_label(o)} {required_value_text(o)}", *_change(c)) for c in o.change]
+    hopeless = [f"{requirement_label(o)} {required_value_text(o)}" for o in found.missed if not o.change]
     more = f", {len(rows) - len(brief)} more in result.json" if len(rows) > len(brief) else ""
     title = f"changes of one parameter that would meet them{more}"
     none = f"No change of one parameter within its bounds meets {', '.join(hopeless)}."
@@ -97,4 +108,4 @@ def _change(c: Change) -> tuple[object, ...]:
 
 
 def _margin(o: Outcome) -> str | None:
-    return None if o.margin is None else f"{'+' if o.margin >= 0 else '−'}{rounded(abs(o.margin))}"
+    return None if o.margin is None else f"{'+' if o.margin >= 0 else '−'}{three_digits(abs(o.margin))}"

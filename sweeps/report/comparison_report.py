@@ -9,8 +9,8 @@ import numpy as np
 
 from mmrjax.errors import count_noun
 from sweeps.pages import words
-from sweeps.report.condition_columns import conditions
-from sweeps.report.document import Cell, Column, Document, Figure, Note, Section, Table, drawing, missing
+from sweeps.report.condition_columns import condition_formats
+from sweeps.report.document import Cell, Column, Document, Figure, Note, Section, Table, deferred_drawing, is_missing
 from sweeps.results.comparison_results import Comparison
 
 _FITS = {
@@ -28,15 +28,17 @@ _PARITY = (
 )
 
 
-def document(found: Comparison) -> Document:
+def comparison_document(found: Comparison) -> Document:
     """The report of a comparison."""
     known = found.table, found.channels
     lead = (
         f"Robot: **{found.robot_name}**. Fidelity: **{found.model}**. Measured: **{found.source}**, "
         f"{count_noun(len(found.table['status']), 'row')}."
     )
-    draw = drawing("comparison_figures.errors_over", *known, in_units=True, beside=found.over)
-    parity = Figure("parity", _bias(found), _PARITY, drawing("comparison_figures.parity", *known, band=False))
+    draw = deferred_drawing("comparison_figures.errors_over", *known, in_units=True, beside=found.over)
+    parity = Figure(
+        "parity", _bias(found), _PARITY, deferred_drawing("comparison_figures.draw_parity", *known, band=False)
+    )
     errors = Figure(
         "errors",
         _trend(found),
@@ -46,7 +48,7 @@ def document(found: Comparison) -> Document:
     )
     return Document(
         f"{found.robot_name} against {found.source}",
-        answer(found),
+        comparison_answer(found),
         (
             Note(lead, "lead", terminal=False),
             *(Note(text, "warn") for text in _unsolved(found)),
@@ -71,11 +73,11 @@ def _over_time(found: Comparison) -> tuple[Section, ...]:
         "**Measured and simulated readings over time, each with its residual below.** "
         "The run with the largest residuals comes first."
     )
-    draw = drawing("time_overlay.time_overlay", found.table, found.channels, {"simulated_": "simulated"})
-    return (Section("Over time", (Figure("overlay", answer(found), caption, draw),)),)
+    draw = deferred_drawing("time_overlay.time_overlay", found.table, found.channels, {"simulated_": "simulated"})
+    return (Section("Over time", (Figure("overlay", comparison_answer(found), caption, draw),)),)
 
 
-def answer(found: Comparison) -> str:
+def comparison_answer(found: Comparison) -> str:
     """The rms errors with their rows, the worst reading, and if this robot was fitted to these rows."""
     every, total = found.summary["all"], len(found.table["status"])
     each = [(c, every[c.name]) for c in found.channels if every[c.name]["rows"]]
@@ -100,7 +102,7 @@ def _unsolved(found: Comparison) -> list[str]:
     """A sentence for each status that gives no operating point."""
     status = found.table["status"]
     return [
-        f"{words.short(name).capitalize()}: {count} of {len(status)} rows; {words.meaning(name)}."
+        f"{words.short_status(name).capitalize()}: {count} of {len(status)} rows; {words.status_meaning(name)}."
         for name, count in Counter(map(str, status)).items()
         if name not in words.SETTLED
     ]
@@ -115,13 +117,13 @@ def _summary(found: Comparison) -> Table:
     for group, by_channel in found.summary.items():
         for c in found.channels:
             e = by_channel[c.name]
-            rms = None if missing(e["rms"]) else f"{e['rms']:.{c.resolution}f} {c.unit}"
+            rms = None if is_missing(e["rms"]) else f"{e['rms']:.{c.resolution}f} {c.unit}"
             rows.append((group, c.label, e["rows"], rms, e["rms_percent"], e["max_percent"], e["r2"]))
     return Table("errors", columns, rows)
 
 
 def _rows(found: Comparison) -> Table:
-    table, shown = found.table, conditions(found.table, mass=True)
+    table, shown = found.table, condition_formats(found.table, mass=True)
     columns = [Column("configuration"), *(Column(heading, form=form) for heading, form in shown.values())]
     columns.append(Column("status"))
     cells: list[Any] = [table["configuration"], *(table[c] for c in shown)]
@@ -136,7 +138,7 @@ def _rows(found: Comparison) -> Table:
 
 
 def _status(status: str) -> Cell:
-    return Cell(words.short(status), "" if status in words.SETTLED else "slides")
+    return Cell(words.short_status(status), "" if status in words.SETTLED else "slides")
 
 
 def _bias(found: Comparison) -> str:
@@ -151,7 +153,9 @@ def _bias(found: Comparison) -> str:
 def _trend(found: Comparison) -> str:
     """The channel and condition whose errors correlate most."""
     best, size = "No error changes with a condition", 0.0
-    headings = {column: heading for column, (heading, _) in conditions(found.table).items()} | dict(found.over or {})
+    headings = {column: heading for column, (heading, _) in condition_formats(found.table).items()} | dict(
+        found.over or {}
+    )
     for c in found.channels:
         error = found.table[f"error_{c.name}_percent"]
         for column, heading in headings.items():

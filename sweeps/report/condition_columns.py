@@ -17,7 +17,7 @@ def _column(condition: Condition) -> str:
 CONDITIONS = {_column(c): (c.heading, c.shown) for c in SET if c.heading}
 
 
-def conditions(table: dict[str, np.ndarray], *, mass: bool = False) -> dict[str, tuple[str, str]]:
+def condition_formats(table: dict[str, np.ndarray], *, mass: bool = False) -> dict[str, tuple[str, str]]:
     """Heading and format of each condition of a table, by column, without columns that are readings.
 
     Args:

@@ -66,7 +66,7 @@ class Column:
     def text(self, cell: Any) -> str:
         """Text of a cell, the same on page and terminal; a missing number is a dash."""
         value = cell.value if isinstance(cell, Cell) else cell
-        if missing(value):
+        if is_missing(value):
             return DASH
         if self.form and isinstance(value, int | float | np.number):
             return re.sub(r"^-(?=0\.?0*$)", "", self.form.format(value))
@@ -117,10 +117,10 @@ class Table:
         """The table as CSV with numbers in full; missing ones are empty cells."""
         stream = io.StringIO()
         writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(plain(column.full_title) for column in self.columns)
+        writer.writerow(plain_text(column.full_title) for column in self.columns)
         for row in self.rows:
             bare = (cell.value if isinstance(cell, Cell) else cell for cell in row)
-            writer.writerow("" if missing(v) else plain(v) if isinstance(v, str) else v for v in bare)
+            writer.writerow("" if is_missing(v) else plain_text(v) if isinstance(v, str) else v for v in bare)
         return stream.getvalue()
 
 
@@ -171,17 +171,17 @@ class Document:
         return [*self.blocks, *(block for section in self.sections for block in section.blocks)]
 
 
-def tone(cell: Any) -> str:
+def cell_tone(cell: Any) -> str:
     """Tone of a cell, "" for a plain value."""
     return cell.tone if isinstance(cell, Cell) else ""
 
 
-def missing(value: Any) -> bool:
+def is_missing(value: Any) -> bool:
     """True for None and for numbers that are not finite."""
     return value is None or (isinstance(value, float | np.floating) and not math.isfinite(value))
 
 
-def drawing(name: str, *known: Any, **options: Any) -> Callable[[], Any]:
+def deferred_drawing(name: str, *known: Any, **options: Any) -> Callable[[], Any]:
     """A function that draws `module.function` of `sweeps/pages`, imported when it is called.
 
     matplotlib costs half a second, which a command without a page saves.
@@ -190,6 +190,6 @@ def drawing(name: str, *known: Any, **options: Any) -> Callable[[], Any]:
     return lambda: getattr(importlib.import_module(f"sweeps.pages.{module}"), function)(*known, **options)
 
 
-def plain(text: str) -> str:
+def plain_text(text: str) -> str:
     """A text without the marks of bold words and names."""
     return re.sub(r"\*\*(.+?)\*\*|`([^`]+)`", lambda m: m[1] or m[2], text)

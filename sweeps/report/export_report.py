@@ -5,7 +5,7 @@ from __future__ import annotations
 from mmrjax.model import channels
 from sweeps.export.comparison import APPROXIMATED, DROPPED, HELD
 from sweeps.export.formats import Export
-from sweeps.report.document import Cell, Column, Document, Figure, Note, Section, Table, drawing
+from sweeps.report.document import Cell, Column, Document, Figure, Note, Section, Table, deferred_drawing
 from sweeps.report.words import export_words as words
 
 #: Tone of a verdict's cell.
@@ -19,16 +19,21 @@ _FITTED = (
 _RUNS = "**Each run.** On the line the exported drive shows the same as the reference."
 
 
-def document(found: Export) -> Document:
+def export_document(found: Export) -> Document:
     """The report of an exported drive."""
     compared = found.comparison
-    used = words.USE[found.format].format(name=found.joint.name, at="drive", armature=words.armature(found))
+    used = words.USE[found.format].format(name=found.joint.name, at="drive", armature=words.rotor_inertia(found))
     fates = Table(
         "fates", (Column("term or effect"), Column("verdict"), Column("kept", "%", "{:.0f}"), Column("how")),
         [(f.name, Cell(f.verdict, TONES[f.verdict]), 100 * f.kept, f.how) for f in compared.fates],
         "what the format holds",
     )  # fmt: skip
-    readings = Figure("readings", words.statement(found), _RUNS, drawing("export_figures.readings", compared))
+    readings = Figure(
+        "readings",
+        words.export_statement(found),
+        _RUNS,
+        deferred_drawing("export_figures.draw_export_readings", compared),
+    )
     sections = [
         Section("What the format holds", (fates, Note(_KEPT, "key", terminal=False)), "holds"),
         Section(
@@ -56,8 +61,8 @@ def document(found: Export) -> Document:
     )
     return Document(
         f"{found.joint.file.name} for {found.format}",
-        words.statement(found),
-        (Note(used, "lead", terminal=False), Note(tuple(words.remarks(found)), name="notes")),
+        words.export_statement(found),
+        (Note(used, "lead", terminal=False), Note(tuple(words.export_remarks(found)), name="notes")),
         (*sections, _constants(found), Section("Conditions seen, and what was not tested", conditions)),
     )
 

@@ -10,13 +10,13 @@ from markupsafe import Markup, escape
 from sweeps.report.document import PAGE_ROWS, Table
 
 
-def marked(text: str) -> Markup:
+def marked_html(text: str) -> Markup:
     """A text as HTML, with its bold words and names."""
     html = re.sub(r"\*\*(.+?)\*\*", r"<b>\1</b>", str(escape(text)))
     return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", html))
 
 
-def download(table: Table) -> Markup:
+def download_link(table: Table) -> Markup:
     """A link that saves a table as CSV: the file of the run folder that holds more rows, or the table itself."""
     if len(table.rows) > PAGE_ROWS:
         return Markup('<a class="csv" download href="{0}">all rows as CSV</a>').format(table.file)

@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Any
 
 from calibration.data.robot_file import RobotFile
-from sweeps.pages.page import Album, named, render
+from sweeps.pages.page import Album, render_page, robot_section
 from sweeps.report.document import Document, Figure
 
 
-def write(folder: Path, document: Document, file: RobotFile | None = None) -> Path:
+def write_report_page(folder: Path, document: Document, file: RobotFile | None = None) -> Path:
     """Write `report.html` and `figures/` of a document; returns the path of the page.
 
     Args:
@@ -20,5 +20,5 @@ def write(folder: Path, document: Document, file: RobotFile | None = None) -> Pa
     for block in document.every_block:
         if isinstance(block, Figure):
             album.add(block.name, block.draw)
-    robot: dict[str, Any] = {"curves": (), "about_robot": None} if file is None else named(file)
-    return render(folder, "document.html.j2", album, title=document.title, document=document, **robot)
+    robot: dict[str, Any] = {"curves": (), "about_robot": None} if file is None else robot_section(file)
+    return render_page(folder, "document.html.j2", album, title=document.title, document=document, **robot)

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from calibration.data.settling import Settled, Stretch
-from sweeps.report.document import Column, Document, Figure, Note, Section, Table, drawing
+from sweeps.report.document import Column, Document, Figure, Note, Section, Table, deferred_drawing
 from sweeps.report.words import settle_words as words
 
 #: Imposed quantity of a log and its unit.
@@ -22,25 +22,25 @@ _SDS = (
 )
 
 
-def document(found: Settled, few: str = "", notes: tuple[str, ...] = ()) -> Document:
+def settle_document(found: Settled, few: str = "", notes: tuple[str, ...] = ()) -> Document:
     """The report; `few`: sentence of `words.too_few`; notes: further sentences on the settled runs."""
     next_step = Note("Next: `mmrjax loop settled.csv` with the same `--robot`.", "lead", terminal=False)
     next_step = Note(few, "lead", "few") if few else next_step
-    remarks = (*words.remarks(found), *notes)
+    remarks = (*words.settle_remarks(found), *notes)
     left = words.left_out(found.stretches, bool(few))
     columns = (
         Column("reason"), Column("stretches", form="{}"), Column("samples", form="{}"),
         Column("rows, for example", form="{}"), Column("what to do"),
     )  # fmt: skip
-    log = Figure("log", words.statement(found), _LOG, drawing("settle_figures.over_log", found))
+    log = Figure("log", words.settle_statement(found), _LOG, deferred_drawing("settle_figures.over_log", found))
     sections = [Section("Over the log", (log,))]
     if left:
         sections.append(Section("Left out", (Table("left", columns, left, "left out"),)))
-    levels = Note(words.levels(found), "key", terminal=False)
+    levels = Note(words.levels_and_samples(found), "key", terminal=False)
     settled = Section("Settled runs", (_settled(found), levels, Note(_SDS, "key", terminal=False)))
     return Document(
         f"Settled runs of {Path(found.runs.source).name}",
-        words.statement(found),
+        words.settle_statement(found),
         (next_step, *([Note(remarks, name="notes")] if remarks else [])),
         (*sections, settled),
     )

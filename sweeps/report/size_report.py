@@ -11,9 +11,9 @@ from calibration.sizing.chart import LIMITS, Chart
 from calibration.sizing.design import OBJECTIVES
 from calibration.sizing.design_search import SizedDesign
 from mmrjax.errors import count_noun
-from sweeps.report.check_report import sheet
-from sweeps.report.document import Cell, Column, Document, Figure, Note, Section, Table, drawing
-from sweeps.results.size_results import SizeResult, missed, objective, verdict
+from sweeps.report.check_report import requirements_sheet
+from sweeps.report.document import Cell, Column, Document, Figure, Note, Section, Table, deferred_drawing
+from sweeps.results.size_results import SizeResult, design_verdict, missed_limits, objective_text
 
 _HEADINGS = {"mass": "mass", "energy": "energy", "cost": "price of motors and gearboxes"}
 COLUMNS = (
@@ -38,7 +38,7 @@ _LIMITS = (
 _FRONT = "**Pareto front.** No other design with ratios of the sheets and whole cells is better in both."
 
 
-def document(found: SizeResult, robot_name: str) -> Document:
+def size_document(found: SizeResult, robot_name: str) -> Document:
     """The report of a sizing that started from a robot of that name."""
     s, wanted = found.sizing, ", ".join(OBJECTIVES[name][1] for name in found.objectives)
     lead = (
@@ -47,7 +47,7 @@ def document(found: SizeResult, robot_name: str) -> Document:
     )
     best = () if s.best is None else (s.best, *s.alternatives)
     about = _DESIGNS if best else "No design of these parts meets the requirements."
-    tables = _table("best", found, best), sheet(found.outcomes, terminal=False)
+    tables = _table("best", found, best), requirements_sheet(found.outcomes, terminal=False)
     motors = _table("by_motor", found, s.motors.values(), "best design of each motor, the first five", terminal=True)
     return Document(
         "Sizing",
@@ -66,10 +66,10 @@ def _table(
     left_out = found.sizing.unmeetable
     rows = [
         (
-            Cell(verdict(f, left_out), "good" if f.feasible and not left_out else "bad"), f.drive.motor.name,
+            Cell(design_verdict(f, left_out), "good" if f.feasible and not left_out else "bad"), f.drive.motor.name,
             f"{f.drive.family}, {count_noun(f.drive.stages, 'stage')}", f.ratio, 1000 * f.radius,
             f"{f.in_series} × {f.parallel:.3g} {f.cell.name}", *(f.objectives.get(k) for k in OBJECTIVES),
-            ", ".join(f.binds if f.feasible else missed(f)) or "none",
+            ", ".join(f.binds if f.feasible else missed_limits(f)) or "none",
         )
         for f in designs
     ]  # fmt: skip
@@ -83,7 +83,9 @@ def _limits(found: SizeResult, robot_name: str) -> tuple[Figure, ...]:
     names = [] if best is None else [f"best: {best.drive.motor.name}, ratio {best.ratio:.4g}"]
     charts = dict(zip([*names, f"as it is: {robot_name}"], found.charts, strict=True))
     alternative = "; ".join(f"{name}: {_reach(c)}" for name, c in charts.items())
-    return (Figure("limits", alternative, _LIMITS, drawing("size_figures.limits", found, charts)),)
+    return (
+        Figure("limits", alternative, _LIMITS, deferred_drawing("size_figures.draw_nearest_limits", found, charts)),
+    )
 
 
 def _reach(c: Chart) -> str:
@@ -100,6 +102,9 @@ def _front(found: SizeResult) -> tuple[Figure | Note, ...]:
     first, second = found.objectives
     text = (
         f"{count_noun(len(front), 'design')} on the Pareto front of {first} and {second}, from "
-        f"{objective(front[0], first)} to {objective(front[-1], second)}"
+        f"{objective_text(front[0], first)} to {objective_text(front[-1], second)}"
     )
-    return (Note(f"{text}."), Figure("front", text, _FRONT, drawing("size_figures.front", found)))
+    return (
+        Note(f"{text}."),
+        Figure("front", text, _FRONT, deferred_drawing("size_figures.draw_pareto_front", found)),
+    )

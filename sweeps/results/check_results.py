@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from calibration.data.input_errors import rounded
+from calibration.data.input_errors import three_digits
 from calibration.data.requirements_file import Requirements
 from calibration.sizing import sheet
 from calibration.sizing.sheet import Outcome
@@ -47,7 +47,7 @@ class CheckResult:
         if not missed:
             return f"All {number} requirements are met." if number > 1 else "The requirement is met."
         verb = "is" if len(missed) == 1 else "are"
-        listed = "; ".join(f"{label(o)} {shortfall(o)}" for o in missed[:NAMED])
+        listed = "; ".join(f"{requirement_label(o)} {shortfall_text(o)}" for o in missed[:NAMED])
         more = f"; and {len(missed) - NAMED} more" if len(missed) > NAMED else ""
         worst = "" if len(missed) <= NAMED else "the worst "
         return f"{len(missed)} of {number} requirements {verb} missed: {worst}{listed}{more}."
@@ -65,10 +65,10 @@ class CheckResult:
 
 def _share(outcome: Outcome) -> float:
     """Margin as a share of the limit [-]; the least for a requirement without a value."""
-    return -math.inf if outcome.margin is None else outcome.margin / max(abs(limit(outcome)), 1e-12)
+    return -math.inf if outcome.margin is None else outcome.margin / max(abs(requirement_limit(outcome)), 1e-12)
 
 
-def label(outcome: Outcome) -> str:
+def requirement_label(outcome: Outcome) -> str:
     """Name of a requirement, with its duty."""
     at = outcome.at
     duty = ""
@@ -77,35 +77,36 @@ def label(outcome: Outcome) -> str:
     return f"{outcome.requirement.quantity.label}{duty}"
 
 
-def limit(outcome: Outcome) -> float:
+def requirement_limit(outcome: Outcome) -> float:
     """Required value, or the rating of the part."""
     found = outcome.requirement.limit
     assert found is not None
     return found
 
 
-def wanted(outcome: Outcome) -> str:
+def required_value_text(outcome: Outcome) -> str:
     """Required value with its sense and unit, as in `≥ 0.9 m/s`."""
     r = outcome.requirement
-    return f"{'≥' if r.least else '≤'} {rounded(limit(outcome))} {r.quantity.unit}"
+    return f"{'≥' if r.least else '≤'} {three_digits(requirement_limit(outcome))} {r.quantity.unit}"
 
 
-def reached(outcome: Outcome) -> str:
+def reached_value_text(outcome: Outcome) -> str:
     """Value with its unit, or the reason for having none."""
     quantity = outcome.requirement.quantity
     if outcome.value is not None:
-        return f"{rounded(outcome.value)} {quantity.unit}"
+        return f"{three_digits(outcome.value)} {quantity.unit}"
     no_turn = quantity.group == "turn" and outcome.status == STATUSES[NOT_SETTLED]
-    return words.NO_TURN if no_turn else words.why(outcome.status)
+    return words.NO_TURN if no_turn else words.reason_without_value(outcome.status)
 
 
-def shortfall(outcome: Outcome) -> str:
+def shortfall_text(outcome: Outcome) -> str:
     """Value and its distance from the limit."""
     r = outcome.requirement
     if outcome.value is None or outcome.margin is None:
-        return f"({reached(outcome)})"
+        return f"({reached_value_text(outcome)})"
     way = "below" if r.least else "above"
-    return f"{reached(outcome)}, {rounded(-outcome.margin)} {way} {rounded(limit(outcome))}"
+    distance, limit = three_digits(-outcome.margin), three_digits(requirement_limit(outcome))
+    return f"{reached_value_text(outcome)}, {distance} {way} {limit}"
 
 
 _PLACES = {
@@ -114,7 +115,7 @@ _PLACES = {
 }  # fmt: skip
 
 
-def corner(outcome: Outcome) -> str:
+def worst_corner_text(outcome: Outcome) -> str:
     """The worst corner in words."""
     parts = []
     for key, form in _PLACES.items():

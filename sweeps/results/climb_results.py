@@ -39,7 +39,7 @@ COORDINATES = ("x_mm", "z_mm", "pitch_deg", "shaft_deg", "front_deg", "rear_deg"
 SHOWN = ("time_s", "traction_current_A")
 
 
-def coordinates(table: Mapping[str, np.ndarray]) -> np.ndarray:
+def footing_coordinates(table: Mapping[str, np.ndarray]) -> np.ndarray:
     """Coordinates of `mmrjax.climbing.footing` at every sample of a history, (samples, 6)."""
     x, z, pitch, shaft, front, rear = (table[name] for name in COORDINATES)
     turned = np.radians([-pitch, shaft, front, 180 - rear])
@@ -91,8 +91,8 @@ class Seen:
             table = {name: np.array([float(row[name]) for row in rows]) for name in (*COORDINATES, *SHOWN)}
             lengths = (jnp.asarray(ground[name]) / 1000 for name in ("points_mm", "nose_mm", "finish_mm"))
             return Seen(
-                robot_file.find(str(folder / "robot.toml")).robot, found["configuration"], found["obstacle"],
-                Terrain(*lengths), table,
+                robot_file.find_robot_file(str(folder / "robot.toml")).robot,
+                found["configuration"], found["obstacle"], Terrain(*lengths), table,
             )  # fmt: skip
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise BadConfiguration(f"--climb: {folder} cannot be read; expected a folder of mmrjax climb") from error

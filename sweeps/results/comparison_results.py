@@ -41,7 +41,7 @@ class Comparison:
     notes: tuple[str, ...] = ()
 
 
-def compared(
+def compare_readings(
     measured: Runs, simulated: dict[str, np.ndarray], robot: Robot | None = None
 ) -> tuple[dict[str, np.ndarray], Summary]:
     """Measured and simulated readings with their errors, and their summary by group.

@@ -69,7 +69,7 @@ class Postures:
     over: StepMap
 
 
-def postures(robot: Robot, runs: Runs, conditions: Conditions) -> Postures | None:
+def posture_of_runs(robot: Robot, runs: Runs, conditions: Conditions) -> Postures | None:
     """Postures of the runs of a table; None if it states no levers."""
     if not conditions.states_levers:
         return None

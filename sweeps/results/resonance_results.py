@@ -133,9 +133,9 @@ class ResonanceResult:
             loads = "" if len(self.modes) == 1 else "at one payload or another: "
             parts.append(f"Avoid {loads}{_listed(named, self.passing.name)}.")
         elif not bare:
-            largest = ", ".join(f"{s.label} {percent(self._largest(n))}" for n, s in SIGNALS.items())
+            largest = ", ".join(f"{s.label} {ripple_percent(self._largest(n))}" for n, s in SIGNALS.items())
             parts.append(
-                f"No speed to avoid for its ripple between {span(low, high)} mm/s: nothing peaks at a natural "
+                f"No speed to avoid for its ripple between {span_text(low, high)} mm/s: nothing peaks at a natural "
                 f"frequency (largest ripple: {largest})."
             )
         if bare:
@@ -143,13 +143,14 @@ class ResonanceResult:
             parts.append(f"{also}, with no natural frequency to name, at {_listed(bare, self.passing.name)}.")
         for name, lowest, highest in self._spread():
             parts.append(
-                f"{name.capitalize()} has no one frequency: {span(lowest, highest, 1)} Hz over the belt's position."
+                f"{name.capitalize()} has no one frequency: {span_text(lowest, highest, 1)} Hz over the "
+                "belt's position."
             )
         if self.restless:
-            spans = ", ".join(span(*x) for x in self.restless)
+            spans = ", ".join(span_text(*x) for x in self.restless)
             parts.append(f"Not every run settles at {spans} mm/s.")
         if self.avoid or self.restless:
-            free = ", ".join(span(*x) for x in self.quiet)
+            free = ", ".join(span_text(*x) for x in self.quiet)
             parts.append(f"Free of all this: {free} mm/s." if free else "No speed is free of all this.")
         if self._table8():
             parts.append(self._table8())
@@ -255,7 +256,7 @@ def _merged(ranges: Iterable[tuple[float, float]]) -> list[tuple[float, float]]:
     return found
 
 
-def percent(value: float) -> str:
+def ripple_percent(value: float) -> str:
     """A ripple [%] as a sentence has it."""
     return "under 0.01 %" if value < 0.01 else f"{value:.0f} %" if value >= 10 else f"{value:.2g} %"
 
@@ -266,15 +267,15 @@ def _listed(ranges: list[tuple[float, float, list[Resonance]]], what: str) -> st
     texts = []
     for low, high, members in sorted(most, key=lambda r: r[0]):
         first, last = min(r.frequencies[0] for r in members), max(r.frequencies[1] for r in members)
-        meets = f"{members[0].mode} at {span(first, last, 1)} Hz meets " if members[0].mode else ""
-        order = f"{members[0].order} × {what}" if members[0].order else f"{span(first, last, 1)} Hz"
-        how = ", ".join(f"{SIGNALS[r.signal].label} {percent(100 * r.ripple)}" for r in members)
-        texts.append(f"{span(low, high)} mm/s ({meets}{order}; ripple up to: {how})")
+        meets = f"{members[0].mode} at {span_text(first, last, 1)} Hz meets " if members[0].mode else ""
+        order = f"{members[0].order} × {what}" if members[0].order else f"{span_text(first, last, 1)} Hz"
+        how = ", ".join(f"{SIGNALS[r.signal].label} {ripple_percent(100 * r.ripple)}" for r in members)
+        texts.append(f"{span_text(low, high)} mm/s ({meets}{order}; ripple up to: {how})")
     more = f"; {len(ranges) - len(most)} more on the map" if len(ranges) > len(most) else ""
     return "; ".join(texts) + more
 
 
-def span(low: float, high: float, unit: float = MM) -> str:
+def span_text(low: float, high: float, unit: float = MM) -> str:
     """`low-high` in a unit, or one number if both print the same."""
     ends = f"{low / unit:.0f}", f"{high / unit:.0f}"
     return ends[0] if ends[0] == ends[1] else f"{ends[0]}-{ends[1]}"

@@ -12,7 +12,7 @@ from calibration.sizing.design_search import SizedDesign, Sizing
 from calibration.sizing.sheet import Outcome
 from mmrjax.errors import count_noun
 from mmrjax.model.robot import Robot
-from sweeps.results.check_results import label
+from sweeps.results.check_results import requirement_label
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,13 +37,17 @@ class SizeResult:
         s = self.sizing
         left_out = f" No parts meet the requirement on {' or '.join(s.unmeetable)}; dropped." if s.unmeetable else ""
         if s.best is None:
-            nearest = min(s.motors.values(), key=short, default=None)
-            why = f" The nearest, {described(nearest)}, misses {', '.join(missed(nearest))}." if nearest else ""
+            nearest = min(s.motors.values(), key=margin_shortfall, default=None)
+            why = (
+                f" The nearest, {describe_design(nearest)}, misses {', '.join(missed_limits(nearest))}."
+                if nearest
+                else ""
+            )
             return f"No design of these parts meets the requirements.{why}{left_out}"
-        missing = [label(o) for o in self.outcomes if not (o.met or label(o) in s.unmeetable)]
+        missing = [requirement_label(o) for o in self.outcomes if not (o.met or requirement_label(o) in s.unmeetable)]
         binds = f" Binding limits: {', '.join(s.best.binds) or 'none'}."
         binds += f" It misses {', '.join(missing)}." if missing else ""
-        return f"{described(s.best)}: {objective(s.best, s.objective)}.{binds}{left_out}"
+        return f"{describe_design(s.best)}: {objective_text(s.best, s.objective)}.{binds}{left_out}"
 
     def to_json(self) -> dict[str, Any]:
         """`result.json`."""
@@ -65,22 +69,22 @@ class SizeResult:
         }
 
 
-def verdict(found: SizedDesign, unmeetable: tuple[str, ...]) -> str:
+def design_verdict(found: SizedDesign, unmeetable: tuple[str, ...]) -> str:
     """Verdict on a design; `unmeetable`: requirements that no choice of parts meets, which were dropped."""
     return "misses" if not found.feasible else "meets the others" if unmeetable else "meets"
 
 
-def short(found: SizedDesign) -> float:
+def margin_shortfall(found: SizedDesign) -> float:
     """Sum of the margins that a design misses [-]."""
     return sum(max(-m, 0.0) for m in found.margins.values())
 
 
-def missed(found: SizedDesign) -> list[str]:
+def missed_limits(found: SizedDesign) -> list[str]:
     """Limits that a design misses, with their margins."""
     return [f"{label} ({100 * m:+.1f} %)" for label, m in sorted(found.margins.items(), key=lambda x: x[1]) if m < 0]
 
 
-def described(found: SizedDesign) -> str:
+def describe_design(found: SizedDesign) -> str:
     """Motor, gearbox, ratio, radius and cells of a design."""
     stages = count_noun(found.drive.stages, "stage")
     return (
@@ -89,7 +93,7 @@ def described(found: SizedDesign) -> str:
     )
 
 
-def objective(found: SizedDesign, name: str) -> str:
+def objective_text(found: SizedDesign, name: str) -> str:
     """An objective with its unit, or `not stated` if no sheet states it."""
     unit, words = OBJECTIVES[name]
     return f"{words} {found.objectives[name]:.4g} {unit}" if name in found.objectives else f"{words} not stated"

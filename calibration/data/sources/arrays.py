@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from calibration.data.input_errors import BadData
-from calibration.data.sources.recorded_signals import Signal, known, of_arrays
+from calibration.data.sources.recorded_signals import Signal, of_arrays, values_in_memory
 
 #: Name of the type of an array of objects.
 _OBJECTS = np.dtype(object)
@@ -75,7 +75,7 @@ def of_matlab(path: Path, name: str) -> tuple[Signal, ...]:
     for variable, shape, kind in io.whosmat(path):
         if kind == "struct":
             for field, value in _fields(variable, loaded()[variable]):
-                arrays[field] = (value.shape, value.dtype, known(value))
+                arrays[field] = (value.shape, value.dtype, values_in_memory(value))
         else:
             dtype = np.dtype(float) if kind in plain - {"char"} else np.dtype(str) if kind == "char" else _OBJECTS
             arrays[variable] = (shape, dtype, _variable(loaded, variable))

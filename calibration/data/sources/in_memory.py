@@ -9,7 +9,7 @@ import numpy as np
 
 from calibration.data.input_errors import BadData
 from calibration.data.sources import columnar, json_records
-from calibration.data.sources.recorded_signals import Clock, Signal, known, of_arrays, unit_of_clock
+from calibration.data.sources.recorded_signals import Clock, Signal, of_arrays, unit_of_clock, values_in_memory
 
 EXPECTED = (
     "a path, a pandas or polars DataFrame, an Arrow table, an xarray Dataset, a dict of arrays, or a list of records"
@@ -39,7 +39,7 @@ def of_object(source: Any) -> tuple[str, tuple[Signal, ...]]:
         )
     if isinstance(source, np.ndarray) and source.dtype.names:
         return "the array", of_arrays(
-            {n: (source.shape, source.dtype[n], known(source[n])) for n in source.dtype.names}
+            {n: (source.shape, source.dtype[n], values_in_memory(source[n])) for n in source.dtype.names}
         )
     if isinstance(source, Mapping):
         return "the dict", json_records.of_content(source, "the dict")

@@ -11,7 +11,7 @@ import numpy as np
 
 from calibration.data import input_files
 from calibration.data.input_errors import BadData
-from calibration.data.sources.recorded_signals import Signal, group, known, of_arrays, parts
+from calibration.data.sources.recorded_signals import Signal, of_arrays, parent_path, path_parts, values_in_memory
 
 #: Largest JSON file [bytes]: its objects take some ten times as much memory; most levels within one another.
 LARGEST, DEEPEST = 2**28, 16
@@ -25,7 +25,7 @@ def of_json(path: Path, name: str) -> tuple[Signal, ...]:
     Raises:
         BadData: text that is no JSON, or nested too deep.
     """
-    content = input_files.content(path, name, largest=LARGEST)
+    content = input_files.file_bytes(path, name, largest=LARGEST)
     try:
         text = content.decode("utf-8-sig")
         try:
@@ -55,7 +55,7 @@ def of_content(content: Any, name: str) -> tuple[Signal, ...]:
             f"{name}: holds no list of records and no arrays; expected "
             '[{"time_s": 0.0, ...}, ...] or {"time_s": [...], ...}'
         )
-    return of_arrays({at: (v.shape, v.dtype, known(v)) for at, v in arrays.items()})
+    return of_arrays({at: (v.shape, v.dtype, values_in_memory(v)) for at, v in arrays.items()})
 
 
 def _collect(value: Any, at: str, arrays: dict[str, np.ndarray], name: str, depth: int) -> None:
@@ -132,10 +132,10 @@ def _stacked(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """
     shaped = {at: v for at, v in arrays.items() if v.ndim == 2 and v.dtype.kind in "iuf" and v.shape[1] > 1}
     widths = {v.shape[1] for v in shaped.values()}
-    groups = {group(at) for at in shaped}
+    groups = {parent_path(at) for at in shaped}
     if len(shaped) < 2 or len(widths) > 1 or len(groups) > 1:
         return arrays
     (above,) = groups
     rest = {at: v for at, v in arrays.items() if at not in shaped}
-    runs = np.concatenate([np.full(len(v), parts(at)[-1]) for at, v in shaped.items()])
+    runs = np.concatenate([np.full(len(v), path_parts(at)[-1]) for at, v in shaped.items()])
     return rest | {f"{above}rows": np.concatenate(list(shaped.values())), f"{above}{RUN}": runs}

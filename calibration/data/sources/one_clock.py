@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from calibration.data import counters
-from calibration.data.input_errors import BadData, number
+from calibration.data.input_errors import BadData, bound_text
 from calibration.data.sources.recorded_signals import UNITS, Clock, Signal
 from mmrjax.errors import count_noun
 
@@ -36,7 +36,7 @@ class Elapsed(NamedTuple):
     period: float = 0.0
 
 
-def seconds(clock: Clock) -> Elapsed:
+def clock_seconds(clock: Clock) -> Elapsed:
     """Returns the times of a clock.
 
     A clock that does not state its unit is read by its numbers: since 1970 by their size, else by their steps.
@@ -50,7 +50,7 @@ def seconds(clock: Clock) -> Elapsed:
         raw = raw.astype(np.int64)
     unit, period = clock.unit or guessed_unit(raw), 0.0
     if (np.diff(raw) < 0).any():
-        raw, period = counters.unwrapped(raw.astype(float), np.zeros(len(raw), int))
+        raw, period = counters.unwrap_counter(raw.astype(float), np.zeros(len(raw), int))
     one = UNITS[unit]
     return Elapsed((raw - raw[:1]) * one, float(raw[0]) * one, unit, period)
 
@@ -96,7 +96,7 @@ def on_one_grid(
         BadData: a clock that goes back, or clocks that have no time in common.
     """
     clocks = {id(s.clock): s.clock for s in chosen.values() if s.clock is not None}
-    read = {key: seconds(clock) for key, clock in clocks.items()}
+    read = {key: clock_seconds(clock) for key, clock in clocks.items()}
     begin = min(elapsed.first for elapsed in read.values())
     times = {key: elapsed.time + (elapsed.first - begin) for key, elapsed in read.items()}
     order = {key: _order(time) for key, time in times.items()}
@@ -117,7 +117,7 @@ def on_one_grid(
     for key, time in times.items():
         if time[-1] < rows[kept][0] if kept.any() else True:
             raise BadData(
-                f"{name}: {clocks[key].name} ends at {number(time[-1])} s, before {clocks[main].name} and "
+                f"{name}: {clocks[key].name} ends at {bound_text(time[-1])} s, before {clocks[main].name} and "
                 "every command have begun; expected clocks with a time in common"
             )
     values: dict[str, np.ndarray] = {}
@@ -198,7 +198,7 @@ def _step(time: np.ndarray) -> float:
 
 def _rate(time: np.ndarray) -> str:
     step = _step(time)
-    return f"{number(round(1 / step, 3 if step > 1 else 0))} Hz" if 0 < step < np.inf else "one sample"
+    return f"{bound_text(round(1 / step, 3 if step > 1 else 0))} Hz" if 0 < step < np.inf else "one sample"
 
 
 def _check(name: str, clock: str, time: np.ndarray) -> None:
@@ -207,6 +207,7 @@ def _check(name: str, clock: str, time: np.ndarray) -> None:
     if (back := np.flatnonzero(~(np.diff(time) >= 0))).size:
         at = int(back[0])
         raise BadData(
-            f"{name}, {clock}: goes back from {number(time[at])} to {number(time[at + 1])} s at sample {at + 2}; "
+            f"{name}, {clock}: goes back from {bound_text(time[at])} to {bound_text(time[at + 1])} s at "
+            f"sample {at + 2}; "
             "expected time stamps that rise; sort the recording, or give each part its own file"
         )

@@ -55,7 +55,7 @@ class Format:
                 "pip install mmrjax[logs]"
             ) from error
         except Exception as error:  # each library has errors of its own
-            raise unreadable(name, self.kind, error) from error
+            raise unreadable_file(name, self.kind, error) from error
 
 
 PARQUET = Format("a Parquet file", "columnar", "of_parquet")
@@ -85,13 +85,13 @@ _METADATA = "metadata.yaml"
 _RECORDINGS = (".db3", ".mcap")
 
 
-def unreadable(name: str, kind: str, error: BaseException) -> BadData:
+def unreadable_file(name: str, kind: str, error: BaseException) -> BadData:
     """The error of a file that its library refuses."""
     why = " ".join(str(error).split()) or type(error).__name__
     return BadData(f"{name}: cannot be read as {kind} ({why}); it may be cut off or damaged; export or copy it again")
 
 
-def split(source: str) -> tuple[Path, str]:
+def split_source(source: str) -> tuple[Path, str]:
     """Path of a file, and path of signals in it; empty if it is not stated."""
     if Path(source).exists():
         return Path(source), ""
@@ -113,7 +113,7 @@ def format_of(path: Path, name: str) -> Format | None:
                 f"{name}: is a folder without {_METADATA}; expected that file of the bag, or the path of a "
                 f"recording, as {path / parts[0]}"
             )
-    begin = input_files.beginning(path, name)
+    begin = input_files.first_bytes(path, name)
     for magic, found in BEGINNINGS.items():
         if begin.startswith(magic):
             return found
@@ -133,7 +133,7 @@ def _is_npz(path: Path) -> bool:
     return any(name.endswith(".npy") for name in names)
 
 
-def opened(path: Path, within: str, name: str, form: Format) -> Source:
+def open_signals(path: Path, within: str, name: str, form: Format) -> Source:
     """The signals of a file of a format other than text.
 
     Args:
@@ -147,7 +147,7 @@ def opened(path: Path, within: str, name: str, form: Format) -> Source:
     signals = tuple(form.signals(path, name))
     if not signals:
         raise BadData(f"{name}: is {form.kind} without signals; expected at least one column or array")
-    found = Source(name, form.kind, _guarded(signals, name, form.kind), digest(path))
+    found = Source(name, form.kind, _guarded(signals, name, form.kind), source_digest(path))
     return found.below(within) if within else found
 
 
@@ -161,7 +161,7 @@ def _guarded(signals: Sequence[Signal], name: str, kind: str) -> tuple[Signal, .
             except InputError:
                 raise
             except Exception as error:  # each library has errors of its own
-                raise unreadable(f"{name}, {path}", kind, error) from error
+                raise unreadable_file(f"{name}, {path}", kind, error) from error
 
         return read
 
@@ -186,7 +186,7 @@ def check_folder(path: Path, name: str) -> None:
             raise BadData(f"{name}, {item.name}: is no regular file; expected the files of a bag")
 
 
-def digest(path: Path) -> str:
+def source_digest(path: Path) -> str:
     """SHA-256 of a file, or of the files of a folder in the order of their names."""
     found = hashlib.sha256()
     for file in sorted(path.iterdir()) if path.is_dir() else [path]:
@@ -197,7 +197,7 @@ def digest(path: Path) -> str:
     return found.hexdigest()
 
 
-def available() -> float:
+def available_memory() -> float:
     """Free memory of this machine [bytes]; infinite if the system does not report it."""
     try:
         return float(os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))

@@ -12,10 +12,10 @@ import numpy as np
 from calibration.data import delimited, presets_file
 from calibration.data.columns import SPEED, TIME, WHEN, WORDS, Layout
 from calibration.data.input_errors import BadData
-from calibration.data.named_arrays import NamedArrays, Raw, numbers
+from calibration.data.named_arrays import NamedArrays, Raw, column_numbers
 from calibration.data.presets_file import Preset
 from calibration.data.sources import in_memory, one_clock, opening
-from calibration.data.sources.recorded_signals import Signal, Source, named, offered, one
+from calibration.data.sources.recorded_signals import Signal, Source, find_signal, matching_signals, suggested_paths
 from mmrjax.model import channels, quantities
 
 #: Columns in the form of `Layout.mapped`: name in this program, name in the source, factor from its unit.
@@ -36,7 +36,7 @@ class Reading:
     mapped: Mapped
 
 
-def read(source: Any, layout: Layout, columns: Preset | None = None, between: str = "held") -> Reading:
+def read_columns(source: Any, layout: Layout, columns: Preset | None = None, between: str = "held") -> Reading:
     """Returns the columns of a file or of a table in memory.
 
     Args:
@@ -53,29 +53,29 @@ def read(source: Any, layout: Layout, columns: Preset | None = None, between: st
     if not isinstance(source, str | Path):
         kind, signals = in_memory.of_object(source)
         return _of_signals(Source(kind, kind, signals), layout, columns, between)
-    path, within = opening.split(str(source))
+    path, within = opening.split_source(str(source))
     name = path.name or str(source)
     form = opening.format_of(path, name)
     if form is not None:
-        return _of_signals(opening.opened(path, within, name, form), layout, columns, between)
-    arrays = delimited.arrays(path, name)
+        return _of_signals(opening.open_signals(path, within, name, form), layout, columns, between)
+    arrays = delimited.read_csv_columns(path, name)
     if columns is not None and columns.header:
         arrays = _with_header(arrays, columns)
     return _of_table(arrays, layout, columns)
 
 
-def table(path: Path, within: str = "") -> NamedArrays | None:
+def read_whole_table(path: Path, within: str = "") -> NamedArrays | None:
     """Returns every column of a table in a file, unchanged; None for text, whose comments have a meaning.
 
     Raises:
-        BadData: as `read`; signals with separate clocks, which do not form one table.
+        BadData: as `read_columns`; signals with separate clocks, which do not form one table.
     """
     name = path.name or str(path)
     form = opening.format_of(path, name)
     if form is None:
         return None
-    source = opening.opened(path, within, name, form)
-    signals = {s.path if len(named(source.signals, s.name)) > 1 else s.name: s for s in source.signals}
+    source = opening.open_signals(path, within, name, form)
+    signals = {s.path if len(matching_signals(source.signals, s.name)) > 1 else s.name: s for s in source.signals}
     for signal in signals.values():
         if signal.refused or signal.clock is not None:
             raise BadData(f"{name}, {signal.path}: {signal.refused or 'has a clock of its own; expected one table'}")
@@ -89,7 +89,7 @@ def table(path: Path, within: str = "") -> NamedArrays | None:
 
 def _with_header(arrays: NamedArrays, columns: Preset) -> NamedArrays:
     """A table whose first row is a row of numbers, with the names of a preset."""
-    if len(arrays.header) != len(columns.header) or not np.isfinite(numbers(list(arrays.header))).all():
+    if len(arrays.header) != len(columns.header) or not np.isfinite(column_numbers(list(arrays.header))).all():
         return arrays
     values = tuple([first, *rest] for first, rest in zip(arrays.header, arrays.values, strict=True))
     note = f"{arrays.name}: has no header; its columns are read as {', '.join(columns.header)}"
@@ -108,7 +108,7 @@ def _of_table(arrays: NamedArrays, layout: Layout, columns: Preset | None) -> Re
     if arrays.header and not any(theirs in by_name for _, theirs, _ in mapped):
         raise _none_of(arrays.name, columns, arrays.header)
     return Reading(
-        dataclasses.replace(arrays, notes=(*arrays.notes, *notes)), presets_file.merged(mapped, layout.mapped)
+        dataclasses.replace(arrays, notes=(*arrays.notes, *notes)), presets_file.merge_columns(mapped, layout.mapped)
     )
 
 
@@ -128,12 +128,12 @@ def _of_signals(source: Source, layout: Layout, columns: Preset | None, between:
     signals = source.signals
 
     def found(name: str) -> str | None:
-        return name if named(signals, name) else None
+        return name if matching_signals(signals, name) else None
 
     mapped, notes = ((), ()) if columns is None else columns.mapped(found)
     if columns is not None and not any(found(theirs) for _, theirs, _ in mapped):
         raise _none_of(source.name, columns, [s.path for s in signals])
-    mapped = presets_file.merged(mapped, layout.mapped)
+    mapped = presets_file.merge_columns(mapped, layout.mapped)
     chosen, clock, missing = _chosen(source, mapped, layout)
     for column, signal in chosen.items():
         if signal.refused:
@@ -173,13 +173,13 @@ def _chosen(source: Source, mapped: Mapped, layout: Layout) -> tuple[dict[str, S
     clock, missing = "", []
     clocks = {s.clock.name for s in source.signals if s.clock is not None}
     for mine, theirs, _ in mapped:
-        meant = {s.path for s in named(source.signals, theirs)}
+        meant = {s.path for s in matching_signals(source.signals, theirs)}
         if theirs in clocks or (meant and meant <= clocks):  # several: each signal has its own
             clock = theirs if theirs in clocks else meant.pop() if len(meant) == 1 else ""
         elif meant:
-            chosen[theirs] = one(source.signals, theirs, source.name)
+            chosen[theirs] = find_signal(source.signals, theirs, source.name)
         else:
-            near = offered(theirs, [s.path for s in source.signals])
+            near = suggested_paths(theirs, [s.path for s in source.signals])
             missing.append(f"{source.name}: no signal {theirs}, which {mine} is read from; {near}")
     own = dataclasses.replace(layout, channels=channels.EVERY, mapped=()).spellings()
     spelled = {name.casefold() for name in own}
@@ -204,7 +204,7 @@ def _extras(source: Source, chosen: Mapping[str, Signal], own: Sequence[Signal])
 
 def _check_memory(name: str, signals: Mapping[str, Signal]) -> None:
     """Refuse columns that need more memory than is free."""
-    size, free = opening.VALUE * sum(s.length for s in signals.values()), opening.available()
+    size, free = opening.VALUE * sum(s.length for s in signals.values()), opening.available_memory()
     if size > opening.SHARE * free:
         raise BadData(
             f"{name}: {len(signals)} columns have {size / 1e9:.3g} GB, and {free / 1e9:.3g} GB of memory are free; "
@@ -256,7 +256,7 @@ def _on_a_grid(
 def _how_to_name(source: Source) -> str:
     paths = [s.path for s in source.signals]
     return (
-        f"{offered('', paths)}; state their columns in the robot's file, [columns] supply_voltage_V = "
+        f"{suggested_paths('', paths)}; state their columns in the robot's file, [columns] supply_voltage_V = "
         f'"{paths[0]}" (mmrjax inspect proposes the lines)'
     )
 

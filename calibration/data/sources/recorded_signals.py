@@ -60,35 +60,35 @@ class Signal:
     @property
     def name(self) -> str:
         """Last part of the path."""
-        return parts(self.path)[-1]
+        return path_parts(self.path)[-1]
 
 
-def known(values: np.ndarray) -> Callable[[], np.ndarray]:
+def values_in_memory(values: np.ndarray) -> Callable[[], np.ndarray]:
     """Returns a function that returns the given values."""
     return lambda: values
 
 
-def parts(path: str) -> list[str]:
+def path_parts(path: str) -> list[str]:
     """Returns the parts of a path, separated by slashes, points or double colons."""
     return [part for part in _PARTS.split(path) if part] or [path]
 
 
-def named(signals: Iterable[Signal], name: str) -> list[Signal]:
+def matching_signals(signals: Iterable[Signal], name: str) -> list[Signal]:
     """Signals that match a name: the signal with this path, else signals whose path ends with its parts."""
     pool = list(signals)
     if exact := [s for s in pool if s.path == name]:
         return exact
-    wanted = parts(name)
-    return [s for s in pool if parts(s.path)[-len(wanted) :] == wanted]
+    wanted = path_parts(name)
+    return [s for s in pool if path_parts(s.path)[-len(wanted) :] == wanted]
 
 
-def one(signals: Sequence[Signal], name: str, where: str) -> Signal:
+def find_signal(signals: Sequence[Signal], name: str, where: str) -> Signal:
     """The only signal that matches a name.
 
     Raises:
         BadData: no signal matches, or several match.
     """
-    found = named(signals, name)
+    found = matching_signals(signals, name)
     if len(found) == 1:
         return found[0]
     if found:
@@ -96,10 +96,10 @@ def one(signals: Sequence[Signal], name: str, where: str) -> Signal:
         raise BadData(
             f"{where}, {name}: got a name of {len(found)} signals, {listed}; expected the path of one of them"
         )
-    raise BadData(f"{where}, {name}: no such signal; {offered(name, [s.path for s in signals])}")
+    raise BadData(f"{where}, {name}: no such signal; {suggested_paths(name, [s.path for s in signals])}")
 
 
-def offered(name: str, paths: Sequence[str]) -> str:
+def suggested_paths(name: str, paths: Sequence[str]) -> str:
     """Paths that a message offers for an unknown name: near ones, else the first."""
     close = similar_words(name, paths, 3)
     if close:
@@ -136,29 +136,29 @@ def of_arrays(
     """
     units = units or {}
     shapes = {path: (shape, dtype) for path, (shape, dtype, _) in arrays.items()}
-    lengths = {longest(shape) for shape, _ in shapes.values() if longest(shape) > 1}
+    lengths = {sample_count(shape) for shape, _ in shapes.values() if sample_count(shape) > 1}
     clocks: dict[tuple[str, int], Clock] = {}
     if len(lengths) > 1:
         for path, (shape, dtype) in shapes.items():
-            unit = unit_of_clock(parts(path)[-1])
+            unit = unit_of_clock(path_parts(path)[-1])
             if unit is not None and dtype.kind in "iufM" and sum(n > 1 for n in shape) == 1:
-                clocks.setdefault((group(path), longest(shape)), Clock(path, _flat(arrays[path][2]), unit))
+                clocks.setdefault((parent_path(path), sample_count(shape)), Clock(path, _flat(arrays[path][2]), unit))
     found: list[Signal] = []
     for path, (shape, dtype, load) in arrays.items():
         unit = units.get(path, "")
-        own = {name: clock for (name, n), clock in clocks.items() if n == longest(shape)}
-        clock = own.get(group(path)) or (next(iter(own.values())) if len(own) == 1 else None)
+        own = {name: clock for (name, n), clock in clocks.items() if n == sample_count(shape)}
+        clock = own.get(parent_path(path)) or (next(iter(own.values())) if len(own) == 1 else None)
         found += _of_array(path, shape, dtype, load, unit, clock)
     return tuple(found)
 
 
-def group(path: str) -> str:
+def parent_path(path: str) -> str:
     """Path without its last part."""
-    last = parts(path)[-1]
+    last = path_parts(path)[-1]
     return path[: len(path) - len(last)] if path.endswith(last) else ""
 
 
-def longest(shape: tuple[int, ...]) -> int:
+def sample_count(shape: tuple[int, ...]) -> int:
     """Number of samples of an array: its first dimension, or the second one of a single row."""
     if not shape:
         return 1
@@ -172,7 +172,7 @@ def _flat(load: Callable[[], np.ndarray]) -> Callable[[], np.ndarray]:
 def _of_array(
     path: str, shape: tuple[int, ...], dtype: np.dtype, load: Callable[[], np.ndarray], unit: str, clock: Clock | None
 ) -> list[Signal]:
-    words, n = dtype.kind in "US", longest(shape)
+    words, n = dtype.kind in "US", sample_count(shape)
     refused = ""
     if dtype.names:
         return [
@@ -220,9 +220,9 @@ class Source:
         Raises:
             BadData: there are none.
         """
-        wanted = parts(prefix)
-        found = tuple(s for s in self.signals if parts(s.path)[: len(wanted)] == wanted or s.path == prefix)
+        wanted = path_parts(prefix)
+        found = tuple(s for s in self.signals if path_parts(s.path)[: len(wanted)] == wanted or s.path == prefix)
         if not found:
-            groups = dict.fromkeys(group(s.path).rstrip("/.") or s.path for s in self.signals)
-            raise BadData(f"{self.name}::{prefix}: no such signal; {offered(prefix, list(groups))}")
+            groups = dict.fromkeys(parent_path(s.path).rstrip("/.") or s.path for s in self.signals)
+            raise BadData(f"{self.name}::{prefix}: no such signal; {suggested_paths(prefix, list(groups))}")
         return dataclasses.replace(self, signals=found)

@@ -22,8 +22,15 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from calibration.data.columns import SUPPLY
-from calibration.data.courses import Stretch, applied, changing, differs, divided, stretches
-from calibration.data.input_errors import BadConfiguration, BadData, number
+from calibration.data.courses import (
+    Stretch,
+    applied_drive,
+    changing_columns,
+    course_stretches,
+    differs_from_row_before,
+    divide_run,
+)
+from calibration.data.input_errors import BadConfiguration, BadData, bound_text
 from calibration.data.runs import Runs
 from calibration.inference import bases as bases_room
 from calibration.inference import scans
@@ -305,7 +312,7 @@ class Histories(Observer):
                 if np.ptp(empty) > ROUNDING:
                     raise BadData(
                         f"{runs.source}, total_mass_kg: run {name or '(no run_id)'} changes by "
-                        f"{number(np.ptp(empty))} kg apart from its payload; "
+                        f"{bound_text(np.ptp(empty))} kg apart from its payload; "
                         "within a run only payload_kg may change it"
                     )
         _check_signs(runs)
@@ -337,7 +344,7 @@ class Histories(Observer):
             if (count > 1).any():
                 raise BadData(
                     f"{runs.source}, time_s: run {name or '(no run_id)'} has {count.max()} samples at "
-                    f"{number(times[count.argmax()])} s; give each run its own run_id"
+                    f"{bound_text(times[count.argmax()])} s; give each run its own run_id"
                 )
             for k in moving:
                 size = np.max(np.nan_to_num(np.abs(measured[mine, k])))
@@ -346,7 +353,8 @@ class Histories(Observer):
                     column, unit = runs.channels[k].column, runs.channels[k].unit
                     raise BadData(
                         f"{runs.source} row {first + 1}, time_s: run {name or '(no run_id)'} is moving at "
-                        f"{number(runs['time_s'][first])} s ({number(runs[column][first])} {unit}); a history "
+                        f"{bound_text(runs['time_s'][first])} s ({bound_text(runs[column][first])} "
+                        f"{unit}); a history "
                         "begins at rest at its first row. If it began earlier, add a row at that time without "
                         'readings; if it began in motion, state start = "measured" or "free" in the robot\'s file; '
                         "settled travel is one row a run, without time_s"
@@ -374,7 +382,7 @@ class Histories(Observer):
         time, measured = runs["time_s"], runs.measured()
         each = [
             max((s for s in run if s.driven or s.whole), key=lambda s: s.lasts, default=run[0])
-            for run in stretches(runs)
+            for run in course_stretches(runs)
         ]
         each = [s for s in each if s.driven and (s.whole or s.lasts >= LASTING)]
         if steady:
@@ -475,7 +483,7 @@ class Histories(Observer):
         volts = np.where(of_rows.open > 0.5, 0.0, of_rows.voltage * of_rows.duty)
         volts = volts if of_rows.motor_current is None else of_rows.motor_current
         values = [x for name in CHANGING if (x := getattr(of_rows, name)) is not None]
-        return [divided(rows[rows >= 0], time, values, volts) for rows in rows_of]
+        return [divide_run(rows[rows >= 0], time, values, volts) for rows in rows_of]
 
     @property
     def driven(self) -> Conditions:
@@ -775,7 +783,7 @@ def _autocorrelation(linear: Linearization, lags: int) -> dict[str, list[float]]
 
 def _drive_jumps(runs: Runs, each: list[np.ndarray], rig: Rig) -> list[tuple[np.ndarray, np.ndarray]]:
     """Times of jumps of the drive of each run's motors [s], and the jumps as shares of its largest value."""
-    driven, time = applied(runs), runs["time_s"]
+    driven, time = applied_drive(runs), runs["time_s"]
     # An imposed speed determines the current; a linear drive does not jump; an unknown drive is refused later.
     known = rig.imposed != "motor_speed" and rig.between_rows == "held" and np.isfinite(driven).all() and driven.any()
     coasts = runs["mode"] == "coast" if runs.has("mode") else np.zeros(len(runs), bool)
@@ -909,12 +917,12 @@ def _check_signs(runs: Runs) -> None:
 
     A rig's inertia may carry it forwards during one interval, but not during all of a table.
     """
-    volts, measured = applied(runs), runs.measured()
+    volts, measured = applied_drive(runs), runs.measured()
     time, size = runs["time_s"], np.nanmax(np.abs(measured), 0, initial=0.0)
     unsigned = np.nanmin(measured, 0, initial=0.0) >= -RESTING * size
     unsigned &= [runs.turns_round(c) for c in runs.channels]
     unit = runs.layout.imposed_column.rpartition("_")[2]
-    for run in stretches(runs):
+    for run in course_stretches(runs):
         for s in (s for s in run if volts[s.rows[0]] < 0 and s.lasts >= LASTING):
             rows = s.after(time, 0.5)
             for k in np.flatnonzero(unsigned):
@@ -922,7 +930,8 @@ def _check_signs(runs: Runs) -> None:
                 if shown.size and np.median(shown) > RESTING * size[k]:
                     raise BadData(
                         f"{runs.source} row {rows[0] + 1}, {channel.column}: got "
-                        f"{number(runs[channel.column][rows[0]])} {channel.unit} at {number(volts[rows[0]])} {unit}; "
+                        f"{bound_text(runs[channel.column][rows[0]])} {channel.unit} at "
+                        f"{bound_text(volts[rows[0]])} {unit}; "
                         "expected readings with a sign, negative backward; or state [instruments."
                         f"{channel.name}] signed = false in the robot's file, if it shows the magnitude only"
                     )
@@ -930,7 +939,7 @@ def _check_signs(runs: Runs) -> None:
 
 def _stop_notes(runs: Runs) -> list[Note | str]:
     """Note on runs with motors that are not driven on a slope."""
-    still = (applied(runs) == 0) & (runs["slope_deg"] != 0)
+    still = (applied_drive(runs) == 0) & (runs["slope_deg"] != 0)
     if not still.any():
         return []
     return [StopsOnSlope(tuple(dict.fromkeys(str(n) or "(no run_id)" for n in runs.run_names[still])))]
@@ -957,8 +966,10 @@ def _changes_still(speeds: np.ndarray, half: np.ndarray, quarter: np.ndarray) ->
 def _drive_changes(runs: Runs, rows: np.ndarray, share: float = 0.0) -> np.ndarray:
     """True for rows of a run with a change of its drive (of the motors' supply: above a share of its largest)."""
     supplied = (runs.layout.imposed_column, SUPPLY, "duty")
-    changes = differs(rows, (runs[column] for column in changing(runs) if column not in supplied))
-    changes[1:] |= _relative_jumps(applied(runs)[rows]) > share
+    changes = differs_from_row_before(
+        rows, (runs[column] for column in changing_columns(runs) if column not in supplied)
+    )
+    changes[1:] |= _relative_jumps(applied_drive(runs)[rows]) > share
     return changes
 
 
@@ -984,7 +995,7 @@ def _longest_steps(runs: Runs, robot: Robot) -> list[np.ndarray]:
     whole, rig, exact = runs.whole, robot.rig, robot.rig.imposed == "motor_speed"
     moved = [k for k, c in enumerate(runs.channels) if c.zero_at_rest and (c.directed or not c.settled)]
     measured, rates = whole.measured()[:, moved], [k for k, at in enumerate(moved) if not runs.channels[at].settled]
-    driven = None if exact else applied(whole)
+    driven = None if exact else applied_drive(whole)
     early, found = DELAYED * np.max(np.asarray(rig.delay)) + EARLIER.get(rig.imposed, 0.0), []
     for name in np.unique(runs.run_names):
         rows = whole.in_order(name)

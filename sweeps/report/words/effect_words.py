@@ -32,14 +32,14 @@ VARY = {
 WEIGH = "Weigh the robot, unladen and laden, and take the stated mass from it"
 
 
-def about(effect: type[Effect]) -> tuple[str, str, str]:
+def effect_summary(effect: type[Effect]) -> tuple[str, str, str]:
     """Equation, meaning and source of an effect, each on one line."""
     text, _, source = (effect.__doc__ or "").partition("Source:")
     equation, meaning = ([" ".join(part.split()) for part in text.split("\n\n")] + [""])[:2]
     return equation.rstrip("."), meaning, " ".join(source.split())
 
 
-def declared(effect: type[Effect]) -> Iterator[str]:
+def effect_declarations(effect: type[Effect]) -> Iterator[str]:
     """Declarations of an effect in addition to its equation."""
     words = [
         "dissipative" * effect.dissipative,
@@ -56,7 +56,7 @@ def declared(effect: type[Effect]) -> Iterator[str]:
     yield from filter(None, words)
 
 
-def tests(effect: type[Effect]) -> Iterator[str]:
+def effect_tests(effect: type[Effect]) -> Iterator[str]:
     """Bench tests that distinguish it from other effects: how to isolate its balance, and the change to make."""
     if effect.channel:
         for name in CHECKED_BY.get(effect.channel, ()):

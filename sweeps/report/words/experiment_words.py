@@ -23,34 +23,34 @@ from mmrjax.model.quantities import RPM
 # --- amounts --------------------------------------------------------------------------------------------
 
 
-def both(words: Sequence[str]) -> str:
+def join_words(words: Sequence[str]) -> str:
     """«a, b and c»."""
     *others, last = words
     return f"{', '.join(others)} and {last}" if others else last
 
 
-def amounts(values: Sequence[float], unit: str) -> str:
+def join_amounts(values: Sequence[float], unit: str) -> str:
     """«15 and 33 V», each once, in order."""
-    return f"{both([f'{v:g}' for v in sorted(set(values), key=abs)])} {unit}"
+    return f"{join_words([f'{v:g}' for v in sorted(set(values), key=abs)])} {unit}"
 
 
 #: Torque below which it is in mN·m [N·m].
 SMALL = 0.1
 
 
-def torques(values: Sequence[float]) -> str:
+def join_torques(values: Sequence[float]) -> str:
     """«0, 0.2 and 0.4 N·m»; in mN·m where all are below `SMALL`."""
     size, unit = (1e3, "mN·m") if max(map(abs, values)) < SMALL else (1.0, "N·m")
-    return amounts([menu.round_significant(size * v, 3) for v in values], unit)
+    return join_amounts([menu.round_significant(size * v, 3) for v in values], unit)
 
 
-def slopes(angles: Sequence[float]) -> str:
+def join_slopes(angles: Sequence[float]) -> str:
     """«on the level and up 10 and 20 deg»."""
     words = ["on the level"] if any(s == 0 for s in angles) else []
     for word, sign in (("up", 1), ("down", -1)):
         some = [abs(s) for s in angles if s * sign > 0]
-        words += [f"{word} {amounts(some, 'deg')}"] if some else []
-    return both(words)
+        words += [f"{word} {join_amounts(some, 'deg')}"] if some else []
+    return join_words(words)
 
 
 # --- the menu -------------------------------------------------------------------------------------------
@@ -83,7 +83,7 @@ DOING = {
 }
 
 
-def experiment(e: menu.Experiment) -> str:
+def experiment_sentences(e: menu.Experiment) -> str:
     """Instruction of one experiment: the run, the readings, and the limits to watch."""
     return _act(e) if isinstance(e, menu.Act) else _run(e)
 
@@ -94,7 +94,7 @@ def _act(act: menu.Act) -> str:
     (kind,) = act.kinds
     if act.channel:
         return ACTS[kind].format(channels.find_channel(act.channel).label)
-    return ACTS[kind].format(amounts([v for (v,) in act.at], UNITS[kind]))
+    return ACTS[kind].format(join_amounts([v for (v,) in act.at], UNITS[kind]))
 
 
 def _weigh(act: menu.Act) -> str:
@@ -109,14 +109,14 @@ def _weigh(act: menu.Act) -> str:
 
 def _run(run: menu.Run) -> str:
     level = (run.imposed != "voltage" or bool(run.torque)) and not any(run.slope)
-    where = "" if run.setup in setups.WEIGHTLESS or level else f" {slopes(run.slope)}"
-    read = both([channels.find_channel(c).label for c in run.channels])
+    where = "" if run.setup in setups.WEIGHTLESS or level else f" {join_slopes(run.slope)}"
+    read = join_words([channels.find_channel(c).label for c in run.channels])
     turning = [menu.round_significant(v / RPM) for v in run.voltage]
     unit = {"voltage": "V", "motor_current": "A of each motor"}.get(run.imposed)
-    at = amounts(turning, "rpm of the motor") if unit is None else amounts(run.voltage, unit)
-    against = f" against a brake of {torques(run.torque)}" if any(run.torque) else ""
+    at = join_amounts(turning, "rpm of the motor") if unit is None else join_amounts(run.voltage, unit)
+    against = f" against a brake of {join_torques(run.torque)}" if any(run.torque) else ""
     text = f"{_doing(run)}{where} at {at}{against}; read {read}"
-    return f"{text}. Watch {'; '.join(map(watch, run.watch))}" if run.watch else text
+    return f"{text}. Watch {'; '.join(map(part_to_watch, run.watch))}" if run.watch else text
 
 
 def _doing(run: menu.Run) -> str:
@@ -130,7 +130,7 @@ def _doing(run: menu.Run) -> str:
     return f"{run.where}: {doing}" if run.where else doing
 
 
-def watch(about: Watch) -> str:
+def part_to_watch(about: Watch) -> str:
     """Part that can be damaged, and the sign of it."""
     if isinstance(about, Overspeed):
         return (
@@ -159,7 +159,7 @@ def _allowed(temperature: float) -> str:
 # --- what is proposed -----------------------------------------------------------------------------------
 
 
-def instruction(what: Instruction) -> str:
+def experiment_instruction(what: Instruction) -> str:
     """Instruction for one calibration act: the steps and the readings."""
     if isinstance(what, NothingPossible):
         return "Every experiment of the menu is forbidden or beyond reach"
@@ -168,7 +168,7 @@ def instruction(what: Instruction) -> str:
     if isinstance(what, NothingTells):
         return f"No experiment of the menu tells {' and '.join(what.names)} apart by {what.sigma:g} sigma"
     if isinstance(what, CarryOut):
-        return ". And: ".join(map(experiment, what.experiments))
+        return ". And: ".join(map(experiment_sentences, what.experiments))
     if isinstance(what, TooWeak):
         return f"A series in {what.variable} would show what is missing by {what.sigma:.1f} sigma"
     place = bases.place_in_words(what.place)

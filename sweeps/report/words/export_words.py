@@ -6,7 +6,7 @@ import re
 
 import numpy as np
 
-from calibration.data.input_errors import rounded
+from calibration.data.input_errors import three_digits
 from mmrjax import __version__
 from mmrjax.errors import count_noun
 from mmrjax.model import channels
@@ -56,13 +56,13 @@ NOT_TESTED = (
 BACKWARD = "Runs in which the load drives the motor: the runs above include none."
 
 
-def statement(found: Export) -> str:
+def export_statement(found: Export) -> str:
     """One sentence: what was exported, and its error compared with the native model."""
     compared = found.comparison
     exported, native = compared.of(EXPORTED), compared.of(NATIVE)
     channels_shown = ", ".join(
-        f"{channels.find_channel(n).label} {rounded(exported[n])} %"
-        + (f" (native {rounded(native[n])} %)" if compared.situation.is_measured else "")
+        f"{channels.find_channel(n).label} {three_digits(exported[n])} %"
+        + (f" (native {three_digits(native[n])} %)" if compared.situation.is_measured else "")
         for n in exported
     )
     drive = found.joint
@@ -73,7 +73,7 @@ def statement(found: Export) -> str:
     )
 
 
-def kept(fate: Fate) -> str:
+def share_kept(fate: Fate) -> str:
     """Share of an effect that is kept, in percent; empty where none was computed."""
     return f"{100 * fate.kept:.0f} %" if np.isfinite(fate.kept) else ""
 
@@ -84,7 +84,7 @@ def errors_title(found: Export) -> str:
     return f"error against {compared.reference}, rms over rms"
 
 
-def remarks(found: Export) -> list[str]:
+def export_remarks(found: Export) -> list[str]:
     """Remarks on an export."""
     compared, drive = found.comparison, found.joint
     said = []
@@ -132,14 +132,14 @@ def not_tested(found: Export) -> list[str]:
     return [*NOT_TESTED, *([] if backward else [BACKWARD])]
 
 
-def armature(found: Export) -> float:
+def rotor_inertia(found: Export) -> float:
     """Inertia of the rotor at the joint [kg·m²], of a motor that drives."""
     robot = found.joint.robot
     value = float(robot.motor.inertia) * float(robot.gearbox.ratio) ** 2 * float(robot.gearbox.efficiency_load)
     return value + sum(float(e.amplitude) for e in found.joint.inside if e.balance == "inertia")
 
 
-def equations(found: Export) -> list[str]:
+def law_equations(found: Export) -> list[str]:
     """The law's equations in words, in the order in which they are computed, with the symbols of the constants."""
     robot = found.joint.robot
     where = {"supply": "winding", "electrical": "winding", "inductance": "winding", "motor": "motor",
@@ -174,10 +174,10 @@ def equations(found: Export) -> list[str]:
     return lines
 
 
-def law(found: Export) -> str:
+def law_text(found: Export) -> str:
     """Text of LAW.md."""
     drive, compared = found.joint, found.comparison
-    about = {"name": drive.name, "at": "drive", "armature": armature(found)}
+    about = {"name": drive.name, "at": "drive", "armature": rotor_inertia(found)}
     verdicts = {HELD: "held by", APPROXIMATED: "approximated by", DROPPED: "dropped:"}
     constants = "\n".join(
         f"| `{c.name}` | {c.value:.6g} | {c.unit} | {c.interval or '–'} | {c.meaning} | {c.source} |"
@@ -190,7 +190,8 @@ def law(found: Export) -> str:
     )
     names = [f"{channels.find_channel(n).label} [%]" for n in compared.errors[0].percent]
     fates = "\n".join(
-        f"* {f.name}: {verdicts[f.verdict]} {f.how}{f' ({kept(f)} of its change is kept)' if kept(f) else ''}"
+        f"* {f.name}: {verdicts[f.verdict]} "
+        f"{f.how}{f' ({share_kept(f)} of its change is kept)' if share_kept(f) else ''}"
         for f in compared.fates
     )
     cited = any(re.search(r"\beqs?\.|\bTables? [A\d]", f"{c.meaning} {c.source}") for c in found.constants)
@@ -205,7 +206,7 @@ that program. All units are SI; the joint is the driven wheel or output shaft.
 {USE[found.format].format(**about)}
 
 ## Equations
-{bullets(equations(found))}
+{bullets(law_equations(found))}
 
 ## Constants
 | name | value | unit | interval | meaning | source |

@@ -64,14 +64,14 @@ def estimated_noise(note: fit_notes.EstimatedNoise) -> str:
     )
 
 
-def combination(two: fit_notes.Pair) -> str:
+def determined_combination(two: fit_notes.Pair) -> str:
     """Combination of two parameters that data determine: `the ratio of a and b`, `a + 0.03 · b`."""
     if two.form != "linear":
         return f"the {two.form} of {two.one} and {two.other}"
     return f"{two.one} {'-' if two.weight < 0 else '+'} {abs(two.weight):.2g} · {two.other}"
 
 
-def determined(found: fit_notes.Determination) -> str:
+def is_determined_answer(found: fit_notes.Determination) -> str:
     """Answer whether data determine a parameter: `yes`, `no`, or `only with motor.resistance` for both of a pair."""
     if found.others:
         return f"only with {', '.join(found.others)}"
@@ -80,7 +80,7 @@ def determined(found: fit_notes.Determination) -> str:
 
 def only_together(note: fit_notes.OnlyTogether) -> str:
     """Parameters that are not determined separately, with what is."""
-    each = [f"{combination(p)} (correlation {p.correlation:+.3f})" for p in note.pairs]
+    each = [f"{determined_combination(p)} (correlation {p.correlation:+.3f})" for p in note.pairs]
     return f"determined only together: {', '.join(each)}"
 
 
@@ -120,7 +120,7 @@ def same_predictions(note: fit_notes.SamePredictions) -> str:
     )
 
 
-def agreement(note: fit_notes.Agreement) -> str:
+def search_agreement(note: fit_notes.Agreement) -> str:
     """Agreement of searches from many starts."""
     if note.starts == 1:
         return "one search, which did not converge" if note.open else "one search"
@@ -134,7 +134,7 @@ def agreement(note: fit_notes.Agreement) -> str:
     return ", ".join(parts)
 
 
-def header(found: CalibrationResult, robot_name: str) -> str:
+def calibrated_header(found: CalibrationResult, robot_name: str) -> str:
     """Header of the calibrated robot's file."""
     return f"calibrated from {robot_name} with {found.source}; the free parameters: {', '.join(found.parameters)}"
 
@@ -142,7 +142,7 @@ def header(found: CalibrationResult, robot_name: str) -> str:
 # --- a search by population -----------------------------------------------------------------------------
 
 
-def generations(note: fit_notes.Generations) -> str:
+def search_generations(note: fit_notes.Generations) -> str:
     """Progress of a search."""
     end = "the last gained nothing that counts"
     if not note.settled:
@@ -165,7 +165,7 @@ def members_jump(note: fit_notes.MembersJump) -> str:
     )
 
 
-def edge(at: fit_notes.Edge) -> str:
+def prior_edge(at: fit_notes.Edge) -> str:
     """Bound of a parameter, or its distance from the middle of its prior."""
     if at.bound:
         return f"at its {at.bound} bound"
@@ -174,7 +174,7 @@ def edge(at: fit_notes.Edge) -> str:
 
 def ended_at_edge(note: fit_notes.EndedAtEdge) -> str:
     """A search that ended at the edge of what was allowed."""
-    named = ", ".join(f"{name} {edge(at)}" for name, at in note.edge.items())
+    named = ", ".join(f"{name} {prior_edge(at)}" for name, at in note.edge.items())
     return f"the search ended at the edge of what was allowed: its best member has {named}"
 
 
@@ -216,7 +216,7 @@ def _percent(share: float) -> str:
     return f"{100 * share:.{0 if share > 0.1 else 1}f} %"
 
 
-def adequacy(found: Adequacy) -> str:
+def adequacy_verdict(found: Adequacy) -> str:
     """Verdict on the adequacy of a fit; first line of a calibration's output."""
     if found.obstacle:
         large = "it misses " + _misses([m for m in found.misses if m.large])
@@ -250,7 +250,7 @@ _VERDICTS: dict[bool | None, str] = {
 }
 
 
-def calibration(found: CalibrationResult) -> str:
+def calibration_answer(found: CalibrationResult) -> str:
     """Answer of a calibration: adequate or not, and rms errors before and after over the rows that have both."""
     each, rows = list[tuple[str, str]](), dict[str, int]()
     for c in found.channels:
@@ -318,11 +318,11 @@ SAID: dict[type, str | Callable[[Any], str]] = {
     fit_notes.NoPrediction: no_prediction,
     fit_notes.SamePredictions: same_predictions,
     fit_notes.BlockNotConverged: "a search without a block of {kind} did not converge",
-    fit_notes.Agreement: agreement,
+    fit_notes.Agreement: search_agreement,
     fit_notes.Elsewhere: "{searches} of {of} searches converged at other values of {names}",
     fit_notes.InPieces: "{name}: the values within its 95 % interval are in {pieces} pieces, with worse ones between "
     "them; samples closer together would tell them apart",
-    fit_notes.Generations: generations,
+    fit_notes.Generations: search_generations,
     fit_notes.LostRows: lost_rows,
     fit_notes.MembersJump: members_jump,
     fit_notes.EndedAtEdge: ended_at_edge,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calibration.data.input_errors import rounded
+from calibration.data.input_errors import three_digits
 from calibration.discovery import loop_notes
 from calibration.discovery.clusters import Cluster
 from calibration.discovery.location import DiscrepancyLocation
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 LARGE = 1e5
 
 
-def misfit(chi2: float) -> str:
+def misfit_text(chi2: float) -> str:
     """A χ² or a difference of two: `8088`, and `1e+08` where digits would say nothing."""
     return f"{chi2:.0f}" if abs(chi2) < LARGE else f"{chi2:.0e}"
 
@@ -47,7 +47,7 @@ def misfit(chi2: float) -> str:
 # --- the verdict ----------------------------------------------------------------------------------------
 
 
-def statement(said: loop_notes.Summary) -> str:
+def verdict_sentences(said: loop_notes.Summary) -> str:
     """A verdict in a sentence or a few."""
     text = _verdict(said)
     if said.aside:
@@ -56,7 +56,7 @@ def statement(said: loop_notes.Summary) -> str:
     if said.noise:
         text = f"{text} But {'; '.join(map(fit_words.noise_off, said.noise))}"
     if said.cluster is not None:
-        text = f"{text} {cluster(said.cluster).capitalize()}: that is a finding, so all of them are kept."
+        text = f"{text} {cluster_sentence(said.cluster).capitalize()}: that is a finding, so all of them are kept."
     return text
 
 
@@ -88,7 +88,7 @@ def _verdict(said: loop_notes.Summary) -> str:
     return f"Missing: {'; '.join(names)} (family-wise p {p_value(p)}).{in_model}{left}"
 
 
-def headline(found: loop_notes.Headline) -> str:
+def loop_headline(found: loop_notes.Headline) -> str:
     """Sentence on the claim that holds at every noise factor tried."""
     *first, last = [f"{f:g}" for f in found.factors]
     at = f"At {', '.join(first)} and {last} times the noise" if first else "At the stated noise"
@@ -108,15 +108,15 @@ def headline(found: loop_notes.Headline) -> str:
     return f"{at} {held[found.level]}"
 
 
-def a(noun: str) -> str:
+def with_article(noun: str) -> str:
     """A noun with its indefinite article."""
     return f"{'an' if noun[:1] in 'aeiou' else 'a'} {noun}"
 
 
 def _claim(sure: Sequence[str], others: Sequence[str]) -> str:
     """Members of a claim, and what some noises do not tell from them."""
-    apart = f" (not told at each noise from {' or '.join(map(a, others))})" if others else ""
-    return f"{' or '.join(map(a, sure))}{apart}"
+    apart = f" (not told at each noise from {' or '.join(map(with_article, others))})" if others else ""
+    return f"{' or '.join(map(with_article, sure))}{apart}"
 
 
 def _undescribed(said: loop_notes.Summary) -> str:
@@ -137,10 +137,11 @@ def _undescribed(said: loop_notes.Summary) -> str:
 
 def _mechanism(found: loop_notes.Mechanism, within: str) -> str:
     """A mechanism with its evidence."""
-    return f"{' or '.join(map(a, found.families))}{within}, established as a mechanism: it {evidence(found)}"
+    names = " or ".join(map(with_article, found.families))
+    return f"{names}{within}, established as a mechanism: it {mechanism_evidence(found)}"
 
 
-def evidence(found: loop_notes.Mechanism) -> str:
+def mechanism_evidence(found: loop_notes.Mechanism) -> str:
     """Evidence for a mechanism: share of the misfit, gain on held-out runs, and repeatability."""
     errors = f", {found.gain / found.se:.1f} standard errors" if 0 < found.se < math.inf else ""
     return (
@@ -166,7 +167,7 @@ def no_mechanism(found: loop_notes.Mechanism) -> str:
     return f"the best one is a {found.families[0]}, but {' and '.join(why)}"
 
 
-def course(d: UnnamedDiscrepancy) -> str:
+def curve_course(d: UnnamedDiscrepancy) -> str:
     """Course of a smooth curve with its values at both ends; empty without a variable."""
     if d.window is not None or d.variable not in bases.VARIABLES or len(d.at) < 2:
         return ""
@@ -182,7 +183,7 @@ def proposed_formula(d: UnnamedDiscrepancy) -> str:
     """The formula of a curve, or its course where no single term explains it."""
     if d.proposal.expression:
         return f"{d.proposal.formula} ({d.proposal.mark})"
-    what = course(d)
+    what = curve_course(d)
     return f"The curve {what}; {NO_FORMULA}" if what else NO_FORMULA
 
 
@@ -196,7 +197,7 @@ def _level(variable: str, x: float) -> str:
     return f"{float(f'{x / factor:.3g}'):g} {unit}".rstrip()
 
 
-def brief(said: loop_notes.Summary) -> str:
+def brief_verdict(said: loop_notes.Summary) -> str:
     """A verdict, and the effects in the model by their leaders."""
     found = []
     if said.verdict == "mechanism" and said.mechanism is not None:
@@ -211,7 +212,7 @@ def at_other_noise(found: Sequence[Sensitivity]) -> str:
     """The verdicts with other noise, in a sentence; empty for none."""
     same: dict[str, list[str]] = {}
     for one in found:
-        same.setdefault(brief(one.summary), []).append(f"{one.factor:g}")
+        same.setdefault(brief_verdict(one.summary), []).append(f"{one.factor:g}")
     each = [
         f"with {' and with '.join(factors)} times that noise the verdict is {words}"
         for words, factors in same.items()
@@ -235,19 +236,23 @@ def _tentative(those: Sequence[loop_notes.Missing], support: loop_notes.NameSupp
     if not those:
         return ""
     each = [
-        f"{_named(one)}, which {doubts(one.test)}" if doubts(one.test) else f"{_named(one)} ({reason(support)})"
+        f"{_named(one)}, which {effect_doubts(one.test)}"
+        if effect_doubts(one.test)
+        else f"{_named(one)} ({support_reasons(support)})"
         for one in those
     ]
     return f" Tentative, in the model since it predicts better: {'; '.join(each)}."
 
 
-def verdict(stages: LoopStages) -> str:
+def verdict_line(stages: LoopStages) -> str:
     """The verdict as soon as it is known: `verdict: class, series_resistance or supply_sag`."""
-    sure = [" or ".join(members) for members in stages.members] or [a(family) for family in stages.families]
+    sure = [" or ".join(members) for members in stages.members] or [
+        with_article(family) for family in stages.families
+    ]
     return f"verdict: {', '.join((stages.verdict, *sure))}"
 
 
-def ranking(found: Ranking, most: int = 5) -> list[str]:
+def ranking_lines(found: Ranking, most: int = 5) -> list[str]:
     """Lines of the ranking by regression: whether an effect is missing, and the strongest effects."""
     by = f"by regression on {found.windows} windows of the log" if found.windows else "by regression"
     if not found.missing:
@@ -257,7 +262,7 @@ def ranking(found: Ranking, most: int = 5) -> list[str]:
     if not beyond:
         return [f"{first}; no effect explains more than chance"]
     lines = [
-        f"  {k}. {e.name}, {a(e.family)}: lowers the misfit by {rounded(e.score)} σ², "
+        f"  {k}. {e.name}, {with_article(e.family)}: lowers the misfit by {three_digits(e.score)} σ², "
         f"amplitude {e.amplitude:.3g} ± {e.sd:.2g} {e.unit}".rstrip(" -")
         for k, e in enumerate(beyond, 1)
     ]
@@ -267,7 +272,7 @@ def ranking(found: Ranking, most: int = 5) -> list[str]:
 def so_far(effects: Sequence[str], families: Sequence[str]) -> str:
     """Findings of a search before its verdict is known."""
     return (
-        f"so far, confirmed by simulation: {' and '.join(a(f) for f in dict.fromkeys(families))} "
+        f"so far, confirmed by simulation: {' and '.join(with_article(f) for f in dict.fromkeys(families))} "
         f"({' and '.join(effects)}); which claim stands is not tested yet"
     )
 
@@ -321,7 +326,7 @@ def p_value(p: float) -> str:
     return f"≤ {math.ceil(p / step - 1e-9) * step:.1g}"
 
 
-def cluster(c: Cluster) -> str:
+def cluster_sentence(c: Cluster) -> str:
     """Sentence on the common level of outlying rows."""
     where = f"at {c.axis} {c.level}" if c.level else f"at {c.axis} {c.low:.3g} to {c.high:.3g}"
     return f"{c.inside} of {c.of} outlying rows cluster {where} (p = {c.p:.1g})"
@@ -330,7 +335,7 @@ def cluster(c: Cluster) -> str:
 # --- the first screen -----------------------------------------------------------------------------------
 
 
-def answer(found: DiscoveryResult) -> str:
+def completeness_answer(found: DiscoveryResult) -> str:
     """Answer to the question if the model is complete."""
     if found.verdict == "none":
         return "Yes, as far as these runs can show: the residuals are consistent with noise."
@@ -341,7 +346,7 @@ def answer(found: DiscoveryResult) -> str:
     if found.verdict == "mechanism" and stated is not None:
         over = ""
         if lacks is not None:
-            over = f", which {course(lacks)}" if course(lacks) else _within(lacks)
+            over = f", which {curve_course(lacks)}" if curve_course(lacks) else _within(lacks)
         return f"No: missing is a {' or a '.join(stated.families)}{over}. Its exact law is not established."
     if lacks is not None and not weak:
         place = bases.place_in_words(lacks.channel or lacks.balance)
@@ -355,7 +360,7 @@ def answer(found: DiscoveryResult) -> str:
 
 def _kind_of(effect: FoundEffect) -> str:
     """`a voltage drop that changes with current`."""
-    return a(" or ".join(effect.families))
+    return with_article(" or ".join(effect.families))
 
 
 def is_established(found: DiscoveryResult, effect: FoundEffect) -> bool:
@@ -372,7 +377,7 @@ def how_sure(found: DiscoveryResult, effect: FoundEffect) -> str:
             over = test.over.replace("_", " ")
             known += f"; accuracy of its form ±{100 * test.spread:.0f} % over {over}"
         return f"established{known}"
-    return f"tentative: it predicts, but {doubts(test)}" if doubts(test) else "tentative"
+    return f"tentative: it predicts, but {effect_doubts(test)}" if effect_doubts(test) else "tentative"
 
 
 def use_it(found: DiscoveryResult) -> list[str]:
@@ -417,7 +422,7 @@ def _conditions(columns: Mapping[str, str | float]) -> str:
 SHARE = 10.0
 
 
-def header(found: DiscoveryResult, robot_name: str) -> str:
+def proposed_header(found: DiscoveryResult, robot_name: str) -> str:
     """Header of the proposed robot's file."""
     start = f" from {robot_name}" if robot_name else ""
     return f"found by the loop{start} with {found.runs.source}: {found.statement}"
@@ -446,7 +451,7 @@ REASONS = {
 }
 
 
-def reason(support: loop_notes.NameSupport | None) -> str:
+def support_reasons(support: loop_notes.NameSupport | None) -> str:
     """Reasons for or against the names; empty for none."""
     if support is None:
         return ""
@@ -454,13 +459,13 @@ def reason(support: loop_notes.NameSupport | None) -> str:
         effects=" and ".join(support.effects),
         curves=" and ".join(map(_curve, support.curves)),
         strengths=", ".join(map(_strength, support.tests)),
-        lost="; ".join(f"{t.effect} {doubts(t)}" for t in support.tests if t.fails),
+        lost="; ".join(f"{t.effect} {effect_doubts(t)}" for t in support.tests if t.fails),
     )
 
 
-def why(found: DiscoveryResult) -> str:
+def naming_reasons(found: DiscoveryResult) -> str:
     """Reasons for or against the names; a curve that explains everything comes first."""
-    said, lacks = reason(found.support), found.unnamed
+    said, lacks = support_reasons(found.support), found.unnamed
     if lacks is None or not found.after.adequate or (found.support is not None and found.support.curves):
         return said
     over = loop_notes.CurveOver(lacks.place, (lacks.variable,))
@@ -485,7 +490,7 @@ DOUBTS = {
 }
 
 
-def doubts(test: loop_notes.NameTest | None) -> str:
+def effect_doubts(test: loop_notes.NameTest | None) -> str:
     """Reasons against an effect; empty for none."""
     if test is None or not test.fails:
         return ""
@@ -508,7 +513,7 @@ def _over(place: str, *variables: str) -> str:
     return f"{bases.place_in_words(place)} over {' and '.join(v.replace('_', ' ') for v in variables)}"
 
 
-def standing(found: DiscoveryResult) -> str:
+def support_sentence(found: DiscoveryResult) -> str:
     """Sentence on the support of names; empty without one."""
     if not found.standing:
         return ""
@@ -517,13 +522,13 @@ def standing(found: DiscoveryResult) -> str:
     return f"{found.standing[0].upper()}{found.standing[1:]}."
 
 
-def called(found: DiscoveryResult, effect: FoundEffect) -> str:
+def effect_called(found: DiscoveryResult, effect: FoundEffect) -> str:
     """The name of an effect, and where it is tentative what speaks against it."""
-    said = tentative(found, effect)
+    said = tentative_reason(found, effect)
     return f"{effect.name}\n({said})" if said else effect.name
 
 
-def tentative(found: DiscoveryResult, effect: FoundEffect) -> str:
+def tentative_reason(found: DiscoveryResult, effect: FoundEffect) -> str:
     """In a few words, what speaks against the name of an effect; empty where it is established."""
     if found.support is None or is_established(found, effect):
         return ""
@@ -555,7 +560,7 @@ def ruled_out(found: DiscoveryResult) -> str:
     first = min(candidates, key=lambda a: (len(a.effects), a.rise_chi2))
     what = "the curve" if found.verdict in WITHOUT_NAME else "what is proposed"
     more = first.rise_chi2 < -found.settings.same
-    gain = f"{misfit(-first.rise_chi2)} σ² more than {what}" if more else f"as much as {what}"
+    gain = f"{misfit_text(-first.rise_chi2)} σ² more than {what}" if more else f"as much as {what}"
     are = "are" if len(first.effects) > 1 else "is"
     return (
         f"{' and '.join(first.effects)} would explain {gain}, but {are} ruled out by size or sign alone: {first.why}."
@@ -565,7 +570,7 @@ def ruled_out(found: DiscoveryResult) -> str:
 # --- beside names ---------------------------------------------------------------------------------------
 
 
-def hidden(found: DiscoveryResult) -> str:
+def hidden_effects_sentence(found: DiscoveryResult) -> str:
     """Sentence on effects that the findings could hide, and on runs that would show them; empty for none."""
     if not found.hidden:
         return ""
@@ -584,7 +589,7 @@ def stated_value(name: str, s: StatedValue) -> str:
     )
 
 
-def size(e: FoundEffect) -> str:
+def effect_amplitude(e: FoundEffect) -> str:
     """Amplitude of an effect: `-0.0154 ± 0.00014`, with its unit where it has one."""
     return _estimate(e.parameters["amplitude"])
 
@@ -593,7 +598,7 @@ def _estimate(found: Estimate) -> str:
     return f"{found.value:.3g} ± {found.sd:.2g} {found.unit}".rstrip(" -")
 
 
-def alike(found: DiscoveryResult, e: FoundEffect) -> str:
+def indistinguishable_effects(found: DiscoveryResult, e: FoundEffect) -> str:
     """Effects and stated values that these data do not distinguish from an effect."""
     settled = [x.name for x in effects.ALL if x.settles_to in e.members and not found.runs.sampled]
     others = ", ".join(
@@ -607,7 +612,7 @@ def alike(found: DiscoveryResult, e: FoundEffect) -> str:
     return ", or ".join(words for words in (others, values) if words)
 
 
-def worse(found: Sequence[Worse], predicted: Mapping[str, tuple[int, int]]) -> str:
+def rising_errors_sentence(found: Sequence[Worse], predicted: Mapping[str, tuple[int, int]]) -> str:
     """Sentence on errors that rise and on rows that are no longer predicted; empty for none.
 
     Args:
@@ -635,7 +640,7 @@ def _change(before: float, after: float) -> str:
 # --- the track model ------------------------------------------------------------------------------------
 
 
-def asked(about: loop_notes.Asked) -> str:
+def track_model_question(about: loop_notes.Asked) -> str:
     """Question to the track model."""
     return {
         "missing": f"what is missing in the {about.balance} balance over {about.variable.replace('_', ' ')}",
@@ -644,7 +649,7 @@ def asked(about: loop_notes.Asked) -> str:
     }[about.why]
 
 
-def resolved(found: Resolved) -> str:
+def track_model_answer(found: Resolved) -> str:
     """Answer of the track model."""
     before, after = found.slip_rms
     gear = ", ".join(
@@ -656,13 +661,13 @@ def resolved(found: Resolved) -> str:
     if not found.explains:
         why = f"; {', '.join(found.outside)} outside" if found.outside else ""
         return (
-            f"Track model, {asked(found.asked)}: no running gear within its priors was found to "
+            f"Track model, {track_model_question(found.asked)}: no running gear within its priors was found to "
             f"leave it ({slip}, χ² falls by {found.fall:.0f}, p = {found.p:.2g}{why}){on}"
         )
     held = len(found.constants) - len(found.known_from_rows)
     known = f"not determined by these rows: {held} of {len(found.constants)} constants"
     return (
-        f"Track model, {asked(found.asked)}: a running gear within its priors leaves it ({slip}, "
+        f"Track model, {track_model_question(found.asked)}: a running gear within its priors leaves it ({slip}, "
         f"χ² falls by {found.fall:.0f}, p = {found.p:.2g}): {gear}; {known}{on}"
     )
 
@@ -693,7 +698,7 @@ def noise_from_series(note: loop_notes.NoiseFromSeries) -> str:
     )
 
 
-def copies(note: loop_notes.Copies) -> str:
+def copied_rows(note: loop_notes.Copies) -> str:
     """Rows that copy earlier ones."""
     rows = ", ".join(map(str, note.rows))
     if len(note.rows) == 1:
@@ -716,7 +721,7 @@ def still_lacks(note: loop_notes.StillLacks) -> str:
     return f"not everything is explained: an error in the {place} that varies with {over} remains"
 
 
-def late(note: loop_notes.Late) -> str:
+def imposed_delay(note: loop_notes.Late) -> str:
     """Delay of the imposed quantity, and the line for the rig's file."""
     when = "later" if note.delay > 0 else "earlier"
     return (
@@ -725,7 +730,7 @@ def late(note: loop_notes.Late) -> str:
     )
 
 
-def led(note: loop_notes.Led) -> str:
+def leader_choice(note: loop_notes.Led) -> str:
     """Criterion that chose the leader of a class; a different choice by the other criterion is reported."""
     names, leader = note.names, note.leader
     by = {
@@ -757,7 +762,7 @@ def rests_on(note: loop_notes.RestsOn) -> str:
     )
 
 
-def unwritten(note: loop_notes.Unwritten) -> str:
+def unwritten_reason(note: loop_notes.Unwritten) -> str:
     """Reason why identified effects are not in the written robot."""
     what = "the curve" if note.curve else "what was found"
     how = "no better than" if note.curve and note.gain > 0 else "worse than"
@@ -767,7 +772,7 @@ def unwritten(note: loop_notes.Unwritten) -> str:
     )
 
 
-def outstanding(note: loop_notes.Outstanding) -> str:
+def outstanding_verdicts(note: loop_notes.Outstanding) -> str:
     """Verdicts that are not there yet."""
     at = " and ".join(f"{f:g}" for f in note.factors)
     return (
@@ -785,13 +790,13 @@ SAID: dict[type, str | Callable[[Any], str]] = {
         f"{note.stated:.0%}, so the {note.word} noise gives some of its readings too large a weight; state the "
         "instrument's with --noise"
     ),
-    loop_notes.Copies: copies,
+    loop_notes.Copies: copied_rows,
     loop_notes.KeptOut: kept_out,
     loop_notes.PhasesDiffer: "the wave stands at another angle in each run (it explains {free:.0f} σ² free in each, "
     "{held:.0f} with one phase): robot.toml holds the mean; start runs from a mark",
     loop_notes.StillLacks: still_lacks,
-    loop_notes.Late: late,
-    loop_notes.Led: led,
+    loop_notes.Late: imposed_delay,
+    loop_notes.Led: leader_choice,
     loop_notes.NotPredictable: lambda note: (
         f"not predictable from the others, so neither scored nor tested: blocks by "
         f"{' and by '.join(blocks.kind_in_words(kind) for kind in note.kinds)} that hold all runs of a configuration "
@@ -799,10 +804,10 @@ SAID: dict[type, str | Callable[[Any], str]] = {
     ),
     loop_notes.LostReplicates: "only {settled} of {asked} bootstrap tables could be fitted again; the thresholds are "
     "theirs",
-    loop_notes.Outstanding: outstanding,
+    loop_notes.Outstanding: outstanding_verdicts,
     loop_notes.TooFewReplicates: "{settled} bootstrap tables are too few for every kind of evidence "
     "to count; use 500 or "
     "more",
     loop_notes.RestsOn: rests_on,
-    loop_notes.Unwritten: unwritten,
+    loop_notes.Unwritten: unwritten_reason,
 }

@@ -26,7 +26,7 @@ from sweeps.report.words import (
 Said = str | Callable[..., str]
 #: Kind of note → a sentence with its fields, or a function that makes one.
 NOTES: dict[type, Said] = {
-    fit_notes.Step: step_words.step,
+    fit_notes.Step: step_words.step_sentence,
     **table_words.SAID,
     **fit_words.SAID,
     **loop_words.SAID,
@@ -34,32 +34,32 @@ NOTES: dict[type, Said] = {
 }
 #: The same of results and of their parts that are no notes.
 RESULTS: dict[type, Said] = {
-    **dict.fromkeys(instructions.KINDS, experiment_words.instruction),
-    fit_notes.Determination: fit_words.determined,
-    fit_notes.Edge: fit_words.edge,
-    fit_notes.Pair: fit_words.combination,
+    **dict.fromkeys(instructions.KINDS, experiment_words.experiment_instruction),
+    fit_notes.Determination: fit_words.is_determined_answer,
+    fit_notes.Edge: fit_words.prior_edge,
+    fit_notes.Pair: fit_words.determined_combination,
     fit_notes.Shown: fit_words.shown_by,
-    Adequacy: fit_words.adequacy,
+    Adequacy: fit_words.adequacy_verdict,
     ResidualCluster: fit_words.residual_cluster,
-    fit_results.CalibrationResult: lambda found: fit_words.adequacy(found.adequacy),
+    fit_results.CalibrationResult: lambda found: fit_words.adequacy_verdict(found.adequacy),
     fit_results.Prior: lambda prior: fit_words.PRIORS.get(prior.source, prior.source),
-    loop_notes.Asked: loop_words.asked,
-    loop_notes.Headline: loop_words.headline,
-    loop_notes.Summary: loop_words.statement,
+    loop_notes.Asked: loop_words.track_model_question,
+    loop_notes.Headline: loop_words.loop_headline,
+    loop_notes.Summary: loop_words.verdict_sentences,
     loop_results.Alternative: lambda found: loop_words.why_ruled_out(found.reasons),
-    loop_results.DiscoveryResult: lambda found: loop_words.statement(found.summary),
+    loop_results.DiscoveryResult: lambda found: loop_words.verdict_sentences(found.summary),
     loop_results.Formula: lambda found: found.expression or loop_words.NO_FORMULA,
-    loop_results.Resolved: loop_words.resolved,
-    loop_results.UnnamedDiscrepancy: loop_words.course,
-    SensitivityResult: sensitivity_words.statement,
-    Settled: settle_words.statement,
+    loop_results.Resolved: loop_words.track_model_answer,
+    loop_results.UnnamedDiscrepancy: loop_words.curve_course,
+    SensitivityResult: sensitivity_words.sensitivity_statement,
+    Settled: settle_words.settle_statement,
 }
 #: The same of parts of results, by name.
 PARTS: dict[tuple[type, str], Callable[..., str]] = {
-    (fit_results.CalibrationResult, "header"): fit_words.header,
-    (loop_results.DiscoveryResult, "header"): loop_words.header,
+    (fit_results.CalibrationResult, "header"): fit_words.calibrated_header,
+    (loop_results.DiscoveryResult, "header"): loop_words.proposed_header,
     (loop_results.DiscoveryResult, "refit header"): loop_words.refit_header,
-    (loop_results.DiscoveryResult, "standing"): loop_words.why,
+    (loop_results.DiscoveryResult, "standing"): loop_words.naming_reasons,
 }
 
 

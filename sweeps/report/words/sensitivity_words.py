@@ -32,7 +32,7 @@ _CAUSES = {
 }
 
 
-def meaning(found: SensitivityResult, name: str) -> str:
+def input_in_words(found: SensitivityResult, name: str) -> str:
     """An input in words: its meaning without symbols' sources, and its configuration; the name of an effect's."""
     if name.startswith("effects.") or not found.inputs[name].meaning:
         return name
@@ -41,14 +41,14 @@ def meaning(found: SensitivityResult, name: str) -> str:
     return f"{words} ({where})" if where in set(map(str, found.points.configuration)) else words
 
 
-def statement(found: SensitivityResult) -> str:
+def sensitivity_statement(found: SensitivityResult) -> str:
     """Inputs that matter most for each output, with their operating points."""
     leaders = found.leaders()
     if not leaders:
         return "None of these inputs changes any of these outputs."
     verb, measure, note = _CAUSES.get(found.method, ("causes", "variance", ""))
     said = "; ".join(
-        f"{meaning(found, name)} {verb} {100 * outputs[0][1]:.0f} % of the {measure} of {outputs[0][0]}"
+        f"{input_in_words(found, name)} {verb} {100 * outputs[0][1]:.0f} % of the {measure} of {outputs[0][0]}"
         + "".join(f", {100 * share:.0f} % of {label}" for label, share in outputs[1:])
         for name, outputs in sorted(leaders.items(), key=lambda item: -len(item[1]))
     )
@@ -90,7 +90,7 @@ def _in_words(points: Points, mask: np.ndarray) -> str:
     return " and ".join([words] * bool(words) + [f"{others} more" if words else str(others)] * bool(others))
 
 
-def sampling(note: sensitivity_notes.Sampling) -> str:
+def sampling_scope(note: sensitivity_notes.Sampling) -> str:
     """Distribution of the inputs that a method samples."""
     return f"{METHODS[note.method]}, over {note.points} operating points"
 
@@ -112,7 +112,7 @@ def sample_left_out(note: sensitivity_notes.SampleLeftOut) -> str:
     )
 
 
-def inert(note: sensitivity_notes.Inert) -> str:
+def inert_inputs(note: sensitivity_notes.Inert) -> str:
     """Inputs with only zero derivatives."""
     names = ", ".join(note.inputs)
     if note.correlated:
@@ -125,9 +125,9 @@ def inert(note: sensitivity_notes.Inert) -> str:
 
 #: Kind of note → a sentence with its fields, or a function that makes one.
 SAID: dict[type, str | Callable[[Any], str]] = {
-    sensitivity_notes.Sampling: sampling,
+    sensitivity_notes.Sampling: sampling_scope,
     sensitivity_notes.PointsLeftOut: points_left_out,
     sensitivity_notes.SampleLeftOut: sample_left_out,
-    sensitivity_notes.Inert: inert,
+    sensitivity_notes.Inert: inert_inputs,
     sensitivity_notes.Tied: "kept at their ratio to another input, and part of what it does: {inputs}",
 }

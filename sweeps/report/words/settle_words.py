@@ -24,7 +24,7 @@ WHY = {
 }
 
 
-def reason(stretch: Stretch) -> str:
+def left_out_reason(stretch: Stretch) -> str:
     """Reason why a stretch is left out: `total_current still changes at the end of its level (6.1 %)`."""
     what = f"{stretch.channel} {WHY[stretch.why][0]}" if stretch.channel else WHY[stretch.why][0]
     return what + (f" ({100 * stretch.size:.2g} %)" if stretch.size else "")
@@ -43,11 +43,11 @@ def left_out(stretches: Iterable[Stretch], few: bool = False) -> list[tuple[str,
         longest = max(mine, key=lambda s: len(s.rows))
         rows = f"{longest.rows[0] + 1}-{longest.rows[-1] + 1}"
         cure = "nothing: the log as it is has them" if few and why in OF_LEVELS else WHY[why][1]
-        found.append((reason(longest), len(mine), sum(len(s.rows) for s in mine), rows, cure))
+        found.append((left_out_reason(longest), len(mine), sum(len(s.rows) for s in mine), rows, cure))
     return found
 
 
-def statement(found: Settled) -> str:
+def settle_statement(found: Settled) -> str:
     """Number of settled runs of a log, and its samples."""
     kept, rows = found.kept, sum(len(s.rows) for s in found.kept)
     back = sum(s.imposed < 0 for s in kept)
@@ -58,7 +58,7 @@ def statement(found: Settled) -> str:
     )
 
 
-def levels(found: Settled) -> str:
+def levels_and_samples(found: Settled) -> str:
     """Division of samples into levels, and the samples of a level that are used."""
     return (
         f"Neighbouring samples belong to one level if the imposed quantity differs by less than "
@@ -83,7 +83,7 @@ def too_few(found: Settled, fewest: int, loop: str) -> str:
     )
 
 
-def glitches(found: Settled) -> list[str]:
+def glitch_sentences(found: Settled) -> list[str]:
     """Sentences on the readings that means leave out because they are far from the others, one for each channel."""
     said = []
     for channel in (s.channel for s in found.signals):
@@ -100,13 +100,13 @@ def glitches(found: Settled) -> list[str]:
     return said
 
 
-def remarks(found: Settled) -> list[str]:
+def settle_remarks(found: Settled) -> list[str]:
     """Sentences on what should be looked at."""
     said = []
     if found.gaps:
         rows = ", ".join(str(k + 1) for k in found.gaps[:5]) + (", ..." if len(found.gaps) > 5 else "")
         said.append(f"samples are missing after row{'s' * (len(found.gaps) > 1)} {rows}; no stretch goes across")
-    said += glitches(found)
+    said += glitch_sentences(found)
     angles = {rate: angle for angle, rate, _ in RATES}
     for channel in (s.channel for s in found.signals):
         if channel not in found.runs.channels:

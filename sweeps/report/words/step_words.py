@@ -57,14 +57,14 @@ OF = max(STAGES.values())
 OVER = {2: 0.45, 3: 0.5, 4: 0.7, 5: 0.75, 6: 0.8, 7: 0.9}
 
 
-def step(now: Step) -> str:
+def step_sentence(now: Step) -> str:
     """A step in a sentence, a stage of the loop with its number."""
     about = (" and ".join(x) if isinstance(x, tuple) else x for x in now.about)
     text = STEPS[now.name].format(*about)
     return f"{STAGES[now.name]} of {OF}, {text}" if now.name in STAGES else text
 
 
-def expected(text: str, seconds: float) -> float | None:
+def expected_time(text: str, seconds: float) -> float | None:
     """Time that a loop is expected to take yet, by what the stages before took [s]; None where that is not known.
 
     Args:
@@ -75,7 +75,7 @@ def expected(text: str, seconds: float) -> float | None:
     return None if over is None else seconds * (1 - over) / over
 
 
-def still(doing: str, seconds: float, compiled: int) -> str:
+def still_running_sentence(doing: str, seconds: float, compiled: int) -> str:
     """Progress of a running step: its duration and the number of programs compiled."""
     programs = f", {count_noun(compiled, 'program')} compiled" if compiled else ""
     return f"still {doing} ({seconds:.0f} s{programs})"

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from calibration.data.input_errors import number
+from calibration.data.input_errors import bound_text
 from calibration.inference import fit_notes
 
 #: Measurements that determine a parameter which the data do not, by the start or end of its name.
@@ -39,16 +39,16 @@ def would_measure(name: str) -> str:
     return "runs under conditions in which it acts"
 
 
-def unmeasured(note: fit_notes.Unmeasured) -> str:
+def unmeasured_parameter(note: fit_notes.Unmeasured) -> str:
     """A free parameter that moves no reading."""
     return (
         f"{note.name}: nothing in these data measures it; its value is its prior's. {would_measure(note.name)} would"
     )
 
 
-def repeats(note: fit_notes.Repeats) -> str:
+def differing_repeats(note: fit_notes.Repeats) -> str:
     """Rows under the same conditions whose readings differ."""
-    (first, second), (one, other) = note.rows, map(number, note.values)
+    (first, second), (one, other) = note.rows, map(bound_text, note.values)
     more = f" (and so {note.more} more)" if note.more else ""
     said = (
         f"{note.source} rows {first} and {second}, {note.column}: the same conditions gave {one} and {other}, "
@@ -65,7 +65,7 @@ def repeats(note: fit_notes.Repeats) -> str:
     return f"{wrong}, else find what changed between such rows that the table does not state" if note.more else wrong
 
 
-def unused(note: fit_notes.Unused) -> str:
+def unused_columns(note: fit_notes.Unused) -> str:
     """Columns that vary and have no role, and what each may be."""
     names = [name for name, _ in note.columns]
     vary, are = ("vary", "are") if len(names) > 1 else ("varies", "is")
@@ -89,7 +89,7 @@ def nothing_varies(note: fit_notes.NothingVaries) -> str:
     )
 
 
-def copied(note: fit_notes.Copied) -> str:
+def copied_channel(note: fit_notes.Copied) -> str:
     """A channel that is a line of another."""
     start = f"{note.intercept:.4g} {'+' if note.slope >= 0 else '-'} " if note.intercept else ""
     slope = abs(note.slope) if note.intercept else note.slope
@@ -99,9 +99,9 @@ def copied(note: fit_notes.Copied) -> str:
     return f"{said}: it is computed from it and no reading; remove it from channels and table, or read an instrument"
 
 
-def constant(note: fit_notes.Constant) -> str:
+def constant_condition(note: fit_notes.Constant) -> str:
     """A condition that does not vary."""
-    here = f"{note.column} is {number(note.value)} in every row"
+    here = f"{note.column} is {bound_text(note.value)} in every row"
     return f"{here}: {ALIKE[note.alike]}, and only their priors tell them apart"
 
 
@@ -136,7 +136,9 @@ def coarse_steps(note: fit_notes.CoarseSteps) -> str:
 
 def inherited_priors(note: fit_notes.InheritedPriors) -> str:
     """A part that is not the nominal robot's while friction of it is."""
-    changed = ", ".join(f"{name} {number(mine)} for {number(nominal)}" for name, mine, nominal in note.changed)
+    changed = ", ".join(
+        f"{name} {bound_text(mine)} for {bound_text(nominal)}" for name, mine, nominal in note.changed
+    )
     one = len(note.kept) == 1
     return (
         f"{note.part} is not the nominal robot's ({changed}), but its {', '.join(note.kept)} still "
@@ -148,7 +150,7 @@ def inherited_priors(note: fit_notes.InheritedPriors) -> str:
 def off_by(note: fit_notes.OffBy) -> str:
     """Readings that no robot like this one shows."""
     off, size = (note.factor, "large") if note.factor > 1 else (1 / note.factor, "small")
-    what = f"{note.column}: readings are about {number(float(f'{off:.2g}'))} times too {size} for this robot"
+    what = f"{note.column}: readings are about {bound_text(float(f'{off:.2g}'))} times too {size} for this robot"
     alike = f"; {' and '.join(note.others)} alike: check {note.imposed} and the robot's file" if note.others else ""
     if note.units:
         return f"{what}; are they in {' or '.join(note.units)}? expected {note.unit}{alike}"
@@ -157,19 +159,19 @@ def off_by(note: fit_notes.OffBy) -> str:
 
 #: Kind of note → a sentence with its fields, or a function that makes one.
 SAID: dict[type, str | Callable[[Any], str]] = {
-    fit_notes.Unmeasured: unmeasured,
-    fit_notes.Constant: constant,
-    fit_notes.Repeats: repeats,
+    fit_notes.Unmeasured: unmeasured_parameter,
+    fit_notes.Constant: constant_condition,
+    fit_notes.Repeats: differing_repeats,
     fit_notes.LargerNoise: "{channel}: {pairs} pairs of rows at the same conditions scatter "
     "{factor:.2g} times as much "
     "as the {source} noise says; its sd is taken {factor:.2g} times as large. Check the repeats, or state the noise "
     "with --noise",
-    fit_notes.Unused: unused,
+    fit_notes.Unused: unused_columns,
     fit_notes.NoLoadGives: "{source}, {theirs}: friction and a constant torque of a load leave {share:.0%} of its "
     "variance unexplained; if a brake sets it, it is a condition: state [columns] load_torque_Nm = "
     '"{theirs}" in the robot\'s file, and take output_torque out of its channels',
     fit_notes.NothingVaries: nothing_varies,
-    fit_notes.Copied: copied,
+    fit_notes.Copied: copied_channel,
     fit_notes.Turned: "{source}, {theirs}: off by {off:.2g} (rms) from what the file's numbers give, "
     "with the other sign "
     'by {turned:.2g}; if it is turned round, state [columns] {column} = {{column = "{theirs}", factor = -1}}',
