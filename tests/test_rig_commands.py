@@ -188,7 +188,7 @@ REFUSED = {
     "battery of an imposed speed": ("bench", True, ["simulate", "--battery"], r"--battery: the motors' speed is imposed"),
     "a pendulum's steady state": ("pendulum", False, ["simulate", "--voltage", "3"], r"arm .* has no steady state"),
     "a pendulum's profile": (
-        "pendulum", False, ["simulate", "--profile", "shuttle"], r"--profile: arm is an arm on which gravity acts",
+        "pendulum", False, ["simulate", "--profile", "shuttle"], r"--profile: arm is an arm whose gravity load varies with its angle",
     ),
     "an imposed speed's profile": (
         "bench", True, ["simulate", "--profile", "shuttle"], r"--profile: the motors' speed is imposed on this robot",

@@ -165,7 +165,7 @@ def test_a_voltage_beside_the_battery_is_refused(mmrjax, tmp_path):
         code, _, err = mmrjax(*command, "--battery", "--voltage", "15")
         assert code == 2
         assert err == (
-            "mmrjax: --voltage: got 15 beside --battery, whose voltage is that of its charge; give one of them\n"
+            "mmrjax: --voltage: got 15 with --battery, whose charge sets the voltage; give one of them\n"
         )
     code, _, err = mmrjax("sweep", "--battery", "--voltages", "15,24")
     assert code == 2 and "--voltages acts without --battery only" in err

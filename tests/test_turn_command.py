@@ -341,7 +341,7 @@ def test_turns_are_told_in_plain_words():
     assert not none.sides and not none.notes
     assert "parts allow" not in said()
     robot = params.replace(robot, {"6T2A.turning.width": 0.5})
-    assert "500 mm between the sides is none that the packaged robot's parts allow, 208 to 278 mm" in said()
+    assert "500 mm between the sides is outside the range of the packaged robot's parts, 208 to 278 mm" in said()
     assert "the right motor stands at 1.00 A" in said(motor_speed_right_rpm=0.2)
     back = said(motor_current_left_A=-0.4, motor_speed_left_rpm=900.0, power_left_W=-3.0)
     assert "the left motor is driven by the turn: 0.40 A brake it, 3.0 W go back to the supply" in back
