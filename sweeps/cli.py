@@ -232,7 +232,7 @@ def sweep(
     return room.sweep_to_folder(told.config, told.where, out, force, how)
 
 
-@_command(config.Compare, example="mmrjax compare measured --robot sm1 --set 6T2A.ground.friction.static=0.6")
+@_command(config.Compare, example="mmrjax compare measured --robot found/robot.toml --against nominal")
 def compare(
     told: Told,
     data: Annotated[
@@ -244,7 +244,7 @@ def compare(
     out: _Out = None,
     force: _Force = False,
 ) -> int:
-    """Simulate the runs of a table and compare: equation (35) per row and channel, rms, worst, R²."""
+    """Simulate the runs of a table and compare: errors by row and channel, rms, worst, R²; of two robots too."""
     from sweeps.commands import compare as room
 
     return room.compare_with_table(told.config, data, own_mass, out, force)

@@ -454,6 +454,10 @@ class Sweep(RobotPart, BatchPart, SupplyPart, GridPart, PosteriorPart, OutputPar
 class Compare(RobotPart, DataPart, FidelityPart, PosteriorPart, OutputPart):
     """The runs of a measured table."""
 
+    against: str | None = option_field(
+        None, "A second robot, simulated on the same rows", metavar="ROBOT.toml", format="path"
+    )
+
 
 class Render(RobotPart, FidelityPart, SupplyPart, TurnPart):
     """One run of the fidelity that pictures are made from."""

@@ -38,7 +38,7 @@ from sweeps.report import (
 )
 from sweeps.report.document import Cell, Column, Document, Figure, Note, Section, Table
 from sweeps.results.check_results import CheckResult
-from sweeps.results.comparison_results import Comparison, compare_readings
+from sweeps.results.comparison_results import Comparison, add_second_robot, compare_readings
 from sweeps.results.size_results import SizeResult
 
 RECORD = Path(__file__).parent / "record" / "pages"
@@ -114,6 +114,30 @@ def comparison(log: bool = False) -> Document:
     )  # fmt: skip
 
 
+def comparison_two() -> Document:
+    """The same with a second robot, 2 % below the readings, which reaches the first row but not the second."""
+    measured = records.read_runs("measured")
+    error = np.where(np.arange(len(measured)) == 0, np.nan, 1.04)
+    simulated = {c: measured[c] for c in ("configuration", *measured.axes)}
+    simulated |= {c.column: error * measured[c.column] for c in measured.channels}
+    simulated["status"] = np.where(np.isnan(error), "slides", "converged")
+    table, summary = compare_readings(measured, simulated)
+    error = np.where(np.arange(len(measured)) == 1, np.nan, 0.98)
+    table = add_second_robot(
+        table, measured.channels, {c.column: error * measured[c.column] for c in measured.channels}
+    )
+    return comparison_report.comparison_document(
+        Comparison(
+            table, summary, measured.channels, "measured", "steady", "nominal (PM)", against="found/robot.toml"
+        )
+    )
+
+
+def test_two_robots_are_compared_on_the_rows_that_both_reach():
+    text = as_text(comparison_two())
+    assert "This robot and found/robot.toml on the same 18 rows: total current 4.0 and 2.0 %" in text
+
+
 def comparison_log() -> Document:
     return comparison(log=True)
 
@@ -136,7 +160,7 @@ def settle() -> Document:
 
 
 DOCUMENTS: dict[str, Callable[[], Document]] = {
-    "check": check, "size": size, "comparison": comparison, "comparison_log": comparison_log,
+    "check": check, "size": size, "comparison": comparison, "comparison_log": comparison_log, "comparison_two": comparison_two,
     "settle": settle,
 }  # fmt: skip
 

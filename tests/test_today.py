@@ -164,9 +164,7 @@ def test_a_voltage_beside_the_battery_is_refused(mmrjax, tmp_path):
     for command in (("simulate",), ("render", "a.png")):
         code, _, err = mmrjax(*command, "--battery", "--voltage", "15")
         assert code == 2
-        assert err == (
-            "mmrjax: --voltage: got 15 with --battery, whose charge sets the voltage; give one of them\n"
-        )
+        assert err == ("mmrjax: --voltage: got 15 with --battery, whose charge sets the voltage; give one of them\n")
     code, _, err = mmrjax("sweep", "--battery", "--voltages", "15,24")
     assert code == 2 and "--voltages acts without --battery only" in err
     code, _, err = mmrjax("sensitivity", "--battery", "--vary", "voltage=15:24")

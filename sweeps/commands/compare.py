@@ -1,4 +1,4 @@
-"""The command `compare`: compare a simulation with measured runs, equation (35) and R² of (A1)."""
+"""The command `compare`: compare the simulation of one robot, or of two, with measured runs."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from sweeps import config as configuration
 from sweeps.inputs import beside_robot, fit_of, load_robot, read_runs
 from sweeps.points import run, uncertainty
 from sweeps.report import comparison_report
-from sweeps.results.comparison_results import Comparison, compare_readings
+from sweeps.results.comparison_results import Comparison, add_second_robot, compare_readings
 from sweeps.skeleton import print_report
 from sweeps.store import open_folder
 
@@ -38,8 +38,9 @@ def compare_with_table(
     stated = runs = read_runs(source, file.robot, columns=config.columns, measured=True, series=True, of_turns=True)
     if runs.turns:
         file = dataclasses.replace(file, robot=file.robot.showing_turns(runs.layout.measured_columns), remarks=())
+    second = _second_robot(config, file)
     if runs.sampled:
-        return _over_time(config, file, runs, own_mass, out, force)
+        return _over_time(config, file, second, runs, own_mass, out, force)
     robot = instruments.with_inferred_instruments(file.robot, runs)
     if own_mass:
         runs = dataclasses.replace(runs, columns={k: v for k, v in runs.columns.items() if k != "total_mass_kg"})
@@ -48,11 +49,16 @@ def compare_with_table(
     with open_folder("compare", config, robot, out, force, runs) as folder:
         table = run.evaluate_runs(robot, runs, config, folder)
         comparison, summary = compare_readings(stated, table, robot)
+        if second is not None:
+            other = instruments.with_inferred_instruments(second.robot, runs)
+            comparison = add_second_robot(
+                comparison, stated.channels, run.evaluate_runs(other, runs, config, folder=None)
+            )
         folder.write_table("comparison.csv", comparison)
         notes = (*missing_readings_notes(comparison, stated.channels), *said)
         found = Comparison(
             comparison, summary, stated.channels, Path(runs.source).name, config.model, capabilities.shown_name(file),
-            fit_of(file, runs), notes=notes,
+            fit_of(file, runs), notes=notes, against=_name_of(config, file, second),
         )  # fmt: skip
         shown = print_report(comparison_report.comparison_document(found), dataclasses.replace(file, robot=robot))
         if drawn is not None and config.posterior is not None:
@@ -70,7 +76,13 @@ def compare_with_table(
 
 
 def _over_time(
-    config: configuration.Compare, file: RobotFile, runs: records.Runs, own_mass: bool, out: Path | None, force: bool
+    config: configuration.Compare,
+    file: RobotFile,
+    second: RobotFile | None,
+    runs: records.Runs,
+    own_mass: bool,
+    out: Path | None,
+    force: bool,
 ) -> int:
     """The same for time histories, each simulated from its beginning as in fits."""
     options = {"--own-mass": own_mass, "--posterior": config.posterior, "--duration": config.duration_s}
@@ -85,6 +97,9 @@ def _over_time(
         table = run.follow_histories(ready.robot, runs, model)
         comparison, summary = compare_readings(runs, table, ready.robot)
         comparison |= {column: runs[column] for column in (*OVER, "run_id") if runs.has(column)}
+        if second is not None:
+            other = preparation.prepare(runs, second.robot).robot
+            comparison = add_second_robot(comparison, runs.channels, run.follow_histories(other, runs, model))
         folder.write_table("comparison.csv", comparison)
         notes = (
             *missing_readings_notes(comparison, runs.channels),
@@ -92,7 +107,7 @@ def _over_time(
         )
         found = Comparison(
             comparison, summary, runs.channels, Path(runs.source).name, HISTORIES, capabilities.shown_name(file),
-            fit_of(file, runs), OVER, notes,
+            fit_of(file, runs), OVER, notes, _name_of(config, file, second),
         )  # fmt: skip
         shown = print_report(
             comparison_report.comparison_document(found), dataclasses.replace(file, robot=ready.robot)
@@ -101,6 +116,28 @@ def _over_time(
             "compare", HISTORIES, ready.robot, runs, table, {"errors": summary, "notes": [*file.remarks, *notes]}
         )
         return run.write_run_folder(folder, config, result, shown)
+
+
+def _second_robot(config: configuration.Compare, file: RobotFile) -> RobotFile | None:
+    """The robot of `--against`, or None.
+
+    Raises:
+        BadConfiguration: as `load_robot`, or its channels are not those of the first robot.
+    """
+    if config.against is None:
+        return None
+    second = load_robot(config.model_copy(update={"robot": config.against, "set": {}}))
+    if second.robot.channels != file.robot.channels:
+        raise BadConfiguration(f"--against {config.against}: its channels are not those of {file.name}")
+    return second
+
+
+def _name_of(config: configuration.Compare, file: RobotFile, second: RobotFile | None) -> str:
+    """Name of the second robot, with its folder if both files have the same name; "" for none."""
+    if second is None:
+        return ""
+    name = capabilities.shown_name(second)
+    return str(config.against) if name == capabilities.shown_name(file) else name
 
 
 def missing_readings_notes(table: dict[str, np.ndarray], channels: Sequence[Channel]) -> list[str]:

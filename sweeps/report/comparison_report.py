@@ -53,6 +53,7 @@ def comparison_document(found: Comparison) -> Document:
             Note(lead, "lead", terminal=False),
             *(Note(text, "warn") for text in _unsolved(found)),
             _summary(found),
+            *([_both_robots(found)] if found.against else []),
             Note(_ERRORS, "key"),
             *([Note(found.notes, name="notes")] if found.notes else []),
         ),
@@ -73,7 +74,10 @@ def _over_time(found: Comparison) -> tuple[Section, ...]:
         "**Measured and simulated readings over time, each with its residual below.** "
         "The run with the largest residuals comes first."
     )
-    draw = deferred_drawing("time_overlay.time_overlay", found.table, found.channels, {"simulated_": "simulated"})
+    lines = {"simulated_": found.robot_name, "against_": found.against}
+    if not found.against:
+        lines = {"simulated_": "simulated"}
+    draw = deferred_drawing("time_overlay.time_overlay", found.table, found.channels, lines)
     return (Section("Over time", (Figure("overlay", comparison_answer(found), caption, draw),)),)
 
 
@@ -88,7 +92,28 @@ def comparison_answer(found: Comparison) -> str:
     what = f"{rows} of {total} rows" if rows < total else count_noun(total, "row")
     if found.over is not None:
         what = f"{_seconds(found):.3g} s of log"
-    return f"{what}: rms error {errors} (worst reading {worst:.1f} %). {_FITS[found.fit]}".rstrip()
+    said = f"{what}: rms error {errors} (worst reading {worst:.1f} %). {_FITS[found.fit]}".rstrip()
+    return said if not found.against else f"{said} {_second_robot(found)}"
+
+
+def _second_robot(found: Comparison) -> str:
+    """Errors of both robots on the rows that both reach."""
+    both = found.rms_of_both
+    shared = max(rows for rows, _, _ in both.values())
+    if not shared:
+        return f"No row has numbers of this robot and of {found.against}."
+    parts = [
+        f"{c.label} {both[c.name][1]:.1f} and {both[c.name][2]:.1f} %" for c in found.channels if both[c.name][0]
+    ]
+    return f"This robot and {found.against} on the same {count_noun(shared, 'row')}: {', '.join(parts)}."
+
+
+def _both_robots(found: Comparison) -> Table:
+    columns = (
+        Column("channel"), Column("rows of both", form="{}"), Column(f"rms error, {found.robot_name}", "%", "{:.1f}"),
+        Column(f"rms error, {found.against}", "%", "{:.1f}"),
+    )  # fmt: skip
+    return Table("robots", columns, [(c.label, *found.rms_of_both[c.name]) for c in found.channels])
 
 
 def _seconds(found: Comparison) -> float:

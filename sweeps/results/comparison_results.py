@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -28,6 +28,7 @@ class Comparison:
         fit: `these` if the robot was fitted to these rows, `others` if to other rows, "" if no fit is recorded.
         over: further columns of histories for the axes of the errors, with their headings.
         notes: sentences on the table.
+        against: name of a second robot, "" for none; its readings are the columns `against_<column>` of the table.
     """
 
     table: dict[str, np.ndarray]
@@ -39,6 +40,27 @@ class Comparison:
     fit: str = ""
     over: Mapping[str, str] | None = None
     notes: tuple[str, ...] = ()
+    against: str = ""
+
+    @property
+    def rms_of_both(self) -> dict[str, tuple[int, float, float]]:
+        """For each channel the rows with a number of both robots, and their rms errors [% of the measured rms]."""
+        answer = {}
+        for channel in self.channels:
+            measured = self.table[channel.column]
+            both = [self.table[prefix + channel.column] - measured for prefix in ("simulated_", "against_")]
+            rows = np.isfinite(both[0]) & np.isfinite(both[1])
+            size = residual.root_mean_square(measured[rows])
+            first, second = (100 * residual.root_mean_square(error[rows]) / size for error in both)
+            answer[channel.name] = int(rows.sum()), first, second
+        return answer
+
+
+def add_second_robot(
+    table: dict[str, np.ndarray], channels: Sequence[Channel], simulated: Mapping[str, np.ndarray]
+) -> dict[str, np.ndarray]:
+    """A table of `compare_readings` with the readings that a second robot gives on its rows."""
+    return table | {f"against_{c.column}": simulated[c.column] for c in channels}
 
 
 def compare_readings(
