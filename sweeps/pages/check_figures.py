@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
-from sweeps.pages.figure_style import FAINT, GREEN, INK, VERMILION, new_figure
+from sweeps.pages.figure_style import FAINT, GREEN, INK, VERMILION, is_narrow, new_figure
 from sweeps.results.check_results import (
     CheckResult,
     reached_value_text,
@@ -19,7 +19,10 @@ LONGEST = 100.0
 
 
 def draw_margins(found: CheckResult) -> Figure:
-    """A bar for each requirement: its margin in percent of what is required, right where it is met."""
+    """A bar for each requirement: its margin in percent of what is required, right where it is met.
+
+    The values reached are left out for phones, where the page's table shows them.
+    """
     rows = found.outcomes
     fig, axes = new_figure(1, 1, 0.9 + 0.42 * len(rows))
     ax = axes[0, 0]
@@ -32,16 +35,17 @@ def draw_margins(found: CheckResult) -> Figure:
         share = 100 * o.margin / max(abs(requirement_limit(o)), 1e-12)
         drawn = float(np.clip(share, -LONGEST, LONGEST))
         ax.barh(k, drawn, height=0.62, color=GREEN if o.met else VERMILION)
-        beyond = "" if abs(share) <= LONGEST else " (beyond the axis)"
+        beyond = "" if abs(share) <= LONGEST or is_narrow() else " (beyond the axis)"
         right = drawn >= 0
+        reached = "" if is_narrow() else f"{reached_value_text(o)}, "
         ax.annotate(
-            f"{reached_value_text(o)}, {share:+.0f} %{beyond}", (drawn, k), xytext=(5 if right else -5, 0),
+            f"{reached}{share:+.0f} %{beyond}", (drawn, k), xytext=(5 if right else -5, 0),
             textcoords="offset points", va="center", ha="left" if right else "right", fontsize=8.5, color=INK,
         )  # fmt: skip
     ax.set_yticks(range(len(rows)), [f"{requirement_label(o)} {required_value_text(o)}" for o in rows])
     ax.set_ylim(len(rows) - 0.4, -0.6)
     ax.set_xlim(-1.45 * LONGEST, 1.6 * LONGEST)
-    ax.set_xticks(np.arange(-100, 101, 50))
+    ax.set_xticks(np.arange(-100, 101, 100 if is_narrow() else 50))
     ax.axvline(0, color=INK, linewidth=1)
     ax.grid(axis="y", visible=False)
     ax.set_xlabel("margin [% of what is required]")

@@ -82,9 +82,14 @@ def figure_settings(width: float = WIDTH) -> Iterator[None]:
         yield
 
 
+def is_narrow() -> bool:
+    """True within `figure_settings(NARROW)`."""
+    return bool(matplotlib.rcParams["figure.figsize"][0] == NARROW)
+
+
 def new_figure(rows: int, columns: int, height: float, **keywords: Any) -> tuple[Figure, np.ndarray]:
     """A figure of the width of `figure_settings` and its axes, shape (rows, columns)."""
-    stacked = matplotlib.rcParams["figure.figsize"][0] == NARROW
+    stacked = is_narrow()
     size = WIDTH, height
     if stacked and columns > 1:
         size = NARROW, max(height / rows, 2.2) * columns * rows
@@ -109,7 +114,7 @@ def new_figure(rows: int, columns: int, height: float, **keywords: Any) -> tuple
 def legend_columns(labels: Iterable[str]) -> int:
     """Columns of a legend: all labels in one line; in a narrow figure as many as fit into its width."""
     lengths = [len(label) for label in labels]
-    if matplotlib.rcParams["figure.figsize"][0] != NARROW:
+    if not is_narrow():
         return max(len(lengths), 1)
     return max(1, min(len(lengths), int(72 * NARROW // (0.62 * LEAST_NARROW * max(lengths, default=1) + 40))))
 
