@@ -75,11 +75,6 @@ OF_TURNS = tuple(d for d in TABLE if d.module == _TURN)
 OF_STRAIGHT = tuple(d for d in TABLE if d.module in (_SLOPE, START))
 
 
-def derived_names() -> tuple[str, ...]:
-    """Names of all derived outputs, in order."""
-    return tuple(d.name for d in TABLE)
-
-
 def compute_function(module: str) -> Callable[..., dict[str, Any]]:
     """The function that computes the derived outputs of one run in a module."""
     return importlib.import_module(module).compute

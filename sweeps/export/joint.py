@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
@@ -19,7 +19,7 @@ from mmrjax.model import balances, contact, params
 from mmrjax.model.channels import EVERY
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Signals
-from sweeps.export.expressions import ZERO, Symbol, apply_operation, constant_symbol, names_of, trace_function
+from sweeps.export.expressions import ZERO, Symbol, names_of, trace_function
 
 #: Balances that a joint has; what enters another one belongs to what the joint moves, or to an instrument.
 INSIDE = ("supply", "electrical", "inductance", "motor", "gearbox", "track", "inertia")
@@ -343,16 +343,3 @@ def channels_of(joint: Joint) -> tuple[Any, ...]:
     settled = [c for c in EVERY if c.settled]
     shown = tuple(c for c in settled if c.name in joint.file.robot.rig.channels)
     return shown or tuple(c for c in settled if c.name in ("motor_current", "motor_speed"))
-
-
-def sum_over_parts(parts: Sequence[Part], field: str) -> Symbol:
-    """Sum of a field of several parts."""
-    found = constant_symbol(0.0)
-    for part in parts:
-        found = apply_operation("add", found, getattr(part, field))
-    return found
-
-
-def merge_numbers(known: Mapping[str, float], more: Mapping[str, float]) -> dict[str, float]:
-    """Two tables of numbers as one; the second one's win."""
-    return {**known, **more}

@@ -14,8 +14,6 @@ from calibration.data.sources.recorded_signals import Clock, Signal
 
 #: Most elements of an array in a message that become separate signals; larger arrays are pictures and clouds.
 ELEMENTS = 64
-#: Most messages of the topics that are read.
-MESSAGES = 20_000_000
 #: Field with the time of a message, and its largest difference from the time of recording [ns].
 _STAMP, _APART = "header.stamp", 60_000_000_000
 #: Units of fields by the type of message, as its definition states them.
