@@ -36,8 +36,9 @@ def share_of_measured(simulated: np.ndarray, measured: np.ndarray) -> np.ndarray
     NaN without such a row.
 
     Args:
-        simulated, measured: shape (rows, channels).
+        simulated, measured: shape (rows, channels), or shapes that broadcast to it.
     """
+    simulated, measured = np.broadcast_arrays(simulated, measured)
     both = np.isfinite(simulated) & np.isfinite(measured)
     off, size = (np.sqrt(np.sum(np.square(x), 0, where=both)) for x in (simulated - measured, measured))
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -13,6 +13,7 @@ import numpy as np
 import optimistix as optx
 
 from calibration.inference import solvers
+from calibration.inference.simulation_errors import share_of_measured
 from sweeps.export.joint import Joint, channels_of
 from sweeps.export.situation import AtJoint, Situation
 
@@ -144,13 +145,8 @@ def compare_format(
 
 def channel_errors(joint: Joint, shown: np.ndarray, reference: np.ndarray) -> dict[str, float]:
     """Rms of the difference over the rms of the reference [%], by channel that has readings."""
-    found = {}
-    for k, channel in enumerate(channels_of(joint)):
-        known = np.isfinite(reference[:, k]) & np.isfinite(shown[:, k])
-        size = float(np.sqrt(np.mean(reference[known, k] ** 2))) if known.any() else 0.0
-        if size > 0:
-            found[channel.name] = 100 * float(np.sqrt(np.mean((shown - reference)[known, k] ** 2))) / size
-    return found
+    shares = share_of_measured(shown, reference)
+    return {c.name: 100 * float(s) for c, s in zip(channels_of(joint), shares, strict=True) if np.isfinite(s)}
 
 
 def _at(law: FormatLaw, theta: Any, situation: Situation) -> AtJoint:

@@ -47,12 +47,11 @@ class Comparison:
         """For each channel the rows with a number of both robots, and their rms errors [% of the measured rms]."""
         answer = {}
         for channel in self.channels:
+            both = np.stack([self.table[prefix + channel.column] for prefix in ("simulated_", "against_")], 1)
             measured = self.table[channel.column]
-            both = [self.table[prefix + channel.column] - measured for prefix in ("simulated_", "against_")]
-            rows = np.isfinite(both[0]) & np.isfinite(both[1])
-            size = residual.root_mean_square(measured[rows])
-            first, second = (100 * residual.root_mean_square(error[rows]) / size for error in both)
-            answer[channel.name] = int(rows.sum()), first, second
+            rows = np.isfinite(both).all(1) & np.isfinite(measured)
+            first, second = 100 * residual.share_of_measured(both[rows], measured[rows, None])
+            answer[channel.name] = int(rows.sum()), float(first), float(second)
         return answer
 
 
