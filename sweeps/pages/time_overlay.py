@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from calibration.data.table import Runs
 from mmrjax.model.channels import Channel
 from sweeps.pages.figure_style import BLUE, FAINT, INK, ORANGE, axis_label, new_figure
 
@@ -85,7 +86,8 @@ class TimeOverlay:
         most = max(200, POINTS // (len(self.rows) * len(self.channels) * (1 + len(self.simulated))))
         runs: dict[str, Any] = {}
         spent = 0
-        for name in sorted(self.rows, key=lambda name: name != self.worst):
+        worst = self.worst
+        for name in (worst, *(name for name in self.rows if name != worst)):
             rows = self._thinned(self.rows[name], most)
             spent += len(rows) * len(self.channels) * (1 + len(self.simulated))
             if runs and spent > 2 * POINTS:
@@ -133,10 +135,7 @@ def time_overlay(
         channels: channels to show; those without any reading are left out.
         simulated: prefixes of the simulated columns and their names, as in `TimeOverlay`.
     """
-    names = np.asarray(table["run_id"]) if "run_id" in table else np.zeros(len(table["time_s"]), int)
+    runs = Runs("a table", {name: table[name] for name in ("run_id", "time_s") if name in table})
     shown = [c for c in channels if np.isfinite(table[c.column]).any()]
-    rows = {}
-    for name in dict.fromkeys(names.tolist()):
-        mine = np.flatnonzero(names == name)
-        rows[str(name)] = mine[np.argsort(table["time_s"][mine], kind="stable")]
+    rows = {str(name): runs.in_order(name) for name in dict.fromkeys(runs.run_names.tolist())}
     return TimeOverlay(table, shown, simulated, rows)
