@@ -87,7 +87,8 @@ def before_after(table: dict[str, np.ndarray], channels: Sequence[Channel], verd
         for edge in edges:
             axes.axvline(edge - 0.5, color="#bbbbbb", lw=0.8, ls=":")
         axes.set_ylabel(f"{channel.label} [σ]")
-    grid[0, 0].legend(loc="upper left", ncols=2, bbox_to_anchor=(0, 1.28))
+    handles, labels = grid[0, 0].get_legend_handles_labels()
+    fig.legend(handles, labels, loc="outside upper left", ncols=legend_columns(labels))
     starts = [0, *edges]
     told = [groups[a] for a in starts]
     grid[-1, 0].set_xticks([(a + b - 1) / 2 for a, b in zip(starts, [*edges, len(order)], strict=True)], told,
