@@ -412,7 +412,7 @@ def test_full_disk_names_the_file_whichever_it_is(mmrjax, tmp_path, monkeypatch)
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(Path, "write_text", honest)
-    monkeypatch.setattr("sweeps.pages.runs_page.write_runs_page", picture)
+    monkeypatch.setattr("sweeps.report.page_renderer.write_report_page", picture)
     code, _, err = mmrjax("simulate", "--out", "r")
     assert code == 2 and "r.partial: No space left on device" in err
 

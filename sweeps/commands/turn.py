@@ -28,8 +28,9 @@ from sweeps import capabilities
 from sweeps import config as configuration
 from sweeps.console import print_output, progress_bar, report_stage
 from sweeps.inputs import load_robot, one_run
-from sweeps.pages import posture_words, turn_words
+from sweeps.pages import turn_words
 from sweeps.points import imposed, run, scale
+from sweeps.report.words import posture_words
 from sweeps.results import posture_results
 from sweeps.skeleton import page_writer
 from sweeps.store import open_folder

@@ -16,8 +16,8 @@ from mmrjax.model.signals import FLAGS
 from sweeps import capabilities
 from sweeps.pages import mission_figures, turn_page, words
 from sweeps.pages.page import ROWS, Album, render_page, robot_section, status_rows
-from sweeps.pages.runs_page import run_headings, warming_share
 from sweeps.points.imposed import UNLIMITED
+from sweeps.report.runs_report import run_headings, warming_share
 from sweeps.results.mission_results import Missions
 
 #: Segments of a cycle that a page has room for.

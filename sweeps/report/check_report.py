@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from calibration.data.input_errors import three_digits
 from calibration.sizing.sheet import Change, Outcome
 from mmrjax.model.paper_tables import COULOMB_PER_MAH
-from sweeps.report.document import Block, Cell, Column, Document, Figure, Note, Section, Table, deferred_drawing
+from sweeps.report.document import Block, Cell, Column, Document, Figure, Note, Section, Table, deferred_figure
 from sweeps.results.check_results import (
     CheckResult,
     reached_value_text,
@@ -43,7 +43,7 @@ _CHANGES = (
 def check_document(found: CheckResult, robot_name: str, changes: bool = True) -> Document:
     """The report; `changes`: True where changes were searched for."""
     lead = f"Robot: **{robot_name}**. Requirements: **{found.asked.source}**."
-    margins = Figure("margins", found.statement(), _MARGINS, deferred_drawing("check_figures.draw_margins", found))
+    margins = deferred_figure("margins", found.statement(), _MARGINS, "check_figures.draw_margins", found)
     sections = [
         Section("Requirements", (Note(_CORNERS, terminal=False), requirements_sheet(found.outcomes)), "sheet")
     ]
@@ -76,8 +76,8 @@ def _postures(found: CheckResult) -> tuple[Figure, ...]:
     names = ", ".join(
         f"{requirement_label(o)} {reached_value_text(o)}" for o in found.outcomes if o.requirement.name in found.drawn
     )
-    draw = deferred_drawing("posture_figures.asked_about", found.drawn)
-    return (Figure("postures", f"The robot from the side: {names}", _POSTURES, draw),)
+    title = f"The robot from the side: {names}"
+    return (deferred_figure("postures", title, _POSTURES, "posture_figures.asked_about", found.drawn),)
 
 
 def _changes(found: CheckResult) -> tuple[Note | Table, ...]:

@@ -10,7 +10,7 @@ import numpy as np
 from mmrjax.errors import count_noun
 from sweeps.pages import words
 from sweeps.report.condition_columns import condition_formats
-from sweeps.report.document import Cell, Column, Document, Figure, Note, Section, Table, deferred_drawing, is_missing
+from sweeps.report.document import Cell, Column, Document, Note, Section, Table, deferred_figure, is_missing
 from sweeps.results.comparison_results import Comparison
 
 _FITS = {
@@ -35,16 +35,16 @@ def comparison_document(found: Comparison) -> Document:
         f"Robot: **{found.robot_name}**. Fidelity: **{found.model}**. Measured: **{found.source}**, "
         f"{count_noun(len(found.table['status']), 'row')}."
     )
-    draw = deferred_drawing("comparison_figures.errors_over", *known, in_units=True, beside=found.over)
-    parity = Figure(
-        "parity", _bias(found), _PARITY, deferred_drawing("comparison_figures.draw_parity", *known, band=False)
-    )
-    errors = Figure(
+    parity = deferred_figure("parity", _bias(found), _PARITY, "comparison_figures.draw_parity", *known, band=False)
+    errors = deferred_figure(
         "errors",
         _trend(found),
         "**Errors.** A trend along a condition points at what the model lacks. Band: ±2 standard deviations of the "
         "readings, where they are known.",
-        draw,
+        "comparison_figures.errors_over",
+        *known,
+        in_units=True,
+        beside=found.over,
     )
     return Document(
         f"{found.robot_name} against {found.source}",
@@ -77,8 +77,10 @@ def _over_time(found: Comparison) -> tuple[Section, ...]:
     lines = {"simulated_": found.robot_name, "against_": found.against}
     if not found.against:
         lines = {"simulated_": "simulated"}
-    draw = deferred_drawing("time_overlay.time_overlay", found.table, found.channels, lines)
-    return (Section("Over time", (Figure("overlay", comparison_answer(found), caption, draw),)),)
+    overlay = deferred_figure(
+        "overlay", comparison_answer(found), caption, "time_overlay.time_overlay", found.table, found.channels, lines
+    )
+    return (Section("Over time", (overlay,)),)
 
 
 def comparison_answer(found: Comparison) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from mmrjax.model import channels
 from sweeps.export.comparison import APPROXIMATED, DROPPED, HELD
 from sweeps.export.formats import Export
-from sweeps.report.document import Cell, Column, Document, Figure, Note, Section, Table, deferred_drawing
+from sweeps.report.document import Cell, Column, Document, Note, Section, Table, deferred_figure
 from sweeps.report.words import export_words as words
 
 #: Tone of a verdict's cell.
@@ -28,11 +28,8 @@ def export_document(found: Export) -> Document:
         [(f.name, Cell(f.verdict, TONES[f.verdict]), 100 * f.kept, f.how) for f in compared.fates],
         "what the format holds",
     )  # fmt: skip
-    readings = Figure(
-        "readings",
-        words.export_statement(found),
-        _RUNS,
-        deferred_drawing("export_figures.draw_export_readings", compared),
+    readings = deferred_figure(
+        "readings", words.export_statement(found), _RUNS, "export_figures.draw_export_readings", compared
     )
     sections = [
         Section("What the format holds", (fates, Note(_KEPT, "key", terminal=False)), "holds"),

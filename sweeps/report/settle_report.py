@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from calibration.data.settling import Settled, Stretch
-from sweeps.report.document import Column, Document, Figure, Note, Section, Table, deferred_drawing
+from sweeps.report.document import Column, Document, Note, Section, Table, deferred_figure
 from sweeps.report.words import settle_words as words
 
 #: Imposed quantity of a log and its unit.
@@ -32,7 +32,7 @@ def settle_document(found: Settled, few: str = "", notes: tuple[str, ...] = ()) 
         Column("reason"), Column("stretches", form="{}"), Column("samples", form="{}"),
         Column("rows, for example", form="{}"), Column("what to do"),
     )  # fmt: skip
-    log = Figure("log", words.settle_statement(found), _LOG, deferred_drawing("settle_figures.over_log", found))
+    log = deferred_figure("log", words.settle_statement(found), _LOG, "settle_figures.over_log", found)
     sections = [Section("Over the log", (log,))]
     if left:
         sections.append(Section("Left out", (Table("left", columns, left, "left out"),)))

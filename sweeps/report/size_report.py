@@ -12,7 +12,7 @@ from calibration.sizing.design import OBJECTIVES
 from calibration.sizing.design_search import SizedDesign
 from mmrjax.errors import count_noun
 from sweeps.report.check_report import requirements_sheet
-from sweeps.report.document import Cell, Column, Document, Figure, Note, Section, Table, deferred_drawing
+from sweeps.report.document import Cell, Column, Document, Figure, Note, Section, Table, deferred_figure
 from sweeps.results.size_results import SizeResult, design_verdict, missed_limits, objective_text
 
 _HEADINGS = {"mass": "mass", "energy": "energy", "cost": "price of motors and gearboxes"}
@@ -83,9 +83,7 @@ def _limits(found: SizeResult, robot_name: str) -> tuple[Figure, ...]:
     names = [] if best is None else [f"best: {best.drive.motor.name}, ratio {best.ratio:.4g}"]
     charts = dict(zip([*names, f"as it is: {robot_name}"], found.charts, strict=True))
     alternative = "; ".join(f"{name}: {_reach(c)}" for name, c in charts.items())
-    return (
-        Figure("limits", alternative, _LIMITS, deferred_drawing("size_figures.draw_nearest_limits", found, charts)),
-    )
+    return (deferred_figure("limits", alternative, _LIMITS, "size_figures.draw_nearest_limits", found, charts),)
 
 
 def _reach(c: Chart) -> str:
@@ -106,5 +104,5 @@ def _front(found: SizeResult) -> tuple[Figure | Note, ...]:
     )
     return (
         Note(f"{text}."),
-        Figure("front", text, _FRONT, deferred_drawing("size_figures.draw_pareto_front", found)),
+        deferred_figure("front", text, _FRONT, "size_figures.draw_pareto_front", found),
     )

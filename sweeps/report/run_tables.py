@@ -1,0 +1,145 @@
+"""Blocks that reports of simulated runs share: how runs ended, limits, and quantities in words of the registries."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from calibration.data.robot_file import RobotFile
+from mmrjax import derived
+from mmrjax.fidelities import outputs
+from mmrjax.missions import mission_batch
+from mmrjax.model import channels
+from mmrjax.model.channels import Channel
+from sweeps import capabilities
+from sweeps.pages import words
+from sweeps.points import uncertainty
+from sweeps.report.condition_columns import CONDITIONS
+from sweeps.report.document import Cell, Column, Note, Table
+
+_EVERY: tuple[Any, ...] = (
+    *derived.TABLE, *mission_batch.OF_TURNS, *mission_batch.OUTPUTS, *outputs.FURTHER, *channels.EVERY
+)  # fmt: skip
+#: Quantities of the registries by column, with their label, unit and resolution.
+_REGISTERED = {quantity.column: quantity for quantity in _EVERY}
+#: Columns of runs without a row in a registry: heading, unit, format.
+_OTHERS = {
+    "configuration": ("configuration", "", ""),
+    "status": ("status", "", ""),
+    "flags": ("limits exceeded", "", ""),
+    "time_end_s": ("time at the end", "s", "{:.6g}"),
+    "permissible_time_s": ("permissible at this current for", "s", "{:.3g}"),
+}
+#: What a number that is infinite, or missing, means in some columns.
+_ENDLESS = {"permissible_time_s": words.FOR_EVER}
+_MISSING = {"supply_voltage_V": "battery", "flags": "none"}
+
+
+def quantity_column(name: str, **options: Any) -> Column:
+    """The column of a quantity in a report, from the name of its column in a table of runs."""
+    if name in _REGISTERED:
+        q = _REGISTERED[name]
+        return Column(q.label, q.unit.replace("-", ""), f"{{:.{q.resolution}f}}", **options)
+    if name in CONDITIONS:
+        title, form = CONDITIONS[name]
+        heading, _, unit = title.removesuffix("]").partition(" [")
+        return Column(heading, unit, form, **options)
+    heading, unit, form = _OTHERS[name]
+    return Column(heading, unit, form, **options)
+
+
+def quantity_cells(table: Mapping[str, np.ndarray], name: str) -> list[Any]:
+    """Cells of a column, each with its standard deviation if the table has one; infinite numbers in words."""
+    values, spread = table[name], table.get(name + uncertainty.SD)
+    if spread is not None:
+        digits = _REGISTERED[name].resolution
+        return [
+            None if math.isnan(v) else uncertainty.with_sd(v, s, digits) for v, s in zip(values, spread, strict=True)
+        ]
+    if name == "status":
+        return [Cell(s, "" if s in words.SETTLED else "slides") for s in map(str, values)]
+    if values.dtype.kind != "f":
+        return [_MISSING.get(name, "") if v == "" else v for v in values]
+    endless, missing = _ENDLESS.get(name, words.NONE_SETTLES), _MISSING.get(name)
+    return [missing if math.isnan(v) else endless if math.isinf(v) else v for v in values]
+
+
+def quantity_table(name: str, table: Mapping[str, np.ndarray], names: Iterable[str], **options: Any) -> Table:
+    """The quantities `names` that a table of runs has numbers of, a row for each run.
+
+    Args:
+        name: of the table; options: further fields of it, and its `first` columns with their cells.
+    """
+    first: Sequence[tuple[Column, Sequence[Any]]] = options.pop("first", ())
+    shown = [n for n in dict.fromkeys(names) if n in table and (n == "supply_voltage_V" or not _is_empty(table[n]))]
+    columns = (*(column for column, _ in first), *map(quantity_column, shown))
+    cells = [*(cells for _, cells in first), *(quantity_cells(table, n) for n in shown)]
+    return Table(name, columns, list(zip(*cells, strict=True)), **options)
+
+
+def _is_empty(values: np.ndarray) -> bool:
+    return values.dtype.kind == "f" and bool(np.isnan(values).all())
+
+
+def reading_text(value: Any, channel: Channel) -> str:
+    """A reading with one digit less than its channel's resolution; a dash for a missing one."""
+    return Column("", form=f"{{:.{max(channel.resolution - 1, 0)}f}}").text(value)
+
+
+def reading_columns(shown: Iterable[Channel], kinds: Mapping[str, str]) -> list[tuple[str, Column]]:
+    """Columns of readings, grouped by channel, with their names in a table.
+
+    Args:
+        kinds: heading of each kind of reading, by the prefix of its column, such as `{"": "measured"}`.
+    """
+    return [
+        (f"{prefix}{c.column}", Column(heading, c.unit, f"{{:.{max(c.resolution - 1, 0)}f}}", c.label))
+        for c in shown
+        for prefix, heading in kinds.items()
+    ]
+
+
+def lead_note(file: RobotFile, model: str = "", more: str = "") -> Note:
+    """The line below the answer: robot, fidelity and a further sentence."""
+    parts = [f"Robot: **{capabilities.shown_name(file)}**.", f"Fidelity: **{model}**." * bool(model), more]
+    return Note(" ".join(filter(None, parts)), "lead", terminal=False)
+
+
+def endings_table(
+    counts: Mapping[str, int], things: str = "runs", model: str = "", **more: Mapping[str, Any]
+) -> Table:
+    """How runs or points ended: statuses that occurred, in words, with their number.
+
+    Args:
+        counts: by status; more: further columns, each by status.
+    """
+    total, reached = sum(counts.values()), [s for s, n in counts.items() if n]
+    columns = (
+        Column("ended"), Column(things, form="{:,}"), Column("share", "%", "{:.3g}"),
+        Column("status", terminal=False), Column("meaning"),
+        *(Column(name.replace("_", " "), terminal=False) for name in more),
+    )  # fmt: skip
+    rows = [
+        (
+            Cell(words.short_status(s), "good" if s in words.SETTLED else "bad"), counts[s], 100 * counts[s] / total,
+            f"`{s}`", words.VERDICTS.get((model, s)) or words.status_meaning(s), *(m.get(s) for m in more.values()),
+        )
+        for s in reached
+    ]  # fmt: skip
+    return Table("statuses", columns, rows)
+
+
+def limits_table(limits: Sequence[Mapping[str, Any]], what: str) -> Table:
+    """Use of each limit: its value, the limit and the share of it that is used."""
+    columns = Column("limit of"), Column(what, form="{}"), Column("limit", form="{}"), Column("used", form="{:.0f} %")
+    rows = [(limit["words"], limit["value"], limit["limit"], _used(limit)) for limit in limits]
+    return Table("limits", columns, rows, terminal=False)
+
+
+def _used(limit: Mapping[str, Any]) -> Cell | str:
+    if limit["percent"] is None:
+        return f"not judged: the robot's file states no `{limit['unstated']}`"
+    return Cell(limit["percent"], "over" if limit["percent"] > 100 else "bar")
