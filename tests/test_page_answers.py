@@ -7,9 +7,8 @@ import pytest
 
 from calibration.sensitivity.result import Points
 from mmrjax.model import channels
-from sweeps.pages import mission_page
 from sweeps.paper import error_tables
-from sweeps.report import runs_report, sweep_report
+from sweeps.report import mission_report, runs_report, sweep_report
 from sweeps.report.words import fit_words, sensitivity_words
 
 SHOWN = [channels.find_channel("total_current"), channels.find_channel("speed")]
@@ -56,11 +55,11 @@ def test_runs_without_an_operating_point_say_why():
 
 
 def test_mission_says_where_most_energy_goes():
-    run = {f"energy_to_{name}_Wh": 0.0 for name in mission_page.SINKS} | {
+    run = {f"energy_to_{name}_Wh": 0.0 for name in mission_report.SINKS} | {
         "energy_to_other_Wh": 7.0, "energy_to_track_Wh": 2.0, "energy_drawn_Wh": 10.0, "energy_Wh": 9.5,
         "distance_m": 120.0, "endurance_s": 3600.0, "status": "converged",
     }  # fmt: skip
-    assert mission_page.mission_answer(run) == (
+    assert mission_report.mission_answer(run) == (
         "The mission takes 9.5 Wh over 120 m (other consumers 70 %, tracks and guides 20 %); a full battery lasts 60 min."
     )
 

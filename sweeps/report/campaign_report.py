@@ -17,7 +17,7 @@ from sweeps.pages import words
 from sweeps.points.climbs import LARGEST, SIZE, VERDICT
 from sweeps.points.zarr_store import STORE, Layout
 from sweeps.report import run_tables
-from sweeps.report.document import Block, Column, Document, Figure, Note, Section, Table, deferred_figure
+from sweeps.report.document import Block, Column, Document, Figure, Note, Section, Table, columns, deferred_figure
 from sweeps.results.climb_results import VERDICTS
 
 #: Points, and chunks that they come from, that figures and quantiles are made of; outputs that are drawn.
@@ -84,10 +84,9 @@ def _outputs(
         f"Least and greatest of all points; quantiles and figures of {len(values):,} points{drawn}, of those that "
         "settled."
     )
-    numbers_of = ("least", "5 %", "median", "95 %", "greatest")
-    columns = (Column("output"), Column("unit"), *(Column(n, form="{:.4g}") for n in numbers_of))
+    heads = columns("output", "unit", "least | .4g", "5 % | .4g", "median | .4g", "95 % | .4g", "greatest | .4g")
     yield Note(text)
-    yield Table("ranges", columns, rows)
+    yield Table("ranges", heads, rows)
     yield from figures
 
 
@@ -96,14 +95,14 @@ def _verdicts(values: np.ndarray, found: dict[str, np.ndarray], layout: Layout) 
     codes, design = found[VERDICT].astype(int), layout.design
     meanings = next(v.attributes for v in layout.variables if v.name == VERDICT)["flag_meanings"].split()
     rows = [(f"`{meanings[k]}`", int((codes == k).sum()), *VERDICTS[meanings[k]]) for k in np.unique(codes)]
-    columns = Column("verdict"), Column("points", form="{:,}"), Column("the robot"), Column("meaning")
+    heads = columns("verdict", "points | ,", "the robot", "meaning")
     others = [n for n in design.axes if n != SIZE and len(design.axes[n]) > 1][:1]
     figure = deferred_figure(
         "endings", "Verdicts over what varies and the size of the obstacle", _VERDICTS,
         "campaign_figures.draw_verdicts", codes, meanings, values, layout, *others,
     )  # fmt: skip
     drawn = (figure,) * bool(others and SIZE in design.axes)
-    return Note(_largest(values, found, layout), "answer", "largest"), Table("endings", columns, rows), *drawn
+    return Note(_largest(values, found, layout), "answer", "largest"), Table("endings", heads, rows), *drawn
 
 
 def _largest(values: np.ndarray, found: dict[str, np.ndarray], layout: Layout) -> str:
@@ -160,4 +159,4 @@ def _varied(layout: Layout, values: np.ndarray) -> Table:
         else:
             text = f"{axis.min():.4g} to {axis.max():.4g}, {len(axis):,} values"
         rows.append((f"`{name}`", about["long_name"], about.get("units", "").removeprefix("1"), text))
-    return Table("names", tuple(map(Column, ("name", "meaning", "unit", "values"))), rows)
+    return Table("names", columns("name", "meaning", "unit", "values"), rows)

@@ -37,7 +37,7 @@ class Note:
     text: str | tuple[str, ...]
     kind: str = ""
     name: str = ""
-    terminal: bool = True
+    terminal: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,6 +73,22 @@ class Column:
         if self.form and isinstance(value, int | float | np.number):
             return re.sub(r"^-(?=0\.?0*$)", "", self.form.format(value))
         return str(value)
+
+
+def columns(*titles: str) -> tuple[Column, ...]:
+    """Columns from titles such as `speed > error [%] | +.1f`: heading in a group, unit, and format of numbers.
+
+    Without ` | ` a column has text, with nothing behind it texts of numbers; `~` marks a column for the page only.
+    """
+    found = []
+    for title in titles:
+        name, bar, form = title.removeprefix("~").partition(" |")
+        group, _, heading = name.rpartition(" > ")
+        heading, _, unit = heading.removesuffix("]").partition(" [")
+        form = form.strip()
+        form = form if "{" in form or not bar else f"{{:{form}}}"
+        found.append(Column(heading, unit, form, group, not title.startswith("~")))
+    return tuple(found)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -206,6 +222,12 @@ def cell_tone(cell: Any) -> str:
 def is_missing(value: Any) -> bool:
     """True for None and for numbers that are not finite."""
     return value is None or (isinstance(value, float | np.floating) and not math.isfinite(value))
+
+
+def remarks(texts: Iterable[str], name: str = "notes") -> tuple[Note, ...]:
+    """A list of remarks for page and terminal, if there are any."""
+    items = tuple(texts)
+    return (Note(items, name=name, terminal=True),) if items else ()
 
 
 def deferred_figure(name: str, alternative: str, caption: str, drawing: str, *known: Any, **options: Any) -> Figure:

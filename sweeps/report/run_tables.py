@@ -17,8 +17,9 @@ from mmrjax.model.channels import Channel
 from sweeps import capabilities
 from sweeps.pages import words
 from sweeps.points import uncertainty
+from sweeps.points.imposed import UNLIMITED
 from sweeps.report.condition_columns import CONDITIONS
-from sweeps.report.document import Cell, Column, Note, Table
+from sweeps.report.document import Cell, Column, Note, Table, columns
 
 _EVERY: tuple[Any, ...] = (
     *derived.TABLE, *mission_batch.OF_TURNS, *mission_batch.OUTPUTS, *outputs.FURTHER, *channels.EVERY
@@ -33,6 +34,7 @@ _OTHERS = {
     "time_end_s": ("time at the end", "s", "{:.6g}"),
     "permissible_time_s": ("permissible at this current for", "s", "{:.3g}"),
 }
+WARMING_SHARE = "Winding: share of the temperature rise that it may have above its surroundings."
 #: What a number that is infinite, or missing, means in some columns.
 _ENDLESS = {"permissible_time_s": words.FOR_EVER}
 _MISSING = {"supply_voltage_V": "battery", "flags": "none"}
@@ -75,9 +77,9 @@ def quantity_table(name: str, table: Mapping[str, np.ndarray], names: Iterable[s
     """
     first: Sequence[tuple[Column, Sequence[Any]]] = options.pop("first", ())
     shown = [n for n in dict.fromkeys(names) if n in table and (n == "supply_voltage_V" or not _is_empty(table[n]))]
-    columns = (*(column for column, _ in first), *map(quantity_column, shown))
+    heads = (*(column for column, _ in first), *map(quantity_column, shown))
     cells = [*(cells for _, cells in first), *(quantity_cells(table, n) for n in shown)]
-    return Table(name, columns, list(zip(*cells, strict=True)), **options)
+    return Table(name, heads, list(zip(*cells, strict=True)), **options)
 
 
 def _is_empty(values: np.ndarray) -> bool:
@@ -105,7 +107,7 @@ def reading_columns(shown: Iterable[Channel], kinds: Mapping[str, str]) -> list[
 def lead_note(file: RobotFile, model: str = "", more: str = "") -> Note:
     """The line below the answer: robot, fidelity and a further sentence."""
     parts = [f"Robot: **{capabilities.shown_name(file)}**.", f"Fidelity: **{model}**." * bool(model), more]
-    return Note(" ".join(filter(None, parts)), "lead", terminal=False)
+    return Note(" ".join(filter(None, parts)), "lead")
 
 
 def endings_table(
@@ -117,11 +119,8 @@ def endings_table(
         counts: by status; more: further columns, each by status.
     """
     total, reached = sum(counts.values()), [s for s, n in counts.items() if n]
-    columns = (
-        Column("ended"), Column(things, form="{:,}"), Column("share", "%", "{:.3g}"),
-        Column("status", terminal=False), Column("meaning"),
-        *(Column(name.replace("_", " "), terminal=False) for name in more),
-    )  # fmt: skip
+    further = (f"~{name.replace('_', ' ')}" for name in more)
+    heads = columns("ended", f"{things} | ,", "share [%] | .3g", "~status", "meaning", *further)
     rows = [
         (
             Cell(words.short_status(s), "good" if s in words.SETTLED else "bad"), counts[s], 100 * counts[s] / total,
@@ -129,14 +128,38 @@ def endings_table(
         )
         for s in reached
     ]  # fmt: skip
-    return Table("statuses", columns, rows)
+    return Table("statuses", heads, rows)
 
 
 def limits_table(limits: Sequence[Mapping[str, Any]], what: str) -> Table:
     """Use of each limit: its value, the limit and the share of it that is used."""
-    columns = Column("limit of"), Column(what, form="{}"), Column("limit", form="{}"), Column("used", form="{:.0f} %")
+    heads = columns("limit of", f"{what} |", "limit |", "used | {:.0f} %")
     rows = [(limit["words"], limit["value"], limit["limit"], _used(limit)) for limit in limits]
-    return Table("limits", columns, rows, terminal=False)
+    return Table("limits", heads, rows, terminal=False)
+
+
+def use_of_limits(asked: Iterable[tuple[str, Any, Any, str]], ambient: float) -> list[dict[str, Any]]:
+    """Use of each known limit: words, its value, the limit, and the share of it [%].
+
+    A winding has the share of its permissible temperature rise.
+
+    Args:
+        asked: words, value, limit, and format with the unit; NaN: unknown; ambient: temperature [°C].
+    """
+    return [
+        {
+            "words": name, "value": words.NONE_SETTLES if math.isinf(value) else form.format(float(value)),
+            "limit": form.format(float(limit)),
+            "percent": warming_share(value, limit, ambient) if "°C" in form else 100 * abs(value) / float(limit),
+        }
+        for name, value, limit, form in asked
+        if not (math.isnan(value) or math.isnan(limit) or limit >= UNLIMITED)
+    ]  # fmt: skip
+
+
+def warming_share(value: float, limit: float, ambient: float) -> float:
+    """Share of what a winding may warm up by above the surroundings [%]."""
+    return 100 * (value - ambient) / max(limit - ambient, 1.0)
 
 
 def _used(limit: Mapping[str, Any]) -> Cell | str:

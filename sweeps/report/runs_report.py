@@ -16,10 +16,20 @@ from mmrjax.model.quantities import MM, RPM
 from mmrjax.model.robot import Robot
 from sweeps import capabilities
 from sweeps.pages import words
-from sweeps.points.imposed import UNLIMITED
 from sweeps.report import run_tables
 from sweeps.report.condition_columns import imposed_column
-from sweeps.report.document import SIDE_BY_SIDE, Block, Column, Document, Note, Section, Table, deferred_figure
+from sweeps.report.document import (
+    SIDE_BY_SIDE,
+    Block,
+    Column,
+    Document,
+    Note,
+    Section,
+    Table,
+    columns,
+    deferred_figure,
+    remarks,
+)  # fmt: skip
 from sweeps.report.words import posture_words
 from sweeps.results.posture_results import Postures
 
@@ -32,7 +42,6 @@ _FURTHER = (
     "power_ground_W", "power_lift_W", "winding_settled_C", "permissible_time_s", "adhesion_used", "status", "flags",
 )  # fmt: skip
 HISTORIES, CHAINS, GEARS = 4, 12, 2  # runs that a figure has room for
-_SHARE = "Winding: share of the temperature rise that it may have above its surroundings."
 _COURSES = "**What the instruments show over time**, of each run from rest."
 _HISTORY = (
     "**Current and speeds over time.** Each run on its own slope, as its heading says; a run that goes backward is "
@@ -88,19 +97,18 @@ def runs_document(
     used = limits_used(robot, first) if single else []
     endings = run_tables.endings_table(Counter(map(str, runs["status"])))
     table = capabilities.without_idle(robot, runs)
-    columns = (imposed_column(table), *_CONDITIONS, *(c.column for c in robot.channels), *_FURTHER)
+    shown_columns = (imposed_column(table), *_CONDITIONS, *(c.column for c in robot.channels), *_FURTHER)
     if not np.nan_to_num(table.get("voltage_cell_V", 0.0)).any():
         table.pop("voltage_cell_V", None)
     blocks: list[Block] = [run_tables.lead_note(file, model, "From standstill." if histories is not None else "")]
-    blocks += [run_tables.limits_table(used, "this run"), Note(_SHARE, "key", terminal=False)] if used else []
+    blocks += [run_tables.limits_table(used, "this run"), Note(run_tables.WARMING_SHARE, "key")] if used else []
     shown = run_tables.quantity_table(
-        "runs", table, columns, first=[(Column("run"), names)], file="runs.csv", wide=len(names) > SIDE_BY_SIDE,
+        "runs", table, shown_columns, first=[(Column("run"), names)], file="runs.csv", wide=len(names) > SIDE_BY_SIDE,
         sideways=True,
     )  # fmt: skip
     of_runs = Section("The run" if single else "The runs", (shown,), "runs-section")
     blocks += [] if single and first["status"] in words.SETTLED else [endings]
-    said = [*notes, *([] if stands is None else [posture_words.posture_sentences(stands)])]
-    blocks += [Note(tuple(said), name="notes")] if said else []
+    blocks += remarks([*notes, *([] if stands is None else [posture_words.posture_sentences(stands)])])
 
     def sections() -> Iterable[Section]:
         if histories is not None:
@@ -177,8 +185,8 @@ def _histories(robot: Robot, runs: Mapping[str, np.ndarray], names: list[str], h
                 (s.name, words.short_status(s.status), *(read(n) for n in names_of for read in (s.largest, s.last)))
                 for s in shown
             ]
-            columns = run_tables.reading_columns(robot.channels, {"": "largest", "last_": "at the end"})
-            table = Table("courses-table", (Column("run"), Column("ends"), *(column for _, column in columns)), ends)
+            read_heads = run_tables.reading_columns(robot.channels, {"": "largest", "last_": "at the end"})
+            table = Table("courses-table", (*columns("run", "ends"), *(column for _, column in read_heads)), ends)
             figure = deferred_figure("courses", "channels over time", _COURSES, "history_figures.over_time", shown)
             yield Section("Over time", (*cut, figure, table), "history-section")
         return
@@ -205,11 +213,10 @@ def _histories(robot: Robot, runs: Mapping[str, np.ndarray], names: list[str], h
 
 def _starts(starts: Sequence[Any]) -> Table:
     """Stages, currents and slip of each start; without stages where a run does not get under way."""
-    columns = (
-        Column("run"), Column("ends"), *(Column(f"stage {k} until", "s", "{:.3f}") for k in ("I", "II")),
-        Column("t′: V within 1 % of its end", "s", "{:.3f}"), Column("peak current", "A", "{:.1f}"),
-        Column("current at the end", "A", "{:.2f}"), Column("V at the end", "mm/s", "{:.0f}"),
-        *(Column(share, "%", "{:.1f}", "mean slip") for share in ("stage I", "stage II", "stage III", "over t′")),
+    mean_slips = (f"mean slip > {share} [%] | .1f" for share in ("stage I", "stage II", "stage III", "over t′"))
+    heads = columns(
+        "run", "ends", "stage I until [s] | .3f", "stage II until [s] | .3f", "t′: V within 1 % of its end [s] | .3f",
+        "peak current [A] | .1f", "current at the end [A] | .2f", "V at the end [mm/s] | .0f", *mean_slips,
     )  # fmt: skip
     rows = []
     for s in starts:
@@ -220,23 +227,21 @@ def _starts(starts: Sequence[Any]) -> Table:
             ends = (s.sense * x for x in (s.peak, *s.ended))
             numbers = [*times, *ends, *(100 * x for x in slips)]
         rows.append((s.name, words.short_status(s.status), *numbers))
-    return Table("starts", columns, rows)
+    return Table("starts", heads, rows)
 
 
 def _gear(ripples: Sequence[Any]) -> Iterable[Block]:
     """Ripple of currents, speeds and reactions at the end of runs."""
     from sweeps.pages import gear_figures
 
-    columns = (
-        Column("run"), Column("repeats with"), Column("period found", "ms", "{:.2f}"),
-        Column("eq. (34)", "ms", "{:.2f}"),
-        *(Column(f"{what} ripple ±", "%", "{:.2g}") for what in ("current", "speed", "reaction")),
-        Column("weight on the guides", "%", "{:.1f}"),
+    heads = columns(
+        "run", "repeats with", "period found [ms] | .2f", "eq. (34) [ms] | .2f", "current ripple ± [%] | .2g",
+        "speed ripple ± [%] | .2g", "reaction ripple ± [%] | .2g", "weight on the guides [%] | .1f",
     )  # fmt: skip
     yield deferred_figure(
         "ripple", "ripple of the total current at the end", _RIPPLE, "gear_figures.current_ripple", ripples
     )
-    yield Table("ripple-table", columns, [tuple(gear_figures.ripple_numbers(g).values()) for g in ripples])
+    yield Table("ripple-table", heads, [tuple(gear_figures.ripple_numbers(g).values()) for g in ripples])
     for gear in [g for g in ripples if g.on_tracks][:1]:
         title = f"{gear.name}: touchdowns dotted"
         alternative = "current and reactions when grousers touch down"
@@ -281,39 +286,27 @@ def _power_chain(robot: Robot, runs: dict[str, np.ndarray], names: Sequence[str]
 
 
 def limits_used(robot: Robot, run: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Use of each limit by a run: words, its value, the limit, and the share of it [%].
-
-    A winding has the share of its permissible temperature rise. An inrush without a stated limit has no share.
-    """
+    """Use of each limit by a run; an inrush without a stated limit has no share."""
     idle = capabilities.idle_columns(robot)
     radius = float(robot.configurations[str(run["configuration"])].radius)
-    rpm = RPM
-    shaft = float(run["theoretical_speed_mm_s"]) * MM / radius * float(robot.gearbox.ratio) / rpm
+    shaft = float(run["theoretical_speed_mm_s"]) * MM / radius * float(robot.gearbox.ratio) / RPM
     turning = abs(shaft) > 1e-9
     torque = (
-        float(run["power_gear_W"]) / (float(robot.sides) * shaft * rpm) * float(robot.gearbox.ratio)
+        float(run["power_gear_W"]) / (float(robot.sides) * shaft * RPM) * float(robot.gearbox.ratio)
         if turning
         else math.nan
     )
     cell = math.nan if "voltage_cell_V" in idle else float(run["voltage_cell_V"]) or math.nan  # 0: none feeds it
     gear = f"gearbox torque at {'the driving wheel' if robot.has_ground else 'its output'}"
     asked = [
-        ("adhesion", math.nan if "adhesion_used" in idle else float(run["adhesion_used"]), 1.0, "{:.2f}", ""),
-        ("motor speed", shaft, float(robot.motor.speed_limit) / rpm, "{:.0f}", " rpm"),
-        ("gearbox input speed", shaft, float(robot.gearbox.speed_limit) / rpm, "{:.0f}", " rpm"),
-        ("winding, long running", float(run["winding_settled_C"]), float(robot.motor.temperature_limit), "{:.0f}",
-         " °C"),
-        (gear, torque, robot.gearbox.torque_limit or math.nan, "{:.2f}", " N·m"),
-        ("voltage of a cell, charged", cell, robot.battery.voltage_charge, "{:.2f}", " V"),
-    ]  # fmt: skip
-    ambient = float(robot.motor.temperature_ambient)
-    found = [
-        {"words": name, "value": words.NONE_SETTLES if math.isinf(value) else form.format(value) + unit,
-         "limit": form.format(limit) + unit,
-         "percent": warming_share(value, limit, ambient) if unit == " °C" else 100 * abs(value) / limit}
-        for name, value, limit, form, unit in asked
-        if not (math.isnan(value) or math.isnan(limit) or limit >= UNLIMITED)
-    ]  # fmt: skip
+        ("adhesion", math.nan if "adhesion_used" in idle else float(run["adhesion_used"]), 1.0, "{:.2f}"),
+        ("motor speed", shaft, float(robot.motor.speed_limit) / RPM, "{:.0f} rpm"),
+        ("gearbox input speed", shaft, float(robot.gearbox.speed_limit) / RPM, "{:.0f} rpm"),
+        ("winding, long running", run["winding_settled_C"], robot.motor.temperature_limit, "{:.0f} °C"),
+        (gear, torque, robot.gearbox.torque_limit or math.nan, "{:.2f} N·m"),
+        ("voltage of a cell, charged", cell, robot.battery.voltage_charge, "{:.2f} V"),
+    ]
+    found = run_tables.use_of_limits(asked, float(robot.motor.temperature_ambient))
     if PEAK in run and not math.isnan(peak := float(run[PEAK])):
         most = inrush_limit(robot, math.isnan(float(run.get("supply_voltage_V", math.nan))))
         found.append({
@@ -323,11 +316,6 @@ def limits_used(robot: Robot, run: Mapping[str, Any]) -> list[dict[str, Any]]:
             "unstated": "driver.current_limit" + ", battery.current_limit" * bool(run.get("voltage_cell_V")),
         })  # fmt: skip
     return found
-
-
-def warming_share(value: float, limit: float, ambient: float) -> float:
-    """Share of what a winding may warm up by above the surroundings [%]."""
-    return 100 * (value - ambient) / max(limit - ambient, 1.0)
 
 
 def inrush_limit(robot: Robot, on_battery: bool) -> float | None:

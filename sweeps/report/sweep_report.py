@@ -13,7 +13,7 @@ from sweeps import capabilities
 from sweeps.pages import words
 from sweeps.report import run_tables
 from sweeps.report.condition_columns import imposed_column
-from sweeps.report.document import Column, Document, Note, Section, Table, deferred_figure
+from sweeps.report.document import Document, Note, Section, Table, columns, deferred_figure, remarks
 from sweeps.report.run_tables import quantity_column
 
 Runs = dict[str, np.ndarray]
@@ -47,9 +47,9 @@ def sweep_document(file: RobotFile, model: str, runs: Runs, notes: Sequence[str]
             run_tables.endings_table({s: statuses[s] for s in known}, beyond_a_limit=over, where=where),
             _limits(runs),
             _extremes(shown, extremes),
-            *([Note(tuple(notes), name="notes")] if notes else []),
+            *remarks(notes),
         ),
-        (Section("Over the grid", (Note(_MAPS, terminal=False), *maps), "maps"),),
+        (Section("Over the grid", (Note(_MAPS), *maps), "maps"),),
     )
 
 
@@ -78,8 +78,8 @@ def _limits(runs: Runs) -> Table:
         over = np.array([flag in str(f).split(";") for f in kinds])[which]
         if over.any():
             rows.append((f"{meaning} (`{flag}`)", int(over.sum()), _where(runs, over)))
-    columns = Column("limit exceeded"), Column("runs", form="{:,}"), Column("where", terminal=False)
-    return Table("limits", columns, rows)
+    heads = columns("limit exceeded", "runs | ,", "~where")
+    return Table("limits", heads, rows)
 
 
 def _axes(runs: Runs) -> list[str]:
@@ -122,4 +122,4 @@ def _extremes(runs: Runs, names: Iterable[str]) -> Table:
         (value,) = run_tables.quantity_cells({c: runs[c][k : k + 1]}, c)
         place = "; ".join(_levels(runs, axis, slice(k, k + 1)) for axis in _axes(runs))
         rows.append((f"largest {column.heading}", f"{column.text(value)} {column.unit}".strip(), place))
-    return Table("extremes", (Column("extreme of the settled runs"), Column("value", form="{}"), Column("at")), rows)
+    return Table("extremes", columns("extreme of the settled runs", "value |", "at"), rows)
