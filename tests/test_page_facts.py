@@ -15,6 +15,7 @@ from mmrjax.model.paper_tables import TRACKED, WHEELED
 from sweeps.pages import page as frame
 from sweeps.pages import sweep_figures, words
 from sweeps.paper import run_figures as paper_runs
+from sweeps.report import run_tables
 from sweeps.report import runs_report as page
 from sweeps.results.resonance_results import ResonanceResult
 
@@ -32,8 +33,8 @@ def judged(robot, run, peak=95.3):
 def test_a_winding_is_judged_by_what_it_may_warm_up_by():
     """28 of 125 °C in a room of 25 °C were once 23 % used."""
     assert (
-        page.warming_share(28.0, 125.0, 25.0) == pytest.approx(3.0)
-        and page.warming_share(125.0, 125.0, 25.0) == 100.0
+        run_tables.warming_share(28.0, 125.0, 25.0) == pytest.approx(3.0)
+        and run_tables.warming_share(125.0, 125.0, 25.0) == 100.0
     )
     robot, run = paper_robots.nominal(), run_of(paper_robots.nominal())
     found = judged(robot, run)["winding, long running"]["percent"]

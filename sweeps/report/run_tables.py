@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -111,20 +112,25 @@ def lead_note(file: RobotFile, model: str = "", more: str = "") -> Note:
 
 
 def endings_table(
-    counts: Mapping[str, int], things: str = "runs", model: str = "", **more: Mapping[str, Any]
+    counts: Mapping[str, int],
+    things: str = "runs",
+    model: str = "",
+    meanings: Mapping[str, str] = MappingProxyType({}),
+    **more: Mapping[str, Any],
 ) -> Table:
     """How runs or points ended: statuses that occurred, in words, with their number.
 
     Args:
-        counts: by status; more: further columns, each by status.
+        counts: by status; meanings: of statuses that are no fidelity's; more: further columns, each by status.
     """
     total, reached = sum(counts.values()), [s for s, n in counts.items() if n]
     further = (f"~{name.replace('_', ' ')}" for name in more)
     heads = columns("ended", f"{things} | ,", "share [%] | .3g", "~status", "meaning", *further)
+    meant = {s: meanings.get(s) or words.VERDICTS.get((model, s)) or words.status_meaning(s) for s in reached}
     rows = [
         (
             Cell(words.short_status(s), "good" if s in words.SETTLED else "bad"), counts[s], 100 * counts[s] / total,
-            f"`{s}`", words.VERDICTS.get((model, s)) or words.status_meaning(s), *(m.get(s) for m in more.values()),
+            f"`{s}`", meant[s], *(m.get(s) for m in more.values()),
         )
         for s in reached
     ]  # fmt: skip
