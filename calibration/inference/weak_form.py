@@ -86,8 +86,15 @@ def _current(robot: Robot, conditions: Conditions, state: State, way: Scalar) ->
     return current
 
 
-def _at(plan: Plan, robot: Robot, row: Rows, shown: Array, probes: frozenset[str]) -> tuple[Array, Array, Signals]:
-    """Returns terms f and y of a row's equations, and its signals; `probes`: effects that read no signal."""
+def row_terms(
+    plan: Plan, robot: Robot, row: Rows, shown: Array, probes: frozenset[str] = frozenset()
+) -> tuple[Array, Array, Signals]:
+    """Returns terms f and y of one row's equations, and its signals.
+
+    Args:
+        row: one of `Rows`, without its leading axis; shown: its readings [SI], shape (channels,).
+        probes: names of effects that read no signal.
+    """
     conditions, names = row.conditions, channels.channel_names(robot.channels)
     chassis = robot.chassis(conditions.configuration)
     none, one = jnp.zeros(()), jnp.ones(())
@@ -160,14 +167,14 @@ def _terms(problem: Problem, plan: Plan, rows: Rows, z: Array, effects: tuple[Sc
             amplitude = x[size : size + len(probes)]
             put = tuple(eqx.tree_at(lambda e: e.amplitude, p, a) for p, a in zip(probes, amplitude, strict=True))
             robot = dataclasses.replace(base, effects=(*base.effects, *put))
-            f, y, signals = _at(plan, robot, row, x[size + len(probes) :], frozenset(p.name for p in probes))
+            f, y, signals = row_terms(plan, robot, row, x[size + len(probes) :], frozenset(p.name for p in probes))
             return (f, y), ((f, y), signals)
 
         return jax.jacfwd(both, has_aux=True)(jnp.concatenate([z, jnp.zeros(len(probes)), row.shown]))
 
     slopes, (values, signals) = jax.vmap(one)(rows)
     base = problem.coordinates.robot(problem.base, z)
-    memory = _remembered(base, rows, signals, effects)
+    memory = memory_by_row(base, rows, signals, effects)
     entered = jax.vmap(lambda s, m: effect_terms(base, s, effects, m))(signals, memory)
     # An effect changes an equation like a defect of its balance. An effect of an instrument changes it like a
     # negative reading, or like a defect of that equation if the reading follows from the states.
@@ -198,7 +205,7 @@ def _terms(problem: Problem, plan: Plan, rows: Rows, z: Array, effects: tuple[Sc
     )
 
 
-def _remembered(robot: Robot, rows: Rows, signals: Signals, effects: tuple[ScoredEffect, ...]) -> list[Array]:
+def memory_by_row(robot: Robot, rows: Rows, signals: Signals, effects: tuple[ScoredEffect, ...]) -> list[Array]:
     """Returns the memory of each effect at each row and point of its grid, shape (rows, grid)."""
     count = rows.since.shape[0]
     nothing = [jnp.zeros((count, len(e.at))) for e in effects]
