@@ -7,6 +7,7 @@ fraction of the time between rows, and friction at rest is not a function of spe
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any
 
 import equinox as eqx
@@ -107,6 +108,7 @@ class Rows(eqx.Module):
         conditions: from the row on; shown: readings [SI].
         rate: slope of the channel of the motion, if that is an angle [SI/s]; way: of travel, 0 if it may be at rest.
         angle: of the output since the run's first row [rad]; since: time since the row before [s], 0 for the first.
+        memory: of the robot's effects that have one, by their names.
     """
 
     conditions: Conditions
@@ -115,6 +117,7 @@ class Rows(eqx.Module):
     way: Float[Array, " rows"]
     angle: Float[Array, " rows"]
     since: Float[Array, " rows"]
+    memory: Mapping[str, Float[Array, " rows"]] = eqx.field(default_factory=dict)
 
 
 @dataclasses.dataclass(frozen=True)

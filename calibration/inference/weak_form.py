@@ -110,7 +110,8 @@ def row_terms(
         read = shown[plan.motion] if not plan.angle else row.rate
         turning = read / unit * (robot.gearbox.ratio if plan.angle else 1.0)
     if plan.current >= 0:
-        current = shown[plan.current] / per_unit(plan.current, State(one, none, none, none, distance=none))
+        current_per_unit = 1 / per_unit(plan.current, State(one, none, none, none, distance=none))
+        current = shown[plan.current] * current_per_unit
     elif conditions.motor_current is not None:
         current = jnp.asarray(conditions.motor_current)
     else:
@@ -118,7 +119,7 @@ def row_terms(
 
     def state_at(turning: Scalar, current: Scalar) -> State:
         rolls = chassis.radius * turning / robot.gearbox.ratio
-        return State(current, turning, rolls, none, distance=chassis.radius * row.angle)
+        return State(current, turning, rolls, none, row.memory, distance=chassis.radius * row.angle)
 
     def signals_at(turning: Scalar) -> tuple[Signals, Scalar]:
         at = state_at(turning, current)
@@ -127,9 +128,16 @@ def row_terms(
             own = _current(robot, conditions, at, row.way)
         return balances.rolling_signals(robot, conditions, dataclasses.replace(at, current=own), row.way), own
 
+    first = balances.begin_signals(robot, conditions, state_at(turning, current))
+    errors = {
+        k: balances.effects_sum(robot, first, "sensor", names[k]) for k in (plan.motion, plan.current) if k >= 0
+    }
+    if plan.current >= 0:
+        current = current - errors[plan.current] * current_per_unit
+    if plan.motion >= 0 and not plan.angle:
+        turning = turning - errors[plan.motion] / unit
     if robot.has_ground and plan.mechanical and plan.travels:
         # The wheels turn faster than the load travels because of slip.
-        first = balances.begin_signals(robot, conditions, state_at(turning, current))
         if any(e.balance == "slip" and e.name not in probes for e in robot.effects):
             first = signals_at(turning)[0]
         turning = turning + balances.effects_sum(robot, first, "slip") * robot.gearbox.ratio / chassis.radius
@@ -142,7 +150,7 @@ def row_terms(
     if plan.mechanical:  # in the instrument's unit, because a unit that depends on a parameter would shrink with it
         rise = unit * (1 / robot.gearbox.ratio if plan.angle else 1.0)
         f.append(rise * signals.acceleration_wheel * robot.gearbox.ratio)
-        y.append(shown[plan.motion] + (0.0 if plan.angle else unit * turning - read))
+        y.append(shown[plan.motion] + (-errors[plan.motion] if plan.angle else unit * turning - read))
     if plan.others:
         if robot.has_ground:
             creep = chassis.ground.speed_creep(signals.traction, signals.normal, signals.adhesion)

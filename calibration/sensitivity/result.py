@@ -16,7 +16,7 @@ from mmrjax.model.quantities import Quantity
 
 SCHEMA = "mmrjax.sensitivity/1"
 #: Methods.
-METHODS = ("local", "sobol", "morris", "derivative", "shapley")
+METHODS = ("local", "sobol", "morris", "derivative")
 #: Share of an output's variance below which an input is negligible, for all outputs and points [-].
 NEGLIGIBLE = 0.01
 
@@ -96,8 +96,7 @@ class Input:
     Attributes:
         unit, meaning: of its field; distribution: log-normal, normal, uniform or posterior.
         median: [unit]; interval: of 95 % [unit]; sd: to first order [unit].
-        inert: True if all computed derivatives of all outputs by it were exactly zero. It is then not sampled,
-            except for Shapley effects if it is correlated with active inputs.
+        inert: True if all computed derivatives of all outputs by it were exactly zero. It is then not sampled.
     """
 
     unit: str
@@ -145,7 +144,7 @@ class OutputStudy:
     @property
     def overall_share(self) -> np.ndarray:
         """Share over all points together, shape (inputs,): of the method, else the mean over the points."""
-        main = next((self.overall[k].value for k in ("total", "shapley", "upper") if k in self.overall), None)
+        main = next((self.overall[k].value for k in ("total", "upper") if k in self.overall), None)
         if main is not None and np.isfinite(main).any():
             return np.clip(np.nan_to_num(main), 0.0, 1.0)
         finite = np.isfinite(self.share).any(1)
@@ -241,7 +240,7 @@ class SensitivityResult:
         for study in self.outputs.values():
             ends = [study.overall_share]
             if study.at_points:
-                main = study.at_points.get("total") or study.at_points.get("shapley")
+                main = study.at_points.get("total")
                 if main is not None:
                     ends.append(np.nanmax(np.where(np.isfinite(main.high), main.high, 0.0), axis=0))
             shares = np.where(np.isfinite(study.share), study.share, 0.0)

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from calibration.sensitivity.replicates import Estimate
 from calibration.sensitivity.result import NEGLIGIBLE, NextRuns, OutputStudy, SensitivityResult
 from mmrjax.errors import count_noun
-from sweeps.pages.figure_style import BLUE, GREEN, INK, ORANGE, PURPLE, VERMILION, corner_note, new_figure
+from sweeps.pages.figure_style import BLUE, GREEN, INK, ORANGE, VERMILION, corner_note, new_figure
 from sweeps.pages.words import short_name
 
 #: Inputs that a figure shows at most, and operating points of a tornado.
@@ -115,7 +115,7 @@ def draw_indices(study: OutputStudy, found: SensitivityResult) -> Figure:
 _WORDS = {
     "first": ("alone (first order)", BLUE), "total": ("with others (total)", ORANGE),
     "lower": ("first order is at least", BLUE), "upper": ("total is at most", ORANGE),
-    "shapley": ("Shapley effect", PURPLE), "mean_absolute_effect": ("μ*, mean size of effects", GREEN),
+    "mean_absolute_effect": ("μ*, mean size of effects", GREEN),
 }  # fmt: skip
 
 
