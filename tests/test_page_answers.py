@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from calibration.sensitivity.result import Points
+from calibration.words import fit_words, sensitivity_words
 from mmrjax.model import channels
 from sweeps.paper import error_tables
 from sweeps.report import mission_report, runs_report, sweep_report
-from sweeps.report.words import fit_words, sensitivity_words
 
 SHOWN = [channels.find_channel("total_current"), channels.find_channel("speed")]
 

@@ -11,12 +11,10 @@ import numpy as np
 from calibration.data.profiles import CONTROLLED, YAW_RATE
 from calibration.data.robot_file import RobotFile
 from mmrjax.errors import count_noun
-from mmrjax.missions import mission_batch
 from mmrjax.missions.profile import PAIRS
 from mmrjax.model import channels
-from mmrjax.model.channels import WARMING
 from mmrjax.model.energy import SINKS
-from mmrjax.model.quantities import RPM
+from mmrjax.model.quantities import RPM, TABLE, WARMING
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import FLAGS
 from sweeps import capabilities
@@ -33,7 +31,7 @@ SEGMENTS = 60
 _RUNS = (
     "energy_Wh", "energy_per_metre_Wh", "distance_m", "duration_s", "rms_current_A", "peak_current_A",
     "rms_torque_Nm", "winding_peak_C", "housing_end_C", "state_of_charge", "endurance_s", "range_m",
-    *(output.column for output in mission_batch.OF_TURNS), "status", "flags",
+    *(output.column for output in TABLE["mission of sides"]), "status", "flags",
 )  # fmt: skip
 #: Those of each segment.
 _OF_SEGMENTS = ("energy_Wh", "distance_m", "rms_current_A", "peak_current_A", "winding_peak_C")

@@ -10,11 +10,8 @@ from typing import Any
 import numpy as np
 
 from calibration.data.robot_file import RobotFile
-from mmrjax import derived
-from mmrjax.fidelities import outputs
-from mmrjax.missions import mission_batch
-from mmrjax.model import channels
 from mmrjax.model.channels import Channel
+from mmrjax.model.quantities import TABLE
 from sweeps import capabilities
 from sweeps.pages import words
 from sweeps.points import uncertainty
@@ -22,11 +19,12 @@ from sweeps.points.imposed import UNLIMITED
 from sweeps.report.condition_columns import CONDITIONS
 from sweeps.report.document import Cell, Column, Note, Table, columns
 
-_EVERY: tuple[Any, ...] = (
-    *derived.TABLE, *mission_batch.OF_TURNS, *mission_batch.OUTPUTS, *outputs.FURTHER, *channels.EVERY
-)  # fmt: skip
-#: Quantities of the registries by column, with their label, unit and resolution.
-_REGISTERED = {quantity.column: quantity for quantity in _EVERY}
+#: Quantities by column, of several of one column that of runs.
+_REGISTERED = {
+    q.column: q
+    for place in ("derived", "mission of sides", "mission", "run", "channel of a turn", "channel")
+    for q in TABLE[place]
+}
 #: Columns of runs without a row in a registry: heading, unit, format.
 _OTHERS = {
     "configuration": ("configuration", "", ""),
@@ -45,7 +43,7 @@ def quantity_column(name: str, **options: Any) -> Column:
     """The column of a quantity in a report, from the name of its column in a table of runs."""
     if name in _REGISTERED:
         q = _REGISTERED[name]
-        return Column(q.label, q.unit.replace("-", ""), f"{{:.{q.resolution}f}}", **options)
+        return Column(q.label, q.unit_shown.replace("-", ""), f"{{:.{q.resolution}f}}", **options)
     if name in CONDITIONS:
         title, form = CONDITIONS[name]
         heading, _, unit = title.removesuffix("]").partition(" [")

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from calibration.data.settling import Settled, Stretch
+from calibration.words import settle_words as words
 from sweeps.report.document import Document, Note, Section, Table, columns, deferred_figure, remarks
-from sweeps.report.words import settle_words as words
 
 #: Imposed quantity of a log and its unit.
 IMPOSED = {
