@@ -10,8 +10,10 @@ from typing import Any
 import numpy as np
 
 from calibration.data.robot_file import RobotFile
+from mmrjax import effects
 from mmrjax.model.channels import Channel
 from mmrjax.model.quantities import TABLE
+from mmrjax.model.robot import Robot
 from sweeps import capabilities
 from sweeps.pages import words
 from sweeps.points import uncertainty
@@ -33,6 +35,10 @@ _OTHERS = {
     "time_end_s": ("time at the end", "s", "{:.6g}"),
     "permissible_time_s": ("permissible at this current for", "s", "{:.3g}"),
 }
+_CURVES = (
+    "This robot holds {}: a smooth curve fitted to what its model lacks, which nobody has named. Trust it only under "
+    "the conditions of the runs that it was fitted to."
+)
 WARMING_SHARE = "Winding: share of the temperature rise that it may have above its surroundings."
 #: What a number that is infinite, or missing, means in some columns.
 _ENDLESS = {"permissible_time_s": words.FOR_EVER}
@@ -107,6 +113,12 @@ def lead_note(file: RobotFile, model: str = "", more: str = "") -> Note:
     """The line below the answer: robot, fidelity and a further sentence."""
     parts = [f"Robot: **{capabilities.shown_name(file)}**.", f"Fidelity: **{model}**." * bool(model), more]
     return Note(" ".join(filter(None, parts)), "lead")
+
+
+def curve_warning(robot: Robot) -> tuple[Note, ...]:
+    """A warning of curves of a robot that nobody has named, if it has any."""
+    names = " and ".join(f"`{e.name}`" for e in robot.effects if e.name in effects.UNNAMED)
+    return (Note(_CURVES.format(names), "warn", "curve-warning"),) if names else ()
 
 
 def endings_table(
