@@ -294,6 +294,7 @@ KEPT = {
     ("calibration/data/parts.py", "packaged_gearboxes"): "a packaged table",
     ("calibration/data/parts.py", "packaged_cells"): "a packaged table",
     ("calibration/discovery/scales.py", "_nominal"): "pure: signals of the nominal robot",
+    ("sweeps/report/catalogue.py", "_content"): "a packaged file",
     ("sweeps/cli.py", "os.environ"): "set for jax, before it is imported",
     ("sweeps/cli.py", "jax.config"): "a switch of jax, once a process",
     (

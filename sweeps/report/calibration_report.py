@@ -15,55 +15,28 @@ from calibration.inference.simulation_errors import OF_SIZE
 from calibration.words import fit_words
 from mmrjax.errors import count_noun
 from sweeps.pages import words
-from sweeps.report import fit_tables, run_tables
-from sweeps.report.document import Block, Document, Note, Section, Table, columns, deferred_figure, remarks
-
-_PRIORS = (
-    "**Shift from the prior.** Dot: the optimum; bar: 95 % interval; band: the prior's. Grey: not determined by "
-    "these runs, the posterior sd is above {:g} of the prior's; a bar as wide as the band is a parameter of which "
-    "these data say nothing."
-)
-_ERRORS = (
-    "**rms errors, in percent of the {}.** Held out: each block's rows are predicted by a fit that has not seen the "
-    "block. Rows that a robot does not reach have no error and are not counted; their number stands beside the bar."
-)
-_RESIDUALS = (
-    "**Errors of the fit, in {}.** A trend along a condition is what the model lacks; no free parameter hides it."
-)
-_PROFILES = (
-    "**Profile likelihood.** The objective refitted at each value of one parameter; below the line lies its 95 % "
-    "interval (shaded)."
-)
-_CORRELATIONS = "**Posterior correlations, and singular values of the data's Jacobian in prior sds.**"
-_PAIRS = (
-    "**Posterior of the most correlated pairs of parameters.** The contours hold 68 % and 95 %; a narrow oblique one "
-    "means that the data determine a combination better than either parameter."
-)
-_ESTIMATED = "; the noise was estimated from the misfit, so this tests nothing"
+from sweeps.report import catalogue, fit_tables, run_tables
+from sweeps.report.document import Block, Document, Note, Section, Table, remarks
 
 
 def calibration_document(found: CalibrationResult, robot_name: str) -> Document:
     """The report of a calibration of a robot of that name or file."""
     sized = Layout.of(found.robot).crosses_zero
     chi, about = found.chi_square, found.identifiability
-    facts = (
-        f"{count_noun(len(found), 'row')}, fidelity **{found.model}**, {len(found.parameters)} free parameters; "
-        f"maximum a posteriori by {METHOD} with exact Jacobians. χ² {chi.value:.1f} on "
-        f"{chi.degrees_of_freedom:.1f} degrees of freedom{'' if chi.tests_adequacy else _ESTIMATED}. The data say "
-        f"more than the priors in {int(np.sum(about.singular_values > 1))} of {len(found.parameters)} directions "
-        f"(numerical rank {about.rank})."
-    )
+    estimated = "" if chi.tests_adequacy else catalogue.text("calibration.estimated")
+    facts = catalogue.note(
+        "calibration.facts", count_noun(len(found), "row"), found.model, len(found.parameters), METHOD, chi.value,
+        chi.degrees_of_freedom, estimated, int(np.sum(about.singular_values > 1)), len(found.parameters), about.rank,
+    )  # fmt: skip
     search = Note(f"{found.starts.statement()}.", "" if found.converged else "warn", "search", terminal=True)
     rms = [fit_tables.rms_table(found.rms, found.channels)] if sized else []
-    before_after = deferred_figure(
-        "before_after", fit_words.calibration_answer(found), _ERRORS.format(OF_SIZE),
-        "calibration_figures.before_after", found,
-    )  # fmt: skip
+    answer = fit_words.calibration_answer(found)
+    before_after = catalogue.figure("calibration.before_after", found, finding=answer, words=(OF_SIZE,))
     table = found.rows()
     kinds = {"": "measured", "after_": "fitted"}
     return Document(
         f"Calibration of {words.words_shown(Path(robot_name).name)} to {Path(found.source).name}",
-        fit_words.calibration_answer(found),
+        answer,
         (
             Note(f"{found.adequacy.statement}.", "lead", "adequate", terminal=True),
             _parameters(found),
@@ -72,7 +45,7 @@ def calibration_document(found: CalibrationResult, robot_name: str) -> Document:
             search,
             *run_tables.curve_warning(found.robot),
             *remarks(found.notes),
-            Note(facts, "lead"),
+            facts,
         ),
         (
             Section("Parameters before and after", tuple(_shifts(found)), "parameters-section"),
@@ -86,10 +59,6 @@ def calibration_document(found: CalibrationResult, robot_name: str) -> Document:
 
 
 def _parameters(found: CalibrationResult) -> Table:
-    heads = columns(
-        "parameter", "value | .4g", "~sd | .2g", "95 % interval |", "~unit", "~prior median | .4g",
-        "shift [σ] | +.1f", "~variance ratio | .2f", "determined", "~meaning",
-    )  # fmt: skip
     rows = []
     for name, p in found.parameters.items():
         ends = zip(("≤ ", "≥ "), p.interval_open, p.interval, strict=True)
@@ -99,7 +68,7 @@ def _parameters(found: CalibrationResult) -> Table:
         numbers = (p.value, p.sd, interval, p.unit, median, shift, p.variance_ratio)
         rows.append((f"`{name}`", *numbers, found.determined(name) + bound, p.meaning))
     title = f"{count_noun(len(found), 'row')}, {found.model}"
-    return Table("parametertable", heads, rows, title, wide=True)
+    return catalogue.table("calibration.parametertable", rows, title=title)
 
 
 def _errors(found: CalibrationResult) -> Table:
@@ -113,13 +82,12 @@ def _errors(found: CalibrationResult) -> Table:
         )
         for which, by in lines.items()
     ]  # fmt: skip
-    heads = columns("", "rows |", *(f"{c.label} | .1f" for c in found.channels))
-    return Table("errors", heads, rows, f"rms of simulated - measured [% of {OF_SIZE}]")
+    title = f"rms of simulated - measured [% of {OF_SIZE}]"
+    return catalogue.table("calibration.errors", rows, *(f"{c.label} | .1f" for c in found.channels), title=title)
 
 
 def _shifts(found: CalibrationResult) -> Iterable[Block]:
-    caption, drawing = _PRIORS.format(HELD), "calibration_figures.draw_parameter_intervals"
-    yield deferred_figure("parameters", "parameters against their priors", caption, drawing, found)
+    yield catalogue.figure("calibration.parameters", found, words=(HELD,))
     if found.tied:
         yield Note(f"Tied: {'; '.join(f'`{n}` = {t.ratio:.4g} x `{t.leader}`' for n, t in found.tied.items())}.")
     yield Note(fit_tables.noise_sentence(found.noise, found.channels))
@@ -132,35 +100,26 @@ def _over_rows(found: CalibrationResult, sized: bool) -> Iterable[Section]:
     answer, shown = fit_words.calibration_answer(found), found.channels
     if found.axis:
         lines = {"after_": "calibrated", "before_": "before"}
-        yield Section("Histories", (fit_tables.overlay_figure("histories", answer, table, shown, lines),))
-    parity = "**Fitted over measured.**" + ("" if sized else " Band: ±5 %.")
+        yield Section("Histories", (catalogue.figure("fit.overlay", table, shown, lines, finding=answer),))
     unit = "the channel's unit; band: ±2 sd of the readings" if sized else f"percent of the {OF_SIZE}"
     along = {found.axis: "time [s]"} if found.axis else {}
     figures = (
-        deferred_figure(
-            "parity", "fitted over measured", parity, "comparison_figures.draw_parity", table, shown, band=not sized
-        ),
-        deferred_figure(
-            "residuals", "residuals over every condition", _RESIDUALS.format(unit), "comparison_figures.errors_over",
-            table, shown, sized, along,
-        ),
+        catalogue.figure("calibration.parity", table, shown, not sized, more="" if sized else " Band: ±5 %."),
+        catalogue.figure("calibration.residuals", table, shown, sized, along, words=(unit,)),
     )  # fmt: skip
     yield from (Section(h, (f,)) for h, f in zip(("Parity", "Residuals over every condition"), figures, strict=True))
 
 
 def _certainty(found: CalibrationResult) -> Iterable[Block]:
-    drawn = {
-        "profiles": (found.profiled, "profile likelihoods", _PROFILES, "draw_profile_likelihoods"),
-        "correlations": (True, "correlation map and singular values", _CORRELATIONS, "draw_correlations"),
-        "pairs": (len(found.posterior) > 1, "posterior of each two parameters", _PAIRS, "draw_correlated_pairs"),
-    }
-    for name, (wanted, alternative, caption, function) in drawn.items():
-        if wanted:
-            yield deferred_figure(name, alternative, caption, f"calibration_figures.{function}", found)
+    if found.profiled:
+        yield catalogue.figure("calibration.profiles", found)
+    yield catalogue.figure("calibration.correlations", found)
+    if len(found.posterior) > 1:
+        yield catalogue.figure("calibration.pairs", found)
     weak = [
         (value, " ".join(f"{x:+.2f} `{n}`" for n, x in parts.items()))
         for value, parts in found.identifiability.weak_directions()
     ]
     if weak:
-        yield Note("Directions of which the priors say more than the data (in prior sds):")
-        yield Table("weak", columns("singular value | .2g", "combination"), weak, terminal=False)
+        yield catalogue.note("calibration.weak-note")
+        yield catalogue.table("calibration.weak", weak)

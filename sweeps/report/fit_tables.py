@@ -9,15 +9,10 @@ import numpy as np
 
 from calibration.inference.residual_clusters import ResidualCluster
 from mmrjax.model.channels import Channel
-from sweeps.report import run_tables
+from sweeps.report import catalogue, run_tables
 from sweeps.report.condition_columns import condition_formats
-from sweeps.report.document import Cell, Column, Figure, Section, Table, columns, deferred_figure, remarks
+from sweeps.report.document import Cell, Column, Section, Table, remarks
 
-_CLUSTERS = "**Residuals by columns that have no role.** Simulated less measured; bar: the mean of a level."
-_OVERLAY = (
-    "**Measured and simulated readings over time, each with its residual below.** The run with the largest residuals "
-    "comes first."
-)
 #: Names of fits that rms errors are of.
 FITS = {
     "before": "before", "after": "after", "held_out": "held out", "held_out_before": "before, held out",
@@ -49,25 +44,21 @@ def noise_sentence(noise: Mapping[str, Any], shown: Iterable[Channel]) -> str:
 
 def rms_table(rms: Mapping[str, Mapping[str, float]], shown: Sequence[Channel]) -> Table:
     """rms errors in the units of their channels, by fit."""
-    heads = columns("rms of simulated − measured", *(f"{c.label} [{c.unit}] | .3g" for c in shown))
-    return Table("rms", heads, [(FITS[fit], *(by.get(c.name) for c in shown)) for fit, by in rms.items()])
-
-
-def overlay_figure(
-    name: str, alternative: str, table: dict[str, np.ndarray], shown: Sequence[Channel], lines: Mapping[str, str]
-) -> Figure:
-    """Measured and simulated readings over time; `lines`: words of each simulation by the prefix of its columns."""
-    return deferred_figure(name, alternative, _OVERLAY, "time_overlay.time_overlay", table, shown, lines)
+    rows = [(FITS[fit], *(by.get(c.name) for c in shown)) for fit, by in rms.items()]
+    return catalogue.table("fit.rms", rows, *(f"{c.label} [{c.unit}] | .3g" for c in shown))
 
 
 def clusters_section(clusters: Sequence[ResidualCluster]) -> tuple[Section, ...]:
     """Columns without a role that residuals go with, if there are any."""
     if not clusters:
         return ()
-    alternative = "residuals by columns without a role"
-    figure = deferred_figure("clusters", alternative, _CLUSTERS, "cluster_figures.draw_clusters", clusters)
     statements = (f"{c.statement}." for c in clusters)
-    return (Section("What the residuals cluster by", (*remarks(statements, "clusters"), figure)),)
+    return (
+        Section(
+            "What the residuals cluster by",
+            (*remarks(statements, "clusters"), catalogue.figure("fit.clusters", clusters)),
+        ),
+    )
 
 
 def rows_section(
@@ -98,4 +89,4 @@ def rows_section(
             cells.append([error_cell(float(e)) for e in table[f"error_{c.name}_percent"]])
     heads += [Column(word) for word in more.get("last", {})]
     rows = list(zip(*cells, *more.get("last", {}).values(), strict=True))
-    return Section("Rows", (Table("rowtable", tuple(heads), rows, file="rows.csv", wide=True, terminal=False),))
+    return Section("Rows", (catalogue.table("fit.rowtable", rows, *heads),))

@@ -18,6 +18,7 @@ from sweeps import capabilities
 from sweeps.pages import words
 from sweeps.points import uncertainty
 from sweeps.points.imposed import UNLIMITED
+from sweeps.report import catalogue
 from sweeps.report.condition_columns import CONDITIONS
 from sweeps.report.document import Cell, Column, Note, Table, columns
 
@@ -35,11 +36,6 @@ _OTHERS = {
     "time_end_s": ("time at the end", "s", "{:.6g}"),
     "permissible_time_s": ("permissible at this current for", "s", "{:.3g}"),
 }
-_CURVES = (
-    "This robot holds {}: a smooth curve fitted to what its model lacks, which nobody has named. Trust it only under "
-    "the conditions of the runs that it was fitted to."
-)
-WARMING_SHARE = "Winding: share of the temperature rise that it may have above its surroundings."
 #: What a number that is infinite, or missing, means in some columns.
 _ENDLESS = {"permissible_time_s": words.FOR_EVER}
 _MISSING = {"supply_voltage_V": "battery", "flags": "none"}
@@ -118,7 +114,7 @@ def lead_note(file: RobotFile, model: str = "", more: str = "") -> Note:
 def curve_warning(robot: Robot) -> tuple[Note, ...]:
     """A warning of curves of a robot that nobody has named, if it has any."""
     names = " and ".join(f"`{e.name}`" for e in robot.effects if e.name in effects.UNNAMED)
-    return (Note(_CURVES.format(names), "warn", "curve-warning"),) if names else ()
+    return (catalogue.note("run.curves", names),) if names else ()
 
 
 def endings_table(
@@ -149,9 +145,8 @@ def endings_table(
 
 def limits_table(limits: Sequence[Mapping[str, Any]], what: str) -> Table:
     """Use of each limit: its value, the limit and the share of it that is used."""
-    heads = columns("limit of", f"{what} |", "limit |", "used | {:.0f} %")
     rows = [(limit["words"], limit["value"], limit["limit"], _used(limit)) for limit in limits]
-    return Table("limits", heads, rows, terminal=False)
+    return catalogue.table("run.limits", rows, f"{what} |")
 
 
 def use_of_limits(asked: Iterable[tuple[str, Any, Any, str]], ambient: float) -> list[dict[str, Any]]:
