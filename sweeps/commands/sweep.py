@@ -286,7 +286,7 @@ def finish_sweep(
 def write_sweep_folder(store: SweepStore, config: Campaign, file: RobotFile, job: scale.Job, same: Identity) -> None:
     """Write all files of a run folder except the store, then move the store into place."""
     robot_file.write_robot(
-        job.robot, store.partial / "robot.toml", note=f"the robot of this sweep, from {config.robot}"
+        job.robot, store.results() / "robot.toml", note=f"the robot of this sweep, from {config.robot}"
     )
     found = sweep_summary(store.layout, job, store.done().values())
     store.write_json("result.json", found)

@@ -23,7 +23,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float
 
-from mmrjax import fidelities
+from mmrjax import WORKER, fidelities
 from mmrjax.compile.compiling import compiled
 from mmrjax.compile.precision import Threads
 from mmrjax.fidelities import outputs
@@ -263,7 +263,7 @@ def produce_chunks(
     Args:
         advance: called with how many more points are done, of chunks that are computed in parts.
     """
-    with Threads(1, thread_name_prefix="points") as maker:
+    with Threads(1) as maker:
         ahead = deque[tuple[int, concurrent.futures.Future[Any]]]()
         for chunk in chunks:
             ahead.append((chunk, maker.submit(compiled.points, chunk)))
@@ -356,7 +356,7 @@ def write_chunks(keep: Keep, job: Job, chunks: Produced, advance: Advance, times
                 failures.append(error)
                 stop.set()
 
-    writer = threading.Thread(target=keep_writing, name="writer", daemon=True)
+    writer = threading.Thread(target=keep_writing, name=WORKER, daemon=True)
     writer.start()
     try:
         for piece in chunks:
