@@ -41,6 +41,8 @@ POINTS = "points"
 SHARED = 16_384
 #: Chunks that may wait for the writer, besides the one that it writes and the one that is computed.
 WAITING = 1
+#: Time after an interrupt to write chunks that have been computed, for each of two steps [s].
+LAST = 2.5
 #: Types in which outputs that are no numbers are stored.
 KINDS = {STATUS: "uint8", FLAGS: "uint16", VERDICT: "uint8"}
 
@@ -333,13 +335,16 @@ def write_chunks(keep: Keep, job: Job, chunks: Produced, advance: Advance, times
     begun = time.perf_counter()
 
     def write(piece: Piece) -> None:
+        whole = all(x.is_ready() for x in piece.arrays.values() if isinstance(x, Array))
+        if stop.is_set() and not whole:
+            return
         start = time.perf_counter()
         jax.block_until_ready(list(piece.arrays.values()))
         computed = time.perf_counter()
         count = job.blocks.count(piece.chunk)
         here = fetch_values(piece.arrays, count)
         transferred = time.perf_counter()
-        if stop.is_set():  # interrupted while it was computed
+        if stop.is_set() and not whole:  # interrupted while it was computed
             return
         keep(piece.chunk, here, drawn_samples(job, piece))
         times.compute += computed - start
@@ -350,7 +355,7 @@ def write_chunks(keep: Keep, job: Job, chunks: Produced, advance: Advance, times
     def keep_writing() -> None:
         while (piece := waiting.get()) is not None:
             try:
-                if not stop.is_set():
+                if not failures:
                     write(piece)
             except BaseException as error:
                 failures.append(error)
@@ -367,11 +372,9 @@ def write_chunks(keep: Keep, job: Job, chunks: Produced, advance: Advance, times
         writer.join()
     except BaseException:
         stop.set()
-        with contextlib.suppress(queue.Empty):  # the writer takes from it too
-            while True:
-                waiting.get_nowait()
-        waiting.put(None)
-        writer.join(5.0)  # what is written now is finished, what is still computed is not waited for
+        with contextlib.suppress(queue.Full):
+            waiting.put(None, timeout=LAST)
+        writer.join(LAST)  # what is computed is written, what is still being computed is not waited for
         raise
     finally:
         times.total += time.perf_counter() - begun
