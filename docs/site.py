@@ -209,7 +209,7 @@ def quantities() -> str:
     from mmrjax.model import channels, quantities
 
     conditions = [
-        (f"`{c.column}`", c.label, c.unit_shown or "-", _range(c), ", ".join(u for u, _ in c.other_units) or "-")
+        (f"`{c.column}`", c.label, c.unit_shown or "-", _range(c), ", ".join(c.other_units) or "-")
         for c in quantities.SET
     ]
     shown = [

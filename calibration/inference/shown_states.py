@@ -18,9 +18,10 @@ from jaxtyping import Array, Float
 
 from calibration.inference.priors import DELAY
 from calibration.inference.problem import Problem
-from mmrjax.model import balances, channels
+from mmrjax.model import balances
 from mmrjax.model.channels import Channel
 from mmrjax.model.conditions import Conditions
+from mmrjax.model.quantities import CURRENT, VOLTAGE
 from mmrjax.model.signals import State
 
 #: Length of a window in times between rows, and its limits [s]; its fewest rows; distance between the starts of
@@ -75,7 +76,7 @@ def plan_of(problem: Problem) -> Plan | None:
     imposed = robot.rig.imposed
     pulsed = np.ptp(np.asarray(problem.observe.of_rows.duty)) > 0  # type: ignore[attr-defined]
     drawn = "total_current"  # proportional to the duty of pulses
-    currents = {k: c.name == drawn for k, c in shown.items() if c.rests_on == channels.CURRENT}
+    currents = {k: c.name == drawn for k, c in shown.items() if c.rests_on == CURRENT}
     speeds = [k for k, c in shown.items() if c.zero_at_rest and c.settled]
     angles = [k for k, c in shown.items() if c.zero_at_rest and not c.settled]
     if imposed == "motor_speed":
@@ -92,7 +93,7 @@ def plan_of(problem: Problem) -> Plan | None:
 
 
 def _voltages(shown: dict[int, Channel]) -> list[int]:
-    return [k for k, c in shown.items() if c.rests_on == channels.VOLTAGE]
+    return [k for k, c in shown.items() if c.rests_on == VOLTAGE]
 
 
 def _travels(channel: Channel) -> bool:

@@ -16,13 +16,13 @@ from calibration.sensitivity.methods import (
     morris_screening,
     sobol_indices,
 )
-from calibration.sensitivity.model import OutputRow
 from calibration.sensitivity.next_runs import Candidates, next_runs
 from calibration.sensitivity.result import METHODS, Input, OutputStudy, SensitivityResult
 from calibration.sensitivity.sensitivity_notes import Inert, PointsLeftOut, SampleLeftOut, Sampling, Tied
 from calibration.sensitivity.study import Study
 from calibration.sensitivity.uncertain_inputs import Inputs
 from mmrjax import derived, fidelities
+from mmrjax.model.quantities import Quantity
 
 #: Default number of model evaluations: of solves, and with a run over time among the outputs.
 EVALUATIONS, EVALUATIONS_LONG = 1_000_000, 100_000
@@ -30,7 +30,7 @@ EVALUATIONS, EVALUATIONS_LONG = 1_000_000, 100_000
 LEAST = 1_000
 
 
-def default_evaluations(outputs: tuple[OutputRow, ...], model: str) -> int:
+def default_evaluations(outputs: tuple[Quantity, ...], model: str) -> int:
     """Default number of model evaluations."""
     long = fidelities.fidelity_facts(model).rollout or any(o in derived.OF_START for o in outputs)
     return EVALUATIONS_LONG if long else EVALUATIONS
@@ -135,7 +135,7 @@ def _described(inputs: Inputs, idle: np.ndarray) -> dict[str, Input]:
     return described
 
 
-def _study_of(row: OutputRow, study: Study, found: Local, part: Part | None) -> OutputStudy:
+def _study_of(row: Quantity, study: Study, found: Local, part: Part | None) -> OutputStudy:
     name, points = row.name, len(study.points)
     value, slopes, scores = found.value[name], found.derivative[name], found.by_score[name]
     median = study.inputs.values(study.inputs.centre)[study.inputs.places]

@@ -11,8 +11,8 @@ from scipy import stats
 from calibration.data.runs import Runs
 from calibration.described import described, sentences
 from calibration.inference.fit_notes import Note
-from calibration.sensitivity.model import OutputRow
 from calibration.sensitivity.replicates import LEVEL, REPLICATES, Estimate
+from mmrjax.model.quantities import Quantity
 
 SCHEMA = "mmrjax.sensitivity/1"
 #: Methods.
@@ -127,7 +127,7 @@ class OutputStudy:
         lost: share of base points without a value at each point, shape (points,); studied: True for included points.
     """
 
-    row: OutputRow
+    row: Quantity
     value: np.ndarray
     derivative: np.ndarray
     elasticity: np.ndarray
@@ -334,7 +334,7 @@ class SensitivityResult:
             where = {key: np.repeat(x, size) for key, x in self.points.columns().items()}
             table = {
                 "output": np.full(points * size, name),
-                "unit": np.full(points * size, study.row.unit),
+                "unit": np.full(points * size, study.row.unit_shown),
                 **where,
                 "input": np.tile(names, points),
                 "value": np.repeat(study.value, size) / study.row.factor,
@@ -363,7 +363,7 @@ class SensitivityResult:
 def _output(study: OutputStudy) -> dict[str, Any]:
     return {
         "label": study.row.label,
-        "unit": study.row.unit,
+        "unit": study.row.unit_shown,
         "factor": study.row.factor,
         "value": study.value.tolist(),
         "sd": study.sd.tolist(),
