@@ -32,7 +32,7 @@ from sweeps.points.sampled_design import Blocks
 from sweeps.points.tasks import task_of
 from sweeps.points.zarr_store import STORE, Done, Layout, SweepStore
 from sweeps.skeleton import page_writer
-from sweeps.store import DONE, SOLVER_FAILED, default_path, open_folder
+from sweeps.store import DONE, IDENTITY, SOLVER_FAILED, default_path, open_folder
 
 #: Most runs of which a grid leaves a table, runs.csv; of more it leaves a store, in a tenth of the time and bytes.
 TABLE = 100_000
@@ -111,6 +111,8 @@ def _into_store(config: Campaign, file: RobotFile, where: str, out: Path | None,
         files = [*([config.robot] if Path(config.robot).is_file() else []), *config.effects, *plan.data]
         files += [config.profile] if config.profile is not None and config.profile not in profiles.PACKAGED else []
         same = job_identity(config, robot, files, device)
+        if not any((folder / IDENTITY).is_file() for folder in (path, path.with_name(f"{path.name}.partial"))):
+            _refuse_without_space(layout.size, 1.0, path)  # a sweep that goes on needs less
         store = SweepStore(path, same, layout, force=force)
         try:
             if not store.finished:

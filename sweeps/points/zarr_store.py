@@ -24,6 +24,7 @@ from typing import Any, TextIO
 import numpy as np
 
 from calibration.data.input_errors import BadConfiguration, BadData
+from calibration.data.writing import naming_file
 from mmrjax.fidelities.variation import STATUS
 from mmrjax.model.signals import STATUSES
 from sweeps.console import print_message
@@ -47,6 +48,8 @@ from sweeps.store import (
 COMMAND = "sweep into a store"
 #: Status of a point that has not been simulated.
 ABSENT = 255
+#: Unit in which file systems give space to files and folders, and typical metadata of an array in its group [bytes].
+BLOCK, METADATA = 4096, 1024
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,11 +85,19 @@ class Layout:
 
     @property
     def size(self) -> int:
-        """Bytes of all arrays, uncompressed."""
-        outputs = sum(np.dtype(v.dtype).itemsize for v in self.variables) * len(self.blocks) * self.blocks.points
-        samples = self.design.samples
-        drawn = 0 if samples is None else 8 * len(samples.names) * samples.number
-        return outputs + drawn + 8 * sum(len(v) for v in self.design.axes.values())
+        """Bytes of the store on a disk, uncompressed: blocks of its files and folders, metadata and journal."""
+        counts, points = self.blocks.counts, self.blocks.points
+        folders = sum(math.prod(counts[:k]) for k in range(len(counts)))
+        each = sum(_on_disk(np.dtype(v.dtype).itemsize * points) for v in self.variables) * len(self.blocks)
+        outputs = each + BLOCK * folders * len(self.variables)
+        names = () if self.design.samples is None else self.design.samples.names
+        drawn = len(names) * counts[-1] * _on_disk(8 * self.blocks.size[-1])
+        axes = sum(_on_disk(8 * len(values)) for values in self.design.axes.values())
+        arrays = len(self.variables) + len(names) + len(self.design.axes)
+        widest = {v.name: (-1.2345678901234567e-300,) * 2 for v in self.variables}
+        checks = dict.fromkeys([*widest, *names], 2**32 - 1)
+        line = _line(Done(len(self.blocks), (points,) * len(STATUSES), widest, checks))
+        return outputs + drawn + axes + arrays * (3 * BLOCK + METADATA) + _on_disk(len(line) * len(self.blocks))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -240,7 +251,8 @@ class SweepStore(Folder):
         (self.partial / LOCK).write_text(lock_text(COMMAND), encoding="utf-8")
         (self.partial / JOURNAL).mkdir()
         (self.partial / ASIDE).mkdir()
-        create_store(self.partial / STORE, self.layout)
+        with naming_file(self.partial / STORE):
+            create_store(self.partial / STORE, self.layout)
         write_file(self.partial / IDENTITY, json.dumps(self._identity, indent=1).encode(), self._aside)
 
     def _altered(self, folder: Path) -> dict[Path, bytes]:
@@ -455,9 +467,10 @@ def write_file(path: Path, content: Any, aside: Path) -> None:
             stream.flush()
             os.fsync(stream.fileno())
         os.replace(aside, path)
-    except OSError:
+    except OSError as error:
         with contextlib.suppress(OSError):
             aside.unlink()
+        error.filename = str(path)
         raise
 
 
@@ -501,6 +514,10 @@ def create_store(path: Path, layout: Layout) -> None:
         # xarray opens a store with it at once, and one without it with a warning
         warnings.filterwarnings("ignore", message="Consolidated metadata is currently not part")
         zarr.consolidate_metadata(path)
+
+
+def _on_disk(size: int) -> int:
+    return -(-size // BLOCK) * BLOCK
 
 
 def fill_value(variable: Variable) -> Any:
