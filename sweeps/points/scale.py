@@ -335,7 +335,7 @@ def write_chunks(keep: Keep, job: Job, chunks: Produced, advance: Advance, times
     begun = time.perf_counter()
 
     def write(piece: Piece) -> None:
-        whole = all(x.is_ready() for x in piece.arrays.values() if isinstance(x, Array))
+        whole = all(x.is_ready() for x in piece.arrays.values() if isinstance(x, jax.Array))  # type: ignore[attr-defined]
         if stop.is_set() and not whole:
             return
         start = time.perf_counter()
