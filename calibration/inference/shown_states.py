@@ -20,10 +20,11 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from calibration.inference.problem import Problem
-from mmrjax.model import balances, channels
+from mmrjax.model import balances
 from mmrjax.model.channels import Channel
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar
+from mmrjax.model.quantities import CURRENT, VOLTAGE
 from mmrjax.model.signals import State
 
 #: Length of a window in correlation times of the motion and in rows, at least; its points, about; its fewest rows;
@@ -100,8 +101,8 @@ def plan_or_lacking(problem: Problem) -> Plan | Lacking:
     imposed = robot.rig.imposed
     pulsed = np.ptp(np.asarray(problem.observe.of_rows.duty)) > 0  # type: ignore[attr-defined]
     drawn = "total_current"  # proportional to the duty of pulses
-    currents = {k: c.name == drawn for k, c in shown.items() if c.rests_on == channels.CURRENT}
-    voltages = [k for k, c in shown.items() if c.rests_on == channels.VOLTAGE]
+    currents = {k: c.name == drawn for k, c in shown.items() if c.rests_on == CURRENT}
+    voltages = [k for k, c in shown.items() if c.rests_on == VOLTAGE]
     speeds = [k for k, c in shown.items() if c.zero_at_rest and c.settled]
     angles = [k for k, c in shown.items() if c.zero_at_rest and not c.settled]
     if imposed == "motor_speed":

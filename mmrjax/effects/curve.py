@@ -32,7 +32,7 @@ ROUND = {"yaw": ("N·m", 0.5, "direction_turn")}
 #: The channel `yaw`, a heading, has none: its curve is the one of the balance `yaw`.
 READINGS = {
     c.name: (
-        c.unit_si or c.unit,
+        c.unit_si,
         0.01 * c.range[1] * c.factor,
         "direction_turn" if c in channels.OF_TURNS and c.side is None else "direction",
     )

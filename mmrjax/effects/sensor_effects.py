@@ -101,7 +101,7 @@ class SpeedGain(SensorEffect):
 
 def _error(read: Channel, of_zero: bool) -> type[Effect]:
     """The error of scale or zero of a channel's instrument."""
-    largest, unit = (10 * read.zero_error, read.unit_si or read.unit) if of_zero else (0.2, "-")
+    largest, unit = (10 * read.zero_error, read.unit_si) if of_zero else (0.2, "-")
     source = "limits of error of instruments, IEC 60051-2", "class of the instrument: 0.5 to 2.5 %"
     if read.unit_shown == "°C":
         source = "tolerances of thermocouples, IEC 60584-1", "class of the instrument: 1 to 3 K"
