@@ -393,16 +393,16 @@ def search_delay(problem: Problem, plan: Plan) -> Delay:
 
     def fits(delays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Half of what -2 log L of the windows exceeds its least, and the coordinates, at each delay."""
-        here = course.at(0.0)[0]
-        moves = [here, *({**here, n: x + np.ptp(x)} for n, x in here.items())]
+        prompt = course.at(0.0)[0]
+        moves = [prompt, *({**prompt, n: x + np.ptp(x)} for n, x in prompt.items())]
         fixed, *others = (
             np.asarray(_by_coordinates(problem, plan, _with_imposed(rows, x), jnp.asarray(z))) for x in moves
         )
-        change = {n: (other - fixed) / np.ptp(x) for (n, x), other in zip(here.items(), others, strict=True)}
+        change = {n: (other - fixed) / np.ptp(x) for (n, x), other in zip(prompt.items(), others, strict=True)}
         costs, ends = [], []
         for delay in delays:
-            there = course.at(float(delay))[0]
-            moved = {n: (there[n] - here[n])[:, None, None] for n in change}
+            means = course.at(float(delay))[0]
+            moved = {n: (means[n] - prompt[n])[:, None, None] for n in change}
             f, y = (fixed[k] + sum(moved[n] * change[n][k] for n in change) for k in range(2))
             whole = np.concatenate([_integrated(plan, w, f, y) for w in cut], 1)  # (equations, windows, 1 + z)
             size = np.sqrt(np.mean(whole[..., 0] ** 2, 1))
@@ -483,15 +483,18 @@ def weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> WeakF
         factors = [_factor(plan, w, np.asarray(rows.sd), known) for w in cut]
         offset = whole(factors, terms(rows, z))[:, 0] - whole(factors, known)[:, 0]
 
-        @functools.lru_cache(maxsize=1)
-        def at(z: tuple[float, ...]) -> np.ndarray:
-            mine = whole(factors, terms(smooth, np.array(z), effects))
-            mine[:, 0] += offset
-            rest = np.zeros((len(z), mine.shape[1]))
-            rest[:, 0], rest[:, 1 : len(z) + 1] = z - centre, np.eye(len(z))
-            return np.concatenate([mine, rest])
+        last: list[tuple[np.ndarray, np.ndarray]] = []
 
-        return lambda z: at(tuple(z))
+        def at(z: np.ndarray) -> np.ndarray:
+            if not last or np.any(last[0][0] != z):
+                mine = whole(factors, terms(smooth, z, effects))
+                mine[:, 0] += offset
+                rest = np.zeros((len(z), mine.shape[1]))
+                rest[:, 0], rest[:, 1 : len(z) + 1] = z - centre, np.eye(len(z))
+                last[:] = [(z.copy(), np.concatenate([mine, rest]))]
+            return last[0][1]
+
+        return at
 
     centre = late.start(problem)
     z, size = centre, len(centre)
