@@ -520,20 +520,6 @@ def test_killed_at_twenty_random_moments_goes_on_to_equal_stores(tmp_path):
         shutil.rmtree(tmp_path / f"s{k}")
 
 
-def test_interrupt_is_not_replaced_where_the_writer_empties_the_queue(monkeypatch):
-    class Raced(scale.queue.Queue):
-        def empty(self):
-            return False  # and then the writer takes the last piece
-
-    def interrupted():
-        raise KeyboardInterrupt
-        yield
-
-    monkeypatch.setattr(scale.queue, "Queue", Raced)
-    with pytest.raises(KeyboardInterrupt):
-        scale.write_chunks(print, None, interrupted(), print, scale.Times())
-
-
 # --- shares -------------------------------------------------------------------------------------------------------
 
 

@@ -83,8 +83,8 @@ def figure_settings(width: float = WIDTH) -> Iterator[None]:
     """
     with matplotlib.rc_context():
         matplotlib.rcdefaults()
-        matplotlib.rcParams.update(_RC | {"figure.figsize": (width, width)})
-        yield
+        with matplotlib.rc_context(_RC | {"figure.figsize": (width, width)}):
+            yield
 
 
 def is_narrow() -> bool:
