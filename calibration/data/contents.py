@@ -172,7 +172,7 @@ def _facts(signal: Signal, clock: Clock | None, times: dict[int, tuple[np.ndarra
     try:
         values = signal.load()
     except BadData as error:
-        return dataclasses.replace(found, refused=str(error))
+        return dataclasses.replace(found, refused=str(error).partition(f"{signal.path}: ")[2] or str(error))
     if values.dtype.kind in "US":
         return dataclasses.replace(found, words=tuple(map(str, dict.fromkeys(values[:10_000].tolist())))[:5])
     if values.dtype.kind in "mM":
