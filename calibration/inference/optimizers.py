@@ -660,7 +660,7 @@ def search_starts(
 
 @compiled
 def _search_starts(problem: Problem, starts: Array | np.ndarray, data: Data) -> tuple[Optimum, Array, Array]:
-    def search(z: Z) -> tuple[Optimum, Array, Array]:
+    def search(z: Any) -> tuple[Optimum, Array, Array]:
         optimum, seen = levenberg_marquardt(problem, z, data)
         return optimum, problem.observation(z).status, seen.status
 
