@@ -82,7 +82,7 @@ def read_runs(
         with resources.as_file(resources.files("calibration") / "data" / PACKAGED[str(source)]) as path:
             arrays, mapped = delimited.read_csv_columns(path, str(source)), layout.mapped
     else:
-        if source == "":
+        if isinstance(source, str) and not source:
             raise BadData(f"the source: got an empty path; expected {EXPECTED}")
         if isinstance(source, str | Path) and not opening.split_source(str(source))[0].exists():
             raise BadData(f"{source}: no such file and no packaged table; packaged: {', '.join(PACKAGED)}")

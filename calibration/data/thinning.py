@@ -15,8 +15,8 @@ from mmrjax.model.robot import Robot
 
 #: Rows at the start of a run whose readings are always used: they show its initial state.
 FIRST = 5
-#: Memory that a loop takes for each settled row, measured at 50 000 rows [bytes].
-ROW = 460_000
+#: Memory that a loop takes for each settled row [bytes]: the base fit took 61 kB at 50 000 rows of a bench.
+ROW = 100_000
 
 
 def used_rows(runs: Runs, robot: Robot, most: int = ROWS) -> Runs:

@@ -163,7 +163,7 @@ class Conditions(eqx.Module):
         which: Any = configuration
         if not isinstance(configuration, jax.Array | Named):
             words = np.asarray(configuration)
-            which = Named.of(words) if words.dtype.kind == "U" else words
+            which = Named.of(words) if words.dtype.kind == "U" else configuration
         which = which if isinstance(which, Named) else _number("configuration", which, int)
         given = {
             "voltage": voltage, "slope_deg": slope_deg, "payload": payload, "battery": battery,
