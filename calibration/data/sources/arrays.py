@@ -190,7 +190,7 @@ def _walk(
         shape = item.shape[::-1] if matlab else item.shape
         arrays[here] = (shape, dtype, _dataset(path, here, words, char, matlab))
         stated = next((item.attrs[key] for key in ("unit", "units", "Unit", "Units") if key in item.attrs), "")
-        units[here] = stated.decode() if isinstance(stated, bytes) else str(stated)
+        units[here] = stated.decode("utf-8", "replace") if isinstance(stated, bytes) else str(stated)
 
 
 def _dataset(path: Path, at: str, words: bool, char: bool, matlab: bool) -> Callable[[], np.ndarray]:

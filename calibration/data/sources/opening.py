@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import collections
 import dataclasses
+import fnmatch
 import hashlib
 import importlib
 import math
+import os
 import stat
 import zipfile
 from collections.abc import Callable, Sequence
@@ -71,12 +73,15 @@ BAG = Format("a ROS bag", "bags", "of_bag", "rosbags")
 MCAP = Format("an MCAP file", "bags", "of_bag", "rosbags")
 ULOG = Format("a ULog file", "ulog", "of_ulog", "pyulog")
 MDF = Format("an MDF file", "mdf", "of_mdf", "asammdf")
+WPILOG = Format("a WPILOG file", "wpilog", "of_wpilog")
+WORKBOOK = Format("a workbook", "workbook", "of_workbook", "python-calamine")
 
 #: First bytes of each format.
 BEGINNINGS = {
     b"PAR1": PARQUET, b"ARROW1": ARROW, b"\xff\xff\xff\xff": ARROW, b"\x89HDF\r\n\x1a\n": HDF5,
     b"MATLAB 7.3": HDF5, b"MATLAB 5.0": MATLAB, b"\x93NUMPY": NPY, b"#ROSBAG": BAG, b"\x89MCAP": MCAP,
-    b"ULog": ULOG, b"MDF     ": MDF, b"UnFinMF ": MDF,
+    b"ULog": ULOG, b"MDF     ": MDF, b"UnFinMF ": MDF, b"WPILOG": WPILOG,
+    b"\xd0\xcf\x11\xe0": WORKBOOK,
 }  # fmt: skip
 #: Formats whose files begin with anything, by suffix.
 SUFFIXES = {".mat": MATLAB, ".db3": BAG, ".jsonl": JSON, ".ndjson": JSON}
@@ -99,6 +104,15 @@ def split_source(source: str) -> tuple[Path, str]:
     return Path(file), within
 
 
+def files_of_group(source: str) -> list[Path]:
+    """Files that match a pattern such as `runs/*.csv`, in order; empty if it is a file's name, or none matches."""
+    path = Path(source)
+    if not set("*?[") & {*source} or path.exists():
+        return []
+    names = fnmatch.filter(os.listdir(path.parent), path.name) if path.parent.is_dir() else []
+    return sorted(path.parent / name for name in names if not name.startswith("."))
+
+
 def format_of(path: Path, name: str) -> Format | None:
     """Format of a file or of a bag's folder; None: text in columns.
 
@@ -117,20 +131,23 @@ def format_of(path: Path, name: str) -> Format | None:
     for magic, found in BEGINNINGS.items():
         if begin.startswith(magic):
             return found
-    if begin.startswith(b"PK\x03\x04") and _is_npz(path):
-        return NPZ
+    if begin.startswith(b"PK\x03\x04") and (kind := _kind_of_zip(path)) is not None:
+        return kind
     if any(text.match(begin) for text, word in input_files.TEXTS.items() if word == "JSON"):
         return JSON
     return SUFFIXES.get(path.suffix.lower())
 
 
-def _is_npz(path: Path) -> bool:
+def _kind_of_zip(path: Path) -> Format | None:
+    """Format of a zip file by the names in it, by its suffix if it is damaged."""
     try:
         with zipfile.ZipFile(path) as archive:
             names = archive.namelist()
     except (zipfile.BadZipFile, OSError):
-        return path.suffix.lower() == ".npz"
-    return any(name.endswith(".npy") for name in names)
+        names = {".npz": [".npy"], ".xlsx": ["xl/"], ".ods": ["content.xml"]}.get(path.suffix.lower(), [])
+    if any(name.endswith(".npy") for name in names):
+        return NPZ
+    return WORKBOOK if any(name.startswith("xl/") or name == "content.xml" for name in names) else None
 
 
 def open_signals(path: Path, within: str, name: str, form: Format) -> Source:
@@ -187,13 +204,15 @@ def _guarded(signals: Sequence[Signal], name: str, kind: str) -> tuple[Signal, .
     """Signals that raise `BadData` if they are refused, too large for the memory, or if their library cannot read
     their values; shared clocks stay shared."""
 
-    def guarded(load: Callable[[], np.ndarray], path: str, size: float, refused: str) -> Callable[[], np.ndarray]:
+    def guarded(
+        load: Callable[[], np.ndarray], path: str, signal: Signal, refused: str = ""
+    ) -> Callable[[], np.ndarray]:
         where = f"{name}, {path}"
 
         def read() -> np.ndarray:
             if refused:
                 raise BadData(f"{where}: {refused}")
-            input_files.check_memory(where, size)
+            input_files.check_memory(where, signal.size or input_files.VALUE * signal.length)
             try:
                 values = load()
                 why = refused_type(values.dtype)
@@ -202,24 +221,22 @@ def _guarded(signals: Sequence[Signal], name: str, kind: str) -> tuple[Signal, .
                 raise
             except Exception as error:  # each library has errors of its own
                 raise unreadable_file(where, kind, error) from error
-            if why:
+            if why or len(values) != signal.length:
+                why = why or f"has {len(values)} of the {signal.length} values that it declares; it may be damaged"
                 raise BadData(f"{where}: {why}")
             return values
 
         return read
 
-    def size_of(signal: Signal) -> float:
-        return signal.size or float(input_files.VALUE * signal.length)
-
-    clocks = {id(s.clock): (s.clock, size_of(s)) for s in signals if s.clock is not None}
+    clocks = {id(s.clock): (s.clock, s) for s in signals if s.clock is not None}
     sound = {
-        key: dataclasses.replace(clock, load=guarded(clock.load, clock.name, size, ""))
-        for key, (clock, size) in clocks.items()
+        key: dataclasses.replace(clock, load=guarded(clock.load, clock.name, signal))
+        for key, (clock, signal) in clocks.items()
     }
     return tuple(
         dataclasses.replace(
             s,
-            load=guarded(s.load, s.path, size_of(s), s.refused),
+            load=guarded(s.load, s.path, s, s.refused),
             clock=None if s.clock is None else sound[id(s.clock)],
         )
         for s in signals
