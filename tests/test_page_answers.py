@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from calibration.sensitivity.result import Points
+from calibration.words import fit_words, sensitivity_words
 from mmrjax.model import channels
 from sweeps.pages import mission_page, runs_page, sweep_page
 from sweeps.paper import error_tables
-from sweeps.report.words import fit_words, sensitivity_words
 
 SHOWN = [channels.find_channel("total_current"), channels.find_channel("speed")]
 

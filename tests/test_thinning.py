@@ -11,6 +11,7 @@ from calibration.data import columns, input_files
 from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.data.runs import Runs
 from calibration.data.thinning import FIRST, thin_rows
+from calibration.described import describe
 from calibration.discovery import discover
 from calibration.inference import calibration as calibrate
 from calibration.inference import foresight
@@ -19,7 +20,6 @@ from calibration.inference.noise import infer_noise
 from calibration.inference.observers import Histories, SettledRuns
 from mmrjax.model import paper_robots
 from sweeps.commands import rig_check
-from sweeps.report.words.note_words import describe
 
 EVERY, ROWS = 0.01, 300
 

@@ -22,7 +22,7 @@ from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.data.posterior_file import Posterior
 from calibration.data.runs import Runs
 from calibration.data.thinning import used_rows
-from calibration.described import described, in_words
+from calibration.described import describe, in_words
 from calibration.discovery import findings, kept, menu, prediction, preference, scales
 from calibration.discovery.active_set import CandidateSpace, candidate_space
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
@@ -292,7 +292,7 @@ def prepare_loop(
     ready = preparation.prepare(distinct, robot, noise, stated)
     for note in ready.checked:
         if isinstance(note, NothingVaries) or (isinstance(note, Copied) and not note.tied):
-            raise BadData(described(note))
+            raise BadData(describe(note))
     at_first = (*ready.foreign, *ready.doubted)
     said: Notes = (*notes, *ready.checked, *ready.begins, *ready.weighed, *at_first)
     turned = scales.output_rotation(distinct, ready.robot)

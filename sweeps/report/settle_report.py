@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from calibration.data.settling import Settled, Stretch
+from calibration.words import settle_words as words
 from sweeps.report.document import Column, Document, Figure, Note, Section, Table, deferred_drawing
-from sweeps.report.words import settle_words as words
 
 #: Imposed quantity of a log and its unit.
 IMPOSED = {

@@ -146,6 +146,7 @@ def _of_table(arrays: NamedArrays, layout: Layout, columns: Preset | None) -> Re
     mapped, notes = columns.mapped(lambda name: name if name in by_name else None, has_readings)
     if arrays.header and not any(theirs in by_name for _, theirs, _ in mapped):
         raise _none_of(arrays.name, columns, arrays.header)
+    columns.check_needed(mapped, layout.imposed_column, arrays.name)
     return Reading(
         dataclasses.replace(arrays, notes=(*arrays.notes, *notes)), presets_file.merge_columns(mapped, layout.mapped)
     )
@@ -173,6 +174,8 @@ def _of_signals(source: Source, layout: Layout, columns: Preset | None, between:
     mapped, notes = ((), ()) if columns is None else columns.mapped(found)
     if columns is not None and not any(found(theirs) for _, theirs, _ in mapped):
         raise _none_of(source.name, columns, [s.path for s in signals])
+    if columns is not None:
+        columns.check_needed(mapped, layout.imposed_column, source.name)
     mapped = presets_file.merge_columns(mapped, layout.mapped)
     chosen, clock, missing = _chosen(source, mapped, layout)
     for column, signal in chosen.items():
