@@ -96,7 +96,7 @@ def test_battery_sags_and_ends_clearly(mmrjax, tmp_path):
     current = float(full["total_current_A"])
     assert code == 0 and float(full["voltage_V"]) == pytest.approx(8 * (4.17 - 0.049 * (current + 1.5)))
     code, out, _ = mmrjax("simulate", "--battery", "--discharge", "2300", "--no-report", "--out", "empty")
-    assert code == 0 and "battery_empty: the battery has no charge left" in out
+    assert code == 0 and "battery empty" in out and "the battery's capacity is used up" in out
 
 
 @pytest.mark.slow
@@ -412,7 +412,7 @@ def test_full_disk_names_the_file_whichever_it_is(mmrjax, tmp_path, monkeypatch)
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(Path, "write_text", honest)
-    monkeypatch.setattr("sweeps.pages.runs_page.write_runs_page", picture)
+    monkeypatch.setattr("sweeps.report.page_renderer.write_report_page", picture)
     code, _, err = mmrjax("simulate", "--out", "r")
     assert code == 2 and "r.partial: No space left on device" in err
 
