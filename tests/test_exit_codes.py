@@ -91,7 +91,8 @@ def test_an_interrupt_within_a_callback_is_obeyed(monkeypatch, capsys):
         thing = Garbage()
         held = weakref.ref(thing, lambda _: signal.raise_signal(signal.SIGINT))
         del thing
-        time.sleep(5)
+        for _ in range(500):
+            time.sleep(0.01)
         return held
 
     monkeypatch.setattr(cli, "app", app)
