@@ -9,11 +9,10 @@ from types import ModuleType
 from typing import Any
 
 from mmrjax import __version__
+from mmrjax.model.balances import TORQUE_STEPS
 from sweeps.export.expressions import JAX, TORCH, Dialect, Symbol, lines_of, names_of
 from sweeps.export.joint import VARIABLES, Joint, Part
 
-#: Newton steps by which torques of the gearbox and of the wheel follow from those that depend on them.
-STEPS = 3
 _ARGUMENTS = (*VARIABLES, "load", "pull")
 
 
@@ -122,6 +121,7 @@ def step_lines(joint: Joint, library: _Library) -> list[str]:
     circuit = joint.of("supply") + joint.of("electrical")
     gear, track = joint.of("gearbox"), joint.of("track")
     later = {p.name: f'memory["{p.name}"]' for p in joint.remembering}
+    through = "(load + rotor)" if joint.accelerates else "load"
     lines = [
         "p, voltage, angle, wheel_speed = params, command, joint_position, joint_velocity",
         'motor_speed = p["gearbox.ratio"] * wheel_speed',
@@ -152,25 +152,42 @@ def step_lines(joint: Joint, library: _Library) -> list[str]:
         f"at_shaft = made - ({_sum(joint.of('motor'), '', later)})",
         f"load = at_shaft - {call_text(joint.of('idle')[0])}",
         f'through = p["gearbox.ratio"] * {call_text(joint.of("efficiency")[0])} * load',
-        *_solved("load", "through", gear, later),
-        *_solved("pull", "load", track, later),
+        *(_inertia_lines(joint) if joint.accelerates else ()),
+        *_solved("load", "through - rotor" if joint.accelerates else "through", gear, later),
+        *_solved("pull", "load - wheel" if joint.accelerates else "load", track, later),
         'info = {"current": current, "voltage": voltage, "motor_speed": motor_speed, "power": voltage * current,',
         '        "lost_winding": lost * current, "lost_motor": (made - at_shaft) * motor_speed,',
-        '        "lost_gearbox": at_shaft * motor_speed - load * wheel_speed,',
-        '        "lost_output": (load - pull) * wheel_speed}',
-        "return pull, memory, info",
+        f'        "lost_gearbox": at_shaft * motor_speed - {through} * wheel_speed,',
+        f'        "lost_output": (load{" - wheel" * joint.accelerates} - pull) * wheel_speed}}',
+        f"return pull{' + wheel + rotor' * joint.accelerates}, memory, info",
     ]
     return lines
+
+
+def _inertia_lines(joint: Joint) -> list[str]:
+    """Lines for the torques that accelerate rotor and wheel: the joint has their inertia, losses by torque do not."""
+    wheel = [f'p["{joint.configuration}.inertia"]', *map(call_text, joint.of("inertia"))]
+    return [
+        "# Torques that accelerate rotor and wheel, by the acceleration of the last step.",
+        'acceleration = (wheel_speed - state["speed"]) / dt',
+        'memory["speed"] = wheel_speed',
+        f"rotor = {_ROTOR} * acceleration",
+        f"wheel = ({' + '.join(wheel)}) * acceleration",
+    ]
+
+
+#: Inertia of the rotor at the joint.
+_ROTOR = 'p["motor.inertia"] * p["gearbox.ratio"] ** 2 * p["gearbox.efficiency_load"]'
 
 
 def _solved(name: str, given: str, parts: Sequence[Part], later: Mapping[str, str]) -> list[str]:
     """Lines that find x with x + losses(x) = given."""
     if not any(p.by for p in parts):
         return [f"{name} = {given} - ({_sum(parts, '', later)})" if parts else f"{name} = {given}"]
-    left = f"({name} + {_sum(parts, '', later)} - {given})"
+    left = f"({name} + {_sum(parts, '', later)} - ({given}))"
     return [
         f"{name} = {given}",
-        f"for _ in range({STEPS}):  # a loss that depends on the torque itself",
+        f"for _ in range({TORQUE_STEPS}):  # a loss that depends on the torque itself",
         f"    {name} = {name} - {left} / (1.0 + {_sum(parts, '_slope', later)})",
     ]
 
@@ -224,7 +241,10 @@ def torch_source(
 
 
 def _source(joint: Joint, constants: Sequence[Constant], library: _Library, what: str, notes: Sequence[str]) -> str:
-    states = ", ".join(f'"{n}": zero' for n in ("current", *(p.name for p in joint.remembering)))
+    states = ", ".join(f'"{n}": zero' for n in joint.states)
+    moving = (
+        "" if not joint.accelerates else ", and the joint's speed one step before [rad/s]: set it if the joint moves"
+    )
     added = "".join(f" + {call_text(p)}" for p in joint.of("inertia"))
     body = textwrap.indent("\n".join(step_lines(joint, library)), "    ")
     zero = "jnp.zeros(shape)" if library.dialect is JAX else "torch.zeros(shape, device=device)"
@@ -235,9 +255,9 @@ def _source(joint: Joint, constants: Sequence[Constant], library: _Library, what
         f"def armature(params):\n"
         f'    """Inertia of the rotor at the joint, J i² η, for the joint\'s own armature [kg·m²]."""\n'
         f"    p = params\n"
-        f'    return p["motor.inertia"] * p["gearbox.ratio"] ** 2 * p["gearbox.efficiency_load"]{added}\n\n\n'
+        f"    return {_ROTOR}{added}\n\n\n"
         f"def initial_state({given}):\n"
-        f'    """State at rest: current [A], and memories of effects."""\n'
+        f'    """State at rest: current [A], memories of effects{moving}."""\n'
         f"    zero = {zero}\n"
         f"    return {{{states}}}\n\n\n"
         f"def actuator(params, state, command, joint_position, joint_velocity, dt):\n"
