@@ -8,11 +8,13 @@ import dataclasses
 import importlib
 import io
 import json
+import os
 import re
 import shutil
 import subprocess
 import sys
 import types
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -241,9 +243,34 @@ def test_energy_of_the_actuator_is_what_is_given_and_lost(with_effects):
     np.testing.assert_allclose(info["power"], torque * speed + lost, rtol=1e-9)
 
 
+@pytest.mark.slow
+def test_serialised_actuator_has_the_same_bytes_in_every_process_and_folder(rig, tmp_path):
+    code = (
+        "import sys; from calibration.data import robot_file; "
+        "from sweeps.export import constants, jax_actuator, joint, law_source; "
+        "drive = joint.joint_of_robot(robot_file.find_robot_file('rig.toml')); "
+        "module = law_source.module_from_source(law_source.jax_source(drive, constants.constants_of(drive, None, None))); "
+        "sys.stdout.buffer.write(jax_actuator.serialise_actuator(module))"
+    )
+    found = []
+    for seed in "12":
+        (folder := tmp_path / seed).mkdir()
+        shutil.copy(rig, folder)
+        shutil.copytree(Path(law_source.__file__).parents[1], folder / "sweeps")
+        path = os.pathsep.join([str(folder), str(Path(law_source.__file__).parents[2])])
+        given = {**os.environ, "PYTHONHASHSEED": seed, "PYTHONPATH": path}
+        found.append(
+            subprocess.run(
+                [sys.executable, "-c", code], cwd=folder, env=given, check=True, stdout=subprocess.PIPE
+            ).stdout
+        )
+    assert found[0] == found[1] and len(found[0]) > 1000
+
+
 def test_serialised_actuator_computes_what_its_source_does(with_effects):
     drive, _, known = with_effects
     files = jax_actuator.jax_files(drive, known, [])
+    assert b".py" not in files["actuator.jaxexport"]  # no path of this machine
     module = law_source.module_from_source(files["actuator.py"])
     with jax.enable_x64(False):
         kept = jax.export.deserialize(bytearray(files["actuator.jaxexport"]))
@@ -582,12 +609,44 @@ def test_a_rig_whose_angle_alone_is_read_is_compared_by_its_motor(rig):
     assert {c.name for c in joints.channels_of(drive)} == {"motor_speed", "motor_current"}
 
 
+def test_error_without_data_is_that_of_mujoco_under_load_and_backward(rig):
+    """The grid was three runs forward without load: the stated 0.01 % of current was 28 % backward."""
+    losses = "[effects.gear_quadratic_loss]\namplitude = 0.05\n[effects.directional_viscous]\namplitude = 0.0012\n"
+    rig.write_text(RIG.split("torque_gravity")[0].replace("efficiency_load = 1.0", "efficiency_load = 0.81") + losses)
+    found = formats.export_format(robot_file.find_robot_file(str(rig)), "mujoco")
+    seen = found.comparison.situation
+    for way in (-1, 1):
+        assert {(v, m > 0) for v, m in zip(way * seen.command, way * seen.load, strict=True) if v > 0} >= {
+            (v, loaded) for v in (4.0, 8.0, 12.0) for loaded in (False, True)
+        }
+    kept = {f.name: f.kept for f in found.comparison.fates}
+    assert kept["directional_viscous"] < 0.01 and kept["gear_quadratic_loss"] < 0.95
+    rng = np.random.default_rng(4)
+    volts = rng.choice((-1.0, 1.0), 8) * rng.uniform(4, 12, 8)
+    grid = situation.export_grid(found.joint)
+    loads = rng.uniform(0, 0.5, 8) * np.sign(volts) * situation.stall_torque(found.joint, np.abs(volts))
+    columns = {"configuration": np.repeat("arm", 8), grid.layout.imposed_column: volts, "load_torque_Nm": loads}
+    other = situation.situation_of_joint(found.joint, dataclasses.replace(grid, columns=columns))
+    law = mujoco.translate_law(found.joint, 0.0)
+    theta = jnp.asarray([found.comparison.refitted[n] for n in law.names])
+    near = comparison.evaluate_law(law, theta, other.command, other.load, other.way)
+    motor = mujoco.mjcf_motor(found.joint, found.comparison.refitted)
+    got = mujoco.settle_in_mujoco(
+        found.files, motor, other, situation.AtJoint(*map(np.asarray, near)), range(len(other.load))
+    )
+    stated = found.comparison.of(comparison.EXPORTED)
+    assert len(other.load) >= 6
+    assert stated["total_current"] > 1
+    assert 100 * apart(got.current, other.inside.current) < 1.3 * stated["total_current"]
+    assert 100 * apart(got.speed, other.inside.speed) < 1.3 * stated["motor_speed"]
+
+
 def test_command_leaves_the_files_the_law_and_a_page(mmrjax, rig):
     code, out, _ = mmrjax("export", rig, "--to", "mujoco", "--out", "out", "--joint", "wheel")
     assert code == 0 and "series_resistance" not in out
     folder = rig.parent / "out"
     result = json.loads((folder / "result.json").read_text())
-    assert result["errors_percent"]["exported"]["motor_speed"] < 0.01
+    assert result["errors_percent"]["exported"]["motor_speed"] < 0.1  # heat at half of the stall torque
     assert {e["name"]: e["verdict"] for e in result["effects"]}["thermal_drift"] == "held"
     law = (folder / "LAW.md").read_text()
     for heading in (
