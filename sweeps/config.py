@@ -696,8 +696,8 @@ class Sensitivity(RobotPart, DataPart, FidelityPart, SupplyPart, OutputPart):
 
     method: str = option_field(
         "sobol",
-        "local, sobol, morris, derivative, or shapley (of a posterior)",
-        usual="sobol; with --posterior shapley",
+        "local, sobol, morris or derivative",
+        usual="sobol; with --posterior local",
     )
     configurations: Annotated[tuple[str, ...], Field(min_length=1)] | None = option_field(
         None, "Comma-separated, of the robot's", usual="all that it has"
@@ -725,7 +725,7 @@ class Sensitivity(RobotPart, DataPart, FidelityPart, SupplyPart, OutputPart):
         usual="current, speeds, slip, power, efficiency, steepest slope",
     )
     evaluations: Annotated[int, Field(ge=1, le=1_000_000_000)] | None = option_field(
-        None, "Model evaluations, at least, in all", usual="1000000; shapley 300000; runs over time 100000"
+        None, "Model evaluations, at least, in all", usual="1000000; runs over time 100000"
     )
     seed: Seed = option_field(0, "Of the sample")
     posterior: bool = option_field(False, "Take the inputs from the posterior.nc of the calibrated --robot")
@@ -741,9 +741,9 @@ class Sensitivity(RobotPart, DataPart, FidelityPart, SupplyPart, OutputPart):
     @model_validator(mode="before")
     @classmethod
     def _of_a_posterior(cls, values: Any) -> Any:
-        """Its inputs depend on one another, which Shapley effects alone are for."""
+        """Its inputs are correlated, and the methods that sample need independent ones."""
         if isinstance(values, dict) and values.get("posterior") and values.get("method") is None:
-            return {**values, "method": "shapley"}
+            return {**values, "method": "local"}
         return values
 
 

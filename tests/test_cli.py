@@ -586,10 +586,23 @@ def test_no_word_in_brackets_is_lost_from_a_help():
         assert rich.text.Text.from_markup(text).plain == text.replace("\\[", "["), text
 
 
+def test_help_lists_commands_under_four_headings_with_one_line_each():
+    commands = typer.main.get_command(cli.app).commands
+    assert {c.rich_help_panel for c in commands.values()} == {cli.MODEL, cli.DATA, cli.DESIGN, cli.ELSEWHERE}
+    for name, command in commands.items():
+        assert 0 < len((command.help or "").partition("\n\n")[0]) <= 62, name
+
+
+def test_mmrjax_alone_prints_commands_that_exist(mmrjax):
+    code, out, _ = mmrjax()
+    names = [line.split()[1] for line in out.splitlines() if line.startswith("  mmrjax ")]
+    assert code == 0 and len(names) == 3 and {*names} <= {*typer.main.get_command(cli.app).commands}
+
+
 @pytest.mark.slow
-def test_doctor_finds_this_installation_healthy(mmrjax):
-    code, out, _ = mmrjax("doctor")
-    assert code == 0 and "fails" not in out and "24 V / C_E" in out
+def test_check_passes_on_this_installation(mmrjax):
+    code, out, _ = mmrjax("--check")
+    assert code == 0 and "FAILED" not in out and "24 V / C_E" in out
     assert "compilation cache" in out and ("programs" in out or "off" in out)
 
 
@@ -606,7 +619,7 @@ def test_cache_is_neither_read_nor_written_when_it_is_not_wanted(tmp_path):
 
 def test_every_command_that_compiles_can_do_without_the_cache(monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", "200")
-    for command in ("simulate", "sweep", "compare", "reproduce", "render", "calibrate", "loop", "doctor"):
+    for command in ("simulate", "sweep", "compare", "reproduce", "render", "calibrate", "loop"):
         monkeypatch.setattr(sys, "argv", ["mmrjax", command, "--help"])
         with pytest.raises(SystemExit):
             cli.main()

@@ -14,7 +14,7 @@ from calibration.inference.calibration import calibrate
 from calibration.inference.fit_notes import Constant
 from calibration.inference.ranges import check_ranges
 from mmrjax.fidelities.steady import steady_batch
-from mmrjax.model import channels, paper_robots, params
+from mmrjax.model import paper_robots, params, quantities
 from mmrjax.model.chassis import Chassis
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.contact import Friction
@@ -700,7 +700,7 @@ quantum = "free"
     assert robot_file.read_robot(tmp_path / "again.toml").rig.instruments == robot.rig.instruments
     speeds = np.array([-4000, -3100, -2700, -1900, -1300, -1000, 1000, 1600, 2300, 2900, 3700, 4000.0])
     robot_there = params.replace(robot, {"brake.loss_coulomb": 0.15})
-    truth = steady_batch(robot_there, Conditions(motor_speed=speeds * channels.RPM)).reading["total_current"]
+    truth = steady_batch(robot_there, Conditions(motor_speed=speeds * quantities.RPM)).reading["total_current"]
     assert float(truth[0]) < 0  # without a table it is shown with its sign
     read = np.round(np.abs(np.asarray(truth)) / 0.004) * 0.004
     path = tmp_path / "t.csv"

@@ -16,7 +16,8 @@ from mmrjax.derived import turning_figures as derived
 from mmrjax.errors import UsageError
 from mmrjax.missions.profile import profile
 from mmrjax.model import paper_robots
-from mmrjax.model.channels import HEAT, SIDES
+from mmrjax.model.channels import SIDES
+from mmrjax.model.quantities import HEAT
 from sweeps import config, inputs
 from sweeps.commands import simulate
 from sweeps.commands import turn as turn_room

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import fnmatch
 import re
 import string
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -34,7 +35,8 @@ class PresetColumn:
     """A column of this program, and its source in a logger's file.
 
     Attributes:
-        mine: name of the column; theirs: names that it may have in the file; the first that it has is read.
+        mine: name of the column; theirs: names that it may have in the file, `*` for any text; the first that the
+            file has is read.
         factor: from its unit to the unit of `mine`; note: its meaning, for a note.
     """
 
@@ -129,10 +131,14 @@ def recognise_preset(names: Sequence[str]) -> str:
     ends = {*names, *(re.split(r"[/.]", name)[-1] for name in names)}
     for name in PACKAGED:
         preset = find_preset(SEPARATOR.join([name, *(f"{key}=1" for key in numbers_to_state(name))]))
-        count = sum(any(theirs in ends for theirs in column.theirs) for column in preset.columns)
+        count = sum(any(_among(theirs, ends) for theirs in column.theirs) for column in preset.columns)
         if count > most:
             best, most = name, count
     return best
+
+
+def _among(theirs: str, names: set[str]) -> bool:
+    return bool(fnmatch.filter(names, theirs)) if "*" in theirs else theirs in names
 
 
 def numbers_to_state(name: str) -> tuple[str, ...]:

@@ -16,8 +16,7 @@ from calibration.data.robot_file import RobotFile
 from calibration.data.runs import Runs
 from mmrjax.errors import count_noun
 from mmrjax.model import params
-from mmrjax.model.channels import VOLTAGE
-from mmrjax.model.quantities import RPM
+from mmrjax.model.quantities import RPM, VOLTAGE
 from mmrjax.model.robot import Robot
 from mmrjax.model.shaft import Shaft
 from mmrjax.model.signals import GRAVITY

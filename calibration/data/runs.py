@@ -59,9 +59,9 @@ def read_runs(
 
     Args:
         source: `measured`, `simulated_by_paper`, a path, or a table in memory. Files are CSV, Parquet, Feather,
-            Arrow, MATLAB, HDF5, NumPy, JSON, ROS bags, MCAP, ULog and MDF; a path of signals may follow `::`.
-            Tables in memory are a pandas or polars DataFrame, an Arrow table, an xarray Dataset, a dict of arrays,
-            or a list of records.
+            Arrow, spreadsheets, MATLAB, HDF5, NumPy, JSON, ROS bags, MCAP, ULog, MDF and WPILOG. A path of signals
+            may follow `::`. A pattern such as `runs/*.csv` reads files that are a run each. Tables in memory are a
+            pandas or polars DataFrame, an Arrow table, an xarray Dataset, a dict of arrays, or a list of records.
         columns: of the source, where its names are not this program's: a packaged preset (`vesc,pole_pairs=7`), a
             preset's file, or a dict such as `{"motor_speed_rpm": "speed"}`. They win over the robot's file.
         measured, battery, robot, of_turns: as for `of_arrays`.
@@ -81,7 +81,8 @@ def read_runs(
         with resources.as_file(resources.files("calibration") / "data" / PACKAGED[str(source)]) as path:
             arrays, mapped = delimited.read_csv_columns(path, str(source)), layout.mapped
     else:
-        if isinstance(source, str | Path) and not opening.split_source(str(source))[0].exists():
+        named = isinstance(source, str | Path) and not opening.files_of_group(str(source))
+        if named and not opening.split_source(str(source))[0].exists():
             raise BadData(f"{source}: no such file and no packaged table; packaged: {', '.join(PACKAGED)}")
         found = reading.read_columns(source, layout, preset, between)
         arrays, mapped = found.arrays, found.mapped

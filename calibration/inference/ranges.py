@@ -161,7 +161,7 @@ def _factor(measured: np.ndarray, possible: np.ndarray) -> float:
 
 def _units(channel: Channel, measured: np.ndarray, possible: np.ndarray, robot: Robot) -> list[str]:
     """Units that would make the readings possible, the most probable first; arguments as in `_factor`."""
-    known = {unit: channel.factor / size for unit, size in channel.other_units}
+    known = {unit: channel.factor / size for unit, size in channel.sizes.items() if size != channel.factor}
     if channel.name == "motor_speed" and robot.has_ground:
         known["rpm of the driving wheel"] = 1 / float(robot.gearbox.ratio)
     left = {unit: abs(math.log(_factor(measured / f, possible))) for unit, f in known.items()}

@@ -7,6 +7,7 @@ fraction of the time between rows, and friction at rest is not a function of spe
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any
 
 import equinox as eqx
@@ -17,9 +18,10 @@ from jaxtyping import Array, Float
 
 from calibration.inference.priors import DELAY
 from calibration.inference.problem import Problem
-from mmrjax.model import balances, channels
+from mmrjax.model import balances
 from mmrjax.model.channels import Channel
 from mmrjax.model.conditions import Conditions
+from mmrjax.model.quantities import CURRENT, VOLTAGE
 from mmrjax.model.signals import State
 
 #: Length of a window in times between rows, and its limits [s]; its fewest rows; distance between the starts of
@@ -74,7 +76,7 @@ def plan_of(problem: Problem) -> Plan | None:
     imposed = robot.rig.imposed
     pulsed = np.ptp(np.asarray(problem.observe.of_rows.duty)) > 0  # type: ignore[attr-defined]
     drawn = "total_current"  # proportional to the duty of pulses
-    currents = {k: c.name == drawn for k, c in shown.items() if c.rests_on == channels.CURRENT}
+    currents = {k: c.name == drawn for k, c in shown.items() if c.rests_on == CURRENT}
     speeds = [k for k, c in shown.items() if c.zero_at_rest and c.settled]
     angles = [k for k, c in shown.items() if c.zero_at_rest and not c.settled]
     if imposed == "motor_speed":
@@ -91,7 +93,7 @@ def plan_of(problem: Problem) -> Plan | None:
 
 
 def _voltages(shown: dict[int, Channel]) -> list[int]:
-    return [k for k, c in shown.items() if c.rests_on == channels.VOLTAGE]
+    return [k for k, c in shown.items() if c.rests_on == VOLTAGE]
 
 
 def _travels(channel: Channel) -> bool:
@@ -106,6 +108,7 @@ class Rows(eqx.Module):
         conditions: from the row on; shown: readings [SI].
         rate: slope of the channel of the motion, if that is an angle [SI/s]; way: of travel, 0 if it may be at rest.
         angle: of the output since the run's first row [rad]; since: time since the row before [s], 0 for the first.
+        memory: of the robot's effects that have one, by their names.
     """
 
     conditions: Conditions
@@ -114,6 +117,7 @@ class Rows(eqx.Module):
     way: Float[Array, " rows"]
     angle: Float[Array, " rows"]
     since: Float[Array, " rows"]
+    memory: Mapping[str, Float[Array, " rows"]] = eqx.field(default_factory=dict)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -86,8 +86,15 @@ def _current(robot: Robot, conditions: Conditions, state: State, way: Scalar) ->
     return current
 
 
-def _at(plan: Plan, robot: Robot, row: Rows, shown: Array, probes: frozenset[str]) -> tuple[Array, Array, Signals]:
-    """Returns terms f and y of a row's equations, and its signals; `probes`: effects that read no signal."""
+def row_terms(
+    plan: Plan, robot: Robot, row: Rows, shown: Array, probes: frozenset[str] = frozenset()
+) -> tuple[Array, Array, Signals]:
+    """Returns terms f and y of one row's equations, and its signals.
+
+    Args:
+        row: one of `Rows`, without its leading axis; shown: its readings [SI], shape (channels,).
+        probes: names of effects that read no signal.
+    """
     conditions, names = row.conditions, channels.channel_names(robot.channels)
     chassis = robot.chassis(conditions.configuration)
     none, one = jnp.zeros(()), jnp.ones(())
@@ -103,7 +110,8 @@ def _at(plan: Plan, robot: Robot, row: Rows, shown: Array, probes: frozenset[str
         read = shown[plan.motion] if not plan.angle else row.rate
         turning = read / unit * (robot.gearbox.ratio if plan.angle else 1.0)
     if plan.current >= 0:
-        current = shown[plan.current] / per_unit(plan.current, State(one, none, none, none, distance=none))
+        current_per_unit = 1 / per_unit(plan.current, State(one, none, none, none, distance=none))
+        current = shown[plan.current] * current_per_unit
     elif conditions.motor_current is not None:
         current = jnp.asarray(conditions.motor_current)
     else:
@@ -111,7 +119,7 @@ def _at(plan: Plan, robot: Robot, row: Rows, shown: Array, probes: frozenset[str
 
     def state_at(turning: Scalar, current: Scalar) -> State:
         rolls = chassis.radius * turning / robot.gearbox.ratio
-        return State(current, turning, rolls, none, distance=chassis.radius * row.angle)
+        return State(current, turning, rolls, none, row.memory, distance=chassis.radius * row.angle)
 
     def signals_at(turning: Scalar) -> tuple[Signals, Scalar]:
         at = state_at(turning, current)
@@ -120,9 +128,16 @@ def _at(plan: Plan, robot: Robot, row: Rows, shown: Array, probes: frozenset[str
             own = _current(robot, conditions, at, row.way)
         return balances.rolling_signals(robot, conditions, dataclasses.replace(at, current=own), row.way), own
 
+    first = balances.begin_signals(robot, conditions, state_at(turning, current))
+    errors = {
+        k: balances.effects_sum(robot, first, "sensor", names[k]) for k in (plan.motion, plan.current) if k >= 0
+    }
+    if plan.current >= 0:
+        current = current - errors[plan.current] * current_per_unit
+    if plan.motion >= 0 and not plan.angle:
+        turning = turning - errors[plan.motion] / unit
     if robot.has_ground and plan.mechanical and plan.travels:
         # The wheels turn faster than the load travels because of slip.
-        first = balances.begin_signals(robot, conditions, state_at(turning, current))
         if any(e.balance == "slip" and e.name not in probes for e in robot.effects):
             first = signals_at(turning)[0]
         turning = turning + balances.effects_sum(robot, first, "slip") * robot.gearbox.ratio / chassis.radius
@@ -135,7 +150,7 @@ def _at(plan: Plan, robot: Robot, row: Rows, shown: Array, probes: frozenset[str
     if plan.mechanical:  # in the instrument's unit, because a unit that depends on a parameter would shrink with it
         rise = unit * (1 / robot.gearbox.ratio if plan.angle else 1.0)
         f.append(rise * signals.acceleration_wheel * robot.gearbox.ratio)
-        y.append(shown[plan.motion] + (0.0 if plan.angle else unit * turning - read))
+        y.append(shown[plan.motion] + (-errors[plan.motion] if plan.angle else unit * turning - read))
     if plan.others:
         if robot.has_ground:
             creep = chassis.ground.speed_creep(signals.traction, signals.normal, signals.adhesion)
@@ -160,14 +175,14 @@ def _terms(problem: Problem, plan: Plan, rows: Rows, z: Array, effects: tuple[Sc
             amplitude = x[size : size + len(probes)]
             put = tuple(eqx.tree_at(lambda e: e.amplitude, p, a) for p, a in zip(probes, amplitude, strict=True))
             robot = dataclasses.replace(base, effects=(*base.effects, *put))
-            f, y, signals = _at(plan, robot, row, x[size + len(probes) :], frozenset(p.name for p in probes))
+            f, y, signals = row_terms(plan, robot, row, x[size + len(probes) :], frozenset(p.name for p in probes))
             return (f, y), ((f, y), signals)
 
         return jax.jacfwd(both, has_aux=True)(jnp.concatenate([z, jnp.zeros(len(probes)), row.shown]))
 
     slopes, (values, signals) = jax.vmap(one)(rows)
     base = problem.coordinates.robot(problem.base, z)
-    memory = _remembered(base, rows, signals, effects)
+    memory = memory_by_row(base, rows, signals, effects)
     entered = jax.vmap(lambda s, m: effect_terms(base, s, effects, m))(signals, memory)
     # An effect changes an equation like a defect of its balance. An effect of an instrument changes it like a
     # negative reading, or like a defect of that equation if the reading follows from the states.
@@ -198,7 +213,7 @@ def _terms(problem: Problem, plan: Plan, rows: Rows, z: Array, effects: tuple[Sc
     )
 
 
-def _remembered(robot: Robot, rows: Rows, signals: Signals, effects: tuple[ScoredEffect, ...]) -> list[Array]:
+def memory_by_row(robot: Robot, rows: Rows, signals: Signals, effects: tuple[ScoredEffect, ...]) -> list[Array]:
     """Returns the memory of each effect at each row and point of its grid, shape (rows, grid)."""
     count = rows.since.shape[0]
     nothing = [jnp.zeros((count, len(e.at))) for e in effects]

@@ -20,10 +20,9 @@ from mmrjax.errors import count_noun
 from mmrjax.fidelities import outputs
 from mmrjax.missions import mission_batch
 from mmrjax.missions.mission import Mission
-from mmrjax.missions.mission_batch import JOULE_PER_WH
 from mmrjax.missions.mission_steps import MARKS
 from mmrjax.missions.profile import PAIRS
-from mmrjax.model import balances, channels, ground
+from mmrjax.model import balances, channels, ground, quantities
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.paper_tables import lateral_ratio
 from mmrjax.model.power import COULOMB_PER_MAH
@@ -337,20 +336,20 @@ def _course(
     of_shaft = {}
     if not robot.has_ground:
         of_shaft = {
-            "motor_speed_rpm": np.asarray(reading["motor_speed"]) / channels.RPM,
-            "demanded_motor_speed_rpm": demanded * per_speed / channels.RPM,
+            "motor_speed_rpm": np.asarray(reading["motor_speed"]) / quantities.RPM,
+            "demanded_motor_speed_rpm": demanded * per_speed / quantities.RPM,
         }
     return {
         "run_id": np.full(len(picked), name),
         "time_s": course.time + late,
         **{c.column: np.asarray(reading[c.name]) / c.factor for c in robot.channels},
-        "theoretical_speed_mm_s": signals.speed_theoretical / channels.MM,
+        "theoretical_speed_mm_s": signals.speed_theoretical / quantities.MM,
         "slip": np.asarray(ground.slip_ratio(signals.speed, signals.speed_theoretical)),
         "distance_m": course.path,
         "displacement_m": course.distance,
         "voltage_V": signals.voltage,
         "traction_N": float(robot.sides) * signals.traction,
-        "demanded_speed_mm_s": demanded / channels.MM,
+        "demanded_speed_mm_s": demanded / quantities.MM,
         **of_shaft,
         "duty": signals.duty,
         "source_voltage_V": signals.voltage_source,
@@ -359,7 +358,7 @@ def _course(
         **({} if signals.load_torque is None else {LOAD: signals.load_torque}),
         "winding_temperature_C": winding if source.turns else np.asarray(reading["winding_temperature"]),
         "housing_temperature_C": housing,
-        "energy_Wh": course.energy / JOULE_PER_WH,
+        "energy_Wh": course.energy / quantities.SIZES["Wh"],
         "state_of_charge": left if battery else np.full(len(picked), np.nan),
         "cycle": course.segment // source.segments + 1,
         "segment": segment + 1,

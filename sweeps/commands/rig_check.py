@@ -24,9 +24,10 @@ from calibration.inference.fit_posterior import undetermined_names
 from calibration.inference.foresight import Determined, Foresight
 from mmrjax.errors import count_noun
 from mmrjax.model import channels
-from mmrjax.model.channels import HEAT, Channel
+from mmrjax.model.channels import Channel
 from mmrjax.model.driver import FAST
 from mmrjax.model.motor import UNLIMITED
+from mmrjax.model.quantities import HEAT
 from mmrjax.model.robot import Robot
 from mmrjax.model.shaft import Shaft
 from sweeps.commands.rig_template import EXAMPLE

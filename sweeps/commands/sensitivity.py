@@ -123,7 +123,7 @@ def _operating_points(
         )
     table8: dict[str, tuple[float, ...]] = {}
     if layout.table8:
-        table8 = CORNERS if config.method in ("sobol", "morris", "shapley") else WHOLE
+        table8 = CORNERS if config.method in ("sobol", "morris") else WHOLE
         if not set(OF_TURNS).isdisjoint(ranges):  # which settle on level ground alone
             table8 = {**table8, "slopes_deg": (0.0,)}
     axes = {key: getattr(config, key) or table8.get(key) for key in (*WHOLE, "motor_speeds_rpm")}

@@ -22,7 +22,7 @@ from mmrjax.derived.start_figures import curve_peak
 from mmrjax.fidelities import outputs, start_stages
 from mmrjax.fidelities.base import History, Run
 from mmrjax.fidelities.result import result_of_signals
-from mmrjax.model import channels, ground
+from mmrjax.model import channels, ground, quantities
 from mmrjax.model.channels import Channel
 from mmrjax.model.motor import Motor
 from mmrjax.model.params import Scalar
@@ -250,7 +250,7 @@ def history_table(robot: Robot, history: History, runs: records.Runs) -> dict[st
         "run_id": np.repeat(_names(runs), history.time.shape[-1]),
         "time_s": np.ravel(history.time),
         **{c.column: np.ravel(history.reading[c.name]) / c.factor for c in shown},
-        "theoretical_speed_mm_s": np.ravel(signals.speed_theoretical) / channels.MM,
+        "theoretical_speed_mm_s": np.ravel(signals.speed_theoretical) / quantities.MM,
         "slip": np.ravel(ground.slip_ratio(signals.speed, signals.speed_theoretical)),
         "displacement_m": np.ravel(history.distance),
         "voltage_V": np.ravel(signals.voltage),

@@ -20,7 +20,7 @@ from mmrjax.derived import turning_figures
 from mmrjax.fidelities import outputs
 from mmrjax.fidelities.base import History, Run
 from mmrjax.fidelities.rest import voltage_at_rest
-from mmrjax.model import channels
+from mmrjax.model import channels, quantities
 from mmrjax.model.channels import Channel
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.robot import Robot
@@ -84,7 +84,7 @@ def simulate_turn(config: configuration.Simulate, given: str | dict[str, Any], o
             folder.write_table("history.csv", history_table(history, shown))
         own = {name: np.asarray(values) for name, values in first.columns.items()}
         table = {**run.condition_table(robot, runs), **_columns(robot, shown, asked, first), **own}
-        turn = {name: _number(table[name][0]) for name in turning_figures.COLUMNS}
+        turn = {name: _number(table[name][0]) for name in (q.column for q in quantities.TABLE["turn"])}
         facts = turn_words.turn_in_words(robot, {name: values[0] for name, values in table.items()}, _ended(history))
         print_output(facts.answer)
         if facts.sides:

@@ -9,8 +9,8 @@ import numpy as np
 
 from calibration.data.robot_file import RobotFile
 from mmrjax.missions import mission_batch
-from mmrjax.model.channels import WARMING
 from mmrjax.model.energy import SINKS
+from mmrjax.model.quantities import WARMING
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import FLAGS
 from sweeps import capabilities

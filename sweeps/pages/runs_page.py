@@ -11,8 +11,8 @@ import numpy as np
 
 from calibration.data.robot_file import RobotFile
 from mmrjax.fidelities.base import Run
-from mmrjax.model.channels import VOLTAGE, Channel
-from mmrjax.model.quantities import MM, RPM
+from mmrjax.model.channels import Channel
+from mmrjax.model.quantities import MM, RPM, VOLTAGE
 from mmrjax.model.robot import Robot
 from sweeps import capabilities
 from sweeps.pages import posture_words, power_figures, words

@@ -69,12 +69,15 @@ BAG = Format("a ROS bag", "bags", "of_bag", "rosbags")
 MCAP = Format("an MCAP file", "bags", "of_bag", "rosbags")
 ULOG = Format("a ULog file", "ulog", "of_ulog", "pyulog")
 MDF = Format("an MDF file", "mdf", "of_mdf", "asammdf")
+WPILOG = Format("a WPILOG file", "wpilog", "of_wpilog")
+WORKBOOK = Format("a workbook", "workbook", "of_workbook", "python-calamine")
 
 #: First bytes of each format.
 BEGINNINGS = {
     b"PAR1": PARQUET, b"ARROW1": ARROW, b"\xff\xff\xff\xff": ARROW, b"\x89HDF\r\n\x1a\n": HDF5,
     b"MATLAB 7.3": HDF5, b"MATLAB 5.0": MATLAB, b"\x93NUMPY": NPY, b"#ROSBAG": BAG, b"\x89MCAP": MCAP,
-    b"ULog": ULOG, b"MDF     ": MDF, b"UnFinMF ": MDF,
+    b"ULog": ULOG, b"MDF     ": MDF, b"UnFinMF ": MDF, b"WPILOG": WPILOG,
+    b"\xd0\xcf\x11\xe0": WORKBOOK,
 }  # fmt: skip
 #: Formats whose files begin with anything, by suffix.
 SUFFIXES = {".mat": MATLAB, ".db3": BAG, ".jsonl": JSON, ".ndjson": JSON}
@@ -99,6 +102,14 @@ def split_source(source: str) -> tuple[Path, str]:
     return Path(file), within
 
 
+def files_of_group(source: str) -> list[Path]:
+    """Files that match a pattern such as `runs/*.csv`, in order; empty if it is a file's name, or none matches."""
+    path = Path(source)
+    if not set("*?[") & {*source} or path.exists():
+        return []
+    return sorted(file for file in path.parent.glob(path.name) if not file.name.startswith("."))
+
+
 def format_of(path: Path, name: str) -> Format | None:
     """Format of a file or of a bag's folder; None: text in columns.
 
@@ -117,20 +128,23 @@ def format_of(path: Path, name: str) -> Format | None:
     for magic, found in BEGINNINGS.items():
         if begin.startswith(magic):
             return found
-    if begin.startswith(b"PK\x03\x04") and _is_npz(path):
-        return NPZ
+    if begin.startswith(b"PK\x03\x04") and (kind := _kind_of_zip(path)) is not None:
+        return kind
     if any(text.match(begin) for text, word in input_files.TEXTS.items() if word == "JSON"):
         return JSON
     return SUFFIXES.get(path.suffix.lower())
 
 
-def _is_npz(path: Path) -> bool:
+def _kind_of_zip(path: Path) -> Format | None:
+    """Format of a zip file by the names in it, by its suffix if it is damaged."""
     try:
         with zipfile.ZipFile(path) as archive:
             names = archive.namelist()
     except (zipfile.BadZipFile, OSError):
-        return path.suffix.lower() == ".npz"
-    return any(name.endswith(".npy") for name in names)
+        names = {".npz": [".npy"], ".xlsx": ["xl/"], ".ods": ["content.xml"]}.get(path.suffix.lower(), [])
+    if any(name.endswith(".npy") for name in names):
+        return NPZ
+    return WORKBOOK if any(name.startswith("xl/") or name == "content.xml" for name in names) else None
 
 
 def open_signals(path: Path, within: str, name: str, form: Format) -> Source:

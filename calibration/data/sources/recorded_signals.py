@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import fnmatch
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
@@ -74,8 +75,13 @@ def path_parts(path: str) -> list[str]:
 
 
 def matching_signals(signals: Iterable[Signal], name: str) -> list[Signal]:
-    """Signals that match a name: the signal with this path, else signals whose path ends with its parts."""
+    """Signals that match a name: the signal with this path, else signals whose path ends with its parts.
+
+    A `*` in the name stands for any text of the path.
+    """
     pool = list(signals)
+    if "*" in name:
+        return [s for s in pool if fnmatch.fnmatchcase(s.path, name)]
     if exact := [s for s in pool if s.path == name]:
         return exact
     wanted = path_parts(name)
