@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections.abc import Iterable
@@ -16,6 +15,7 @@ from calibration.data import presets_file
 from calibration.data.columns import ROWS
 from calibration.data.input_errors import BadConfiguration, allowed_words, parse_number
 from calibration.data.input_files import toml_content, toml_text
+from calibration.data.writing import toml_value
 from calibration.inference import solvers
 from mmrjax import fidelities
 from mmrjax.model import channels
@@ -942,19 +942,7 @@ def as_toml(config: Part) -> str:
     for key, value in values.items():
         if value is None or key in tables:  # None is left to the fidelity or the robot
             continue
-        lines.append(f"{key} = {_toml(value)}")
+        lines.append(f"{key} = {toml_value(value)}")
     for key, table in tables.items():
-        lines += ["", f"[{key}]", *(f'"{name}" = {_toml(value)}' for name, value in table.items())]
+        lines += ["", f"[{key}]", *(f"{toml_value(name)} = {toml_value(value)}" for name, value in table.items())]
     return "\n".join(lines) + "\n"
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False)
-    if isinstance(value, tuple | list):
-        return "[" + ", ".join(_toml(v) for v in value) + "]"
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{json.dumps(name)} = {_toml(v)}" for name, v in value.items()) + "}"
-    return repr(value)

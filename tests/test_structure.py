@@ -300,6 +300,7 @@ KEPT = {
     ("calibration/discovery/scales.py", "_nominal"): "pure: signals of the nominal robot",
     ("sweeps/cli.py", "os.environ"): "set for jax, before it is imported",
     ("sweeps/cli.py", "jax.config"): "a switch of jax, once a process",
+    ("sweeps/export/jax_actuator.py", "jax.config"): "set back after a program is lowered",
     (
         "sweeps/points/cluster.py",
         "_compiled",

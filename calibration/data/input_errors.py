@@ -6,15 +6,15 @@ import math
 from typing import Any
 
 from mmrjax.errors import allowed_words as allowed_words
-from mmrjax.errors import shorten
+from mmrjax.errors import printable, shorten
 
 
 class InputError(Exception):
     """Error of input from outside; the message is one sentence for a person."""
 
     def __init__(self, message: str) -> None:
-        """Keeps the message `shortened`."""
-        super().__init__(shorten(message))
+        """Keeps the message, `shorten` and `printable`."""
+        super().__init__(shorten(printable(message)))
 
     exit_code = 2
 

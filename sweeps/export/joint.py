@@ -89,9 +89,10 @@ class Joint:
 
     @property
     def name(self) -> str:
-        """Name of the robot, as a word of letters, digits and underscores."""
+        """Name of the robot, as a name that Python, C and XML allow."""
         stem = self.file.name.rpartition("/")[2].removesuffix(".toml")
-        return "".join(c if c.isalnum() and c.isascii() else "_" for c in stem) or "robot"
+        word = "".join(c if c.isalnum() and c.isascii() else "_" for c in stem)
+        return word if word.isidentifier() else f"robot_{word}"
 
     @property
     def limit(self) -> float | None:

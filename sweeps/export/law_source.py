@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import ast
+import contextlib
 import dataclasses
+import json
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from types import ModuleType
 from typing import Any
 
+from calibration.data.input_errors import BadConfiguration
 from mmrjax import __version__
+from mmrjax.errors import printable
 from mmrjax.model.balances import TORQUE_STEPS
 from sweeps.export.expressions import JAX, TORCH, Dialect, Symbol, lines_of, names_of
 from sweeps.export.joint import VARIABLES, Joint, Part
@@ -65,11 +70,21 @@ def function_arguments(symbol: Symbol) -> list[str]:
     return [*found, "memory"] if any(n.startswith("memory.") for n in used) else found
 
 
+def quoted(word: str) -> str:
+    """A word as a literal of Python, in double quotes."""
+    return json.dumps(word)
+
+
+def _docstring(text: str) -> str:
+    """A text as a docstring: names in it come from users, so nothing in it can end the literal."""
+    return '"""' + printable(text).replace("\\", "\\\\").replace('"', '\\"') + '"""'
+
+
 def _function(name: str, symbol: Symbol, document: str, dialect: Dialect) -> str:
     def spelled(word: str) -> str:
         if word in _ARGUMENTS:
             return word
-        return "memory" if word.startswith("memory.") else f'p["{word}"]'
+        return "memory" if word.startswith("memory.") else f"p[{quoted(word)}]"
 
     head = f"def {name}({', '.join(['p', *function_arguments(symbol)])}):"
     body = textwrap.indent(_wrapped(document), "    ")
@@ -78,9 +93,8 @@ def _function(name: str, symbol: Symbol, document: str, dialect: Dialect) -> str
 
 def _wrapped(document: str) -> str:
     lines = textwrap.wrap(document, 108)
-    if len(lines) == 1 and len(document) < 104:
-        return f'"""{document}"""'
-    return '"""' + "\n".join(lines) + '\n"""'
+    short = len(lines) == 1 and len(document) < 104
+    return _docstring(document if short else "\n".join(lines) + "\n")
 
 
 def call_text(part: Part, suffix: str = "", memory: str | None = None) -> str:
@@ -104,7 +118,7 @@ def functions_text(joint: Joint, dialect: Dialect) -> str:
     for part in joint.parts:
         unit = "" if part.unit == "-" else f" [{part.unit}]"
         meaning = part.meaning if part.meaning.endswith(".") else f"{part.meaning}." if part.meaning else ""
-        document = f"{part.equation.rstrip('.')}{unit}. {meaning}".strip().replace("\\", "")
+        document = f"{part.equation.rstrip('.')}{unit}. {meaning}".strip()
         found.append(_function(part.name, part.value, document, dialect))
         if part.by:
             what = f"Derivative of `{part.name}` by `{part.by}`."
@@ -166,7 +180,7 @@ def step_lines(joint: Joint, library: _Library) -> list[str]:
 
 def _inertia_lines(joint: Joint) -> list[str]:
     """Lines for the torques that accelerate rotor and wheel: the joint has their inertia, losses by torque do not."""
-    wheel = [f'p["{joint.configuration}.inertia"]', *map(call_text, joint.of("inertia"))]
+    wheel = [f"p[{quoted(f'{joint.configuration}.inertia')}]", *map(call_text, joint.of("inertia"))]
     return [
         "# Torques that accelerate rotor and wheel, by the acceleration of the last step.",
         'acceleration = (wheel_speed - state["speed"]) / dt',
@@ -196,8 +210,8 @@ def constants_text(constants: Sequence[Constant], name: str = "PARAMS") -> str:
     """Text of the table of the law's numbers, each with its unit, meaning, interval and source."""
     lines = [f"{name} = {{"]
     for c in constants:
-        lines += [f"    # {text}" for text in textwrap.wrap(_about(c), 106)]
-        lines.append(f'    "{c.name}": {c.value!r},')
+        lines += [f"    # {text}" for text in textwrap.wrap(printable(_about(c)), 106)]
+        lines.append(f"    {quoted(c.name)}: {c.value!r},")
     return "\n".join([*lines, "}"])
 
 
@@ -209,7 +223,7 @@ def _about(c: Constant) -> str:
 def _header(joint: Joint, what: str, notes: Sequence[str]) -> str:
     head = f"{what} of {joint.file.name}, {joint.configuration}. Written by mmrjax {__version__}."
     body = "\n\n".join("\n".join(textwrap.wrap(n, 108)) for n in notes)
-    return f'"""{head}\n\n{body}\n"""\n'
+    return _docstring(f"{head}\n\n{body}\n") + "\n"
 
 
 _DOCUMENT = '''"""One step of the drive: torque at the joint, state after the step, and what happens inside.
@@ -266,10 +280,39 @@ def _source(joint: Joint, constants: Sequence[Constant], library: _Library, what
 
 
 def module_from_source(source: str, name: str = "exported_law") -> ModuleType:
-    """Module of a source text."""
+    """Module of the source of a law.
+
+    Raises:
+        BadConfiguration: it has more than an import, literals, and functions that call each other and the library.
+    """
+    tree = ast.parse(source)
+    if not _states_a_law(tree):
+        raise BadConfiguration("export: the generated source would do more than state a law, so it is not executed")
     module = ModuleType(name)
-    exec(compile(source, f"<{name}>", "exec"), module.__dict__)
+    exec(compile(tree, f"<{name}>", "exec"), module.__dict__)
     return module
+
+
+def _states_a_law(tree: ast.Module) -> bool:
+    """True if a source imports one library, assigns literals, and defines functions that call only these."""
+    defined = {node.name for node in tree.body if isinstance(node, ast.FunctionDef)} | {"range"}
+    for node in tree.body:
+        if isinstance(node, ast.Assign):
+            with contextlib.suppress(ValueError):
+                ast.literal_eval(node.value)
+                continue
+            return False
+        literal = isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
+        if not literal and not isinstance(node, ast.Import | ast.FunctionDef):
+            return False
+    called = [node.func for node in ast.walk(tree) if isinstance(node, ast.Call)]
+    imported = [name.name for node in ast.walk(tree) if isinstance(node, ast.Import) for name in node.names]
+    return imported in (["jax.numpy"], ["numpy"], ["torch"]) and all(
+        f.id in defined
+        if isinstance(f, ast.Name)
+        else isinstance(f, ast.Attribute) and isinstance(f.value, ast.Name) and f.value.id in ("jnp", "torch")
+        for f in called
+    )
 
 
 def constant_values(constants: Sequence[Constant]) -> dict[str, Any]:
