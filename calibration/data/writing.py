@@ -98,7 +98,7 @@ def cell_text(value: Any) -> str:
     """A cell of a table; a word that a spreadsheet would run as a formula gets an apostrophe (`cell_word`)."""
     if isinstance(value, float | np.floating):
         return f"{value:.9g}" if math.isfinite(value) else ""
-    text = printable(str(value))
+    text = printable(str(value)).replace("\n", " ")
     return f"'{text}" if isinstance(value, str) and _FORMULA.match(text) and not _is_number(text) else text
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 import contextlib
 import dataclasses
-import json
+import re
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from types import ModuleType
@@ -71,8 +71,8 @@ def function_arguments(symbol: Symbol) -> list[str]:
 
 
 def quoted(word: str) -> str:
-    """A word as a literal of Python, in double quotes."""
-    return json.dumps(word)
+    """A word as a literal of Python."""
+    return f'"{word}"' if re.fullmatch(r"[\w.-]+", word) else repr(word)
 
 
 def _docstring(text: str) -> str:
