@@ -21,9 +21,9 @@ from calibration.data import delimited, robot_file, writing
 from calibration.data.input_errors import BadConfiguration, BadData
 from mmrjax.errors import UsageError, printable
 from mmrjax.model.robot import Configurations
-from sweeps import console
 from sweeps import config as configuration
-from sweeps.export import constants, feed_forward, law_source, mjlab, mujoco
+from sweeps import console
+from sweeps.export import feed_forward, law_source, mjlab, mujoco
 from sweeps.export import joint as joints
 from sweeps.report import page_renderer
 from sweeps.report.document import Column, Document, Note, Section, Table
