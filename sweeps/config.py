@@ -15,7 +15,6 @@ from calibration.data import presets_file
 from calibration.data.columns import ROWS
 from calibration.data.input_errors import BadConfiguration, allowed_words, parse_number
 from calibration.data.input_files import toml_content, toml_text
-from calibration.data.writing import toml_value
 from calibration.inference import solvers
 from mmrjax import fidelities
 from mmrjax.model import channels
@@ -933,6 +932,8 @@ def parse_axis(option: str, text: str | None) -> tuple[float, ...] | None:
 
 def as_toml(config: Part) -> str:
     """The resolved configuration; `--config` accepts it."""
+    from calibration.data.writing import toml_value  # with NumPy, which --help does not wait for
+
     lines = []
     values = config.model_dump()
     values["set"] = values.pop("set")  # tables come last
