@@ -8,7 +8,7 @@ import re
 from collections.abc import Iterable
 
 #: A word longer than the first number is cut to `SHOWN` characters; longest path; longest message.
-WORD, SHOWN, PATH, LONGEST = 80, 40, 300, 900
+WORD, SHOWN, PATH, LONGEST = 80, 40, 240, 400
 
 
 #: Characters that Python does not call printable and a text may contain: line feed, tab, and spaces of typesetting.

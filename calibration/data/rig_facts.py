@@ -71,8 +71,9 @@ def _motor(robot: Robot) -> Iterator[Fact]:
         odd = "" if fastest < 2 * motor.speed_limit else "more than twice motor.speed_limit; look at torque_constant"
         yield Fact(f"speed without load at {three_digits(voltage)} V", f"{three_digits(fastest / RPM)} rpm", odd)
     if with_resistance and voltage is not None:
-        odd = _within(voltage / resistance, 0.02, 1000, "look at motor.resistance")
-        yield Fact(f"stall current at {three_digits(voltage)} V", f"{three_digits(voltage / resistance)} A", odd)
+        stall = float(motor.current_stall(voltage))
+        odd = _within(stall, 0.02, 1000, "look at motor.resistance")
+        yield Fact(f"stall current at {three_digits(voltage)} V", f"{three_digits(stall)} A", odd)
     if with_constant and with_resistance:
         size = constant**2 / resistance
         odd = _within(
@@ -119,7 +120,7 @@ def _drawn(robot: Robot, what: str, torque: float, places: str) -> Iterator[Fact
     current, limit = _current(robot, torque), robot.motor.voltage_limit
     odd = _within(current, 0, 200, f"look at {places}, and the gearbox")
     if limit is not None and robot.knows(["motor.resistance"]):
-        stall = limit / float(robot.motor.resistance)
+        stall = float(robot.motor.current_stall(limit))
         if current > stall:
             odd = (
                 f"above the stall current {three_digits(stall)} A at {three_digits(limit)} V, so it stands; "
@@ -172,7 +173,7 @@ def _vehicle(robot: Robot, name: str) -> Iterator[Fact]:
     limit = robot.motor.voltage_limit
     if limit is None or not robot.knows(["motor.resistance"]):
         return
-    pull = _torque(robot, limit / float(robot.motor.resistance)) - float(load.track.loss_coulomb)
+    pull = _torque(robot, float(robot.motor.current_stall(limit))) - float(load.track.loss_coulomb)
     climb = pull * sides / (radius * mass * GRAVITY) - rolling - guide
     odd = "" if climb > 0 else "its motors cannot move it; look at mass, ratio, torque_constant and resistance"
     angle = "any" if climb >= 1 else f"{math.degrees(math.asin(max(climb, 0.0))):.0f}°"

@@ -9,7 +9,7 @@ import numpy as np
 
 from calibration.data.input_errors import BadData, bound_text
 from calibration.data.runs import Runs
-from calibration.described import described
+from calibration.described import describe
 from calibration.inference import observers
 from calibration.inference.fit_notes import Note, OffBy, SlopesIn, Turned
 from calibration.inference.operating import operating_readings
@@ -91,7 +91,7 @@ def check_ranges(runs: Runs, robot: Robot) -> list[Note]:
             runs.layout.imposed_column,
         )
         if off > REFUSED:
-            raise BadData(f"{runs.source}, {described(found)}")
+            raise BadData(f"{runs.source}, {describe(found)}")
         said.append(found)
     return [*said, *_turned(runs, measured, possible), *_slopes(runs, measured, possible[1], robot)]
 

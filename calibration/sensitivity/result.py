@@ -9,7 +9,7 @@ import numpy as np
 from scipy import stats
 
 from calibration.data.runs import Runs
-from calibration.described import described, sentences
+from calibration.described import describe, sentences
 from calibration.inference.fit_notes import Note
 from calibration.sensitivity.replicates import LEVEL, REPLICATES, Estimate
 from mmrjax.model.quantities import Quantity
@@ -270,7 +270,7 @@ class SensitivityResult:
 
     def statement(self) -> str:
         """What decides these outputs, in one sentence."""
-        return described(self)
+        return describe(self)
 
     @property
     def notes(self) -> tuple[str, ...]:

@@ -11,11 +11,7 @@ import dataclasses
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from mmrjax.model.robot import Robot
-    from mmrjax.model.signals import Signals
+from typing import Any
 
 DEG = math.pi / 180  # rad
 RPM = math.pi / 30  # rad/s
@@ -236,7 +232,7 @@ class Channel(Quantity):
     sd_share: float = 0.01
     _: dataclasses.KW_ONLY
     word: str = ""
-    signal: str | Callable[[Robot, Signals], Any] = ""
+    signal: str | Callable[..., Any] = ""
     resolution: int = 1
     zero_at_rest: bool = False
     sign: str = TRAVEL
@@ -250,7 +246,7 @@ class Channel(Quantity):
         super().__post_init__()
         self._complete(word=self.word or self.name, signal=self.signal or self.name)
 
-    def read(self, robot: Robot, signals: Signals) -> Any:
+    def read(self, robot: Any, signals: Any) -> Any:
         """Reading of an ideal instrument [SI]."""
         return getattr(signals, self.signal) if isinstance(self.signal, str) else self.signal(robot, signals)
 
@@ -290,14 +286,14 @@ def channel_of_name(name: str) -> Channel:
     return next(c for c in channel_rows() if c.name == name)
 
 
-def _winding_temperature(robot: Robot, signals: Signals) -> Any:
+def _winding_temperature(robot: Any, signals: Any) -> Any:
     """Winding temperature [°C]: the present one if it is followed, else after long running at this current."""
     if signals.temperature is not None:
         return signals.temperature
     return robot.motor.temperature_settled(signals.current)
 
 
-def _position(robot: Robot, signals: Signals) -> Any:
+def _position(robot: Any, signals: Any) -> Any:
     """Distance that the driven wheel has rolled [m]."""
     return robot.chassis(signals.configuration).radius * signals.angle
 

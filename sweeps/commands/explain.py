@@ -12,6 +12,7 @@ import numpy as np
 
 from calibration.data import effect_file
 from calibration.data.input_errors import BadConfiguration, bound_text
+from calibration.words import effect_words
 from mmrjax import derived, effects
 from mmrjax.effects import Effect
 from mmrjax.errors import similar_words
@@ -22,7 +23,6 @@ from mmrjax.model.params import Parameter, Spec
 from mmrjax.model.signals import Result
 from sweeps.console import print_output
 from sweeps.pages import words
-from sweeps.report.words import effect_words
 from sweeps.results.climb_results import VERDICTS
 
 #: A line of an explanation: heading and text.

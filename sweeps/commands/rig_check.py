@@ -15,11 +15,12 @@ from calibration.data.input_errors import BadConfiguration
 from calibration.data.rig_facts import Fact, Origin
 from calibration.data.rig_file import FREE
 from calibration.data.runs import Runs
-from calibration.described import described, sentences
+from calibration.described import describe, sentences
 from calibration.inference import foresight, identifiability, priors
 from calibration.inference.fit_notes import Determination
 from calibration.inference.fit_posterior import undetermined_names
 from calibration.inference.foresight import Determined, Foresight
+from calibration.words import fit_words
 from mmrjax.errors import count_noun
 from mmrjax.model import channels
 from mmrjax.model.channels import Channel
@@ -33,7 +34,6 @@ from sweeps.config import RobotPart
 from sweeps.console import print_json, print_output
 from sweeps.inputs import load_robot, read_runs
 from sweeps.pages import words
-from sweeps.report.words import fit_words
 
 
 @dataclasses.dataclass(frozen=True)
@@ -195,7 +195,7 @@ class RigCheck:
     def determined(self, parameter: Determined) -> str:
         """`yes`, `no`, or with which parameters together the table determines one."""
         assert self.foresight is not None
-        return described(Determination.of(parameter.name, parameter.held, self.foresight.together))
+        return describe(Determination.of(parameter.name, parameter.held, self.foresight.together))
 
     def to_json(self) -> dict[str, Any]:
         """The whole, for machines."""

@@ -10,9 +10,9 @@ import numpy as np
 
 from calibration.data.robot_file import RobotFile
 from calibration.sensitivity.result import NEGLIGIBLE, OutputStudy, SensitivityResult, interactions
+from calibration.words import sensitivity_words
 from sweeps.pages import sensitivity_figures
 from sweeps.pages.page import Album, printed_number, render_page, robot_section
-from sweeps.report.words import sensitivity_words
 
 #: Pairs of a table of interactions.
 PAIRS = 5
