@@ -13,7 +13,7 @@ from calibration.data import delimited, presets_file, proposals
 from calibration.data.columns import Layout
 from calibration.data.input_errors import BadData
 from calibration.data.named_arrays import NamedArrays, column_numbers
-from calibration.data.sources import in_memory, one_clock, opening
+from calibration.data.sources import one_clock, opening
 from calibration.data.sources.recorded_signals import Clock, Signal, Source, unit_of_clock, values_in_memory
 from mmrjax.model import channels
 
@@ -91,7 +91,8 @@ def inspect_source(source: str | Path | Any) -> Contents:
     if len(clocks) > 1:
         notes.append(f"{found.name}: signals have {len(clocks)} clocks; rows become those of the densest channel")
     still = {fact.path for fact in facts if fact.least == fact.greatest}
-    moving = sorted(found.signals, key=lambda signal: signal.path in still)  # of several, the first that changes
+    read = (dataclasses.replace(s, refused=f.refused) for s, f in zip(found.signals, facts, strict=True))
+    moving = sorted(read, key=lambda signal: signal.path in still)  # of several, the first that changes
     lines = dict(_proposed(moving))
     proposed = tuple(lines[s.path] for s in found.signals if s.path in lines)
     return Contents(found.name, found.kind, facts, tuple(notes), preset, () if preset else proposed)
@@ -99,8 +100,7 @@ def inspect_source(source: str | Path | Any) -> Contents:
 
 def _source(source: Any) -> Source:
     if not isinstance(source, str | Path):
-        kind, signals = in_memory.of_object(source)
-        return Source(kind, kind, signals)
+        return opening.open_object(source)
     path, within = opening.split_source(str(source))
     name = path.name or str(source)
     if not path.exists():
@@ -130,7 +130,9 @@ def _clock_of_table(source: Source) -> Signal | None:
     """The signal of a table that is its time, by its name."""
     if any(s.clock is not None for s in source.signals):
         return None
-    return next((s for s in source.signals if _unit_of_time(s.name) is not None and not s.words), None)
+    return next(
+        (s for s in source.signals if _unit_of_time(s.name) is not None and not s.words and not s.refused), None
+    )
 
 
 def _clock(signal: Signal | None) -> Clock | None:
@@ -150,12 +152,10 @@ def _facts(signal: Signal, clock: Clock | None, times: dict[int, tuple[np.ndarra
     )
     if signal.refused or not signal.length:
         return found
-    if opening.VALUE * signal.length > opening.SHARE * opening.available_memory():
-        return dataclasses.replace(found, refused="has more values than the free memory holds")
     try:
         values = signal.load()
     except BadData as error:
-        return dataclasses.replace(found, refused=str(error))
+        return dataclasses.replace(found, refused=str(error).partition(f"{signal.path}: ")[2] or str(error))
     if values.dtype.kind in "US":
         return dataclasses.replace(found, words=tuple(map(str, dict.fromkeys(values[:10_000].tolist())))[:5])
     if values.dtype.kind in "mM":
@@ -177,7 +177,10 @@ def _facts(signal: Signal, clock: Clock | None, times: dict[int, tuple[np.ndarra
 
 
 def _seconds(clock: Clock) -> tuple[np.ndarray, str] | str:
-    found = one_clock.clock_seconds(clock)
+    try:
+        found = one_clock.clock_seconds(clock)
+    except BadData as error:
+        return str(error)
     back = np.flatnonzero(np.diff(found.time) < 0)
     if back.size:
         return f"{clock.name} goes back at sample {back[0] + 2}"

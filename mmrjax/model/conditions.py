@@ -22,8 +22,12 @@ Number = float | Sequence[float] | np.ndarray | Array
 
 #: Conditions that can be stated for each side.
 OF_SIDES = ("duty_left", "duty_right", "open_left", "open_right", "motor_speed_left", "motor_speed_right")
+#: Conditions that may be true or false.
+SWITCHES = ("battery", "open", "open_left", "open_right")
 #: Conditions that free a robot to turn if they are stated.
 OF_TURNS = (*OF_SIDES, "heading_deg")
+#: Conditions that every run has.
+NUMBERS = ("voltage", "slope_deg", "payload", "battery", "discharge", "adhesion", "order", "duty", "open")
 
 
 class Named(eqx.Module):
@@ -158,13 +162,14 @@ class Conditions(eqx.Module):
         if not isinstance(duty, np.ndarray | jax.Array | None) and None not in (duty_left, duty_right):
             raise UsageError(sides_contradiction(("duty", *OF_SIDES[:2])))
         duty = 1.0 if duty is None else duty
-        stated: dict[str, Any] = {name: x for name, x in locals().items() if name in CONDITIONS and x is not None}
+        given: dict[str, Any] = locals()
+        stated = {name: given[name] for name in CONDITIONS if given[name] is not None or name in NUMBERS}
         which: Any = configuration
         if not isinstance(configuration, jax.Array | Named):
             words = np.asarray(configuration)
-            which = Named.of(words) if words.dtype.kind == "U" else words
-        which = which if isinstance(which, Named) else _number(which, int)
-        numbers = {name: _number(x) for name, x in stated.items()}
+            which = Named.of(words) if words.dtype.kind == "U" else configuration
+        which = which if isinstance(which, Named) else _number("configuration", which, int)
+        numbers = {name: _number(name, x) for name, x in stated.items()}
         shapes = {name: x.shape for name, x in {"configuration": which, **numbers}.items()}
         try:
             shape = np.broadcast_shapes(*shapes.values())
@@ -172,7 +177,7 @@ class Conditions(eqx.Module):
             listed = ", ".join(f"{name} {s}" for name, s in shapes.items() if s)
             raise ValueError(f"Conditions: shapes do not broadcast to one another: {listed}") from None
         self.configuration = jax.tree.map(lambda x: _broadcast(x, shape), which)
-        self.begin = None if begin is None else _broadcast(_number(begin, int), shape)
+        self.begin = None if begin is None else _broadcast(_number("begin", begin, int), shape)
         # an equal number for all runs is stored once: most fields of a large batch are 0 or 1
         shared: dict[float, Array] = {}
         for name in CONDITIONS:
@@ -258,9 +263,20 @@ def sides_contradiction(stated: Collection[str]) -> str:
     return f"{known}: got it without {lacking}; state both"
 
 
-def _number(x: Any, kind: type = float) -> Any:
-    """Array of numbers of that kind; NumPy input stays NumPy's, so that no JAX operation is compiled for it."""
-    return jnp.asarray(x, kind) if isinstance(x, jax.Array) else np.asarray(x, kind)
+def _number(name: str, x: Any, kind: type = float) -> Any:
+    """Array of numbers of that kind; NumPy input stays NumPy's, so that no JAX operation is compiled for it.
+
+    Raises:
+        UsageError: words, dates, complex numbers, truth values of a quantity, or parts of a whole number.
+    """
+    if isinstance(x, jax.Array):
+        return jnp.asarray(x, kind)
+    stated = np.asarray(x)
+    whole = kind is float or stated.dtype.kind in "biu" or (stated.dtype.kind == "f" and not (stated % 1).any())
+    if stated.dtype.kind not in ("biuf" if name in SWITCHES else "iuf") or not whole:
+        expected = "numbers" if kind is float else "whole numbers" + ", or names" * (name == "configuration")
+        raise UsageError(f"Conditions: {name}: got {x!r}; expected {expected}")
+    return stated.astype(kind)
 
 
 def _broadcast(x: Any, shape: tuple[int, ...]) -> Any:
