@@ -14,7 +14,7 @@ from pydantic_core import PydanticCustomError
 
 from calibration.data import presets_file
 from calibration.data.columns import ROWS
-from calibration.data.input_errors import BadConfiguration, allowed_words, parse_number
+from calibration.data.input_errors import SEEDS, BadConfiguration, allowed_words, parse_number
 from calibration.data.input_files import toml_content, toml_text
 from calibration.inference import solvers
 from mmrjax import fidelities
@@ -37,7 +37,7 @@ Voltage = Annotated[float, Field(ge=_VOLTAGE[0], le=_VOLTAGE[1], allow_inf_nan=F
 PROFILED = "drive"
 #: Longest run of `simulate` where none is stated [s]: short enough that the start is seen.
 SHOWN = 5.0
-Seed = Annotated[int, Field(ge=0, le=2**32 - 1)]
+Seed = Annotated[int, Field(ge=0, le=SEEDS)]
 
 
 def option_field(default: Any, description: str, **extra: Any) -> Any:
@@ -286,7 +286,7 @@ class InferencePart(Part):
         "times too), and without such assumes 2, 0.5, 1 %, halved and doubled",
     )
     rows: Annotated[int, Field(ge=100, le=1_000_000)] = option_field(
-        ROWS, "Largest number of rows used of a log over time; a longer log is thinned evenly in time"
+        ROWS, "Largest number of rows used; more are thinned evenly, those of a log in time, others over conditions"
     )
     seed: Seed = option_field(0, "Random seed")
 

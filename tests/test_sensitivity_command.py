@@ -252,7 +252,7 @@ def test_posterior_of_a_robot_is_its_inputs_and_gives_runs_their_uncertainty(mmr
     code, out, _ = mmrjax(
         "simulate", "--robot", "robot.toml", "--posterior", "60", "--voltage", "24", "--no-report", "--out", "u"
     )
-    assert code == 0 and re.search(r"total current \[A\] +│ \d\.\d+ ± 0\.\d+", out)
+    assert code == 0 and re.search(r"total current \[A\] +\d\.\d+ ± 0\.\d+", out)
     (row,) = table(tmp_path / "u" / "runs.csv")
     low, high = float(row["speed_mm_s_lower"]), float(row["speed_mm_s_upper"])
     assert low < float(row["speed_mm_s"]) < high

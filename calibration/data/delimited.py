@@ -21,6 +21,8 @@ from mmrjax.model import channels, quantities
 
 #: Size of a file from which on plain tables are read as arrays at once [bytes].
 LONG = 2_000_000
+#: Memory of a cell that is read as text [bytes].
+CELL = 80
 #: Separators of cells other than a comma, and a word for each.
 SEPARATORS = {";": "semicolons", "\t": "tabs"}
 _SEPARATOR = re.compile(r"[,;\t]")
@@ -47,8 +49,11 @@ def read_csv_columns(path: Path, name: str) -> NamedArrays:
     if len(content) >= LONG and (plain := _plain(name, content)) is not None:
         return plain
     decoded, encoded = decode_text(name, content)
-    rows, notes = split_cells(name, below_comments([line for line in decoded.splitlines() if line.strip()]))
+    input_files.check_memory(name, CELL * sum(decoded.count(mark) for mark in (",", *SEPARATORS)))
+    lines = below_comments([line for line in decoded.splitlines() if line.strip()])
+    rows, notes = split_cells(name, lines)
     header, body = (rows[0], rows[1:]) if rows else ([], [])
+    input_files.check_declared(name, len(header))
     units = row_of_units(header, body[0]) if body else ()
     if units:
         body = body[1:]
@@ -81,6 +86,7 @@ def _plain(name: str, content: bytes) -> NamedArrays | None:
         first = content[: content.find(b"\n", end + 1)].decode().splitlines()
     except UnicodeDecodeError:
         return None
+    input_files.check_declared(name, first[0].count(",") + 1)
     header, row = ([cell.strip() for cell in line.split(",")] for line in (*first, "", "")[:2])
     if len(header) < 2 or not all(header) or len(header) != len(row) or row_of_units(header, row):
         return None

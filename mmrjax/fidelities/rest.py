@@ -51,7 +51,7 @@ def travel_direction(robot: Robot, conditions: Conditions) -> Array:
         return jax.lax.stop_gradient(jnp.where(conditions.motor_speed >= 0, 1.0, -1.0))
     chassis = robot.chassis(conditions.configuration)
     mass = chassis.mass + conditions.payload if conditions.total_mass is None else conditions.total_mass
-    stall = robot.motor.torque_electromagnetic(voltage_at_rest(robot, conditions) / robot.motor.resistance)
+    stall = robot.motor.torque_electromagnetic(robot.motor.current_stall(voltage_at_rest(robot, conditions)))
     weight = chassis.torque_weight(mass * (1 / robot.sides), conditions.slope)
     weight = weight if conditions.load_torque is None else weight + conditions.load_torque
     return jax.lax.stop_gradient(jnp.where(robot.gearbox.ratio * stall >= weight, 1.0, -1.0))
@@ -219,7 +219,7 @@ def current_settled(robot: Robot, conditions: Conditions, state: State) -> Scala
         here = dataclasses.replace(state, current=current)
         return balances.driven_signals(robot, conditions, here, jnp.zeros_like(state.speed)).voltage_left
 
-    guess = left(jnp.zeros_like(state.current)) / robot.motor.resistance
+    guess = robot.motor.current_stall(left(jnp.zeros_like(state.current)))
     first, second = left(0.5 * guess), left(guess)
     slope = (second - first) / jnp.where(guess == 0, 1.0, 0.5 * guess)
     return guess - jnp.where(guess == 0, 0.0, second / jnp.where(guess == 0, 1.0, slope))
