@@ -8,6 +8,7 @@ import io
 import json
 import math
 import re
+import shutil
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, TextIO
@@ -29,10 +30,36 @@ def naming_file(path: Path | str) -> Iterator[None]:
         raise
 
 
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Path next to a file, which replaces the file when the block ends.
+
+    After an error the file is as it was. A full disk is an example: writing into the file would have emptied it.
+    """
+    path = path.resolve()  # the file that a link names
+    if path.exists() and not path.is_file():  # a device or a pipe
+        with naming_file(path):
+            yield path
+        return
+    aside = path.with_name(f".{path.stem[:100]}.writing{path.suffix}")
+    try:
+        with naming_file(path):
+            yield aside
+            if path.exists():
+                shutil.copymode(path, aside)
+            aside.replace(path)
+    except OSError as error:
+        if error.filename == str(aside):
+            error.filename = str(path)
+        raise
+    finally:
+        aside.unlink(missing_ok=True)
+
+
 def write_text(path: Path, text: str) -> None:
     """Write a text file."""
-    with naming_file(path):
-        path.write_text(text, encoding="utf-8")
+    with replacing(path) as aside:
+        aside.write_text(text, encoding="utf-8")
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
@@ -71,9 +98,9 @@ def write_table(path: Path, columns: Mapping[str, np.ndarray], tables: str = "cs
     if tables == "parquet":
         from pyarrow import parquet
 
-        with naming_file(path):
-            parquet.write_table(frames.to_arrow(columns), path.with_suffix(".parquet"))
-    with naming_file(path), path.open("w", newline="", encoding="utf-8") as stream:
+        with replacing(path.with_suffix(".parquet")) as aside:
+            parquet.write_table(frames.to_arrow(columns), aside)
+    with replacing(path) as aside, aside.open("w", newline="", encoding="utf-8") as stream:
         _write_rows(stream, columns)
 
 
