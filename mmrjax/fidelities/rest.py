@@ -51,7 +51,8 @@ def travel_direction(robot: Robot, conditions: Conditions) -> Array:
         return jax.lax.stop_gradient(jnp.where(conditions.motor_speed >= 0, 1.0, -1.0))
     chassis = robot.chassis(conditions.configuration)
     mass = chassis.mass + conditions.payload if conditions.total_mass is None else conditions.total_mass
-    stall = robot.motor.torque_electromagnetic(voltage_at_rest(robot, conditions) / robot.motor.resistance)
+    stall = voltage_at_rest(robot, conditions) / _resistance(robot, conditions)
+    stall = robot.motor.torque_electromagnetic(admitted_current(robot, conditions, stall)[0])
     weight = chassis.torque_weight(mass * (1 / robot.sides), conditions.slope)
     weight = weight if conditions.load_torque is None else weight + conditions.load_torque
     return jax.lax.stop_gradient(jnp.where(robot.gearbox.ratio * stall >= weight, 1.0, -1.0))
@@ -63,9 +64,39 @@ def voltage_at_rest(robot: Robot, conditions: Conditions) -> Array:
         return jnp.asarray(robot.motor.voltage_back(conditions.motor_speed))
     if conditions.motor_current is not None:  # an amplifier's, see `balances.electrical`
         return jnp.asarray(robot.motor.resistance * conditions.motor_current)
+    return conditions.duty * jnp.where(conditions.open > 0.5, 0.0, _source_at_rest(robot, conditions))
+
+
+def _source_at_rest(robot: Robot, conditions: Conditions) -> Array:
     battery = robot.battery.voltage(0.0, conditions.discharge)
-    source = jnp.where(conditions.battery > 0.5, battery, conditions.voltage)
-    return conditions.duty * jnp.where(conditions.open > 0.5, 0.0, source)
+    return jnp.where(conditions.battery > 0.5, battery, conditions.voltage)
+
+
+def _resistance(robot: Robot, conditions: Conditions) -> Scalar:
+    """Resistance of a motor and its share of the battery's, at the demanded duty [ohm]."""
+    battery, duty = robot.battery, conditions.duty
+    if conditions.voltage_follows:
+        return robot.motor.resistance
+    behind = robot.sides * battery.cells * battery.resistance * duty * robot.driver.share_drawn(duty)
+    return robot.motor.resistance + jnp.where(conditions.battery > 0.5, behind, 0.0)
+
+
+def admitted_current(robot: Robot, conditions: Conditions, wanted: Scalar) -> tuple[Scalar, Scalar]:
+    """Current that limit and diode of the driver admit [A], and the voltage that holds back the rest [V].
+
+    See `Driver.admitted`. An amplifier that imposes speed or current has neither.
+    """
+    if conditions.voltage_follows:
+        return wanted, jnp.zeros_like(wanted)
+    resistance, source = _resistance(robot, conditions), _source_at_rest(robot, conditions)
+    resistance, source = jax.lax.stop_gradient((resistance, source))
+    current, held = robot.driver.admitted(wanted, conditions.polarity * conditions.duty, jnp.abs(source) / resistance)
+    return current, resistance * held
+
+
+def without_diode(robot: Robot) -> Robot:
+    """Same robot on a supply that takes current back, for balances at an `admitted_current`."""
+    return dataclasses.replace(robot, driver=dataclasses.replace(robot.driver, returns_current=True))
 
 
 def _carried(robot: Robot, conditions: Conditions, state: State, direction: Scalar) -> Signals:
@@ -215,14 +246,17 @@ def slides_in_place(robot: Robot, conditions: Conditions) -> Array:
 def current_settled(robot: Robot, conditions: Conditions, state: State) -> Scalar:
     """Current [A] that settles at the motor speed of `state`, by the secant of its voltage balance."""
 
-    def left(current: Scalar) -> Scalar:
+    def left(wanted: Scalar) -> Scalar:
+        current, held = admitted_current(robot, conditions, wanted)
         here = dataclasses.replace(state, current=current)
-        return balances.driven_signals(robot, conditions, here, jnp.zeros_like(state.speed)).voltage_left
+        none = jnp.zeros_like(state.speed)
+        return balances.driven_signals(without_diode(robot), conditions, here, none).voltage_left - held
 
     guess = left(jnp.zeros_like(state.current)) / robot.motor.resistance
     first, second = left(0.5 * guess), left(guess)
     slope = (second - first) / jnp.where(guess == 0, 1.0, 0.5 * guess)
-    return guess - jnp.where(guess == 0, 0.0, second / jnp.where(guess == 0, 1.0, slope))
+    wanted = guess - jnp.where(guess == 0, 0.0, second / jnp.where(guess == 0, 1.0, slope))
+    return admitted_current(robot, conditions, wanted)[0]
 
 
 def current_at_rest(robot: Robot, conditions: Conditions, state: State) -> Scalar:

@@ -30,7 +30,9 @@ Residual = Callable[[Vector, Any, Any], Vector]
 Function = Callable[[Vector, tuple[Any, Any]], tuple[Vector, Any]]
 
 #: Linearisations after which a search has failed.
-MAX_STEPS = 40
+MAX_STEPS = 60
+#: Turns of full steps before a search is bounded.
+PATIENCE = 8
 
 
 def _linearised(fn: Function, y: Vector, args: Any, apart: bool) -> tuple[Matrix, Vector]:
@@ -78,21 +80,55 @@ def _watched(value: Array, index: int, moved: set[int]) -> Array:
 
 
 def _small(value: Vector, tolerance: float) -> Bool[Array, ""]:
-    return functools.reduce(jnp.logical_and, [jnp.abs(x) < tolerance for x in value])
+    return functools.reduce(jnp.logical_and, [jnp.abs(x) < tolerance for x in value], jnp.asarray(True))
 
 
-def _step(fn: Function, y: Vector, args: Any, apart: bool) -> tuple[Vector, Vector]:
-    """y - J⁻¹ f, with unknowns unchanged that would not be finite; and J⁻¹ f."""
-    jacobian, value = _linearised(fn, y, args, apart)
-    step = tuple(jnp.zeros(()) if x is None else x for x in substitute(factorise(jacobian), value))
-    return tuple(jnp.where(jnp.isfinite(b), a - b, a) for a, b in zip(y, step, strict=True)), step
+def _solution(factors: list, value: Vector) -> Vector:
+    return tuple(jnp.zeros(()) if x is None else x for x in substitute(factors, value))
+
+
+def _less(y: Vector, step: Vector) -> Vector:
+    """y - step, with unknowns unchanged that would not be finite."""
+    return tuple(jnp.where(jnp.isfinite(b), a - b, a) for a, b in zip(y, step, strict=True))
 
 
 class Turning(eqx.Module):
-    """State of a search: the unknowns, and True once f is 0 at them."""
+    """State of a search.
+
+    Full steps between branches of f can alternate without end. After `PATIENCE` turns, the last unknown therefore
+    stays between the places where its equation was last below and above 0, with the other equations solved.
+
+    Attributes:
+        y: the unknowns; solved: True once f is 0 at them; turns: number of linearisations.
+        low, high: ends of the interval of the last unknown.
+    """
 
     y: Vector
     solved: Bool[Array, ""]
+    turns: Array
+    low: Array
+    high: Array
+
+    @staticmethod
+    def begun(y: Vector, solved: Array) -> Turning:
+        """A search without turns."""
+        return Turning(y, solved, jnp.asarray(0), jnp.full_like(y[-1], -jnp.inf), jnp.full_like(y[-1], jnp.inf))
+
+    def after(self, jacobian: Matrix, value: Vector, atol: float) -> Turning:
+        """The search after one turn, from ∂f/∂y and f at its unknowns."""
+        factors = factorise(jacobian)
+        step, here, left = _solution(factors, value), self.y[-1], value[-1]
+        # Such a small step leaves an error of the order of its square.
+        solved, others, late = _small(step, atol**0.7), _small(value[:-1], atol**0.5), self.turns >= PATIENCE
+        low = jnp.where(others & (left < 0), here, self.low)
+        high = jnp.where(others & (left > 0), here, self.high)
+        then = here - step[-1]
+        leaves = late & others & ~solved & jnp.isfinite(high - low) & ((then <= low) | (then >= high))
+        share = jnp.where(leaves, (here - 0.5 * (low + high)) / jnp.where(leaves, step[-1], 1.0), 1.0)
+        aside = (*_solution([row[:-1] for row in factors[:-1]], value[:-1]), jnp.zeros_like(here))
+        alone = late & ~others & ~solved
+        taken = tuple(jnp.where(alone, b, jnp.where(leaves, share * a, a)) for a, b in zip(step, aside, strict=True))
+        return Turning(_less(self.y, taken), solved, self.turns + 1, low, high)
 
 
 class FewUnknowns(optx.AbstractRootFinder[Vector, Vector, Any, Turning]):
@@ -128,9 +164,10 @@ class FewUnknowns(optx.AbstractRootFinder[Vector, Vector, Any, Turning]):
     ) -> Turning:
         """Returns the state of a search before its first turn."""
         if not self.linear:
-            return Turning(y, jnp.asarray(False))
-        y, _ = _step(fn, y, args, self.apart)
-        return Turning(y, _small(fn(y, args)[0], self.atol))
+            return Turning.begun(y, jnp.asarray(False))
+        jacobian, value = _linearised(fn, y, args, self.apart)
+        y = _less(y, _solution(factorise(jacobian), value))
+        return Turning.begun(y, _small(fn(y, args)[0], self.atol))
 
     def step(
         self, fn: Function, y: Vector, args: tuple[Any, Any], options: dict[str, Any], state: Turning, tags: frozenset
@@ -141,9 +178,8 @@ class FewUnknowns(optx.AbstractRootFinder[Vector, Vector, Any, Turning]):
             # turns before the first of them, even if there is none.
             shared, own = args
             args = shared, jax.tree.map(lambda x: jnp.where(state.solved, jnp.ones_like(x), x), own)
-        # Such a small step leaves an error of the order of its square.
-        y, step = _step(fn, state.y, args, self.apart)
-        return y, Turning(y, _small(step, self.atol**0.7)), None
+        state = state.after(*_linearised(fn, state.y, args, self.apart), self.atol)
+        return state.y, state, None
 
     def terminate(
         self, fn: Function, y: Vector, args: Any, options: dict[str, Any], state: Turning, tags: frozenset
