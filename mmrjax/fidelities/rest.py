@@ -11,6 +11,7 @@ from jaxtyping import Array
 from mmrjax.fidelities.result import movers_slip, travel_status
 from mmrjax.model import balances
 from mmrjax.model.conditions import Conditions
+from mmrjax.model.driver import STEEPNESS
 from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import NOT_SETTLED, SLIDES, STALLED, Signals, State
@@ -44,15 +45,18 @@ def smallest(*values: Scalar) -> Array:
 def travel_direction(robot: Robot, conditions: Conditions) -> Array:
     """Direction in which a robot can travel, 1 forward or -1 backward, from the torque on its shafts at rest.
 
-    The torque is that of the motors at stall current less gravity's. Friction can hold the robot but not reverse it.
-    With an imposed motor speed, the direction of that speed.
+    The torque is that of the motors at stall current, within the driver's limit, less gravity's. Friction can hold the
+    robot but not reverse it. With an imposed motor speed, the direction of that speed.
     """
     if conditions.motor_speed is not None:
         return jax.lax.stop_gradient(jnp.where(conditions.motor_speed >= 0, 1.0, -1.0))
     chassis = robot.chassis(conditions.configuration)
     mass = chassis.mass + conditions.payload if conditions.total_mass is None else conditions.total_mass
-    stall = voltage_at_rest(robot, conditions) / _resistance(robot, conditions)
-    stall = robot.motor.torque_electromagnetic(admitted_current(robot, conditions, stall)[0])
+    stall = voltage_at_rest(robot, conditions) / robot.motor.resistance
+    if not conditions.voltage_follows:
+        most = robot.driver.current_limit * (1 + jnp.abs(conditions.duty) * (1 / STEEPNESS))
+        stall = one_sided.clip(stall, -most, most)
+    stall = robot.motor.torque_electromagnetic(stall)
     weight = chassis.torque_weight(mass * (1 / robot.sides), conditions.slope)
     weight = weight if conditions.load_torque is None else weight + conditions.load_torque
     return jax.lax.stop_gradient(jnp.where(robot.gearbox.ratio * stall >= weight, 1.0, -1.0))
@@ -72,25 +76,19 @@ def _source_at_rest(robot: Robot, conditions: Conditions) -> Array:
     return jnp.where(conditions.battery > 0.5, battery, conditions.voltage)
 
 
-def _resistance(robot: Robot, conditions: Conditions) -> Scalar:
-    """Resistance of a motor and its share of the battery's, at the demanded duty [ohm]."""
-    battery, duty = robot.battery, conditions.duty
-    if conditions.voltage_follows:
-        return robot.motor.resistance
-    behind = robot.sides * battery.cells * battery.resistance * duty * robot.driver.share_drawn(duty)
-    return robot.motor.resistance + jnp.where(conditions.battery > 0.5, behind, 0.0)
-
-
 def admitted_current(robot: Robot, conditions: Conditions, wanted: Scalar) -> tuple[Scalar, Scalar]:
     """Current that limit and diode of the driver admit [A], and the voltage that holds back the rest [V].
 
-    See `Driver.admitted`. An amplifier that imposes speed or current has neither.
+    See `Driver.admitted`, with the resistance of a motor and its share of the battery's. An amplifier that imposes
+    speed or current has neither limit nor diode.
     """
     if conditions.voltage_follows:
         return wanted, jnp.zeros_like(wanted)
-    resistance, source = _resistance(robot, conditions), _source_at_rest(robot, conditions)
-    resistance, source = jax.lax.stop_gradient((resistance, source))
-    current, held = robot.driver.admitted(wanted, conditions.polarity * conditions.duty, jnp.abs(source) / resistance)
+    battery, duty = robot.battery, conditions.duty
+    behind = robot.sides * battery.cells * battery.resistance * duty * robot.driver.share_drawn(duty)
+    resistance = robot.motor.resistance + jnp.where(conditions.battery > 0.5, behind, 0.0)
+    resistance, source = jax.lax.stop_gradient((resistance, _source_at_rest(robot, conditions)))
+    current, held = robot.driver.admitted(wanted, conditions.polarity * duty, jnp.abs(source) / resistance)
     return current, resistance * held
 
 

@@ -87,6 +87,11 @@ def _residual(unknowns: Vector, robot: Robot, own: tuple[Conditions, Array]) -> 
     return _settled_at(robot, _sound(robot, conditions)[1], unknowns, sense)[2]
 
 
+def _residual_unlimited(unknowns: Vector, robot: Robot, own: tuple[Conditions, Array]) -> Vector:
+    """`_residual` in most runs: linear, without the driver's limit and diode."""
+    return _residual(unknowns, dataclasses.replace(robot, driver=robot.driver.unlimited()), own)
+
+
 def _sound(robot: Robot, conditions: Conditions) -> tuple[Array, Conditions]:
     """Returns whether a run's conditions are finite and its mass positive, and the conditions, set to 1 if not.
 
@@ -126,7 +131,8 @@ def _root(robot: Robot, conditions: Conditions, large: bool = True) -> tuple[Vec
     sound = _sound(robot, conditions)[1]
     start = jax.lax.stop_gradient(_start(robot, sound))
     own = conditions, travel_direction(robot, sound)
-    return root(_residual, start, robot, own, tolerance, large and not robot.effects, large)
+    linear = _residual_unlimited if large and not robot.effects else None
+    return root(_residual, start, robot, own, tolerance, linear, large)
 
 
 @compiled

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import equinox as eqx
 import jax.numpy as jnp
 
@@ -66,6 +68,10 @@ class Driver(eqx.Module):
     returns_current: bool = eqx.field(default=True, static=True)
     decay: str = eqx.field(default=SLOW, static=True)
 
+    def unlimited(self) -> Driver:
+        """Same driver without limit and diode."""
+        return dataclasses.replace(self, current_limit=None, returns_current=True)
+
     def voltage(self, source: Scalar, duty: Scalar, pause: Scalar, back: Scalar) -> Scalar:
         """Mean voltage at the motors [V]; `pause`: share of a period without pulses [-]; `back`: back-EMF E [V]."""
         pulses = duty * source
@@ -87,7 +93,9 @@ class Driver(eqx.Module):
 
         `polarity` is the sign of the supply voltage.
         """
-        over = at_least(0.0, jnp.abs(current) / self.current_limit - 1)
+        if self.current_limit is None:
+            return duty
+        over = at_least(0.0, jnp.abs(current) * (1 / self.current_limit) - 1)
         return clip(duty - polarity * jnp.sign(current) * STEEPNESS * over, -1.0, 1.0)
 
     def limits(self, current: Scalar) -> Scalar:
@@ -126,6 +134,8 @@ class Driver(eqx.Module):
         Args:
             wanted: any number; duty: as for `conducts`; most: |U_s|/R, or any number above 0 if it has no source [A].
         """
+        if self.current_limit is None:
+            return wanted, jnp.zeros_like(wanted)
         way, limit = jnp.where(wanted < 0, -1.0, 1.0), self.current_limit
         along = way * duty
         over, step = at_least(jnp.abs(wanted) - limit, 0.0), limit / STEEPNESS

@@ -22,6 +22,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float
 
 from mmrjax.numerics.linear_equations import Entry, Matrix, Vector, factorise, regularise, substitute
+from mmrjax.numerics.rarely import compute_rarely
 
 #: f(y, shared, own): as many scalars as unknowns, so that in a batch each is an array.
 Residual = Callable[[Vector, Any, Any], Vector]
@@ -109,11 +110,6 @@ class Turning(eqx.Module):
     low: Array
     high: Array
 
-    @staticmethod
-    def begun(y: Vector, solved: Array) -> Turning:
-        """A search without turns."""
-        return Turning(y, solved, jnp.asarray(0), jnp.full_like(y[-1], -jnp.inf), jnp.full_like(y[-1], jnp.inf))
-
     def after(self, jacobian: Matrix, value: Vector, atol: float) -> Turning:
         """The search after one turn, from ∂f/∂y and f at its unknowns."""
         factors = factorise(jacobian)
@@ -134,14 +130,10 @@ class Turning(eqx.Module):
 class FewUnknowns(optx.AbstractRootFinder[Vector, Vector, Any, Turning]):
     """Newton's method for a few scalars, each determined by the equation of the same index (see `factorise`).
 
-    A member is solved once |f| < `atol`, or after a step whose square is below `atol`. A linear f needs one
-    pass. `init` makes it, outside the loop, so that XLA fuses it over a batch with the code before and after. The
-    loop then runs only for members that crossed into another branch of f.
+    A member is solved after a step whose square is below `atol`.
 
     Attributes:
         atol: of f; rtol, norm: not read.
-        linear: True if f is linear in y except for branches; correct for any f, fast for such. Arguments of f are
-            then the data shared by a batch and the data of each member, in this order.
         apart: True to compute ∂f/∂y one unknown after another, which is faster over large batches; False: all
             together, a program of a third of the size.
     """
@@ -149,7 +141,6 @@ class FewUnknowns(optx.AbstractRootFinder[Vector, Vector, Any, Turning]):
     rtol: float = 0.0
     atol: float = 1e-12
     norm: Callable[[Any], Array] = optx.max_norm
-    linear: bool = False
     apart: bool = False
 
     def init(
@@ -163,21 +154,13 @@ class FewUnknowns(optx.AbstractRootFinder[Vector, Vector, Any, Turning]):
         tags: frozenset,
     ) -> Turning:
         """Returns the state of a search before its first turn."""
-        if not self.linear:
-            return Turning.begun(y, jnp.asarray(False))
-        jacobian, value = _linearised(fn, y, args, self.apart)
-        y = _less(y, _solution(factorise(jacobian), value))
-        return Turning.begun(y, _small(fn(y, args)[0], self.atol))
+        least = jnp.full_like(y[-1], -jnp.inf)
+        return Turning(y, jnp.asarray(False), jnp.asarray(0), least, -least)
 
     def step(
         self, fn: Function, y: Vector, args: tuple[Any, Any], options: dict[str, Any], state: Turning, tags: frozenset
     ) -> tuple[Vector, Turning, Any]:
         """One turn: y - J⁻¹ f."""
-        if self.linear:
-            # Solved members are masked. Without the mask the compiler would compute and store the common part of the
-            # turns before the first of them, even if there is none.
-            shared, own = args
-            args = shared, jax.tree.map(lambda x: jnp.where(state.solved, jnp.ones_like(x), x), own)
         state = state.after(*_linearised(fn, state.y, args, self.apart), self.atol)
         return state.y, state, None
 
@@ -198,13 +181,19 @@ class FewUnknowns(optx.AbstractRootFinder[Vector, Vector, Any, Turning]):
         tags: frozenset,
         result: optx.RESULTS,
     ) -> tuple[Vector, Any, dict[str, Any]]:
-        """Returns the unknowns, also if no turn was needed."""
+        """Returns the unknowns."""
         return state.y, aux, {}
 
 
 @eqx.filter_custom_jvp
 def root(
-    residual: Residual, start: Vector, shared: Any, own: Any, tolerance: float, linear: bool, apart: bool
+    residual: Residual,
+    start: Vector,
+    shared: Any,
+    own: Any,
+    tolerance: float,
+    linear: Residual | None,
+    apart: bool,
 ) -> tuple[Vector, Bool[Array, ""]]:
     """Solves f(y) = 0 by `FewUnknowns`, until every member of a batch has converged.
 
@@ -215,23 +204,29 @@ def root(
         shared, own: arguments of f other than y: data of all members of a batch and of each. Derivatives with respect
             to both are implicit, dy = -(∂f/∂y)⁻¹ (∂f/∂shared dshared + ∂f/∂own down), forward and reverse, zero if
             ∂f/∂y is singular. The program holds no host callback.
-        tolerance, linear, apart: as for `FewUnknowns`.
+        tolerance, apart: as for `FewUnknowns`.
+        linear: f in its usual branches, where it is linear in y; None if it has none. Its root is computed first, so
+            that XLA fuses it over a batch with the code before and after. The search runs only for members in which
+            that leaves |f| above the tolerance.
 
     Returns:
         y, and whether it converged within `MAX_STEPS` turns; False for a residual that is not finite.
     """
+    function, own = _function(residual), jax.tree.map(jnp.asarray, own)
 
-    function: Any = _function(residual)
-    found: optx.Solution = optx.root_find(
-        function,
-        FewUnknowns(atol=tolerance, linear=linear, apart=apart),
-        start,
-        (shared, jax.tree.map(jnp.asarray, own)),
-        has_aux=True,
-        max_steps=MAX_STEPS,
-        throw=False,
-    )
-    return found.value, found.state.solved
+    def search(start: Vector, shared: Any, own: Any) -> tuple[Vector, Array]:
+        method: Any = FewUnknowns(atol=tolerance, apart=apart)
+        found: optx.Solution = optx.root_find(
+            function, method, start, (shared, own), has_aux=True, max_steps=MAX_STEPS, throw=False
+        )
+        return found.value, found.state.solved
+
+    if linear is None:
+        return search(start, shared, own)
+    jacobian, value = _linearised(_function(linear), start, (shared, own), apart)
+    y = _less(start, _solution(factorise(jacobian), value))
+    solved = _small(residual(y, shared, own), tolerance)
+    return compute_rarely(~solved, search, (y, shared, own), (y, solved))
 
 
 def _function(residual: Residual) -> Function:
