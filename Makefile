@@ -7,7 +7,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 READY := $(VENV)/ready
 TOOLS := $(VENV)/tools
 
-.PHONY: demo test quick test-all slow nightly lint mutants campaign bench docs gallery clean
+.PHONY: demo test quick test-all slow nightly lint mutants everything campaign bench docs gallery clean
 
 demo: $(READY)
 	$(BIN)/mmrjax loop measured --out runs/demo/loop --force
@@ -46,6 +46,11 @@ lint: $(TOOLS)
 # Tries plausible mistakes; prints how many die by `make test` alone and by all tests.
 mutants: $(TOOLS)
 	$(QUICK) $(BIN)/python benchmarks/mutants.py --jobs 2
+
+# All tiers, one after another, on all cores: one table at the end, and in runs/everything/table.json.
+JOBS ?= $(shell $(PYTHON) -c "import os; print(os.cpu_count())")
+everything: $(TOOLS)
+	$(BIN)/python benchmarks/everything.py --jobs $(JOBS)
 
 campaign: $(TOOLS)
 	$(BIN)/python benchmarks/loop.py --clean-wide 1000 --noise 100 --library 500 --variants 300 --outside 300 --pairs 200 --triples 150 --drift 100 --cluster 120 --coverage 600 --clean-unstated 300 --clean-heavy 120 --clean-uneven 120 --clean-rounded 120 --library-unstated 150 --outside-unstated 100 --pairs-unstated 60

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from calibration.words import effect_words as words
 from mmrjax.effects import ALL, OF_CHANNELS, OF_TURNS, Effect
 from mmrjax.fidelities.drive import drive
 from mmrjax.fidelities.steady import steady
@@ -22,7 +23,6 @@ from mmrjax.model import balances, channels, paper_robots, params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.paper_tables import TRACKED, WHEELED
 from mmrjax.model.robot import Robot
-from sweeps.report.words import effect_words as words
 
 jax.config.update("jax_enable_x64", True)
 

@@ -1,22 +1,45 @@
-"""Sentences of notes and results, which the layer above makes: `mmrjax.describe` imports it when it is called."""
+"""`describe`: English sentences of notes and results, from the tables in `calibration/words`."""
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable, Iterable
+from typing import Any
 
-import mmrjax
 
+def describe(found: Any, part: str = "", *about: str) -> str:
+    """English sentence of a note or a result, such as a calibration's `remarks` or what `discover` returns.
 
-def described(found: object, part: str = "", *about: str) -> str:
-    """Sentence of a note or result, or of one part of it; see `mmrjax.describe`."""
-    return mmrjax.describe(found, part, *about)
+    Args:
+        found: a note, a result, or a sentence, which is returned as it is.
+        part: of a result: `header` of its robot's file, or `standing` of the loop's names; "": its answer.
+        about: the robot's name, for a header.
+
+    Returns:
+        The sentence; "" where there is nothing to report.
+
+    Raises:
+        TypeError: nothing is known about this kind of object or part.
+    """
+    if isinstance(found, str):
+        return found
+    # results and notes are described by methods of their own, so their module cannot be imported above
+    tables = importlib.import_module("calibration.words.note_words")
+    said = tables.PARTS.get((type(found), part)) if part else (tables.NOTES | tables.RESULTS).get(type(found))
+    if said is None:
+        kind = type(found).__name__ + (f", {part}" if part else "")
+        raise TypeError(f"describe: got {kind}; expected a note or a result of calibrate, discover or sensitivity")
+    if isinstance(said, str):
+        listed = {name: ", ".join(x) if isinstance(x, tuple) else x for name, x in vars(found).items()}
+        return said.format(**listed)
+    return said(found, *about)
 
 
 def sentences(notes: Iterable[object]) -> tuple[str, ...]:
     """Sentence of each note, in order."""
-    return tuple(map(described, notes))
+    return tuple(map(describe, notes))
 
 
 def in_words(tell: Callable[[str], None]) -> Callable[[object], None]:
     """A callback for notes that passes their sentences on to `tell`."""
-    return lambda note: tell(described(note))
+    return lambda note: tell(describe(note))

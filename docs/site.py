@@ -132,7 +132,7 @@ def exit_codes() -> str:
     rows = [(", ".join(f"`{name}`" for name in names), meaning) for meaning, names in groups.items()]
     codes = (
         ("0", "done, whatever the answer: runs that stall or slide, requirements that are missed, every verdict"),
-        ("1", "internal error; `doctor`: a part of the installation does not work"),
+        ("1", "internal error; `--check`: a part of the installation does not work"),
         ("2", "usage or configuration, a folder that cannot be written or is in use, or not enough memory"),
         ("3", "done, but a solver failed or the time ran out; the results state where"),
         ("4", "bad data, or a finished sweep with damaged files"),
@@ -209,7 +209,7 @@ def quantities() -> str:
     from mmrjax.model import channels, quantities
 
     conditions = [
-        (f"`{c.column}`", c.label, c.unit_shown or "-", _range(c), ", ".join(u for u, _ in c.other_units) or "-")
+        (f"`{c.column}`", c.label, c.unit_shown or "-", _range(c), ", ".join(c.other_units) or "-")
         for c in quantities.SET
     ]
     shown = [

@@ -12,39 +12,11 @@ Called outside a trace, the functions compute in double precision; within a trac
 from __future__ import annotations
 
 import importlib
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 __version__ = "0.1.0"
 
-if TYPE_CHECKING:
-    from calibration import calibrate as calibrate
-    from calibration import discover as discover
-    from calibration import read_robot as read_robot
-    from calibration import read_runs as read_runs
-    from calibration import runs as runs
-    from calibration import to_pandas as to_pandas
-    from calibration import to_polars as to_polars
-    from calibration import to_xarray as to_xarray
-    from mmrjax.effects import Effect as Effect
-    from mmrjax.errors import UsageError as UsageError
-    from mmrjax.fidelities.results import Results as Results
-    from mmrjax.fidelities.simulation import simulate as simulate
-    from mmrjax.fidelities.stepping import initial_state as initial_state
-    from mmrjax.fidelities.stepping import rates as rates
-    from mmrjax.fidelities.stepping import step as step
-    from mmrjax.missions.profile import profile as profile
-    from mmrjax.model.conditions import Conditions as Conditions
-    from mmrjax.model.paper_robots import nominal as nominal
-    from mmrjax.model.params import replace as replace
-    from mmrjax.model.robot import Robot as Robot
-    from mmrjax.model.signals import STATUSES as STATUSES
-    from mmrjax.model.signals import State as State
-    from sweeps import sweep as sweep
-    from sweeps.compilation_cache import keep_programs as keep_programs
-    from sweeps.export.drive_export import export as export
-    from sweeps.report.words.note_words import describe as describe
-
-#: Module of each public name.
+#: Module of each public name; `__init__.pyi` has the same list for type checkers.
 _HOME = {
     "Conditions": "model.conditions",
     "Effect": "effects",
@@ -65,7 +37,7 @@ _HOME = {
 #: Names of the layers above `mmrjax`; each is imported when it is first used.
 _ABOVE = {
     "calibrate": "calibration",
-    "describe": "sweeps.report.words.note_words",
+    "describe": "calibration.described",
     "discover": "calibration",
     "export": "sweeps.export.drive_export",
     "keep_programs": "sweeps.compilation_cache",
@@ -78,35 +50,7 @@ _ABOVE = {
     "to_xarray": "calibration",
 }
 
-__all__ = [
-    "STATUSES",
-    "Conditions",
-    "Effect",
-    "Results",
-    "Robot",
-    "State",
-    "UsageError",
-    "__version__",
-    "calibrate",
-    "describe",
-    "discover",
-    "export",
-    "initial_state",
-    "keep_programs",
-    "nominal",
-    "profile",
-    "rates",
-    "read_robot",
-    "read_runs",
-    "replace",
-    "runs",
-    "simulate",
-    "step",
-    "sweep",
-    "to_pandas",
-    "to_polars",
-    "to_xarray",
-]
+__all__ = sorted((*_HOME, *_ABOVE, "__version__"))
 
 #: Value for XLA_FLAGS, to be set before JAX is imported. It turns off LLVM's fast instruction selection, which acts
 #: at optimization level 0 and compiles some derivatives wrongly (NaN or zero; jaxlib 0.10.2).

@@ -8,7 +8,7 @@ import re
 from collections.abc import Iterable
 
 #: A word longer than the first number is cut to `SHOWN` characters; longest path; longest message.
-WORD, SHOWN, PATH, LONGEST = 80, 40, 300, 900
+WORD, SHOWN, PATH, LONGEST = 80, 40, 240, 400
 
 
 def shorten(message: str, longest: int = LONGEST) -> str:

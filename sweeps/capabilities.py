@@ -9,12 +9,12 @@ import numpy as np
 
 from calibration.data import rig_file
 from calibration.data.robot_file import RobotFile
-from mmrjax import derived
 from mmrjax.fidelities import outputs
-from mmrjax.model import params
-from mmrjax.model.channels import EVERY, HEAT, SIDES, VOLTAGE, WARMING
+from mmrjax.model import params, quantities
+from mmrjax.model.channels import SIDES
 from mmrjax.model.paper_robots import blank_robot
 from mmrjax.model.power import Battery
+from mmrjax.model.quantities import WARMING
 from mmrjax.model.robot import Robot
 from sweeps.pages import words
 
@@ -26,16 +26,8 @@ OF_GROUND = (
 OF_TRAVEL = (
     "theoretical_speed_mm_s", "distance_m", "displacement_m", "demanded_speed_mm_s", "energy_per_metre_Wh", "range_m",
 )  # fmt: skip
-#: Those of how a winding warms.
-_WARMING = ("winding_temperature_C", "housing_temperature_C", "winding_peak_C", "winding_end_C", "housing_end_C")
-#: Column → parameters on which it rests and which a rig's file may leave open.
-RESTS_ON: dict[str, tuple[str, ...]] = {
-    **{output.column: output.rests_on for output in outputs.output_table(EVERY)},
-    **{output.column: output.rests_on for output in derived.TABLE},
-    **dict.fromkeys(("power_left_W", "power_right_W"), VOLTAGE),
-    **dict.fromkeys(("winding_left_C", "winding_right_C"), HEAT),
-    **dict.fromkeys(("permissible_time_s", *_WARMING), WARMING),
-}
+#: Column → parameters on which it rests and which a rig's file may leave open; of a channel over time last.
+RESTS_ON = {q.column: q.rests_on for rows in quantities.TABLE.values() for q in rows if q.rests_on}
 
 
 def _nothing(robot: Robot) -> dict[str, float]:
@@ -77,7 +69,8 @@ def idle_columns(robot: Robot) -> set[str]:
     if not robot.shows_travel:
         found |= {*OF_TRAVEL}
     found |= {column for column, names in RESTS_ON.items() if not robot.knows(names)}
-    found |= {f"{column.removesuffix('_C')}_{side}_C" for column in found & {*_WARMING} for side in SIDES}
+    warm = [column.removesuffix("_C") for column in found if RESTS_ON.get(column) == WARMING]
+    found |= {f"{name}_{side}_C" for name in warm for side in SIDES}
     if not has_battery(robot):
         found |= {"voltage_cell_V"}
     return found

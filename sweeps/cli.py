@@ -25,18 +25,19 @@ from sweeps.flags import options_of_fields as flags_of
 INTERRUPTED = 130
 
 app = typer.Typer(
-    name="mmrjax", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
+    name="mmrjax", add_completion=False, pretty_exceptions_enable=False,
     rich_markup_mode="rich",
-    help="Simulate a small tracked or wheeled robot's drive and running gear, and set it against measured runs.\n\n"
+    help="Simulate the drive and running gear of a small robot, and compare the model with measured data.\n\n"
     "[bold]Exit codes[/bold]: 0 done, whatever the answer; 1 internal error; 2 usage or configuration; 3 done, but a "
-    "solver failed; 4 bad data; 130 interrupted (the same command takes it up again).",
+    "solver failed; 4 bad data; 130 interrupted (the same command continues).",
 )  # fmt: skip
 
 
 _Out = Annotated[Path | None, typer.Option("--out", help="The run folder.  \\[default: runs/COMMAND-TIME]")]
 _Force = Annotated[bool, typer.Option("--force", help="Replace an existing run folder.")]
 _NoCache = Annotated[
-    bool, typer.Option("--no-cache", help="Compile anew: neither read nor keep compiled programs (see doctor).")
+    bool,
+    typer.Option("--no-cache", help="Compile again: neither read nor keep compiled programs."),
 ]
 _Config = Annotated[
     Path | None, typer.Option("--config", help="TOML file with the keys of a config.resolved.toml; options win.")
@@ -68,6 +69,7 @@ class Told(NamedTuple):
 def _command(
     kind: type[config.Part],
     *,
+    group: str,
     example: str,
     failure: str = "the solver failed at some runs (status failed). Runs that stall or slide are answers: 0",
     beside: type[config.Part] | None = None,
@@ -79,7 +81,7 @@ def _command(
     Its function is called with `Told`, once jax is ready, and with its own options and arguments by name.
 
     Args:
-        kind: of the configuration; failure: what exit code 3 means.
+        kind: of the configuration; group: heading in `--help`; failure: meaning of exit code 3.
         beside: configuration of options that change no number; a file may state its `[solver]` only.
         arguments: fields that are arguments; a `plan` of the function's own is the file, as --config is.
         resolve: in place of `config.resolve_configuration`.
@@ -124,26 +126,53 @@ def _command(
         run.__signature__ = inspect.Signature(everything)  # type: ignore[attr-defined]
         run.__annotations__ = {p.name: p.annotation for p in everything}
         del run.__wrapped__  # whose annotations are not these
-        app.command(epilog=f"Example: {example}\n\nExit code 3: {failure}.")(run)
+        app.command(epilog=f"Example: {example}\n\nExit code 3: {failure}.", rich_help_panel=group)(run)
         return function
 
     return of
 
 
+#: Headings of commands in `--help`, in their order there.
+MODEL, DATA, DESIGN, ELSEWHERE = "Model", "Data", "Design", "Export and reference"
 _AT_CORNER = "the solver failed at the worst corner"
 #: Parameters of commands that stand after those of their configurations.
 _LAST = ("out", "force")
 
 
+#: What `mmrjax` alone prints.
+FIRST_HOUR = """mmrjax simulates a small robot's drive and compares it with measured data. Begin with:
+
+  mmrjax simulate --configuration 6T2A --voltage 24 --slope 10    one run of the packaged robot
+  mmrjax inspect log.csv                                          what a data file contains
+  mmrjax loop measured --out found                                what the model lacks of the packaged runs
+
+mmrjax --help lists all commands."""
+
+
 @app.callback(invoke_without_command=True)
-def _root(version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False) -> None:
+def _root(
+    context: typer.Context,
+    version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
+    check: Annotated[
+        bool, typer.Option("--check", help="Check the installation: versions, devices, cache, one solved run.")
+    ] = False,
+) -> None:
+    if version or check:
+        print(f"mmrjax {__version__}")
+    if check:
+        _start_jax(no_cache=False)
+        from sweeps.commands import installation
+
+        raise typer.Exit(installation.check_installation())
     if version:
-        typer.echo(f"mmrjax {__version__}")
         raise typer.Exit
+    if context.invoked_subcommand is None:
+        print(FIRST_HOUR)
 
 
 @_command(
     config.Simulate,
+    group=MODEL,
     beside=config.OneRun,
     example="mmrjax simulate --configuration 4W2T --voltage 24 --slope 10 --payload 5 --model drive; "
     "mmrjax simulate --profile patrol --battery --payload 5; mmrjax simulate --left 33 --right 15",
@@ -156,13 +185,13 @@ def simulate(
     out: _Out = None,
     force: _Force = False,
 ) -> int:
-    """Simulate one run, or the runs of a CSV file, and write a run folder.
+    """Simulate operating points, a start, a mission or a turn.
 
-    With --model drive or track the run starts from standstill, and history.csv holds current and speeds over
-    time; with track, reactions.csv holds every load inside the running gear too. With --profile it follows a mission:
-    energy (Wh, Wh/m), distance, peaks, temperatures and charge, of the whole and in segments.csv of each segment.
-    With --left and --right the sides are driven apart: how the robot circles on level ground, and what each motor
-    takes; with --model drive its path over time, on slopes too (docs/howto/turn.md).
+    One operating point is stated by options, several by --runs FILE.csv. With --model drive or track the run starts
+    from standstill. history.csv then holds current and speeds over time. With track, reactions.csv also holds the
+    loads inside the running gear. With --profile the robot follows a mission: segments.csv holds energy (Wh, Wh/m),
+    distance, peaks, temperatures and charge of each segment. With --left and --right the two sides have different
+    voltages, and the robot turns (docs/howto/turn.md).
     """
     cells = told.beside.model_dump()
     stated = {column for column, value in cells.items() if value is not None}
@@ -188,6 +217,7 @@ def simulate(
 
 @_command(
     config.Sweep,
+    group=MODEL,
     beside=config_campaign.SharePart,
     resolve=config_campaign.resolve_campaign,
     example="mmrjax sweep --slopes 0:20:0.5 --payloads 0,4,8 --voltages 24 --configurations 6T2A "
@@ -219,12 +249,12 @@ def sweep(
     out: _Out = None,
     force: _Force = False,
 ) -> int:
-    """Simulate every combination of a grid in vmapped batches: Table 8 in every configuration by default.
+    """Simulate every combination of a grid in one batch.
 
-    An axis is 0,5,10 or first:last:step as 0:20:0.5. Up to 100 000 runs leave runs.csv; results of more go to a Zarr
-    store, and to runs.csv too with --export csv. So do those of a CONFIG.toml, where any parameter or condition
-    varies, as a grid or sampled (docs/reference/plans.md). An interrupted sweep continues with the same command and
-    the same --out.
+    The default grid is the paper's Table 8. An axis is a list, 0,5,10, or a range, first:last:step, such as
+    0:20:0.5. Up to 100 000 runs are written to runs.csv. Larger sweeps write a Zarr store; --export csv writes
+    runs.csv too. In a CONFIG.toml any parameter or condition can vary, on a grid or by sampling
+    (docs/reference/plans.md). An interrupted sweep continues with the same command and the same --out.
     """
     how = config_campaign.sweep_options(told.beside.shard, told.beside.scheduler, export, dry_run, zarr, outputs)
     from sweeps.commands import sweep as room
@@ -232,7 +262,7 @@ def sweep(
     return room.sweep_to_folder(told.config, told.where, out, force, how)
 
 
-@_command(config.Compare, example="mmrjax compare measured --robot found/robot.toml --against nominal")
+@_command(config.Compare, group=DATA, example="mmrjax compare measured --robot found/robot.toml --against nominal")
 def compare(
     told: Told,
     data: Annotated[
@@ -244,17 +274,21 @@ def compare(
     out: _Out = None,
     force: _Force = False,
 ) -> int:
-    """Simulate the runs of a table and compare: errors by row and channel, rms, worst, R²; of two robots too."""
+    """Simulate measured runs and report the errors.
+
+    Errors are given by row and channel, with rms, worst and R². --against compares two robots on the same rows.
+    """
     from sweeps.commands import compare as room
 
     return room.compare_with_table(told.config, data, own_mass, out, force)
 
 
-@_command(config.Reproduce, example="mmrjax reproduce --robot found/robot.toml --model track")
+@_command(config.Reproduce, group=MODEL, example="mmrjax reproduce --robot found/robot.toml --model track")
 def reproduce(told: Told, out: _Out = None, force: _Force = False) -> int:
-    """Remake the paper's figures and tables with a robot: the bench's rows, Figs. 5a-29, row by row.
+    """Reproduce the paper's tables and figures with a robot.
 
-    With --model track the running gear is resolved: Figs. 23-27, how the weight divides.
+    The bench's rows and Figs. 5a-29 are compared row by row. With --model track the running gear is resolved (Figs.
+    23-27).
     """
     from sweeps.commands import reproduce as room
 
@@ -263,6 +297,7 @@ def reproduce(told: Told, out: _Out = None, force: _Force = False) -> int:
 
 @_command(
     config.Render,
+    group=MODEL,
     beside=config.OneRun,
     example="mmrjax render start.mp4 --slope 10 --payload 5 --begin 0 --end 0.2 --slow 20",
 )
@@ -283,10 +318,11 @@ def render(
     ] = None,
     force: _Force = False,
 ) -> int:
-    """Draw a run of the track model from standstill: the robot on its slope, its track running, its forces.
+    """Draw a picture or film of the track model.
 
-    With --left and --right it turns, and is seen from above. With --climb a climb that has been computed is drawn.
-    Needs no display.
+    It shows the robot on its slope, its track and the contact forces. The run starts from standstill. With --left
+    and --right the robot turns and is shown from above. --climb draws a climb that has been computed. No display is
+    needed.
     """
     from sweeps.commands import render as room
 
@@ -301,6 +337,7 @@ def render(
 
 @_command(
     config.Calibrate,
+    group=DATA,
     beside=config.MembersPart,
     example="mmrjax calibrate measured --noise current=2%,motor_speed=0.5%,speed=1% --out fitted",
     failure="the search, or one without a block, did not converge, or the solver failed at a row. A fit that is not "
@@ -312,12 +349,13 @@ def calibrate(
     out: _Out = None,
     force: _Force = False,
 ) -> int:
-    """Find friction coefficients from measured runs, with their uncertainty, by gradients through the model.
+    """Fit parameters to measured runs, with intervals.
 
-    Writes robot.toml, which every command takes with --robot, and result.json. A log over time is fitted by drive,
-    settled runs by steady unless --model says otherwise; with drive or track the search of settled runs begins at the
-    optimum of steady, and track takes minutes. Intervals are linear then, unless --profiles. With the running gear
-    free (--model track --free running_gear.guide_recess,...) a population is searched first.
+    The search follows gradients through the simulation. By default it frees friction, slip and data-sheet values.
+    Writes result.json and robot.toml, which every command accepts as --robot. Logs are fitted with the drive model,
+    settled runs with the steady model unless --model is given. With drive or track the search starts at the optimum
+    of steady, and intervals are linear unless --profiles is given. track takes minutes. If the running gear is free
+    (--model track --free running_gear.guide_recess,...), a population is searched first.
     """
     from sweeps.commands import calibrate as room
 
@@ -326,6 +364,7 @@ def calibrate(
 
 @_command(
     config.Settle,
+    group=DATA,
     example="mmrjax settle log.csv --robot rig.toml --out settled, then "
     "mmrjax loop settled/settled.csv --robot rig.toml",
     failure="does not occur: nothing is solved",
@@ -338,9 +377,10 @@ def settle(
     out: _Out = None,
     force: _Force = False,
 ) -> int:
-    """Take the settled runs out of a log over time: the table for loop and calibrate, what was left out and why.
+    """Extract the settled runs of a log as a table.
 
-    Writes settled.csv (means with their sds), stretches.csv (every stretch, with what still changes), report.html.
+    The table is input for loop and calibrate. The page reports what was left out and why. Writes settled.csv (means
+    and their sds), stretches.csv (every stretch and what still changes) and report.html.
     """
     from sweeps.commands import settle as room
 
@@ -348,24 +388,8 @@ def settle(
 
 
 @_command(
-    config.Export,
-    arguments=("robot",),
-    example="mmrjax export found/robot.toml --to mujoco --data runs.csv --out exported",
-    failure="does not occur: runs that do not settle are left out of the comparison",
-)
-def export(told: Told, out: _Out = None, force: _Force = False) -> int:
-    """Write a drive in the format of another simulator, and a page on what the format loses.
-
-    Parameters of the format are refitted to this model over the runs of --data. LAW.md describes the law to people
-    who have never seen this program: equations, constants with intervals, conditions seen, what was not tested.
-    """
-    from sweeps.commands import export_drive as room
-
-    return room.export_to_folder(told.config, out, force)
-
-
-@_command(
     config.Loop,
+    group=DATA,
     beside=config.LoopBeside,
     example="mmrjax loop measured --out found, then mmrjax sweep --robot found/robot.toml",
     failure="the fit that is proposed did not converge, or --within was out before a verdict (the same command with "
@@ -380,10 +404,11 @@ def loop(
     out: _Out = None,
     force: _Force = False,
 ) -> int:
-    """Find what the model lacks: fit it, trace what is left to an effect, add that, report errors before and after.
+    """Find the effect that the model lacks, and add it.
 
-    Says that nothing is missing where nothing is, and names no effect where none of the library fits. Writes
-    result.json, report.html, and robot.toml, which every command takes with --robot.
+    The model is fitted, the residual is traced to an effect, and errors are reported before and after. The answer
+    may be that nothing is missing, or that no effect of the library explains the residual. Writes result.json,
+    report.html, and robot.toml, which every command accepts as --robot.
     """
     from sweeps.commands import loop as room
 
@@ -391,13 +416,15 @@ def loop(
 
 
 @_command(
-    config.Sensitivity, example="mmrjax sensitivity --outputs speed,peak_current --slopes 0,5 --evaluations 200000"
+    config.Sensitivity,
+    group=DESIGN,
+    example="mmrjax sensitivity --outputs speed,peak_current --slopes 0,5 --evaluations 200000",
 )
 def sensitivity(told: Told, out: _Out = None, force: _Force = False) -> int:
-    """Say which parameters matter where, which do not matter at all, and which runs would tell more of them.
+    """Rank parameters by influence, and propose the next runs.
 
-    Writes result.json, report.html, points.csv and indices.csv. Local derivatives and elasticities at every
-    operating point come with every method.
+    Every method includes local derivatives and elasticities at every operating point. Writes result.json,
+    report.html, points.csv and indices.csv.
     """
     from sweeps.commands import sensitivity as room
 
@@ -406,15 +433,17 @@ def sensitivity(told: Told, out: _Out = None, force: _Force = False) -> int:
 
 @_command(
     config.Resonance,
+    group=MODEL,
     example="mmrjax resonance --configuration 6T2A --voltages 10:40:0.5 --payloads 0,4,8 "
     "--set running_gear.guide_recess=1e-4",
 )
 def resonance(told: Told, out: _Out = None, force: _Force = False) -> int:
-    """Say which speeds to avoid: ripple of reaction, current and speed over speed and payload, by the track model.
+    """Find speeds at which the tracks excite the chassis.
 
-    A Campbell diagram compares the grouser-passing frequency and its harmonics with the bounce and pitch modes of
-    the robot on its contacts. An axis is 0,5,10 or first:last:step. Writes result.json, report.html, points.csv,
-    modes.csv and peaks.csv; the points of Table 8 are run too. About a minute on two cores.
+    The track model gives the ripple of reaction, current and speed over speed and payload. A Campbell diagram
+    compares the grouser-passing frequency and its harmonics with the bounce and pitch modes of the robot on its
+    contacts. An axis is 0,5,10 or first:last:step. Writes result.json, report.html, points.csv, modes.csv and
+    peaks.csv. The points of Table 8 are included. Takes about a minute on two cores.
     """
     from sweeps.commands import resonance as room
 
@@ -423,15 +452,17 @@ def resonance(told: Told, out: _Out = None, force: _Force = False) -> int:
 
 @_command(
     config.Climb,
+    group=MODEL,
     example="mmrjax climb --step 120 --levers-front 45 --levers-rear -8.5 --voltage 6; mmrjax climb --find step",
     failure="numbers of the run went wrong (verdict failed). That a robot does not get over is an answer: 0",
 )
 def climb(told: Told, out: _Out = None, force: _Force = False) -> int:
-    """Send a robot with levers over a step, stairs, a gap or a terrain, met squarely: over, or why not.
+    """Simulate a climb over a step, stairs, a gap or a terrain.
 
-    It begins on level ground before the obstacle. Levers stay at their angles, or follow a --sequence. With --find
-    the largest obstacle is searched for by bisection. Writes result.json, report.html and history.csv: posture,
-    currents of all four drives, margin of tipping and energy over time (docs/howto/climb.md).
+    Reports what stops the robot. The robot starts on level ground and meets the obstacle squarely. Levers keep
+    their angles or follow a --sequence. --find searches the largest obstacle by bisection. Writes result.json,
+    report.html and history.csv with posture, currents of all four drives, tipping margin and energy over time
+    (docs/howto/climb.md).
     """
     from sweeps.commands import climb as room
 
@@ -440,14 +471,16 @@ def climb(told: Told, out: _Out = None, force: _Force = False) -> int:
 
 @_command(
     config.Check,
+    group=DESIGN,
     arguments=("requirements",),
     example="mmrjax check requirements.toml --robot found/robot.toml --set gearbox.ratio=40",
     failure=f"{_AT_CORNER}. A requirement that is missed is an answer: 0; result.json counts them",
 )
 def check(told: Told, out: _Out = None, force: _Force = False) -> int:
-    """Hold a robot against requirements: pass or fail with margin, each at the worst corner of its envelope.
+    """Check a robot against requirements.
 
-    Of each that is missed it says what change of one parameter would meet it.
+    Each requirement passes or fails with a margin, at the worst corner of its envelope. For each missed requirement
+    it reports the change of one parameter that would meet it.
     """
     from sweeps.commands import check as room
 
@@ -456,25 +489,46 @@ def check(told: Told, out: _Out = None, force: _Force = False) -> int:
 
 @_command(
     config.Size,
+    group=DESIGN,
     arguments=("requirements",),
     example="mmrjax size requirements.toml --pareto mass,energy",
     failure=f"{_AT_CORNER} of the best. That no design meets all is an answer: 0",
 )
 def size(told: Told, out: _Out = None, force: _Force = False) -> int:
-    """Search motor, gearbox, ratio, radius and cells for a robot that meets requirements, with the makers' parts.
+    """Choose motor, gearbox and cells that meet requirements.
 
-    Leaves the best as robot.toml, alternatives, what binds each motor.
+    The search covers makers' motors and gearboxes, ratio, wheel radius and number of cells. Writes the best design
+    as robot.toml, the alternatives, and the requirement that limits each motor.
     """
     from sweeps.commands import size as room
 
     return room.size_to_folder(told.config, out, force)
 
 
+@_command(
+    config.Export,
+    group=ELSEWHERE,
+    arguments=("robot",),
+    example="mmrjax export found/robot.toml --to mujoco --data runs.csv --out exported",
+    failure="does not occur: runs that do not settle are left out of the comparison",
+)
+def export(told: Told, out: _Out = None, force: _Force = False) -> int:
+    """Write the drive for MuJoCo, JAX, ONNX and others.
+
+    A page reports what the format cannot represent. The format's parameters are refitted to this model over the
+    runs of --data. LAW.md documents the law on its own: equations, constants with intervals, conditions covered by
+    the data, and what was not tested.
+    """
+    from sweeps.commands import export_drive as room
+
+    return room.export_to_folder(told.config, out, force)
+
+
 rig = typer.Typer(
     no_args_is_help=True, rich_markup_mode="rich",
-    help="Describe a bench or robot of your own in a file, and check it (docs/howto/describe-a-rig.md).",
+    help="Describe your own bench or robot in a file, and check it.",
 )  # fmt: skip
-app.add_typer(rig, name="rig")
+app.add_typer(rig, name="rig", rich_help_panel=DATA)
 
 
 _SHEET = "Data sheet"
@@ -518,13 +572,15 @@ def new(
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace the file where there is one.")] = False,
 ) -> int:
-    """Write a rig's file to fill in, with units and where each number comes from; it asks nothing.
+    """Write a rig's file to fill in.
 
-    As written it can be read, with numbers of an example. Units are SI but where a comment says another.
+    Each number has its unit and source. The file is valid as written, with example numbers. Units are SI unless a
+    comment states another.
 
-    --kind wheeled writes the file of a kind. --from reads a joint: mass, inertia, radius, ratio, friction, damping,
-    armature. --from-sheet reads a motor from four to six numbers with units; a contradiction above 10 % is refused.
-    Both can be combined. Each number has its source and a wide ±. The command lists what it did not find.
+    --kind chooses the kind of rig. --from reads a joint: mass, inertia, radius, ratio, friction, damping, armature.
+    --from-sheet reads a motor from four to six numbers with units. Numbers that contradict each other by more than
+    10 % are refused. Both can be combined. Each number gets its source and a wide ±. The command lists what is
+    missing.
     """
     from sweeps.commands import rig_new
 
@@ -548,11 +604,12 @@ def rig_check(
     json: Annotated[bool, typer.Option("--json", help="Print JSON (mmrjax.rig_check/1) instead of words.")] = False,
     no_cache: _NoCache = False,
 ) -> int:
-    """Say what was understood of a rig's file, where each number comes from, and whether it makes sense.
+    """Check a rig's file, and data for it.
 
-    With data: which columns are used for what, over what range, and which parameters these data can determine;
-    one whose posterior sd is above 0.9 of its prior's is not determined. Nothing is fitted or written.
-    Exit codes: 0 it can be used; 2 the file cannot; 4 the data cannot.
+    Lists values, their sources and their plausibility. With data it lists each column's use and range, and the
+    parameters that these data determine. A parameter is not determined if its posterior sd is above 0.9 of its
+    prior sd. Nothing is fitted or written. Exit codes: 0 usable; 2 the file is not usable; 4 the data are not
+    usable.
     """
     _start_jax(no_cache)
     from sweeps.commands import rig_check as room
@@ -560,21 +617,23 @@ def rig_check(
     return room.check_rig_file(file, data, tuple(effects or ()), json, columns)
 
 
-@app.command("inspect", epilog="Example: mmrjax inspect log.bag; mmrjax inspect log.h5::/run1 --json")
+@app.command(
+    "inspect", rich_help_panel=DATA, epilog="Example: mmrjax inspect log.bag; mmrjax inspect log.h5::/run1 --json"
+)
 def inspect_file(
     file: Annotated[str, typer.Argument(metavar="FILE", help="A file of data; ::PATH for a part of it.")],
     json: Annotated[bool, typer.Option("--json", help="Print JSON (mmrjax.inspect/1) instead of words.")] = False,
 ) -> int:
-    """List what a file of data contains: signals, units, rates, ranges, gaps; and propose names for its columns.
+    """List the signals of a data file, and propose column names.
 
-    Exit codes: 0 it can be read; 4 it cannot.
+    Signals have units, rates, ranges and gaps. Exit codes: 0 readable; 4 not readable.
     """
     from sweeps.commands import inspect as room
 
     return room.inspect_file(file, json)
 
 
-@app.command(epilog="Example: mmrjax explain series_resistance")
+@app.command(rich_help_panel=ELSEWHERE, epilog="Example: mmrjax explain series_resistance")
 def explain(
     name: Annotated[
         str | None, typer.Argument(help="An effect, status, flag, output, channel or parameter; none lists them.")
@@ -582,20 +641,14 @@ def explain(
     effects: _Effects = None,
     no_cache: _NoCache = False,
 ) -> int:
-    """Say what a name means: equation, source, typical size, what it looks like in data, how to test for it."""
+    """Explain the name of an effect, status, output or parameter.
+
+    Prints its equation, source, typical size, signature in data and a test for it.
+    """
     _start_jax(no_cache)
     from sweeps.commands import explain as room
 
     return room.explain_name(name, tuple(effects or ()))
-
-
-@app.command()
-def doctor(no_cache: _NoCache = False) -> int:
-    """Check this installation: versions, devices, the compilation cache, a solved run, a writable folder."""
-    _start_jax(no_cache)
-    from sweeps.commands import doctor as room
-
-    return room.check_installation()
 
 
 def _prepared(resolved: Any, no_cache: bool = False) -> Any:

@@ -14,7 +14,7 @@ from pydantic_core import PydanticCustomError
 
 from calibration.data import presets_file
 from calibration.data.columns import ROWS
-from calibration.data.input_errors import BadConfiguration, allowed_words, parse_number
+from calibration.data.input_errors import SEEDS, BadConfiguration, allowed_words, parse_number
 from calibration.data.input_files import toml_content, toml_text
 from calibration.inference import solvers
 from mmrjax import fidelities
@@ -37,7 +37,7 @@ Voltage = Annotated[float, Field(ge=_VOLTAGE[0], le=_VOLTAGE[1], allow_inf_nan=F
 PROFILED = "drive"
 #: Longest run of `simulate` where none is stated [s]: short enough that the start is seen.
 SHOWN = 5.0
-Seed = Annotated[int, Field(ge=0, le=2**32 - 1)]
+Seed = Annotated[int, Field(ge=0, le=SEEDS)]
 
 
 def option_field(default: Any, description: str, **extra: Any) -> Any:
@@ -286,7 +286,7 @@ class InferencePart(Part):
         "times too), and without such assumes 2, 0.5, 1 %, halved and doubled",
     )
     rows: Annotated[int, Field(ge=100, le=1_000_000)] = option_field(
-        ROWS, "Largest number of rows used of a log over time; a longer log is thinned evenly in time"
+        ROWS, "Largest number of rows used; more are thinned evenly, those of a log in time, others over conditions"
     )
     seed: Seed = option_field(0, "Random seed")
 
@@ -696,8 +696,8 @@ class Sensitivity(RobotPart, DataPart, FidelityPart, SupplyPart, OutputPart):
 
     method: str = option_field(
         "sobol",
-        "local, sobol, morris, derivative, or shapley (of a posterior)",
-        usual="sobol; with --posterior shapley",
+        "local, sobol, morris or derivative",
+        usual="sobol; with --posterior local",
     )
     configurations: Annotated[tuple[str, ...], Field(min_length=1)] | None = option_field(
         None, "Comma-separated, of the robot's", usual="all that it has"
@@ -725,7 +725,7 @@ class Sensitivity(RobotPart, DataPart, FidelityPart, SupplyPart, OutputPart):
         usual="current, speeds, slip, power, efficiency, steepest slope",
     )
     evaluations: Annotated[int, Field(ge=1, le=1_000_000_000)] | None = option_field(
-        None, "Model evaluations, at least, in all", usual="1000000; shapley 300000; runs over time 100000"
+        None, "Model evaluations, at least, in all", usual="1000000; runs over time 100000"
     )
     seed: Seed = option_field(0, "Of the sample")
     posterior: bool = option_field(False, "Take the inputs from the posterior.nc of the calibrated --robot")
@@ -741,9 +741,9 @@ class Sensitivity(RobotPart, DataPart, FidelityPart, SupplyPart, OutputPart):
     @model_validator(mode="before")
     @classmethod
     def _of_a_posterior(cls, values: Any) -> Any:
-        """Its inputs depend on one another, which Shapley effects alone are for."""
+        """Its inputs are correlated, and the methods that sample need independent ones."""
         if isinstance(values, dict) and values.get("posterior") and values.get("method") is None:
-            return {**values, "method": "shapley"}
+            return {**values, "method": "local"}
         return values
 
 

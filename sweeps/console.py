@@ -91,7 +91,7 @@ def step_reporter(
     """
     import jax
 
-    from sweeps.report.words.step_words import still_running_sentence
+    from calibration.words.step_words import still_running_sentence
 
     compiled, said = 0, [(doing, time.monotonic(), 0)]
     spoke, over = threading.Event(), threading.Event()

@@ -23,8 +23,8 @@ from sweeps import capabilities, store
 from sweeps.config import FidelityPart, OneRun, RobotPart
 from sweeps.console import print_message
 from sweeps.flags import options_of_fields
-from sweeps.pages import turn_words
 from sweeps.points import imposed
+from sweeps.report.words import turn_words
 
 #: Option that states a condition of one run.
 OPTIONS = options_of_fields(OneRun)

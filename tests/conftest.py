@@ -89,7 +89,9 @@ GROUP = {file: name for name, files in SHARING.items() for file in files}
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config, log):
-    """A worker takes a file at a time, or the files that share results."""
+    """With `--dist loadfile` a worker takes a file at a time, or the files that share results."""
+    if config.getoption("dist") != "loadfile":
+        return None
     from xdist.scheduler import LoadScopeScheduling
 
     class ByFile(LoadScopeScheduling):

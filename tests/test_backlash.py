@@ -15,7 +15,7 @@ from mmrjax.effects import ALL
 from mmrjax.fidelities.drive import drive_batch
 from mmrjax.fidelities.histories import history_signals, time_grid
 from mmrjax.fidelities.steady import steady_batch
-from mmrjax.model import balances, channels, paper_robots, params
+from mmrjax.model import balances, paper_robots, params, quantities
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.rig import Rig
 from mmrjax.model.robot import Configurations
@@ -151,7 +151,7 @@ def test_backlash_is_found_in_a_history_of_reversals(tmp_path):
     random = np.random.default_rng(3)
     lines = ["time_s,supply_voltage_V,motor_speed_rpm,motor_speed_sd_rpm,output_angle_deg,output_angle_sd_deg"]
     for k, t in zip(at, SAMPLES, strict=True):
-        speed = float(seen.speed_motor[k]) / channels.RPM + 5 * random.standard_normal()
+        speed = float(seen.speed_motor[k]) / quantities.RPM + 5 * random.standard_normal()
         angle = np.degrees(float(seen.angle[k])) + 0.2 * random.standard_normal()
         lines.append(f"{t:.9g},{VOLTAGE[k]:g},{speed:.6g},5,{angle:.6g},0.2")
     table = tmp_path / "table.csv"

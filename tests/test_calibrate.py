@@ -510,12 +510,11 @@ FOURTH_CHANNEL = """
 import dataclasses, jax
 jax.config.update("jax_enable_x64", True)
 import numpy as np
-from mmrjax.model import channels
-channels.EVERY += (channels.Channel(
-    name="terminal_voltage", unit="V", factor=1.0,
-    label="terminal voltage", word="voltage", range=(0.0, 100.0), sd_largest=10.0,
-    read=lambda robot, signals: signals.voltage, sd_share=0.01,
+from mmrjax.model import quantities
+quantities.TABLE["channel"] += (quantities.Channel(
+    "terminal_voltage", "V", "terminal voltage", (0.0, 100.0), 10.0, word="voltage", signal="voltage"
 ),)
+from mmrjax.model import channels
 channels.USUAL += ("terminal_voltage",)
 import calibration
 from mmrjax.model import paper_robots as robots

@@ -14,12 +14,12 @@ from calibration.inference import optimizers as fit
 from calibration.inference.calibration import calibrate
 from calibration.inference.fit_notes import BesideSteady, PriorOfProduct
 from calibration.inference.priors import GUIDED
+from calibration.words import table_words
 from mmrjax import fidelities
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.fidelities.track import track
 from mmrjax.model import channels, paper_robots, params
 from mmrjax.model.signals import CONVERGED
-from sweeps.report.words import table_words
 
 GUIDE_FRICTION, GUIDE_SHARE = f"6T2A.{priors.GUIDE_FRICTION}", f"6T2A.{priors.GUIDE_SHARE}"
 STATIC = "6T2A.ground.friction.static"

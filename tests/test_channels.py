@@ -22,7 +22,7 @@ from calibration.discovery.result import DiscoveryResult, ReadingsOfRows
 from calibration.inference import estimates, noise, observers
 from calibration.inference.result import CalibrationResult
 from mmrjax.fidelities.steady import steady_batch
-from mmrjax.model import channels, params
+from mmrjax.model import channels, params, quantities
 from sweeps.commands import rig_new
 
 RIG = """base = "none"
@@ -68,7 +68,7 @@ def made_up(robot, unit=None):
     for k, c in enumerate(robot.channels):
         scale, column = 1.0, c.column
         if c.name == "output_torque" and unit is not None:
-            scale, column = 1 / dict(c.other_units)[unit], f"output_torque_{unit}"
+            scale, column = 1 / c.sizes[unit], f"output_torque_{unit}"
         found[column] = scale * (FIRST + k + np.arange(12.0))
         found[column.replace(c.name, f"{c.name}_sd")] = np.full(12, scale * 0.01 * (k + 1))
     return found
@@ -122,7 +122,7 @@ def test_a_reading_keeps_its_column_and_size_from_file_to_result(tmp_path, bench
     assert channels.channel_names(runs.channels) == TORQUE and runs.unknown == ()
     np.testing.assert_allclose(runs.measured()[:, 2], FIRST + 2 + np.arange(12.0), rtol=1e-12)
     np.testing.assert_allclose(runs.deviations()[:, 2], 0.03, rtol=1e-12)
-    np.testing.assert_allclose(runs.measured()[:, 1], (FIRST + 1 + np.arange(12.0)) * channels.RPM, rtol=1e-12)
+    np.testing.assert_allclose(runs.measured()[:, 1], (FIRST + 1 + np.arange(12.0)) * quantities.RPM, rtol=1e-12)
     for table in (calibrated(runs, bench).rows(), discovered(runs).rows_table()):
         assert "speed_mm_s" not in table
         for k, c in enumerate(bench.channels):

@@ -321,7 +321,7 @@ def test_paper_file_states_where_each_aim_comes_from():
     asked = requirements_file.load_requirements(None)
     assert all("Section" in r.source or "Table" in r.source or "sheet" in r.source for r in asked.each)
     assert {r.name for r in asked.each} >= {"speed_m_s", "slope_deg", "payload_kg", "endurance_min", "mass_kg"}
-    assert set(STATUSES) >= {"cut_off", "slides"} and len({q.name for q in QUANTITIES.values()}) == len(QUANTITIES)
+    assert set(STATUSES) >= {"cut_off", "slides"} and len({q.column for q in QUANTITIES.values()}) == len(QUANTITIES)
 
 
 REFUSED = {

@@ -15,7 +15,7 @@ import rich.text
 import typer
 
 from calibration.data.input_errors import BadConfiguration
-from mmrjax import SOUND_AT_LEVEL_0, fidelities
+from mmrjax import SOUND_AT_LEVEL_0, errors, fidelities
 from sweeps import cli, config
 from sweeps.points import scale
 from tests.commands import rows as table
@@ -96,7 +96,7 @@ def test_battery_sags_and_ends_clearly(mmrjax, tmp_path):
     current = float(full["total_current_A"])
     assert code == 0 and float(full["voltage_V"]) == pytest.approx(8 * (4.17 - 0.049 * (current + 1.5)))
     code, out, _ = mmrjax("simulate", "--battery", "--discharge", "2300", "--no-report", "--out", "empty")
-    assert code == 0 and "battery_empty: the battery has no charge left" in out
+    assert code == 0 and "battery empty" in out and "the battery's capacity is used up" in out
 
 
 @pytest.mark.slow
@@ -129,7 +129,7 @@ USAGE = {
     "misspelt option": (["sweep", "--slope", "5"], r"No such option: --slope"),
     "unknown command": (["swep"], r"No such command"),
     "slope of 95": (["sweep", "--slopes", "0,95"], r"--slopes: got 95\.0; expected -45 to 45"),
-    "voltage below all": (["sweep", "--voltages=-300"], r"--voltages: got -300\.0; expected -100 to 100"),
+    "voltage below all": (["sweep", "--voltages=-30000"], r"--voltages: got -30000\.0; expected -10000 to 10000"),
     "NaN": (["sweep", "--payloads", "nan"], r"--payloads: got nan"),
     "no numbers": (
         ["sweep", "--slopes", "steep"],
@@ -412,7 +412,7 @@ def test_full_disk_names_the_file_whichever_it_is(mmrjax, tmp_path, monkeypatch)
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(Path, "write_text", honest)
-    monkeypatch.setattr("sweeps.pages.runs_page.write_runs_page", picture)
+    monkeypatch.setattr("sweeps.report.page_renderer.write_report_page", picture)
     code, _, err = mmrjax("simulate", "--out", "r")
     assert code == 2 and "r.partial: No space left on device" in err
 
@@ -586,10 +586,23 @@ def test_no_word_in_brackets_is_lost_from_a_help():
         assert rich.text.Text.from_markup(text).plain == text.replace("\\[", "["), text
 
 
+def test_help_lists_commands_under_four_headings_with_one_line_each():
+    commands = typer.main.get_command(cli.app).commands
+    assert {c.rich_help_panel for c in commands.values()} == {cli.MODEL, cli.DATA, cli.DESIGN, cli.ELSEWHERE}
+    for name, command in commands.items():
+        assert 0 < len((command.help or "").partition("\n\n")[0]) <= 62, name
+
+
+def test_mmrjax_alone_prints_commands_that_exist(mmrjax):
+    code, out, _ = mmrjax()
+    names = [line.split()[1] for line in out.splitlines() if line.startswith("  mmrjax ")]
+    assert code == 0 and len(names) == 3 and {*names} <= {*typer.main.get_command(cli.app).commands}
+
+
 @pytest.mark.slow
-def test_doctor_finds_this_installation_healthy(mmrjax):
-    code, out, _ = mmrjax("doctor")
-    assert code == 0 and "fails" not in out and "24 V / C_E" in out
+def test_check_passes_on_this_installation(mmrjax):
+    code, out, _ = mmrjax("--check")
+    assert code == 0 and "FAILED" not in out and "24 V / C_E" in out
     assert "compilation cache" in out and ("programs" in out or "off" in out)
 
 
@@ -606,7 +619,7 @@ def test_cache_is_neither_read_nor_written_when_it_is_not_wanted(tmp_path):
 
 def test_every_command_that_compiles_can_do_without_the_cache(monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", "200")
-    for command in ("simulate", "sweep", "compare", "reproduce", "render", "calibrate", "loop", "doctor"):
+    for command in ("simulate", "sweep", "compare", "reproduce", "render", "calibrate", "loop"):
         monkeypatch.setattr(sys, "argv", ["mmrjax", command, "--help"])
         with pytest.raises(SystemExit):
             cli.main()
@@ -751,11 +764,12 @@ def test_memory_exhausted_is_one_sentence_and_leaves_nothing(mmrjax, tmp_path, m
     assert "Traceback" not in err and not any(tmp_path.iterdir())
 
 
-def test_a_message_with_long_paths_is_whole(capsys):
-    message = (
-        f"{'/data' * 30}/log.csv: got none; run mmrjax loop {'/data' * 30}/log.csv --robot {'/rigs' * 30}/r.toml, or"
-    )
-    assert cli._fail(message, 4) == 4 and capsys.readouterr().err == f"mmrjax: {message}\n"
+def test_a_message_has_at_most_400_characters_and_keeps_its_end(capsys):
+    whole = f"{'/data' * 30}/log.csv: got none; run mmrjax loop {'/data' * 30}/log.csv"
+    assert cli._fail(whole, 4) == 4 and capsys.readouterr().err == f"mmrjax: {whole}\n"
+    assert cli._fail(f"x: got {'many words ' * 99}; expected fewer", 2) == 2
+    err = capsys.readouterr().err
+    assert len(err) <= len("mmrjax: \n") + errors.LONGEST == 409 and err.endswith("; expected fewer\n")
 
 
 def test_too_little_memory_is_refused_at_once(mmrjax, tmp_path, monkeypatch):

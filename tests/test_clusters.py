@@ -5,7 +5,7 @@ import pytest
 
 from calibration.discovery import clusters
 from calibration.discovery.clusters import find_cluster
-from sweeps.report.words import loop_words as words
+from calibration.words import loop_words as words
 
 ERROR = 0.01
 RNG = np.random.default_rng(0)

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import pytest
 
 from calibration.inference.fit_notes import Step
+from calibration.words import step_words as steps
+from calibration.words.step_words import still_running_sentence
 from sweeps import console
 from sweeps.console import step_reporter
-from sweeps.report.words import step_words as steps
-from sweeps.report.words.step_words import still_running_sentence
 
 
 def test_silence_is_broken_by_what_goes_on():

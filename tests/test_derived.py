@@ -55,9 +55,9 @@ def differences(f, theta, step):
 
 @pytest.mark.slow
 def test_table_names_modules_that_compute_them(robot):
-    for module in dict.fromkeys(d.module for d in derived.TABLE):
+    for module in dict.fromkeys(d.group for d in derived.TABLE):
         made = jax.eval_shape(derived.compute_function(module), robot, Conditions(0, 24.0))
-        assert {d.name for d in derived.TABLE if d.module == module} | {"status"} == set(made)
+        assert {d.name for d in derived.TABLE if d.group == module} | {"status"} == set(made)
     assert next(d for d in derived.TABLE if d.name == "steepest_slope").ignores == ("slope_deg",)
 
 

@@ -8,8 +8,8 @@ import pytest
 from calibration.data.runs import Runs
 from calibration.discovery.description import undescribed_channels, unused_inputs
 from calibration.discovery.loop_notes import Missed, Summary
+from calibration.words import loop_words
 from mmrjax.model import channels
-from sweeps.report.words import loop_words
 
 ROWS, SD = 40, 0.02
 CURRENT, SPEED = channels.find_channel("total_current"), channels.find_channel("motor_speed")

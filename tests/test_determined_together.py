@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from calibration.data.posterior_file import LOG, NORMAL, Posterior
-from calibration.described import described
+from calibration.described import describe
 from calibration.inference.fit_notes import Determination
 from calibration.inference.fit_posterior import determined_together, undetermined_names
 
@@ -39,14 +39,14 @@ def test_the_combination_is_the_one_that_varies_least(correlation, kinds, spread
     combined = {"ratio": np.log(a / b), "product": np.log(a * b), "linear": a + pair.weight * b}[form]
     alone = a if form == "linear" else np.log(a)
     assert np.std(combined) < 0.2 * np.std(alone)
-    assert [described(Determination.of(n, False, (pair,))) for n in "abc"] == ["only with b", "only with a", "yes"]
+    assert [describe(Determination.of(n, False, (pair,))) for n in "abc"] == ["only with b", "only with a", "yes"]
 
 
 def test_a_pair_that_priors_hold_or_that_hardly_trades_is_none():
     assert determined_together(posterior(0.94, (LOG, LOG))) == ()
     assert determined_together(posterior(0.99, (LOG, LOG)), held=("a", "b")) == ()
     (pair,) = determined_together(posterior(0.99, (LOG, LOG)), held=("a",))  # b is known by the prior of a
-    assert described(Determination.of("a", True, (pair,))) == "only with b"
-    assert described(Determination.of("c", True, (pair,))) == "no" and undetermined_names(("a", "c"), (pair,)) == (
+    assert describe(Determination.of("a", True, (pair,))) == "only with b"
+    assert describe(Determination.of("c", True, (pair,))) == "no" and undetermined_names(("a", "c"), (pair,)) == (
         "c",
     )

@@ -13,11 +13,11 @@ from calibration.discovery import discover
 from calibration.discovery.location import DiscrepancyLocation, varied_by_duty
 from calibration.discovery.settings import settings_for
 from calibration.inference.observers import Histories, SettledRuns
+from calibration.words import loop_words as words
 from mmrjax.effects import BY_NAME
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import channels, paper_robots, params
 from mmrjax.model.conditions import Conditions
-from sweeps.report.words import loop_words as words
 
 FORWARD, EITHER = (15.0, 20.0, 27.0, 33.0), (15.0, 33.0, -15.0, -33.0)
 CLIMBING = {f"{c}.ground.friction.{k}": v for c in ("6T2A", "4W2T") for k, v in (("static", 0.9), ("dynamic", 0.7))}

@@ -24,10 +24,10 @@ from calibration.inference import bases
 from calibration.inference.held_out import hold_out_blocks
 from calibration.inference.linearization import PROBED
 from calibration.inference.observers.settled import SettledLinearization
+from calibration.words import loop_words
 from mmrjax.effects.curve import PLACES
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import channels, params
-from sweeps.report.words import loop_words
 
 #: An effect that no library holds → balance and variable that it acts through.
 CASES = {"commutation_step": ("electrical", "voltage"), "guide_binding": ("track", "payload")}

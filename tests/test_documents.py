@@ -36,7 +36,7 @@ from sweeps.report import (
     size_report,
     terminal_renderer,
 )
-from sweeps.report.document import Cell, Column, Document, Figure, Note, Section, Table
+from sweeps.report.document import Cell, Column, Document, Figure, Note, Section, Table, remarks
 from sweeps.results.check_results import CheckResult
 from sweeps.results.comparison_results import Comparison, add_second_robot, compare_readings
 from sweeps.results.size_results import SizeResult
@@ -173,7 +173,7 @@ def test_a_document_reads_as_recorded(name):
 SMALL = Document(
     "A & B",
     "Speed **0.5 m/s**.",
-    (Note("page only", terminal=False), Note(("one `x_m`", "two"), name="notes")),
+    (Note("page only"), *remarks(("one `x_m`", "two"))),
     (
         Section("Rows", (
             Table("rows", (

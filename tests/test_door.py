@@ -49,8 +49,12 @@ def test_what_instruments_show_is_that_of_the_whole(robot, whole):
     for name in ("total_current", "motor_speed", "speed"):
         np.testing.assert_allclose(getattr(shown_first, name), whole.reading[name], rtol=1e-13, err_msg=name)
     for output in outputs.output_table(robot.channels):
-        np.testing.assert_array_equal(output.get(whole_first.result), output.get(whole), err_msg=output.name)
-        np.testing.assert_allclose(output.get(shown_first.result), output.get(whole), rtol=1e-13, err_msg=output.name)
+        np.testing.assert_array_equal(
+            getattr(whole_first.result, output.name), getattr(whole, output.name), err_msg=output.name
+        )
+        np.testing.assert_allclose(
+            getattr(shown_first.result, output.name), getattr(whole, output.name), rtol=1e-13, err_msg=output.name
+        )
     np.testing.assert_array_equal(whole_first.flags, whole.flags)
     assert shown_first.reading["speed"] is shown_first.speed and shown_first.result.status is shown_first.status
     with pytest.raises(AttributeError, match="Results has no velocity"):

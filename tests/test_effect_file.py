@@ -158,7 +158,7 @@ REFUSED = {
     "memory": (stating("memory_size = True"), r"memory_size: got True; expected a positive number, or None"),
     "no rate": (stating("memory_size = 1.0"), r"cannot be computed \(NotImplementedError: seal_drag has a memory"),
     "source": (GOOD.replace("Source: none, an example.", ""), r"its docstring states no equation with its «Source:»"),
-    "no default": (EXPLICIT.replace("        0.0, unit", "        unit"), r"cannot be made without arguments"),
+    "no default": (EXPLICIT.replace("        0.0, unit", "        unit"), r"its code fails \(TypeError: .*'default'"),
     "no field": (
         GOOD.replace("amplitude: Scalar", "size: Scalar"),
         r"cannot be made without arguments \(.*amplitude.*\); give every field a default",

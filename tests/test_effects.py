@@ -74,7 +74,7 @@ SIGNAL_UNITS = {
     "-": "side duty pause share_drawn on_tracks battery slope adhesion order direction direction_travel direction_turn efficiency_load",
 }
 UNIT_OF = {name: unit for unit, fields in SIGNAL_UNITS.items() for name in fields.split()}
-SENSOR_UNITS = {c.name: c.unit_si or c.unit for c in channels.EVERY}
+SENSOR_UNITS = {c.name: c.unit_si for c in channels.EVERY}
 
 
 def dimensions(unit: str) -> Counter:

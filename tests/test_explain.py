@@ -2,12 +2,12 @@
 
 import pytest
 
+from calibration.words import effect_words as words_of
 from mmrjax import effects
 from mmrjax.errors import allowed_words, similar_words
 from mmrjax.model import channels, paper_robots, params
 from sweeps.commands import explain
 from sweeps.pages import words
-from sweeps.report.words import effect_words as words_of
 
 EVERY = effects.BY_NAME | effects.OF_TURNS | effects.OF_CHANNELS
 

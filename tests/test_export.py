@@ -462,7 +462,7 @@ def test_rig_that_was_exported_comes_back_to_the_last_digit(rig, tmp_path):
         ("scene.obj", None, r"scene.obj: not a readable XML file \(.*\); expected URDF or MuJoCo's XML"),
         ("page.xml", None, r"page.xml: got <html>; expected <robot> of URDF or <mujoco>"),
         ("none.xml", None, r"none.xml: cannot be read"),
-        ("bad.xml", None, r"bad.xml: MuJoCo does not read it"),
+        ("bad.xml", None, r"bad.xml: not a readable XML file"),
         ("two.xml", None, r"--joint: missing, and two.xml has drive, other; expected the name of one joint"),
         ("two.xml", "slide", r"--joint: got slide, which slides or is free; expected a hinge"),
     ],

@@ -6,7 +6,7 @@ import pytest
 
 from calibration.discovery.headline import headline
 from calibration.discovery.loop_notes import Mechanism, Missing, Summary
-from sweeps.report.words import loop_words
+from calibration.words import loop_words
 
 DROP, SLIP = "voltage drop that changes with current", "slip that changes with demand"
 

@@ -426,12 +426,11 @@ def test_report_of_histories_shows_what_only_they_tell(started):
 
 FOURTH = """
 import csv, sys
-from mmrjax.model import channels
-channels.EVERY += (channels.Channel(
-    name="terminal_voltage", unit="V", factor=1.0,
-    label="terminal voltage", word="voltage", range=(-200.0, 200.0), sd_largest=50.0,
-    read=lambda robot, signals: signals.voltage, sd_share=0.01,
+from mmrjax.model import quantities
+quantities.TABLE["channel"] += (quantities.Channel(
+    "terminal_voltage", "V", "terminal voltage", (-200.0, 200.0), 50.0, word="voltage", signal="voltage"
 ),)
+from mmrjax.model import channels
 channels.USUAL += ("terminal_voltage",)
 source, target, out, *priors = sys.argv[1:]
 rows = list(csv.DictReader(open(source)))

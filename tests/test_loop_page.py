@@ -23,12 +23,12 @@ from calibration.discovery.loop_notes import Asked, NameSupport, NameTest, Ruled
 from calibration.discovery.result import Alternative, Estimate, HiddenEffect, Resolved, StatedValue
 from calibration.discovery.settings import WITHOUT_NAME
 from calibration.inference.identifiability import HELD
+from calibration.words import loop_words as words
 from mmrjax.model import channels
 from sweeps.commands import loop as room
 from sweeps.pages import loop_figures
 from sweeps.pages import loop_page as loop_page
 from sweeps.pages import page as page_room
-from sweeps.report.words import loop_words as words
 
 SCHEMA = json.loads((Path(__file__).parents[1] / "docs" / "schemas" / "loop.schema.json").read_text("utf-8"))
 

@@ -79,7 +79,7 @@ def test_derivative_of_breaking_away_is_there_at_every_current(robot):
 
 
 def test_numbers_of_either_side_follow_from_their_totals():
-    of = {name: jnp.asarray(0.0) for name in missions.energy.SINKS}
+    of = {name: jnp.asarray(0.0) for name in missions.SINKS}
     of |= {"drawn": 3.0, "returned": 0.0, "distance": 1.0, "path": 1.0, "current_squared": 8.0, "torque_squared": 2.0}
     of |= {
         "turned": jnp.pi,

@@ -26,10 +26,10 @@ from calibration.data import columns
 from mmrjax import derived
 from mmrjax.climbing.climb_derivatives import OUTPUTS
 from mmrjax.climbing.climb_simulation import LOSSES, SOURCES
-from mmrjax.derived import requirements, turning_figures
+from mmrjax.derived import requirements
 from mmrjax.fidelities import outputs
 from mmrjax.missions import mission_batch
-from mmrjax.model import channels
+from mmrjax.model import channels, quantities
 from mmrjax.undercarriage.ripple_peaks import SIGNALS
 from sweeps import capabilities, cli, config
 from sweeps.points import export
@@ -128,15 +128,15 @@ def registries() -> dict[str, list[tuple[str, str]]]:
     """Unit and meaning of every name of the tables that writers use; of each table in which it is."""
     found: dict[str, list[tuple[str, str]]] = {}
     for row in (*outputs.output_table(channels.EVERY), *mission_batch.OUTPUTS, *derived.TABLE):
-        found.setdefault(row.column, []).append((row.unit, row.label))
+        found.setdefault(row.column, []).append((row.unit_shown, row.label))
     for c in channels.EVERY:
         found.setdefault(c.sd_column, []).append((c.unit_shown, f"sd of a reading: {c.label}"))
-    for name, label in turning_figures.COLUMNS.items():
-        found.setdefault(name, []).append((UNITS[END.search(name)[1]], label))
+    for q in quantities.TABLE["turn"]:
+        found.setdefault(q.column, []).append((q.unit, q.label))
     for name in columns.CONDITIONS:
         found.setdefault(name, []).append((UNITS[END.search(name)[1]], f"condition {name}"))
     for q in requirements.QUANTITIES.values():
-        found.setdefault(q.name, []).append((q.unit, f"required: {q.label}"))
+        found.setdefault(q.column, []).append((q.unit, f"required: {q.label}"))
     return found
 
 
@@ -485,7 +485,7 @@ def test_files_of_every_other_command_have_known_names(made, folder, name):
 
 @pytest.mark.slow
 def test_every_command_that_leaves_a_folder_is_walked():
-    """Of `render`, `doctor`, `explain` and `rig` there is no table; what `rig new` writes has names of parameters."""
+    """Of `render`, `explain` and `rig` there is no table; what `rig new` writes has names of parameters."""
     asked = {words[0] for words in OTHERS.values()} | {"sweep", "simulate", "compare", "calibrate"}
     commands = {(c.name or c.callback.__name__) for c in cli.app.registered_commands}
-    assert commands - asked == {"render", "doctor", "explain"}
+    assert commands - asked == {"render", "explain"}

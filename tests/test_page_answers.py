@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from calibration.sensitivity.result import Points
+from calibration.words import fit_words, sensitivity_words
 from mmrjax.model import channels
-from sweeps.pages import mission_page, runs_page, sweep_page
 from sweeps.paper import error_tables
-from sweeps.report.words import fit_words, sensitivity_words
+from sweeps.report import mission_report, runs_report, sweep_report
 
 SHOWN = [channels.find_channel("total_current"), channels.find_channel("speed")]
 
@@ -23,12 +23,12 @@ def table(statuses, flags):
 
 def test_sweep_counts_the_runs_beyond_a_limit():
     runs = table(["converged"] * 3 + ["slides_back"], ["", "gearbox_overspeed", "gearbox_overspeed;slips", ""])
-    assert sweep_page.sweep_answer(runs) == (
+    assert sweep_report.sweep_answer(runs) == (
         "3 of 4 runs have an operating point; 2 of them exceed a limit, most often: "
         "gearbox input faster than its catalogue permits (2 runs)."
     )
-    assert sweep_page.sweep_answer(table(["converged"] * 2, ["", ""])).endswith("; all within every limit.")
-    assert sweep_page.sweep_answer(table(["slides_back"], [""])) == "0 of 1 run has an operating point."
+    assert sweep_report.sweep_answer(table(["converged"] * 2, ["", ""])).endswith("; all within every limit.")
+    assert sweep_report.sweep_answer(table(["slides_back"], [""])) == "0 of 1 run has an operating point."
 
 
 @pytest.mark.parametrize(
@@ -41,24 +41,25 @@ def test_run_names_its_nearest_limit(percent, says):
         {"words": "inrush", "percent": None, "limit": "not stated"},
         {"words": "adhesion", "percent": 20.0, "limit": "1.00"},
     ]
-    said = runs_page.runs_answer(table(["converged"], [""]), SHOWN, limits)
+    said = runs_report.runs_answer(table(["converged"], [""]), SHOWN, limits)
     assert says in said and said.startswith("Total current 2.50 A, speed 400 mm/s; ")
 
 
 def test_runs_without_an_operating_point_say_why():
-    assert runs_page.runs_answer(table(["slides_back"], [""]), SHOWN, []).startswith("No operating point: ")
+    assert runs_report.runs_answer(table(["slides_back"], [""]), SHOWN, []).startswith("No operating point: ")
     several = table(["converged", "converged", "slides_back"], ["", "slips", ""])
     assert (
-        runs_page.runs_answer(several, SHOWN, []) == "2 of 3 runs have an operating point; 1 of them exceeds a limit."
+        runs_report.runs_answer(several, SHOWN, [])
+        == "2 of 3 runs have an operating point; 1 of them exceeds a limit."
     )
 
 
 def test_mission_says_where_most_energy_goes():
-    run = {f"energy_to_{name}_Wh": 0.0 for name in mission_page.SINKS} | {
+    run = {f"energy_to_{name}_Wh": 0.0 for name in mission_report.SINKS} | {
         "energy_to_other_Wh": 7.0, "energy_to_track_Wh": 2.0, "energy_drawn_Wh": 10.0, "energy_Wh": 9.5,
         "distance_m": 120.0, "endurance_s": 3600.0, "status": "converged",
     }  # fmt: skip
-    assert mission_page.mission_answer(run) == (
+    assert mission_report.mission_answer(run) == (
         "The mission takes 9.5 Wh over 120 m (other consumers 70 %, tracks and guides 20 %); a full battery lasts 60 min."
     )
 

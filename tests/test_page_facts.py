@@ -13,10 +13,10 @@ from mmrjax import effects
 from mmrjax.model import paper_robots, params
 from mmrjax.model.paper_tables import TRACKED, WHEELED
 from sweeps.pages import page as frame
-from sweeps.pages import runs_page as page
 from sweeps.pages import sweep_figures, words
-from sweeps.pages.history_figures import Start
 from sweeps.paper import run_figures as paper_runs
+from sweeps.report import run_tables
+from sweeps.report import runs_report as page
 from sweeps.results.resonance_results import ResonanceResult
 
 
@@ -25,18 +25,16 @@ def run_of(robot, **conditions):
     return {name: np.atleast_1d(values)[0] for name, values in found.to_dict().items()}
 
 
-def judged(robot, run, peak=-95.3):
-    zeros = np.zeros(2)
-    start = Start("a", "6T2A", "converged", np.arange(2.0), np.array([0.0, peak]), zeros, zeros, None)
-    return {line["words"]: line for line in page.limits_used(robot, run, [start])}
+def judged(robot, run, peak=95.3):
+    return {line["words"]: line for line in page.limits_used(robot, run | {"peak_current_A": peak})}
 
 
 @pytest.mark.slow
 def test_a_winding_is_judged_by_what_it_may_warm_up_by():
     """28 of 125 °C in a room of 25 °C were once 23 % used."""
     assert (
-        page.warming_share(28.0, 125.0, 25.0) == pytest.approx(3.0)
-        and page.warming_share(125.0, 125.0, 25.0) == 100.0
+        run_tables.warming_share(28.0, 125.0, 25.0) == pytest.approx(3.0)
+        and run_tables.warming_share(125.0, 125.0, 25.0) == 100.0
     )
     robot, run = paper_robots.nominal(), run_of(paper_robots.nominal())
     found = judged(robot, run)["winding, long running"]["percent"]

@@ -11,7 +11,7 @@ from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration, BadData
 from mmrjax.model import paper_robots, params
 from sweeps.inputs import one_run
-from sweeps.pages import posture_words
+from sweeps.report.words import posture_words
 from sweeps.results import posture_results
 
 

@@ -9,7 +9,7 @@ from pages import Tables, drawn, outside
 from test_sweep_store import CONFIG
 
 from sweeps.pages import campaign_figures
-from sweeps.pages import campaign_page as campaign_page
+from sweeps.report import campaign_report
 
 REPORTED = CONFIG.replace("report = false\n", "")
 
@@ -29,9 +29,9 @@ def test_page_is_offline_and_shows_counts_names_and_ranges_of_the_store(page, tm
     tables = page()
     store = xr.open_zarr(tmp_path / "s" / "results.zarr").load()
     assert outside(tmp_path / "s") == []
-    assert "300 points simulated" in tables.text
+    assert "Sweep of 300 points" in tables.text
     slides = int((store.status == 2).sum())
-    assert f"{slides} slides" in " ".join(tables.text.split())
+    assert ["slides", str(slides)] in [row[:2] for row in tables.tables["statuses"]]
     assert [row[0] for row in tables.tables["names"][1:]] == [
         "configuration",
         "slope_deg",
@@ -51,7 +51,7 @@ def test_page_is_offline_and_shows_counts_names_and_ranges_of_the_store(page, tm
 @pytest.mark.slow
 def test_page_of_a_sweep_in_which_nothing_settles_has_no_figures(page, tmp_path):
     tables = page("[conditions]\nslope_deg = 40\n[axes]\nvoltage = [15, 24, 33]\n")
-    assert "3 slides" in " ".join(tables.text.split()) and tables.tables["ranges"][1][2] == "–"
+    assert tables.tables["statuses"][1][:2] == ["slides", "3"] and tables.tables["ranges"][1][2] == "–"
     assert drawn((tmp_path / "s" / "report.html").read_text()) == set()
 
 
@@ -62,8 +62,8 @@ def test_page_of_one_axis_has_one_band(page):
 
 @pytest.mark.slow
 def test_points_of_the_page_are_drawn_from_all_chunks_where_there_are_many(page, tmp_path, monkeypatch):
-    monkeypatch.setattr(campaign_page, "THINNED", 60)
-    monkeypatch.setattr(campaign_page, "CHUNKS", 6)
+    monkeypatch.setattr(campaign_report, "THINNED", 60)
+    monkeypatch.setattr(campaign_report, "CHUNKS", 6)
     assert "quantiles and figures of 60 points drawn at random" in " ".join(page().text.split())
 
 

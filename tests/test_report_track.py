@@ -15,9 +15,9 @@ from mmrjax.model.conditions import Conditions
 from mmrjax.model.signals import CONVERGED, FAILED
 from mmrjax.undercarriage.stability import largest_step
 from sweeps.pages import gear_figures
-from sweeps.pages import runs_page as runs_page
 from sweeps.paper import report, running_gear_figures
 from sweeps.points import run as simulation
+from sweeps.report import page_renderer, runs_report
 
 FIGURES = {
     "track_fig23_24_from_standstill",
@@ -172,7 +172,6 @@ def test_run_of_the_track_model_shows_its_own_running_gear(robot, tmp_path):
     for name, shown, figures in (("whole", batch, {"history", "power", "slip", "ripple", "reactions"}),
                                  ("short", short, {"history", "power", "slip"})):  # fmt: skip
         table = {**simulation.condition_table(robot, runs), **simulation.ending_columns(robot, batch)}
-        path = runs_page.write_runs_page(
-            tmp_path / name, RobotFile(robot, "nominal"), model="track", runs=table, histories=shown
-        )
+        document = runs_report.runs_document(RobotFile(robot, "nominal"), "track", table, shown)
+        path = page_renderer.write_report_page(tmp_path / name, document)
         assert set(re.findall(r'<figure id="([^"]+)">', path.read_text())) == figures

@@ -94,7 +94,10 @@ def tracked(request, tmp_path_factory):
     """Folder and ResonanceResult of a small map of 6T2A, as the command makes it."""
     folder, kept = tmp_path_factory.mktemp("runs") / "map", []
     with runs_of(request.param) as patch:
-        patch.setattr(room, "print_resonance", kept.append)
+        made = room.resonance_report.resonance_document
+        patch.setattr(
+            room.resonance_report, "resonance_document", lambda *found: kept.append(found[0]) or made(*found)
+        )
         assert command([*SMALL, "--out", folder]) == 0
     return folder, kept[0]
 
@@ -133,7 +136,7 @@ def test_command_leaves_result_tables_and_a_page_of_its_own(tracked):
     page = (folder / "report.html").read_text()
     assert "map" in drawn(page) and outside(folder) == []
     tables = Tables(page).tables
-    assert len(tables["points"]) == 1 + 18 and len(tables["frequencies"]) == 1 + 6
+    assert len(tables["points"]) == 2 + 18 and len(tables["frequencies"]) == 1 + 6
     assert {"config.resolved.toml", "robot.toml", "manifest.json"} <= {p.name for p in folder.iterdir()}
     assert not folder.with_name("map.partial").exists()
 

@@ -16,7 +16,7 @@ from calibration.data.columns import Layout
 from calibration.data.runs import Runs
 from calibration.inference.simulation_errors import relative_error, sized_error
 from mmrjax import fidelities
-from mmrjax.model import channels, params
+from mmrjax.model import params, quantities
 from mmrjax.model.paper_robots import nominal
 from sweeps import capabilities
 from sweeps.commands import rig_new
@@ -258,7 +258,7 @@ def test_levels_are_thirds_of_the_limit_to_two_digits(tmp_path):
         robot_file.read_robot(of_kind(tmp_path, "bench", speed=True)), {"motor.speed_limit": 500.0}, "x"
     )
     notes: list[str] = []
-    top = 500.0 / channels.RPM
+    top = 500.0 / quantities.RPM
     found = imposed.imposed_levels(robot, "--motor-speeds", notes)
     assert all(0.9 * share * top < level <= share * top for level, share in zip(found, imposed.SHARES, strict=True))
     assert notes == [

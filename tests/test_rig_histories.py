@@ -20,7 +20,7 @@ from calibration.inference.observers import time_histories as histories_room
 from calibration.inference.observers.time_histories import Histories
 from mmrjax.effects import UNNAMED
 from mmrjax.fidelities import histories as integrator
-from mmrjax.model import balances, channels, params
+from mmrjax.model import balances, channels, params, quantities
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.rig import Begin, Begins, Rig
 from mmrjax.model.signals import State
@@ -144,7 +144,7 @@ def test_a_delay_of_the_imposed_speed_is_found(tmp_path):
     robot = robot_file.load_robot(str(path))
     truth = params.replace(robot, {"rig.delay": 0.03, "bench.loss_coulomb": 0.26})
     t = np.arange(0, 4, 0.03)
-    speed = (200 * np.sin(1.5 * t) + 50 * np.sin(4 * t)) / channels.RPM
+    speed = (200 * np.sin(1.5 * t) + 50 * np.sin(4 * t)) / quantities.RPM
     runs = history(tmp_path, robot, truth, {"time_s": t, "motor_speed_rpm": speed}, [0.01], 1)
     found = calibrate(runs, robot, **OPTIONS)
     delay, friction = found.parameters["rig.delay"], found.parameters["bench.loss_coulomb"]
@@ -197,7 +197,7 @@ def test_beginnings_are_measured_by_the_first_samples(tmp_path):
         begun = kind.with_initial_states(robot, runs, known)
         assert begun.rig.begins.names == ("begin_",)
         begin = begun.rig.begins.members[0]
-        assert float(begin.motor_speed) == pytest.approx(60 * channels.RPM * 16, rel=1e-9)
+        assert float(begin.motor_speed) == pytest.approx(60 * quantities.RPM * 16, rel=1e-9)
         assert float(begin.angle) == pytest.approx(np.radians(30), abs=0.002)
         assert bool(priors.initial_state_names(begun)) == (start == "free")
 
@@ -248,7 +248,7 @@ def imposed_speed(tmp_path, runs, filled=written):
     robot = robot_file.load_robot(str(path))
     t = np.tile(np.arange(0, 1, 0.05), runs)
     run = np.repeat(np.arange(runs), 20)
-    speed = (200 * np.sin(6 * t + run) + 50 * np.sin(14 * t)) / channels.RPM
+    speed = (200 * np.sin(6 * t + run) + 50 * np.sin(14 * t)) / quantities.RPM
     columns = {"time_s": t, "run_id": run, "motor_speed_rpm": speed}
     return robot, filled(tmp_path, robot, columns, [0.01])
 
@@ -276,7 +276,7 @@ def test_curves_of_a_drive_that_reverses_count_along_its_travel(tmp_path):
     robot, runs = imposed_speed(tmp_path, 2)
     speed = np.repeat(np.linspace(-400, 400, 20)[None], 2, 0)
     speed[1] = -speed[0]
-    runs = dataclasses.replace(runs, columns={**runs.columns, "motor_speed_rpm": speed.ravel() / channels.RPM})
+    runs = dataclasses.replace(runs, columns={**runs.columns, "motor_speed_rpm": speed.ravel() / quantities.RPM})
     observer = observers.observer_kind(runs).of(runs, robot)
     columns = {**runs.columns, "total_current_A": np.sign(speed.ravel()) + speed.ravel() / 100}
     bases = observer.bases(columns, np.ones(len(runs), bool), robot)
@@ -317,7 +317,7 @@ def test_every_row_of_an_imposed_speed_has_the_acceleration_of_its_line(tmp_path
     columns = {
         "time_s": np.concatenate([0.1 * np.arange(len(w)) for w in ramps.values()]),
         "run_id": np.repeat(list(ramps), [len(w) for w in ramps.values()]),
-        "motor_speed_rpm": np.concatenate(list(ramps.values())) / channels.RPM,
+        "motor_speed_rpm": np.concatenate(list(ramps.values())) / quantities.RPM,
     }
     rows = Histories.of(written(tmp_path, robot, columns, [0.01]), robot).of_rows
     expected = [200.0, 400.0, 0.0, -100.0, -100.0, -300.0, -300.0, -300.0, 0.0]

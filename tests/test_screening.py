@@ -20,9 +20,9 @@ from calibration.discovery.settings import settings_for
 from calibration.inference.held_out import predict_unseen
 from calibration.inference.observers import Histories
 from calibration.inference.optimizers import Optimum
+from calibration.words import loop_words as words
 from mmrjax.effects import BY_NAME
 from sweeps.commands import loop as command
-from sweeps.report.words import loop_words as words
 
 NAMES = ("churning", "stribeck_track", "series_resistance", "brush_drop")
 ANALYST = Analyst(dataclasses.replace(settings_for(Histories, 300), slots=2), {n: BY_NAME[n] for n in NAMES})

@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import jsonschema
 import numpy as np
 import pytest
-from test_sensitivity_methods import shapley_of_linear
 
 from calibration.data import posterior_file as posteriors
 from calibration.data import robot_file
@@ -23,10 +22,8 @@ from calibration.sensitivity import information
 from calibration.sensitivity import uncertain_inputs as room
 from calibration.sensitivity.analyse import analyse_sensitivity
 from calibration.sensitivity.local import inert_inputs, local_derivatives
-from calibration.sensitivity.methods import correlated_inputs, shapley_effects
 from calibration.sensitivity.model import chosen_outputs
 from calibration.sensitivity.result import Points
-from calibration.sensitivity.sensitivity_notes import Inert
 from calibration.sensitivity.study import Study
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import params
@@ -130,46 +127,6 @@ def test_sobol_of_a_nearly_linear_study_is_its_linear_share(study):
 
 
 @pytest.mark.slow
-def test_shapley_effects_of_a_posterior_are_those_of_its_linear_model(robot, study):
-    coordinates = priors.parameter_coordinates(robot, NAMES[:2])
-    covariance = np.array([[0.02, 0.012], [0.012, 0.02]])
-    inputs = room.inputs_from_posterior(robot, posterior_of_coordinates(coordinates, np.zeros(2), covariance), {})
-    points = Points(*(x[:1] for x in study.points.columns().values()))
-    one = Study(robot, inputs, points, chosen_outputs(("total_current",), robot))
-    found = analyse_sensitivity(one, "shapley", 20_000)
-    assert sum(found.sampled["steady"].values()) == found.evaluations > 0
-    z_slopes = local_derivatives(one).by_score["total_current"][0] @ np.linalg.inv(inputs.parameters.root)
-    truth = shapley_of_linear(z_slopes, covariance)
-    estimate = found.outputs["total_current"].overall["shapley"]
-    half = (estimate.high - estimate.low) / 2
-    assert np.all(np.abs(estimate.value - truth) <= 1.5 * half + 0.01) and half.max() < 0.1
-
-
-@pytest.mark.slow
-def test_shapley_effects_of_inputs_that_do_nothing_are_those_of_their_correlations(robot, study):
-    # The torque constant acts; the inductance does nothing, and the other two act in one configuration each. The
-    # guides' share is linked with the inductance through the 4W2T's loss alone.
-    names = (NAMES[0], NAMES[2], NAMES[3], NAMES[1])
-    covariance = 0.02 * np.array([[1, 0.6, 0, 0], [0.6, 1, 0.5, 0], [0, 0.5, 1, 0], [0, 0, 0, 1.0]])
-    inputs = room.inputs_from_posterior(
-        robot, posterior_of_coordinates(priors.parameter_coordinates(robot, names), np.zeros(4), covariance), {}
-    )
-    points = Points(*(x[:2] for x in study.points.columns().values()))
-    one = Study(robot, inputs, points, chosen_outputs(("speed",), robot))
-    found = analyse_sensitivity(one, "shapley", 40_000)
-    slopes = local_derivatives(one).by_score["speed"] @ np.linalg.inv(inputs.parameters.root)
-    at = found.outputs["speed"].at_points["shapley"]
-    assert abs(slopes[0, 1]) < 1e-9 and np.all(np.abs(slopes[:, 2]) < 1e-9)
-    for k in range(2):
-        truth, half = shapley_of_linear(slopes[k], covariance), (at.high[k] - at.low[k]) / 2
-        assert np.all(np.abs(at.value[k] - truth) <= 1.5 * half + 0.01) and half.max() < 0.1
-    assert at.value[0, 1] > 0.05 and at.value[0, 2] > 0.01
-    assert found.inputs["motor.inductance"].inert and "motor.inductance" not in found.negligible
-    assert Inert(("motor.inductance",), correlated=True) in found.remarks
-    assert correlated_inputs(inputs, [3]) == (3,) and correlated_inputs(inputs, [2, 3]) == (0, 1, 2, 3)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("variances", [(0.02, 0.01), (0.01, 0.02)])
 def test_inputs_of_a_posterior_that_do_nothing_are_found_whatever_their_variance(robot, study, variances):
     coordinates = priors.parameter_coordinates(robot, (NAMES[0], NAMES[3]))
@@ -181,38 +138,8 @@ def test_inputs_of_a_posterior_that_do_nothing_are_found_whatever_their_variance
     np.testing.assert_array_equal(inert_inputs(one, local_derivatives(one), 0), [False, True])
 
 
-def test_overall_shapley_effects_keep_their_intervals_where_one_point_loses_pairs(robot, study, monkeypatch):
-    coordinates = priors.parameter_coordinates(robot, NAMES[:2])
-    inputs = room.inputs_from_posterior(
-        robot, posterior_of_coordinates(coordinates, np.zeros(2), np.array([[1, 0.5], [0.5, 1.0]])), {}
-    )
-    points = Points(*(x[[0, 3]] for x in study.points.columns().values()))
-    two = Study(robot, inputs, points, chosen_outputs(("speed",), robot))
-    edge = np.inf
-
-    def sample(values, group):
-        """The same output at both points, but for robots that do not travel at the second."""
-        y = np.log(values[:, 0]) + 0.2 * values[:, 1]
-        for k in group:
-            yield k, {"speed": np.where((k == 1) & (values[:, 1] > edge), np.nan, y)}
-
-    monkeypatch.setattr(two, "sample", sample)
-    whole = shapley_effects(two, np.ones(2, bool), 6000, 0)["speed"]
-    edge = 2.2 * float(inputs.parameters.at(inputs.parameters.mean)[1])
-    some = shapley_effects(two, np.ones(2, bool), 6000, 0)["speed"]
-    assert 0 < some.lost[1] < 0.1 and some.lost[0] == 0
-    width = [np.ptp([p.overall["shapley"].low, p.overall["shapley"].high], axis=0) for p in (whole, some)]
-    np.testing.assert_allclose(
-        width[0], np.ptp([whole.at_points["shapley"].low[0], whole.at_points["shapley"].high[0]], axis=0)
-    )
-    # what is the same at both points is known no better for being there twice
-    assert np.all(width[1] > 0.95 * width[0])
-    at, variance = some.at_points["shapley"].value, some.sd**2
-    np.testing.assert_allclose(some.overall["shapley"].value, variance @ at / variance.sum())
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("method", ["sobol", "morris", "derivative", "shapley"])
+@pytest.mark.parametrize("method", ["sobol", "morris", "derivative"])
 def test_evaluations_are_those_whose_statuses_are_counted(robot, study, method):
     inputs = room.inputs_from_priors(robot, (*NAMES[:3], "6T2A.ground.friction.static"), {})  # a size of design each
     points = Points(*(x[:2] for x in study.points.columns().values()))
@@ -320,13 +247,12 @@ def test_posterior_of_a_robot_is_its_inputs_and_gives_runs_their_uncertainty(mmr
     )  # fmt: skip
     document = json.loads((tmp_path / "p" / "result.json").read_text())
     jsonschema.validate(document, SCHEMA)
-    assert code == 0 and document["method"] == "shapley" and document["correlated"]
-    assert sum(x["shapley"] for x in document["indices"]["speed"].values()) == pytest.approx(1)
+    assert code == 0 and document["method"] == "local" and document["correlated"]
 
     code, out, _ = mmrjax(
         "simulate", "--robot", "robot.toml", "--posterior", "60", "--voltage", "24", "--no-report", "--out", "u"
     )
-    assert code == 0 and re.search(r"total current \[A\] +│ \d\.\d+ ± 0\.\d+", out)
+    assert code == 0 and re.search(r"total current \[A\] +\d\.\d+ ± 0\.\d+", out)
     (row,) = table(tmp_path / "u" / "runs.csv")
     low, high = float(row["speed_mm_s_lower"]), float(row["speed_mm_s_upper"])
     assert low < float(row["speed_mm_s"]) < high

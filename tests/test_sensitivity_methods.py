@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 import pytest
 
-from calibration.sensitivity import derivative, information, morris, shapley, sobol
+from calibration.sensitivity import derivative, information, morris, sobol
 from calibration.sensitivity.replicates import REPLICATES, ratio_estimate
 
 A, B = 7.0, 0.1
@@ -211,54 +211,6 @@ def test_morris_design_is_repeatable_and_leaves_the_global_generator_alone():
     first = morris.morris_design(3, 10, 5)
     np.testing.assert_array_equal(np.random.get_state()[1], before)  # noqa: NPY002
     np.testing.assert_array_equal(first, morris.morris_design(3, 10, 5))
-
-
-# --- Shapley ------------------------------------------------------------------------------------------------------
-
-
-def shapley_of_linear(mean_slope, covariance):
-    """Exact effects of y = βᵀz with jointly normal z, over all subsets: what each lowers of the variance that is left
-    once z of a subset is known (Owen and Prieur, SIAM/ASA J. Uncertain. Quantif. 5 (2017))."""
-    size = len(mean_slope)
-
-    def left(known):
-        a, b = list(known), [k for k in range(size) if k not in known]
-        given = covariance[np.ix_(b, a)] @ np.linalg.pinv(covariance[np.ix_(a, a)]) @ covariance[np.ix_(a, b)]
-        return mean_slope[b] @ (covariance[np.ix_(b, b)] - given) @ mean_slope[b]
-
-    orders = [*itertools.permutations(range(size))]
-    lowered = [[left(o[: o.index(k)]) - left(o[: o.index(k) + 1]) for k in range(size)] for o in orders]
-    return np.mean(lowered, axis=0) / left(())
-
-
-COVARIANCE = np.array([[1.0, 0.8, 0.0, 0.1], [0.8, 1.5, -0.3, 0.0], [0.0, -0.3, 0.7, 0.2], [0.1, 0.0, 0.2, 2.0]])
-SLOPES = np.array([1.0, -0.5, 2.0, 0.0])
-
-
-def test_shapley_effects_of_a_linear_model_of_correlated_inputs():
-    design = shapley.shapley_design(np.array([1.0, 2.0, 3.0, 4.0]), COVARIANCE, 600, 0)
-    found = shapley.effects_of_terms(shapley.shapley_terms(design, design.points @ SLOPES))
-    truth = shapley_of_linear(SLOPES, COVARIANCE)
-    assert within(found, truth) and found.value.sum() == pytest.approx(1)
-    assert truth[3] > 0  # it does nothing, and is known through others
-
-
-def test_shapley_effects_of_two_inputs_are_those_of_owen_and_prieur():
-    rho, slopes = 0.6, np.array([1.0, 2.0])
-    covariance = np.array([[1, rho], [rho, 1]])
-    whole = slopes @ covariance @ slopes
-    # eq. (9): half of what they share through their correlation each
-    first = (slopes[0] ** 2 * (1 - rho**2 / 2) + slopes[0] * slopes[1] * rho + slopes[1] ** 2 * rho**2 / 2) / whole
-    assert shapley_of_linear(slopes, covariance)[0] == pytest.approx(first)
-
-
-def test_shapley_effects_of_independent_inputs_are_their_shares():
-    np.testing.assert_allclose(shapley_of_linear(np.array([1.0, 2.0]), np.eye(2)), [0.2, 0.8])
-
-
-def test_shapley_without_numbers_is_none():
-    design = shapley.shapley_design(np.zeros(2), np.eye(2), 50, 0)
-    assert shapley.shapley_terms(design, np.full(len(design.points), np.nan)) is None
 
 
 # --- information --------------------------------------------------------------------------------------------------

@@ -20,9 +20,9 @@ from calibration.data.input_errors import BadData
 from calibration.inference import checks, observers
 from calibration.inference import noise as noises
 from calibration.inference.foresight import Foresight
+from calibration.words import settle_words as words
 from sweeps.commands import rig_check
 from sweeps.commands.settle import rolling_readings
-from sweeps.report.words import settle_words as words
 
 
 def made(tmp_path, seed=1, kind="bench", imposed="voltage", **options):

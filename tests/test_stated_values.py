@@ -11,7 +11,7 @@ from worlds import laws, settled, tables
 from calibration.discovery import discover, findings
 from calibration.discovery.loop_notes import FreedValue
 from calibration.discovery.stated_values import find_prior_shifts, prior_shift_scores
-from sweeps.report.words import loop_words as words
+from calibration.words import loop_words as words
 
 NOMINAL = settled.CLIMBING["motor.resistance"]
 #: χ² that a shift has to explain to be tried.

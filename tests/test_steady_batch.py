@@ -85,7 +85,7 @@ def test_steady_outputs_are_those_of_steady_batch(robot, effects):
     ]  # fmt: skip
     found = steady_outputs(robot, runs, (*ALL, "status", "flags"))
     for output in outputs.output_table(channels.usual_channels()):
-        np.testing.assert_allclose(found[output.name], output.get(whole), rtol=1e-13, err_msg=output.name)
+        np.testing.assert_allclose(found[output.name], getattr(whole, output.name), rtol=1e-13, err_msg=output.name)
     np.testing.assert_array_equal(found["status"], whole.status)
     np.testing.assert_array_equal(found["flags"], whole.flags)
     for name in ("speed", "power_lift"):

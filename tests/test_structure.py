@@ -114,10 +114,6 @@ NAMED = {DOOR, ("mmrjax/compile/programs.py", "OWN")}
 
 def layers_import_those_before_them(path: PurePosixPath, tree: ast.Module) -> Iterator[Breach]:
     layer = path.parts[0]
-    if path.as_posix() == DOOR[0]:  # what annotations alone need, and names of modules in one table
-        tree = ast.Module(
-            [n for n in tree.body if not (isinstance(n, ast.If) and "TYPE_CHECKING" in ast.unparse(n.test))], []
-        )
     place, above = places(tree), LAYERS[LAYERS.index(layer) + 1 :]
     for node in walked(tree):
         named = (
@@ -212,8 +208,9 @@ REPRODUCTION = ("sweeps", "paper")
 #: what shows slip.
 SPELLED = {
     ("calibration/discovery/menu.py", "TURNING, STANDING"),
-    ("sweeps/report/words/effect_words.py", "CHECKED_BY"),  # which act checks which instrument
-    ("calibration/data/contents.py", "MEANINGS"),  # words in the names of other people's signals
+    ("calibration/data/proposals.py", "MEANINGS"),  # words in the names of other people's signals
+    ("calibration/data/proposals.py", "BY_UNIT"),
+    ("calibration/words/effect_words.py", "CHECKED_BY"),  # which act checks which instrument
     ("calibration/inference/blocks.py", "BLOCKS"),  # what is imposed may be a channel's column
     ("calibration/inference/observers/settled_ends.py", "_slides_at_end"),  # the two that show slip
 }
@@ -400,7 +397,7 @@ def _rebound(function: Function) -> set[str]:
     return {name for n in walked(function) if isinstance(n, ast.Global) for name in n.names}
 
 
-#: Rooms that compute, and most words of a string of theirs; what is said in more is said in `sweeps/report/words`.
+#: Rooms that compute, and most words of a string of theirs; what is said in more is said in `calibration/words`.
 COMPUTING = tuple(f"calibration/{room}/" for room in ("inference", "discovery", "sensitivity", "sizing"))
 MOST_WORDS = 5
 
@@ -598,14 +595,14 @@ BAD = {
 #: What no rule may mind.
 GOOD = {
     "mmrjax/model/balances.py": "def f(e, r, s):\n    return e.term(r, s)\n",
-    "mmrjax/__init__.py": "_ABOVE = {'f': 'calibration'}\nif TYPE_CHECKING:\n    from calibration import f as f\n",
+    "mmrjax/__init__.py": "_ABOVE = {'f': 'calibration'}\n",
     "mmrjax/model/paper_tables.py": "TRACKED, WHEELED = '6T2A', '4W2T'\n",
     "calibration/__init__.py": "",
     "calibration/data/table.py": "'''On 6T2A and 4W2T.'''\ndef f(t):\n    return {'time_s': t['time_s'], 'row': 1}\n",
     "calibration/sizing/said.py": "def why(x):\n    return f'{x} is one two three four five six'\ndef f(x, y):\n"
     "    '''One two three four five six.'''\n    cure = 'one two three four five six' if y else 'seven'\n"
     "    if x:\n        raise BadData(why(x))\n    return BadConfiguration(f'one two three {x} four five six {cure}')\n",
-    "sweeps/report/words/loop_words.py": "X = 'one two three four five six seven'\n",
+    "calibration/words/loop_words.py": "X = 'one two three four five six seven'\n",
     "calibration/discovery/menu.py": "TURNING, STANDING = ('total_current', 'motor_speed'), ('total_current',)\n",
     "calibration/discovery/search.py": "def f(space: CandidateSpace) -> int: ...\n",
     "calibration/inference/observers/one.py": "def f(runs, o):\n    return runs.has('time_s') or isinstance(o, Histories)\n",

@@ -14,7 +14,7 @@ from mmrjax.fidelities.drive import drive_batch
 from mmrjax.model import paper_robots, signals
 from sweeps.commands.simulate import PEAK, run_remarks
 from sweeps.pages import figure_style, history_figures, words
-from sweeps.pages import runs_page as runs_page
+from sweeps.report import runs_report
 from tests.commands import rows as table
 
 SPEED_STATIC = 0.02  # V_s of the packaged robot [m/s]: within it contacts creep
@@ -267,7 +267,7 @@ def test_a_history_has_the_peak_of_the_inrush(climb, mmrjax, tmp_path):
     peak = float(np.max(np.asarray(fine.signals.total_current)))
     assert float(np.max(np.asarray(found.history.signals.total_current[0]))) == pytest.approx(peak, rel=2e-3)
     code, out, _ = mmrjax("simulate", "--model", "drive", "--slope", 10, "--no-report", "--out", "a")
-    assert code == 0 and re.search(rf"peak current, all motors \[A\] +│ {peak:.1f}", out)
+    assert code == 0 and re.search(rf"peak current, all motors \[A\] +{peak:.1f}", out)
     (row,) = table(tmp_path / "a" / "runs.csv")
     assert float(row[PEAK]) == pytest.approx(peak, rel=1e-4)
     kept = [float(r["total_current_A"]) for r in table(tmp_path / "a" / "history.csv")]
@@ -278,7 +278,7 @@ def test_a_history_has_the_peak_of_the_inrush(climb, mmrjax, tmp_path):
 @pytest.mark.slow
 def test_a_start_is_drawn_of_the_run_that_was_asked_for(climb):
     robot, found = climb
-    heading = runs_page.run_headings(found.to_dict())
+    heading = runs_report.run_headings(found.to_dict())
     assert heading == ["6T2A, 33 V, 0 kg, 10°", "6T2A, -33 V, 0 kg, -10°"]
     up, back = history_figures.members_from_standstill(
         robot, found.history, np.asarray(found.status), [0, 0], heading
@@ -389,7 +389,7 @@ def test_rated_limits_stand_in_the_report():
     robot = paper_robots.nominal()
     found = api.simulate(robot, api.Conditions("6T2A", 33.0, 10.0, 8.0, battery=1.0))
     run = {name: np.atleast_1d(values)[0] for name, values in found.to_dict().items()}
-    shown = {line["words"]: line for line in runs_page.limits_used(robot, run)}
+    shown = {line["words"]: line for line in runs_report.limits_used(robot, run)}
     torque = shown["gearbox torque at the driving wheel"]
     wheel = float(found.theoretical_speed) / float(robot.configurations["6T2A"].radius)
     assert torque["limit"] == "6.25 N·m"

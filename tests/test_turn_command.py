@@ -16,14 +16,17 @@ from mmrjax.derived import turning_figures as derived
 from mmrjax.errors import UsageError
 from mmrjax.missions.profile import profile
 from mmrjax.model import paper_robots
-from mmrjax.model.channels import HEAT, SIDES
+from mmrjax.model.channels import SIDES
+from mmrjax.model.quantities import HEAT
 from sweeps import config, inputs
 from sweeps.commands import simulate
 from sweeps.commands import turn as turn_room
-from sweeps.pages import mission_figures, turn_page, turn_words
+from sweeps.pages import mission_figures, turn_figures
 from sweeps.pages.figure_style import figure_as_svg
 from sweeps.points.imposed import UNLIMITED
 from sweeps.points.job import showing_turns
+from sweeps.report import run_tables, turn_report
+from sweeps.report.words import turn_words
 from sweeps.results import check_results
 from tests.commands import rows
 
@@ -312,8 +315,8 @@ def test_turns_are_told_in_plain_words():
     robot = paper_robots.nominal()
 
     def said(ended=None, **changes):
-        found = turn_words.turn_in_words(robot, row(**changes), ended)
-        return " ".join((found.answer, *found.notes))
+        turn = row(**changes)
+        return " ".join((turn_words.turn_answer(turn, ended), *turn_words.turn_notes(robot, turn)))
 
     assert "to the left: a circle of 400 mm radius" in said()
     assert "on the spot to the right at 0.50 rad/s, 4.8 turns a minute" in said(yaw_rate_rad_s=-0.5, speed_mm_s=0.2)
@@ -325,20 +328,15 @@ def test_turns_are_told_in_plain_words():
     assert "stalled" in said(status="stalled")
     assert "track width" not in said(status="not_settled")
     assert "winding_hot: winding hotter than permitted" in said(flags="gearbox_overspeed;winding_hot")
-    hot = turn_words.turn_in_words(robot, row(winding_left_C=float("inf"), power_right_W=-0.01), None)
-    assert hot.sides[-2:] == [("electrical power [W]", "5.0", "0.0"), (hot.sides[-1][0], "none settles", "40")]
+    hot = turn_report.sides_table(robot, row(winding_left_C=float("inf"), power_right_W=-0.01)).rows
+    assert hot[-2:] == [("electrical power [W]", "5.0", "0.0"), (hot[-1][0], "none settles", "40")]
     unknown = dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, unknown=HEAT[-1:]))
-    assert [side[0] for side in turn_words.turn_in_words(unknown, row(), None).sides] == [
-        side[0] for side in hot.sides[:-1]
-    ]
+    assert [side[0] for side in turn_report.sides_table(unknown, row()).rows] == [side[0] for side in hot[:-1]]
     nothing = {name: float("nan") for name, value in row().items() if isinstance(value, float)}
-    none = turn_words.turn_in_words(robot, row(status="not_settled", **nothing), None)
-    assert (
-        none.answer.startswith("not_settled: ")
-        and "no settled turn" in none.answer
-        and "--duration" not in none.answer
-    )
-    assert not none.sides and not none.notes
+    none = row(status="not_settled", **nothing)
+    answer = turn_words.turn_answer(none, None)
+    assert answer.startswith("not_settled: ") and "no settled turn" in answer and "--duration" not in answer
+    assert not turn_report.sides_table(robot, none).rows and not turn_words.is_going(none)
     assert "parts allow" not in said()
     robot = params.replace(robot, {"6T2A.turning.width": 0.5})
     assert "500 mm between the sides is outside the range of the packaged robot's parts, 208 to 278 mm" in said()
@@ -433,20 +431,18 @@ def test_profiles_in_python_are_refused_before_they_are_followed(robot, told, sa
         mm.simulate(robot, mm.Conditions("6T2A"), **told)
 
 
-def test_tables_have_no_negative_zero(monkeypatch):
+def test_tables_have_no_negative_zero():
     straight = mm.simulate(mm.nominal(), mm.Conditions("6T2A", voltage=24, slope_deg=-1e-6))
     assert "-0" not in straight.table() and "0.00" in straight.table()
-    said = []
-    monkeypatch.setattr(simulate, "print_output", said.append)
-    table = {"slope_deg": [-0.0], "speed_mm_s": [-0.01], "status": ["converged"]}
-    simulate.print_runs({name: np.array(values) for name, values in table.items()}, paper_robots.nominal().channels)
-    assert [list(c.cells) for c in said[0].columns][1] == ["0", "0.0", "converged"]
+    table = {"slope_deg": np.array([-0.0]), "speed_mm_s": np.array([-0.01])}
+    shown = run_tables.quantity_table("runs", table, table)
+    assert [column.text(cell) for column, cell in zip(shown.columns, shown.rows[0], strict=True)] == ["0", "0.0"]
 
 
 def test_a_path_between_places_that_turn_is_an_arc():
     """A quarter of a circle of 2 m, and a metre straight on, from three rows."""
     x, y, yaw = np.array([0.0, 2.0, 2.0]), np.array([0.0, 2.0, 3.0]), np.array([0.0, np.pi / 2, np.pi / 2])
-    ahead, aside = turn_page.path_arcs(x, y, yaw)
+    ahead, aside = turn_figures.path_arcs(x, y, yaw)
     np.testing.assert_allclose(np.hypot(ahead[:-1], aside[:-1] - 2.0), 2.0, rtol=1e-12)
     assert np.max(np.diff(aside[:-1])) < 0.11 and (ahead[-1], aside[-1], len(ahead)) == (2.0, 3.0, 34)
 

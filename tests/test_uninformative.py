@@ -8,9 +8,9 @@ import pytest
 from calibration.data import robot_file
 from calibration.data import runs as records
 from calibration.data.input_errors import BadData
+from calibration.described import describe
 from calibration.discovery import discover
 from calibration.inference import noise, observers, ranges, uninformative
-from sweeps.report.words.note_words import describe
 
 RIG = """
 base = "none"

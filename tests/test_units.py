@@ -1,6 +1,12 @@
 """Units of columns against a table written out by hand, and quantities that are one row each."""
 
+import csv
+import json
 import math
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 
@@ -24,13 +30,13 @@ BY_HAND = {
 
 @pytest.mark.parametrize("channel", channels.EVERY, ids=lambda c: c.name)
 def test_units_of_a_channel_are_those_of_the_table_by_hand(channel):
-    for unit, factor in ((channel.unit, channel.factor), *channel.other_units):
+    for unit, factor in channel.sizes.items():
         assert factor == pytest.approx(BY_HAND[unit], rel=1e-12), unit
 
 
 @pytest.mark.parametrize("condition", quantities.SET, ids=lambda c: c.column)
 def test_units_of_a_condition_are_those_of_the_table_by_hand(condition):
-    for unit, factor in ((condition.unit, condition.factor), *condition.other_units):
+    for unit, factor in condition.sizes.items():
         assert factor == pytest.approx(BY_HAND[unit], rel=1e-12), unit
         assert condition.value(2.0, quantities.unit_in_column(unit)) == pytest.approx(2.0 * factor / condition.factor)
 
@@ -51,16 +57,13 @@ def test_units_as_people_write_them_are_those_of_columns(written, column):
 
 # --- a quantity is one row -----------------------------------------------------------------------------------
 
-CHANNEL = channels.Channel(
-    name="terminal_voltage", unit="V", factor=1.0, label="terminal voltage", word="terminal", range=(0.0, 100.0),
-    sd_largest=10.0, read=lambda robot, signals: signals.voltage, sd_share=0.01, other_units=(("mV", 1e-3),),
-)  # fmt: skip
-CONDITION = quantities.Condition(
-    "air_pressure", "kPa", 1e3, "pressure of the air", (50.0, 120.0), in_tables=True, other_units=(("Pa", 1.0),)
+CHANNEL = quantities.Channel(
+    "terminal_voltage", "V", "terminal voltage", (0.0, 100.0), 10.0, word="terminal", signal="voltage"
 )
+CONDITION = quantities.Condition("depth", "mm", "depth of the water", (50.0, 120.0), field="", in_tables=True)
 TABLE = (
     "configuration,supply_voltage_V,total_mass_kg,payload_kg,slope_deg,{}\n"
-    "6T2A,15,13.1,0,5,{},2000\n6T2A,24,13.1,0,5,101300,4000\n"
+    "6T2A,15,13.1,0,5,{},2000\n6T2A,24,13.1,0,5,0.1013,4000\n"
 )
 
 
@@ -72,26 +75,69 @@ def two_rows_more(monkeypatch):
 
 def test_a_quantity_is_read_written_and_explained_by_its_row(two_rows_more, tmp_path):
     path = tmp_path / "runs.csv"
-    path.write_text(TABLE.format("air_pressure_Pa,terminal_voltage_mV", 98000))
+    path.write_text(TABLE.format("depth_m,terminal_voltage_mV", 0.098))
     runs = records.read_runs(path)
     assert runs.unknown == () and runs.channels[-1] is CHANNEL
-    assert runs["air_pressure_kPa"].tolist() == [98.0, 101.3] and runs["terminal_voltage_V"].tolist() == [2.0, 4.0]
-    path.write_text(TABLE.format("air_pressure_kPa,terminal_voltage_V", 40))
-    with pytest.raises(BadData, match=r"row 1, air_pressure_kPa: got 40; expected 50 to 120; also row 1, terminal_"):
+    assert runs["depth_mm"].tolist() == [98.0, 101.3] and runs["terminal_voltage_V"].tolist() == [2.0, 4.0]
+    path.write_text(TABLE.format("depth_mm,terminal_voltage_V", 40))
+    with pytest.raises(BadData, match=r"row 1, depth_mm: got 40; expected 50 to 120; also row 1, terminal_"):
         records.read_runs(path)
-    path.write_text(TABLE.format("Air_Pressure_Pa,terminal_voltage_mV", 98000))
-    assert "Air_Pressure_Pa is read as air_pressure_Pa" in records.read_runs(path).notes[0]
+    path.write_text(TABLE.format("Depth_m,terminal_voltage_mV", 0.098))
+    assert "Depth_m is read as depth_m" in records.read_runs(path).notes[0]
     (output,) = (o for o in outputs.output_table(runs.channels) if o.name == CHANNEL.name)
     assert (output.column, output.unit, output.label) == ("terminal_voltage_V", "V", "terminal voltage")
-    for kind, name in (("channel", "terminal_voltage"), ("condition", "air_pressure_kPa")):
-        assert dict(explain.EXPLAINED[kind](name, {}))["column"].startswith(f"{name.removesuffix('_kPa')}_")
+    for kind, name in (("channel", "terminal_voltage"), ("condition", "depth_mm")):
+        assert dict(explain.EXPLAINED[kind](name, {}))["column"].startswith(f"{name.removesuffix('_mm')}_")
 
 
 def test_a_rig_states_a_channel_by_its_row(two_rows_more, tmp_path):
     path = tmp_path / "rig.toml"
-    path.write_text('channels = ["terminal_voltage"]\n[columns]\nair_pressure_Pa = "p"\nterminal_voltage_mV = "Ut"\n')
+    path.write_text('channels = ["terminal_voltage"]\n[columns]\ndepth_m = "p"\nterminal_voltage_mV = "Ut"\n')
     robot = robot_file.read_robot(path)
-    (tmp_path / "runs.csv").write_text(TABLE.format("p,Ut", 98000))
+    (tmp_path / "runs.csv").write_text(TABLE.format("p,Ut", 0.098))
     runs = records.read_runs(tmp_path / "runs.csv", robot=robot)
-    assert runs["air_pressure_kPa"].tolist() == [98.0, 101.3] and runs.measured().tolist() == [[2.0], [4.0]]
+    assert runs["depth_mm"].tolist() == [98.0, 101.3] and runs.measured().tolist() == [[2.0], [4.0]]
     assert robot.channels == (CHANNEL,) and runs.headings["terminal_voltage_V"] == "Ut"
+
+
+ROW_MORE = """
+import sys
+from pathlib import Path
+from mmrjax.model import quantities
+quantities.TABLE["channel"] += (quantities.Channel(
+    "gear_torque", "Nm", "torque of the gearbox", (-100.0, 100.0), 10.0, 0.03, signal="torque_gear"
+),)
+from sweeps import cli
+robot = Path("rig.toml")
+robot.write_text(
+    'base = "none"\\nchannels = ["motor_speed", "gear_torque"]\\nmotor.torque_constant = 0.05\\n'
+    'motor.resistance = 1.0\\ngearbox.ratio = 16\\ngearbox.efficiency_load = 0.8\\n'
+    '[bench]\\nload = "shaft"\\ninertia = 0.001\\nloss_coulomb = 0.1\\n'
+)
+Path("runs.csv").write_text("supply_voltage_V,motor_speed_rpm,gear_torque_mNm\\n12,2200,100\\n24,4400,120\\n")
+commands = (
+    "compare runs.csv --robot rig.toml --out compared",
+    "sweep --robot rig.toml --voltages 12,24 --outputs gear_torque --out swept --no-report --export csv",
+    "explain gear_torque",
+)
+for command in commands:
+    sys.argv = ["mmrjax", *command.split()]
+    try:
+        cli.main()
+    except SystemExit as end:
+        assert end.code in (0, None), command
+"""
+
+
+def test_a_channel_of_one_row_is_in_tables_sweeps_help_pages_and_json(tmp_path):
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
+    done = subprocess.run(
+        [sys.executable, "-c", ROW_MORE], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert "torque of the gearbox [N·m], as its instrument shows it" in done.stdout
+    with (tmp_path / "swept" / "runs.csv").open() as stream:
+        assert [float(row["gear_torque_Nm"]) for row in csv.DictReader(stream)] == pytest.approx([0.1, 0.1])
+    assert "torque of the gearbox" in (tmp_path / "compared" / "report.html").read_text("utf-8")
+    error = json.loads((tmp_path / "compared" / "result.json").read_text())["errors"]["bench"]["gear_torque"]
+    assert error["unit"] == "Nm" and error["rms"] == pytest.approx(math.sqrt((0.0**2 + 0.02**2) / 2), rel=1e-6)

@@ -14,7 +14,7 @@ from calibration.sensitivity.model import chosen_outputs, default_outputs
 from mmrjax.fidelities.base import History
 from mmrjax.missions.profile import profile
 from mmrjax.model import params
-from mmrjax.model.channels import HEAT, WARMING
+from mmrjax.model.quantities import HEAT, WARMING
 from mmrjax.model.signals import Signals
 from sweeps.config import Simulate
 from sweeps.config_campaign import Campaign

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from calibration.described import in_words
+from calibration.described import describe, in_words
 from calibration.discovery import loop_notes as of_loop
 from calibration.discovery.loop_notes import (
     CurveOver,
@@ -28,11 +28,11 @@ from calibration.inference.lack_of_fit import Adequacy
 from calibration.inference.residual_clusters import LevelMean, ResidualCluster
 from calibration.inference.series_noise import SeriesNoise
 from calibration.sensitivity import sensitivity_notes as of_study
+from calibration.words import fit_words, loop_words, step_words, table_words
+from calibration.words.note_words import NOTES
 from mmrjax.model import channels
 from sweeps import console
 from sweeps.pages.words import FILES
-from sweeps.report.words import fit_words, loop_words, step_words, table_words
-from sweeps.report.words.note_words import NOTES, describe
 
 ROOT = Path(__file__).resolve().parents[1]
 #: Notes of every kind; their sentences are in `tests/record/pages/notes.txt`, which `python tests/test_words.py` writes.
@@ -66,6 +66,7 @@ SAMPLES = [
     of_fit.EndsEarly(("a", "b"), 0.01, 0.4),
     of_fit.EndsEarly(("a",), 0.01, float("nan")),
     of_fit.Thinned("log.csv", 25000, 3600),
+    of_fit.ThinnedTable("runs.csv", 50000, 3847),
     of_fit.NeverGrips(("a",), 0.31),
     of_fit.CoarseSteps(90.0, 0.03),
     of_fit.StopsOnSlope(("a", "b")),
@@ -134,8 +135,7 @@ SAMPLES = [
     of_study.PointsLeftOut(2, 8, False, ("speed", "current")),
     of_study.PointsLeftOut(2, 8, True, ("speed",)),
     of_study.SampleLeftOut(3, 0.0123, ("speed",)),
-    of_study.Inert(("a", "b"), False),
-    of_study.Inert(("a",), True),
+    of_study.Inert(("a", "b")),
     of_study.Tied(("a", "b")),
     Step("evaluations", (12345, 1234.6)),
     Step("alike", (("a", "b"),)),

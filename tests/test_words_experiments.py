@@ -9,7 +9,7 @@ from calibration.discovery.experiments import denser_runs_instruction
 from calibration.discovery.instructions import CarryOut, NothingPossible, NothingTells, TooWeak
 from calibration.discovery.loop_notes import Heat, Overspeed, Overvoltage
 from calibration.discovery.reach import Reach, Used
-from sweeps.report.words import experiment_words as words
+from calibration.words import experiment_words as words
 
 TRACKED = Used("6T2A", 0, (15.0, 24.0, 33.0), (0.0, 10.0, 20.0), (0.0, 8.0), 21.1)
 WHEELED = dataclasses.replace(TRACKED, configuration="4W2T", index=1)

@@ -10,8 +10,7 @@ from calibration.data.columns import HEADING, LEVERS, SPEED, SUPPLY
 from calibration.data.input_errors import BadData, bound_text
 from calibration.data.table import Runs
 from mmrjax.model import params
-from mmrjax.model.channels import CURRENT, VOLTAGE
-from mmrjax.model.quantities import RPM
+from mmrjax.model.quantities import CURRENT, RPM, VOLTAGE
 from mmrjax.model.robot import Robot, turn_error
 
 #: Share of the motors' back-EMF below which no voltage turns them at an imposed speed [-], and least back-EMF that

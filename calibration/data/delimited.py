@@ -21,8 +21,13 @@ from mmrjax.model import channels, quantities
 
 #: Size of a file from which on plain tables are read as arrays at once [bytes].
 LONG = 2_000_000
+#: Memory of a cell that is read as text [bytes].
+CELL = 80
 #: Separators of cells other than a comma, and a word for each.
 SEPARATORS = {";": "semicolons", "\t": "tabs"}
+_SEPARATOR = re.compile(r"[,;\t]")
+#: First characters of lines of comments.
+COMMENTS = ("#", "%")
 #: Bytes that no text has.
 _CONTROLS = re.compile(rb"[\0-\x08\x0e-\x1f]")
 _COMMA, _POINT = (re.compile(rf"[+-]?\d*{mark}\d+(?:[eE][+-]?\d+)?") for mark in (",", r"\."))
@@ -44,8 +49,11 @@ def read_csv_columns(path: Path, name: str) -> NamedArrays:
     if len(content) >= LONG and (plain := _plain(name, content)) is not None:
         return plain
     decoded, encoded = decode_text(name, content)
-    rows, notes = split_cells(name, below_comments([line for line in decoded.splitlines() if line.strip()]))
+    input_files.check_memory(name, CELL * sum(decoded.count(mark) for mark in (",", *SEPARATORS)))
+    lines = below_comments([line for line in decoded.splitlines() if line.strip()])
+    rows, notes = split_cells(name, lines)
     header, body = (rows[0], rows[1:]) if rows else ([], [])
+    input_files.check_declared(name, len(header))
     units = row_of_units(header, body[0]) if body else ()
     if units:
         body = body[1:]
@@ -72,12 +80,13 @@ def _plain(name: str, content: bytes) -> NamedArrays | None:
     A plain table is in UTF-8 with commas, without comments, quotes and units.
     """
     end = content.find(b"\n")
-    if content.startswith((b"#", codecs.BOM_UTF8, b"\xff\xfe", b"\xfe\xff")) or b'"' in content or end < 0:
+    if content.startswith((b"#", b"%", codecs.BOM_UTF8, b"\xff\xfe", b"\xfe\xff")) or b'"' in content or end < 0:
         return None
     try:
         first = content[: content.find(b"\n", end + 1)].decode().splitlines()
     except UnicodeDecodeError:
         return None
+    input_files.check_declared(name, first[0].count(",") + 1)
     header, row = ([cell.strip() for cell in line.split(",")] for line in (*first, "", "")[:2])
     if len(header) < 2 or not all(header) or len(header) != len(row) or row_of_units(header, row):
         return None
@@ -144,13 +153,24 @@ def decode_text(name: str, content: bytes) -> tuple[str, tuple[str, ...]]:
 
 
 def below_comments(lines: Sequence[str]) -> list[str]:
-    """Returns the lines of a table, its header first, without comments above; the last comment is the header if
-    numbers follow it."""
-    first = next((k for k, line in enumerate(lines) if not line.startswith("#")), len(lines))
+    """Returns the lines of a table, its header first, without comments above, which begin with # or %.
+
+    If numbers follow the comments, the last comment with as many cells is the header; it may have units below it.
+    """
+    first = next((k for k, line in enumerate(lines) if not line.startswith(COMMENTS)), len(lines))
     below = list(lines[first:])
-    if first and below and any(map(math.isfinite, map(cell_number, re.split(r"[,;\t]", below[0])))):
-        return [lines[first - 1].lstrip("# "), *below]
-    return below
+    if not first or not below:
+        return below
+    if all(line.endswith(";") for line in below) and "," in below[0]:  # the end of a row in MATLAB
+        below = [line[:-1] for line in below]
+    cells = re.split(_SEPARATOR, below[0])
+    if not any(map(math.isfinite, map(cell_number, cells))):
+        return below
+    above = [line.lstrip("#% ") for line in lines[:first]]
+    alike = [line for line in above if len(re.split(_SEPARATOR, line)) == len(cells)] or above[-1:]
+    split = [[cell.strip() for cell in re.split(_SEPARATOR, line)] for line in alike[-2:]]
+    has_units = len(split) == 2 and bool(row_of_units(*split))
+    return [*alike[-1 - has_units :], *below]
 
 
 def split_cells(name: str, lines: Sequence[str]) -> tuple[list[list[str]], tuple[str, ...]]:

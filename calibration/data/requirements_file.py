@@ -11,9 +11,9 @@ from typing import Any
 
 from calibration.data.input_errors import BadConfiguration, allowed_words, stated_number
 from calibration.data.input_files import toml_content, toml_text
-from mmrjax.derived.requirements import AXES, QUANTITIES, Quantity
+from mmrjax.derived.requirements import QUANTITIES
 from mmrjax.model.paper_tables import BENCH, SURFACES
-from mmrjax.model.quantities import CONDITIONS
+from mmrjax.model.quantities import AXES, CONDITIONS, Quantity
 
 SCHEMA = "mmrjax.requirements/1"
 #: The packaged file: the paper's aims.
@@ -287,7 +287,7 @@ def _requirements(name: str, value: Any, envelope: Envelope, where: str) -> list
 
 def _limit(value: Any, where: str, quantity: Quantity) -> float | None:
     if value == RATED:
-        if quantity.name not in RATINGS:
+        if quantity.column not in RATINGS:
             raise BadConfiguration(
                 f"{where}: got {RATED!r}; expected a number, only {', '.join(RATINGS)} have a rating"
             )

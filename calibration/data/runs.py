@@ -31,6 +31,7 @@ from calibration.data.columns import CONDITIONS, DUTY, SUPPLY, TIME, WHEN, Colum
 from calibration.data.input_errors import BadConfiguration, BadData, bound_text
 from calibration.data.named_arrays import NamedArrays, Raw, column_numbers, column_texts, missing_readings
 from calibration.data.sources import opening, reading
+from calibration.data.sources.in_memory import EXPECTED
 from calibration.data.sources.reading import Mapped
 from calibration.data.table import Runs
 from mmrjax.model.quantities import MM, RPM
@@ -59,9 +60,9 @@ def read_runs(
 
     Args:
         source: `measured`, `simulated_by_paper`, a path, or a table in memory. Files are CSV, Parquet, Feather,
-            Arrow, MATLAB, HDF5, NumPy, JSON, ROS bags, MCAP, ULog and MDF; a path of signals may follow `::`.
-            Tables in memory are a pandas or polars DataFrame, an Arrow table, an xarray Dataset, a dict of arrays,
-            or a list of records.
+            Arrow, spreadsheets, MATLAB, HDF5, NumPy, JSON, ROS bags, MCAP, ULog, MDF and WPILOG. A path of signals
+            may follow `::`. A pattern such as `runs/*.csv` reads files that are a run each. Tables in memory are a
+            pandas or polars DataFrame, an Arrow table, an xarray Dataset, a dict of arrays, or a list of records.
         columns: of the source, where its names are not this program's: a packaged preset (`vesc,pole_pairs=7`), a
             preset's file, or a dict such as `{"motor_speed_rpm": "speed"}`. They win over the robot's file.
         measured, battery, robot, of_turns: as for `of_arrays`.
@@ -81,7 +82,10 @@ def read_runs(
         with resources.as_file(resources.files("calibration") / "data" / PACKAGED[str(source)]) as path:
             arrays, mapped = delimited.read_csv_columns(path, str(source)), layout.mapped
     else:
-        if isinstance(source, str | Path) and not opening.split_source(str(source))[0].exists():
+        if isinstance(source, str) and not source:
+            raise BadData(f"the source: got an empty path; expected {EXPECTED}")
+        named = isinstance(source, str | Path) and not opening.files_of_group(str(source))
+        if named and not opening.split_source(str(source))[0].exists():
             raise BadData(f"{source}: no such file and no packaged table; packaged: {', '.join(PACKAGED)}")
         found = reading.read_columns(source, layout, preset, between)
         arrays, mapped = found.arrays, found.mapped

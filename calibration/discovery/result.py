@@ -14,7 +14,7 @@ from calibration.data.columns import DRIVING
 from calibration.data.posterior_file import Posterior
 from calibration.data.runs import WHEN, Runs
 from calibration.data.writing import write_json, write_table
-from calibration.described import described, sentences
+from calibration.described import describe, sentences
 from calibration.discovery.clusters import Cluster
 from calibration.discovery.headline import headline
 from calibration.discovery.instructions import Instruction
@@ -122,7 +122,7 @@ class Formula:
     @property
     def formula(self) -> str:
         """Its expression, or that there is none."""
-        return described(self)
+        return describe(self)
 
     def to_json(self) -> dict[str, Any]:
         """Entry of result.json."""
@@ -200,7 +200,7 @@ class Alternative:
     @property
     def why(self) -> str:
         """Reasons for not being plausible, as a sentence."""
-        return described(self)
+        return describe(self)
 
     def to_json(self) -> dict[str, Any]:
         """Entry of result.json."""
@@ -319,7 +319,7 @@ class NextExperiment:
     @property
     def description(self) -> str:
         """What to do and what to read."""
-        return described(self.instruction)
+        return describe(self.instruction)
 
     def to_json(self) -> dict[str, Any]:
         """Entry of result.json."""
@@ -431,7 +431,7 @@ class Resolved:
     @property
     def statement(self) -> str:
         """In a sentence or two."""
-        return described(self)
+        return describe(self)
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -441,7 +441,7 @@ class Resolved:
     def to_json(self) -> dict[str, Any]:
         """Entry of result.json."""
         return {
-            "asked": described(self.asked),
+            "asked": describe(self.asked),
             "statement": self.statement,
             "explains": self.explains,
             "rows": self.rows,
@@ -551,7 +551,7 @@ class DiscoveryResult:
     @property
     def statement(self) -> str:
         """The verdict as a sentence."""
-        return described(self.summary)
+        return describe(self.summary)
 
     @property
     def headline(self) -> Headline:
@@ -566,7 +566,7 @@ class DiscoveryResult:
     @property
     def standing(self) -> str:
         """Reasons for or against the names, as a sentence; "" for none."""
-        return described(self, "standing")
+        return describe(self, "standing")
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -630,7 +630,7 @@ class DiscoveryResult:
             "verdict": self.verdict,
             "mechanism": None if self.summary.mechanism is None else _mechanism(self.summary.mechanism, self.unnamed),
             "missed": [m._asdict() for m in self.summary.missed],
-            "headline": dataclasses.asdict(self.headline) | {"statement": described(self.headline)},
+            "headline": dataclasses.asdict(self.headline) | {"statement": describe(self.headline)},
             "statement": self.statement,
             "rows": len(self.runs),
             "rows_used": int(self.included.sum()),
@@ -739,10 +739,10 @@ class DiscoveryResult:
         folder.mkdir(parents=True, exist_ok=True)
         write_json(folder / "result.json", self.to_json())
         write_table(folder / "rows.csv", self.rows_table(), tables)
-        held = [described(HeldByPrior(self.held_by_prior))] if self.held_by_prior else []
-        note = "\n".join([described(self, "header", robot_name), *held])
+        held = [describe(HeldByPrior(self.held_by_prior))] if self.held_by_prior else []
+        note = "\n".join([describe(self, "header", robot_name), *held])
         robot_file.write_robot(self.robot, folder / "robot.toml", note=note)
-        robot_file.write_robot(self.refit, folder / REFIT_FILE, note=described(self, "refit header", robot_name))
+        robot_file.write_robot(self.refit, folder / REFIT_FILE, note=describe(self, "refit header", robot_name))
         posterior.write_posterior(self.posterior, folder / posterior.FILE)
         if self.resolved is not None:
             robot_file.write_robot(self.resolved.robot, folder / TRACK_FILE, note=self.resolved.statement)
@@ -767,7 +767,7 @@ class Sensitivity:
     @property
     def statement(self) -> str:
         """The verdict as a sentence."""
-        return described(self.summary)
+        return describe(self.summary)
 
     def to_json(self) -> dict[str, Any]:
         """Entry of result.json."""
@@ -811,7 +811,7 @@ def _mechanism(m: Mechanism, curve: UnnamedDiscrepancy | None) -> dict[str, Any]
         **found,
         "errors": errors,
         "established": not m.fails,
-        "course": "" if curve is None else described(curve),
+        "course": "" if curve is None else describe(curve),
     }
 
 
@@ -835,7 +835,7 @@ def _unnamed(d: UnnamedDiscrepancy) -> dict[str, Any]:
         "effect": d.effect,
         "score_free_in_each_run": d.score_free_in_each_run,
         "curve": curve,
-        "course": described(d),
+        "course": describe(d),
         "proposal": d.proposal.to_json(),
     }
 

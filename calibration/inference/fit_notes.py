@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Iterable
 from typing import NamedTuple, dataclass_transform
 
-from calibration.described import described
+from calibration.described import describe
 
 
 @dataclass_transform(frozen_default=True)
@@ -58,7 +58,7 @@ class Pair(NamedTuple):
 
     def to_json(self) -> dict[str, object]:
         """As in `together` of result.json."""
-        return {"a": self.one, "b": self.other, "correlation": self.correlation, "determined": described(self)}
+        return {"a": self.one, "b": self.other, "correlation": self.correlation, "determined": describe(self)}
 
 
 class Determination(NamedTuple):
@@ -269,6 +269,14 @@ class NeverGrips(Note):
 
 class Thinned(Note):
     """A log with more rows than are used; `kept` of its `rows` are read."""
+
+    source: str
+    rows: int
+    kept: int
+
+
+class ThinnedTable(Note):
+    """A table of settled runs with more rows than are used; `kept` of its `rows` are read."""
 
     source: str
     rows: int

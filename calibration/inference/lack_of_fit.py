@@ -18,7 +18,7 @@ from scipy.special import chdtrc, fdtrc, ndtr
 
 from calibration.data.courses import course_of_each_row
 from calibration.data.runs import DUTY, Runs
-from calibration.described import described
+from calibration.described import describe
 from calibration.inference.fit_notes import Shown
 from calibration.inference.observers import Observer
 from calibration.inference.simulation_errors import share_of_measured
@@ -79,13 +79,13 @@ class Adequacy:
     @property
     def statement(self) -> str:
         """In one sentence; opens a calibration's output."""
-        return described(self)
+        return describe(self)
 
     def to_json(self) -> dict[str, object]:
         """Entries of `adequate` in result.json."""
         return {
             **dataclasses.asdict(self),
-            "shown_by": described(self.shown_by),
+            "shown_by": describe(self.shown_by),
             "statement": self.statement,
         }
 

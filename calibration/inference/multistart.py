@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.described import described
+from calibration.described import describe
 from calibration.inference import identifiability, optimizers, scans, series_noise
 from calibration.inference import noise as noise_room
 from calibration.inference.fit_notes import Agreement, Step
@@ -66,7 +66,7 @@ class Starts:
 
     def statement(self) -> str:
         """Whether the starts agree, as a sentence."""
-        return described(self.agreement)
+        return describe(self.agreement)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -87,7 +87,7 @@ def parse_noise(text: str, shown: tuple[Channel, ...]) -> dict[int, tuple[float,
             raise BadConfiguration(f"--noise {part.strip()}: {name} is given twice; expected each channel once")
         channel = shown[k]
         match = re.fullmatch(r"\s*([-+0-9.eE]+)\s*(%|[^\d\s.]+)\s*", value)
-        sizes = {channel.unit: channel.factor, **dict(channel.other_units)}
+        sizes = channel.sizes
         form = (
             f"expected a positive number with % or {' or '.join(sizes)}, e.g. {name}=2% or {name}=0.1{channel.unit}"
         )

@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from calibration.data.input_errors import BadConfiguration
-from calibration.described import described
+from calibration.described import describe
 from calibration.inference import noise as noise_room
 from calibration.inference import series_noise
 from calibration.inference.fit_notes import (
@@ -401,7 +401,7 @@ class Searched:
             "settled": self.found.settled,
             "generations": [dataclasses.asdict(g) for g in self.found.generations],
             "outcomes": self.outcomes(),
-            "at_edge": {name: described(at) for name, at in self.edge.items()},
+            "at_edge": {name: describe(at) for name, at in self.edge.items()},
             "derivatives_apart": list(self.apart),
             "regression_rms_sd": self.left if np.isfinite(self.left) else None,
         }

@@ -9,7 +9,7 @@ import numpy as np
 
 from calibration.data.input_errors import BadData, bound_text
 from calibration.data.runs import Runs
-from calibration.described import described
+from calibration.described import describe
 from calibration.inference import observers
 from calibration.inference.fit_notes import Note, OffBy, SlopesIn, Turned
 from calibration.inference.operating import operating_readings
@@ -91,7 +91,7 @@ def check_ranges(runs: Runs, robot: Robot) -> list[Note]:
             runs.layout.imposed_column,
         )
         if off > REFUSED:
-            raise BadData(f"{runs.source}, {described(found)}")
+            raise BadData(f"{runs.source}, {describe(found)}")
         said.append(found)
     return [*said, *_turned(runs, measured, possible), *_slopes(runs, measured, possible[1], robot)]
 
@@ -161,7 +161,7 @@ def _factor(measured: np.ndarray, possible: np.ndarray) -> float:
 
 def _units(channel: Channel, measured: np.ndarray, possible: np.ndarray, robot: Robot) -> list[str]:
     """Units that would make the readings possible, the most probable first; arguments as in `_factor`."""
-    known = {unit: channel.factor / size for unit, size in channel.other_units}
+    known = {unit: channel.factor / size for unit, size in channel.sizes.items() if size != channel.factor}
     if channel.name == "motor_speed" and robot.has_ground:
         known["rpm of the driving wheel"] = 1 / float(robot.gearbox.ratio)
     left = {unit: abs(math.log(_factor(measured / f, possible))) for unit, f in known.items()}

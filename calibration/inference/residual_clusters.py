@@ -21,7 +21,7 @@ import numpy as np
 from scipy.special import fdtrc
 
 from calibration.data.runs import CONDITIONS, WHEN, Runs
-from calibration.described import described
+from calibration.described import describe
 from calibration.inference.fit_notes import Note
 from calibration.inference.lack_of_fit import CLEAR, Residuals
 
@@ -97,7 +97,7 @@ class ResidualCluster(Note):
     @property
     def statement(self) -> str:
         """In a sentence."""
-        return described(self)
+        return describe(self)
 
     def to_json(self) -> dict[str, object]:
         """Entries of `residual_clusters` in result.json."""

@@ -12,7 +12,7 @@ import numpy as np
 from calibration.data import posterior_file as posterior
 from calibration.data import writing
 from calibration.data.posterior_file import Posterior
-from calibration.described import described, sentences
+from calibration.described import describe, sentences
 from calibration.inference.fit_notes import Determination, HeldByPrior, Notes, Pair
 from calibration.inference.fit_posterior import determined_together, undetermined_names
 from calibration.inference.identifiability import Identifiability
@@ -48,7 +48,7 @@ class Prior:
 
     def to_json(self) -> dict[str, Any]:
         """As in result.json."""
-        return {**dataclasses.asdict(self), "source": described(self)}
+        return {**dataclasses.asdict(self), "source": describe(self)}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -342,7 +342,7 @@ class CalibrationResult:
 
     def determined(self, name: str) -> str:
         """`yes`, `no`, or with which parameters together these data determine one."""
-        return described(Determination.of(name, self.parameters[name].held_by_prior, self.together))
+        return describe(Determination.of(name, self.parameters[name].held_by_prior, self.together))
 
     @property
     def counts(self) -> dict[str, int]:
@@ -463,8 +463,8 @@ class CalibrationResult:
 
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        held = [described(HeldByPrior(self.undetermined))] if self.undetermined else []
-        note = "\n".join([described(self, "header", robot_name), *held])
+        held = [describe(HeldByPrior(self.undetermined))] if self.undetermined else []
+        note = "\n".join([describe(self, "header", robot_name), *held])
         robot_file.write_robot(self.robot, folder / "robot.toml", note=note)
         writing.write_json(folder / "result.json", self.to_json())
         writing.write_table(folder / "rows.csv", self.rows(), tables)

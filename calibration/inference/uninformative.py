@@ -58,7 +58,7 @@ def copied_channels(runs: Runs, robot: Robot) -> list[Copied]:
 
 def _tied(one: Channel, other: Channel, robot: Robot) -> bool:
     """True if the rig ties two channels to each other: readings of one unit, or speeds without slip."""
-    same = (one.unit_si or one.unit) == (other.unit_si or other.unit)
+    same = one.unit_si == other.unit_si
     return same or (not robot.has_ground and one.zero_at_rest and other.zero_at_rest)
 
 

@@ -12,31 +12,28 @@ from calibration.inference.identifiability import Z95
 from calibration.sensitivity.local import Local, correlated_directions, inert_inputs, local_derivatives
 from calibration.sensitivity.methods import (
     Part,
-    correlated_inputs,
     derivative_bounds,
     morris_screening,
-    shapley_effects,
     sobol_indices,
 )
-from calibration.sensitivity.model import OutputRow
 from calibration.sensitivity.next_runs import Candidates, next_runs
 from calibration.sensitivity.result import METHODS, Input, OutputStudy, SensitivityResult
 from calibration.sensitivity.sensitivity_notes import Inert, PointsLeftOut, SampleLeftOut, Sampling, Tied
 from calibration.sensitivity.study import Study
 from calibration.sensitivity.uncertain_inputs import Inputs
 from mmrjax import derived, fidelities
+from mmrjax.model.quantities import Quantity
 
-#: Default number of model evaluations: of solves, of solves for Shapley effects, whose design costs as much again,
-#: and with a run over time among the outputs.
-EVALUATIONS, EVALUATIONS_SHAPLEY, EVALUATIONS_LONG = 1_000_000, 300_000, 100_000
+#: Default number of model evaluations: of solves, and with a run over time among the outputs.
+EVALUATIONS, EVALUATIONS_LONG = 1_000_000, 100_000
 #: Least number of evaluations.
 LEAST = 1_000
 
 
-def default_evaluations(outputs: tuple[OutputRow, ...], model: str, method: str) -> int:
+def default_evaluations(outputs: tuple[Quantity, ...], model: str) -> int:
     """Default number of model evaluations."""
     long = fidelities.fidelity_facts(model).rollout or any(o in derived.OF_START for o in outputs)
-    return EVALUATIONS_LONG if long else EVALUATIONS_SHAPLEY if method == "shapley" else EVALUATIONS
+    return EVALUATIONS_LONG if long else EVALUATIONS
 
 
 def analyse_sensitivity(
@@ -57,12 +54,11 @@ def analyse_sensitivity(
     inputs, model = study.inputs, study.model
     if method not in METHODS:
         raise BadConfiguration(f"--method: got {method}; expected one of {', '.join(METHODS)}")
-    if inputs.is_posterior and method in ("sobol", "morris", "derivative"):
+    if inputs.is_posterior and method != "local":
         raise BadConfiguration(
-            f"--method {method}: needs independent inputs, and those of a posterior are correlated; "
-            "expected shapley or local"
+            f"--method {method}: needs independent inputs, and those of a posterior are correlated; expected local"
         )
-    usual = default_evaluations(model.outputs, model.fidelity, method)
+    usual = default_evaluations(model.outputs, model.fidelity)
     evaluations = usual if evaluations is None else evaluations
     if evaluations < LEAST:
         raise BadConfiguration(f"--evaluations: got {evaluations}; expected {LEAST} or more")
@@ -112,9 +108,7 @@ def _by_method(study: Study, method: str, moving: np.ndarray, evaluations: int, 
         return sobol_indices(study, moving, evaluations, seed)
     if method == "morris":
         return morris_screening(study, moving, evaluations, seed)
-    if method == "derivative":
-        return derivative_bounds(study, moving, seed)
-    return shapley_effects(study, moving, evaluations, seed)
+    return derivative_bounds(study, moving, seed)
 
 
 def _described(inputs: Inputs, idle: np.ndarray) -> dict[str, Input]:
@@ -141,7 +135,7 @@ def _described(inputs: Inputs, idle: np.ndarray) -> dict[str, Input]:
     return described
 
 
-def _study_of(row: OutputRow, study: Study, found: Local, part: Part | None) -> OutputStudy:
+def _study_of(row: Quantity, study: Study, found: Local, part: Part | None) -> OutputStudy:
     name, points = row.name, len(study.points)
     value, slopes, scores = found.value[name], found.derivative[name], found.by_score[name]
     median = study.inputs.values(study.inputs.centre)[study.inputs.places]
@@ -225,11 +219,9 @@ def _remarks(study: Study, method: str, outputs: dict[str, OutputStudy], idle: n
         some = o.studied & (o.lost >= 1e-3)
         if some.any():
             said.append(SampleLeftOut(int(some.sum()), float(o.lost[some].max()), names))
-    drawn = correlated_inputs(study.inputs, np.flatnonzero(~idle)) if method == "shapley" else ()
-    for followed in (False, True):
-        names = tuple(n for k, n in enumerate(study.inputs.names) if idle[k] and (k in drawn) == followed)
-        if names:
-            said.append(Inert(names, followed))
+    names = tuple(n for k, n in enumerate(study.inputs.names) if idle[k])
+    if names:
+        said.append(Inert(names))
     if study.inputs.parameters.tied:
         said.append(Tied(tuple(f for f, _, _ in study.inputs.parameters.tied)))
     return tuple(said)

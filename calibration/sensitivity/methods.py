@@ -3,24 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 
 import jax
 import numpy as np
-from scipy.special import ndtr
 
 from calibration.inference.identifiability import Z95
-from calibration.sensitivity import derivative, morris, shapley, sobol
+from calibration.sensitivity import derivative, morris, sobol
 from calibration.sensitivity.replicates import REPLICATES, Estimate
 from calibration.sensitivity.study import Study
-from calibration.sensitivity.uncertain_inputs import Inputs
 
 #: Largest share of base points without a value for a point to be studied.
 MOST_LOST = 0.5
 #: Replicates of the derivative method, and points of each.
 GRADIENTS = (8, 8)
-#: Least correlation of inputs that are drawn together.
-LINKED = 1e-6
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,23 +47,6 @@ def group_points(study: Study, moving: np.ndarray) -> dict[tuple[int, ...], list
         if which:
             groups.setdefault(which, []).append(k)
     return groups
-
-
-def correlated_inputs(inputs: Inputs, which: Sequence[int] | np.ndarray) -> tuple[int, ...]:
-    """These inputs and all that are correlated with one of them, directly or through others.
-
-    An inert input that is correlated with these has, by definition, a Shapley effect, because its value is
-    informative about theirs.
-    """
-    p = len(inputs.parameters)
-    covariance = inputs.parameters.covariance
-    sd = np.sqrt(np.diagonal(covariance))
-    linked = np.eye(len(inputs), dtype=bool)
-    linked[:p, :p] |= np.abs(covariance) > LINKED * np.outer(sd, sd)
-    correlated = np.asarray(np.isin(np.arange(len(inputs)), which))
-    while (more := np.asarray(linked[correlated].any(0))).sum() > correlated.sum():
-        correlated = more
-    return tuple(map(int, np.flatnonzero(correlated)))
 
 
 def _blank(points: int, size: int) -> Estimate:
@@ -225,61 +203,3 @@ def derivative_bounds(study: Study, moving: np.ndarray, seed: int) -> dict[str, 
             share, sd, None, (), lost, studied,
         )  # fmt: skip
     return answer
-
-
-def shapley_effects(study: Study, moving: np.ndarray, evaluations: int, seed: int) -> dict[str, Part]:
-    """Shapley effects at each point, and over all of them.
-
-    Inputs that are inert at a point are drawn if they are correlated with active ones; the others have no effect.
-    """
-    points, d = len(study.points), len(study.inputs)
-    names = [o.name for o in study.model.outputs]
-    p = len(study.inputs.parameters)
-    covariance = np.eye(d)
-    covariance[:p, :p] = study.inputs.parameters.covariance
-    mean = np.concatenate([study.inputs.parameters.mean, np.zeros(d - p)])
-    terms: dict[str, dict[int, tuple[shapley.Terms, tuple[int, ...]]]] = {name: {} for name in names}
-    lost = {name: np.zeros(points) for name in names}
-    for acting, group in group_points(study, moving).items():
-        which = correlated_inputs(study.inputs, acting)
-        places = np.array(which)
-        pairs = shapley.pairs_of_orders(evaluations / points, len(which))
-        design = shapley.shapley_design(mean[places], covariance[np.ix_(places, places)], pairs, seed)
-        z = np.tile(mean, (len(design.points), 1))
-        z[:, places] = design.points
-        values = _at_coordinates(study.inputs, z)
-        for k, made in study.sample(values, group):
-            for name in names:
-                output_terms = shapley.shapley_terms(design, made[name])
-                lost[name][k] = 1.0 if output_terms is None else output_terms.lost
-                if output_terms is not None and lost[name][k] <= MOST_LOST:
-                    terms[name][k] = output_terms, which
-    answer = {}
-    for name in names:
-        shown, sd = _blank(points, d), np.full(points, np.nan)
-        studied = np.zeros(points, bool)
-        widened = []
-        for k, (output_terms, which) in terms[name].items():
-            wide = np.zeros((len(output_terms.parts), d))
-            wide[:, list(which)] = output_terms.parts
-            widened.append(dataclasses.replace(output_terms, parts=wide))
-            _put(shown, k, shapley.effects_of_terms(widened[-1]))
-            sd[k], studied[k] = np.sqrt(output_terms.variance), True
-        if not studied.any():
-            answer[name] = Part({}, {}, None, None, None, (), lost[name], studied)
-            continue
-        overall = shapley.effects_of_terms(shapley.terms_of_vector(widened))
-        answer[name] = Part(
-            {"shapley": overall},
-            {"shapley": shown},
-            np.where(np.isfinite(shown.value), np.clip(shown.value, 0.0, 1.0), np.nan),
-            sd, None, (), lost[name], studied,
-        )  # fmt: skip
-    return answer
-
-
-def _at_coordinates(inputs: Inputs, z: np.ndarray) -> np.ndarray:
-    """Columns of the model at coordinates: of the posterior, and normal scores of conditions."""
-    p = len(inputs.parameters)
-    stated = inputs.low + (inputs.high - inputs.low) * ndtr(z[:, p:])
-    return np.concatenate([inputs.parameters.at(z[:, :p]), stated], -1)

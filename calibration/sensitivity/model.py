@@ -15,12 +15,11 @@ from calibration.data.contradictions import cannot_stand
 from calibration.data.input_errors import BadConfiguration, allowed_words
 from mmrjax import derived, fidelities
 from mmrjax.compile.compiling import compiled
-from mmrjax.derived import Derived
 from mmrjax.fidelities import outputs as table_of_outputs
-from mmrjax.fidelities.outputs import Output
 from mmrjax.fidelities.variation import STATUS, Variation, evaluate_points
 from mmrjax.model import channels
 from mmrjax.model.conditions import OF_SIDES, Conditions
+from mmrjax.model.quantities import Quantity
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import STATUSES, is_done
 
@@ -29,8 +28,6 @@ from mmrjax.model.signals import STATUSES, is_done
 CHUNKS = {"solves": (512, 32_768), "runs": (64, 2_048), "derivatives": (512, 512), "derivatives of runs": (64, 64)}
 #: Default outputs, in addition to every channel.
 DEFAULT = ("slip", "power_supply", "efficiency_chassis", "steepest_slope")
-
-OutputRow = Output | Derived
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,10 +53,9 @@ def count_statuses(codes: np.ndarray) -> dict[str, int]:
     return {STATUSES[k]: int(n) for k, n in enumerate(each) if n}
 
 
-def known_outputs(robot: Robot) -> dict[str, OutputRow]:
+def known_outputs(robot: Robot) -> dict[str, Quantity]:
     """Every output by name: those of a fidelity, then the derived ones."""
-    rows: tuple[OutputRow, ...] = (*table_of_outputs.output_table(robot.channels), *derived.TABLE)
-    return {o.name: o for o in rows}
+    return {o.name: o for o in (*table_of_outputs.output_table(robot.channels), *derived.TABLE)}
 
 
 def default_outputs(robot: Robot, turns: bool) -> tuple[str, ...]:
@@ -80,7 +76,7 @@ def default_outputs(robot: Robot, turns: bool) -> tuple[str, ...]:
     return tuple(n for n in (*channels.channel_names(robot.channels), *beside) if robot.knows(outputs[n].rests_on))
 
 
-def chosen_outputs(words: tuple[str, ...], robot: Robot, turns: bool = False) -> tuple[OutputRow, ...]:
+def chosen_outputs(words: tuple[str, ...], robot: Robot, turns: bool = False) -> tuple[Quantity, ...]:
     """Outputs of these names, or the default ones for none; `start` means all outputs of a start.
 
     Args:
@@ -134,16 +130,14 @@ class Model:
     columns: tuple[str, ...]
     fidelity: str
     options: Mapping[str, float]
-    outputs: tuple[OutputRow, ...]
+    outputs: tuple[Quantity, ...]
 
     @property
-    def sources(self) -> dict[str, tuple[OutputRow, ...]]:
+    def sources(self) -> dict[str, tuple[Quantity, ...]]:
         """Outputs by source: the fidelity's name, or the module of derived ones."""
-        rows_of_source: dict[str, list[OutputRow]] = {}
+        rows_of_source: dict[str, list[Quantity]] = {}
         for output in self.outputs:
-            rows_of_source.setdefault(output.module if isinstance(output, Derived) else self.fidelity, []).append(
-                output
-            )
+            rows_of_source.setdefault(output.group or self.fidelity, []).append(output)
         return {source: tuple(rows) for source, rows in rows_of_source.items()}
 
     def chunk(self, source: str, points: int, differentiated: bool = False) -> int:
@@ -176,7 +170,7 @@ class Model:
 
     def ignores(self, source: str) -> tuple[str, ...]:
         """Conditions without influence on any output of a source."""
-        each = [set(o.ignores) if isinstance(o, Derived) else set() for o in self.sources[source]]
+        each = [set(o.ignores) for o in self.sources[source]]
         return tuple(sorted(set.intersection(*each)))
 
     def derivatives(

@@ -9,14 +9,14 @@ import numpy as np
 from scipy import stats
 
 from calibration.data.runs import Runs
-from calibration.described import described, sentences
+from calibration.described import describe, sentences
 from calibration.inference.fit_notes import Note
-from calibration.sensitivity.model import OutputRow
 from calibration.sensitivity.replicates import LEVEL, REPLICATES, Estimate
+from mmrjax.model.quantities import Quantity
 
 SCHEMA = "mmrjax.sensitivity/1"
 #: Methods.
-METHODS = ("local", "sobol", "morris", "derivative", "shapley")
+METHODS = ("local", "sobol", "morris", "derivative")
 #: Share of an output's variance below which an input is negligible, for all outputs and points [-].
 NEGLIGIBLE = 0.01
 
@@ -96,8 +96,7 @@ class Input:
     Attributes:
         unit, meaning: of its field; distribution: log-normal, normal, uniform or posterior.
         median: [unit]; interval: of 95 % [unit]; sd: to first order [unit].
-        inert: True if all computed derivatives of all outputs by it were exactly zero. It is then not sampled,
-            except for Shapley effects if it is correlated with active inputs.
+        inert: True if all computed derivatives of all outputs by it were exactly zero. It is then not sampled.
     """
 
     unit: str
@@ -128,7 +127,7 @@ class OutputStudy:
         lost: share of base points without a value at each point, shape (points,); studied: True for included points.
     """
 
-    row: OutputRow
+    row: Quantity
     value: np.ndarray
     derivative: np.ndarray
     elasticity: np.ndarray
@@ -145,7 +144,7 @@ class OutputStudy:
     @property
     def overall_share(self) -> np.ndarray:
         """Share over all points together, shape (inputs,): of the method, else the mean over the points."""
-        main = next((self.overall[k].value for k in ("total", "shapley", "upper") if k in self.overall), None)
+        main = next((self.overall[k].value for k in ("total", "upper") if k in self.overall), None)
         if main is not None and np.isfinite(main).any():
             return np.clip(np.nan_to_num(main), 0.0, 1.0)
         finite = np.isfinite(self.share).any(1)
@@ -241,7 +240,7 @@ class SensitivityResult:
         for study in self.outputs.values():
             ends = [study.overall_share]
             if study.at_points:
-                main = study.at_points.get("total") or study.at_points.get("shapley")
+                main = study.at_points.get("total")
                 if main is not None:
                     ends.append(np.nanmax(np.where(np.isfinite(main.high), main.high, 0.0), axis=0))
             shares = np.where(np.isfinite(study.share), study.share, 0.0)
@@ -271,7 +270,7 @@ class SensitivityResult:
 
     def statement(self) -> str:
         """What decides these outputs, in one sentence."""
-        return described(self)
+        return describe(self)
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -335,7 +334,7 @@ class SensitivityResult:
             where = {key: np.repeat(x, size) for key, x in self.points.columns().items()}
             table = {
                 "output": np.full(points * size, name),
-                "unit": np.full(points * size, study.row.unit),
+                "unit": np.full(points * size, study.row.unit_shown),
                 **where,
                 "input": np.tile(names, points),
                 "value": np.repeat(study.value, size) / study.row.factor,
@@ -364,7 +363,7 @@ class SensitivityResult:
 def _output(study: OutputStudy) -> dict[str, Any]:
     return {
         "label": study.row.label,
-        "unit": study.row.unit,
+        "unit": study.row.unit_shown,
         "factor": study.row.factor,
         "value": study.value.tolist(),
         "sd": study.sd.tolist(),

@@ -31,10 +31,9 @@ class SampleLeftOut(Note):
 
 
 class Inert(Note):
-    """Inputs with zero derivatives: they are not sampled, or they are `correlated` with others."""
+    """Inputs with zero derivatives, which are not sampled."""
 
     inputs: tuple[str, ...]
-    correlated: bool
 
 
 class Tied(Note):

@@ -11,12 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibration.inference.fit_notes import Note, Step
-from calibration.sensitivity.model import Answer, Model, OutputRow, count_statuses
+from calibration.sensitivity.model import Answer, Model, count_statuses
 from calibration.sensitivity.result import Points
 from calibration.sensitivity.uncertain_inputs import Inputs
 from mmrjax import fidelities
 from mmrjax.model.conditions import Conditions
-from mmrjax.model.quantities import RPM
+from mmrjax.model.quantities import RPM, Quantity
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import STATUSES
 
@@ -42,7 +42,7 @@ class Study:
         robot: Robot,
         inputs: Inputs,
         points: Points,
-        outputs: tuple[OutputRow, ...],
+        outputs: tuple[Quantity, ...],
         model: str = "steady",
         options: Mapping[str, float] | None = None,
         supply: Supply | None = None,

@@ -16,10 +16,8 @@ from calibration.data.requirements_file import Envelope, Requirement, Requiremen
 from calibration.sizing import sheet
 from calibration.sizing.part_options import Options
 from mmrjax.derived.requirements import (
-    CHARGE,
     NODES,
     QUANTITIES,
-    SLOPE,
     EnvelopePoint,
     Ratings,
     heat_left,
@@ -27,6 +25,7 @@ from mmrjax.derived.requirements import (
 )
 from mmrjax.derived.requirements import evaluate_requirement as requirement
 from mmrjax.model import params
+from mmrjax.model.quantities import CHARGE, SLOPE
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import CONVERGED
 
@@ -40,7 +39,7 @@ OBJECTIVES = {
     "cost": ("EUR", "price of motors and gearboxes"),
 }
 #: Requirements on lasting travel: at their points the ratings of the parts apply.
-LASTING = tuple(q.name for q in QUANTITIES.values() if q.group in ("travel", "payload"))
+LASTING = tuple(q.column for q in QUANTITIES.values() if q.group in ("travel", "payload"))
 #: Ratings of parts: name and words.
 RATED = {
     "winding": "winding", "motor_speed": "motor speed", "gearbox_speed": "gearbox input speed",

@@ -17,20 +17,10 @@ from calibration.data.input_errors import BadConfiguration, allowed_words
 from calibration.data.requirements_file import STAIRS, TREAD, Envelope, Requirement, Requirements
 from calibration.inference.fit_notes import Note, Step
 from mmrjax.compile.compiling import compiled
-from mmrjax.derived.requirements import (
-    AMBIENT,
-    AXES,
-    CHARGE,
-    PAYLOAD,
-    SLOPE,
-    EnvelopePoint,
-    Ratings,
-    evaluate_requirement,
-    ratings,
-)
+from mmrjax.derived.requirements import EnvelopePoint, Ratings, evaluate_requirement, ratings
 from mmrjax.model import params
 from mmrjax.model.paper_tables import adhesion_ratio, lateral_ratio
-from mmrjax.model.quantities import MM
+from mmrjax.model.quantities import AMBIENT, AXES, CHARGE, MM, PAYLOAD, SLOPE
 from mmrjax.model.robot import Robot, turn_error
 from mmrjax.model.signals import CONVERGED, STATUSES
 

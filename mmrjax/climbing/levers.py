@@ -21,93 +21,49 @@ class Levers(eqx.Module):
     """
 
     roller: Scalar = parameter(
-        13.5e-3,
-        unit="m",
-        meaning="radius of the roller at a lever's tip over the grousers of its track",
-        bounds=(1e-3, 0.5),
+        13.5e-3, "m", "radius of the roller at a lever's tip over the grousers of its track", (1e-3, 0.5),
+        "Table 6, d/2; with the resulting pitch radius of 8 mm, the track of 112 teeth closes to 0.4 mm",
         relative_sd=0.05,
-        source="Table 6, d/2; with the resulting pitch radius of 8 mm, the track of 112 teeth closes to 0.4 mm",
-    )
+    )  # fmt: skip
     worm_ratio: Scalar = parameter(
-        30.0,
-        unit="-",
-        meaning="ratio of the worm gear of a pair of levers",
-        bounds=(1.0, 1e3),
-        relative_sd=0.01,
-        source="Fig. 5b",
+        30.0, "-", "ratio of the worm gear of a pair of levers", (1.0, 1e3), "Fig. 5b", relative_sd=0.01
     )
     worm_efficiency: Scalar = parameter(
-        0.5,
-        unit="-",
-        meaning="efficiency of the worm gear, driven by its worm; self-locking up to 0.5",
-        bounds=(0.05, 0.99),
-        sd=0.15,
-        source="Fig. 5b, without a table; a worm of one start: 0.4-0.6",
-    )
+        0.5, "-", "efficiency of the worm gear, driven by its worm; self-locking up to 0.5", (0.05, 0.99),
+        "Fig. 5b, without a table; a worm of one start: 0.4-0.6", sd=0.15,
+    )  # fmt: skip
     planetary_ratio: Scalar = parameter(
-        23.04,
-        unit="-",
-        meaning="ratio of the planetary gear between motor and worm",
-        bounds=(1.0, 1e4),
-        relative_sd=0.8,
-        source=f"that of the traction drive, Fig. A1: 12 next to 2; {_UNSTATED}",
-    )
+        23.04, "-", "ratio of the planetary gear between motor and worm", (1.0, 1e4),
+        f"that of the traction drive, Fig. A1: 12 next to 2; {_UNSTATED}", relative_sd=0.8,
+    )  # fmt: skip
     planetary_efficiency: Scalar = parameter(
-        0.75,
-        unit="-",
-        meaning="efficiency of the planetary gear between motor and worm",
-        bounds=(0.1, 1.0),
-        sd=0.1,
-        source=f"catalogue of the traction drive's gear; {_UNSTATED}",
-    )
+        0.75, "-", "efficiency of the planetary gear between motor and worm", (0.1, 1.0),
+        f"catalogue of the traction drive's gear; {_UNSTATED}", sd=0.1,
+    )  # fmt: skip
     rate: Scalar = parameter(
-        1.0,
-        unit="rad/s",
-        meaning="rate of a pair of levers with an imposed angle",
-        bounds=(1e-3, 100.0),
-        relative_sd=0.5,
-        source=f"8810 rpm over the two gears' ratios: 1.3 rad/s without load; {_UNSTATED}",
-    )
+        1.0, "rad/s", "rate of a pair of levers with an imposed angle", (1e-3, 100.0),
+        f"8810 rpm over the two gears' ratios: 1.3 rad/s without load; {_UNSTATED}", relative_sd=0.5,
+    )  # fmt: skip
     angle_least: Scalar = parameter(
-        -math.pi,
-        unit="rad",
-        meaning="least angle of a lever, straight back under the belt",
-        bounds=(-2 * math.pi, 0.0),
-        sd=0.5,
-        source=f"no stop for a lever in Fig. A2; {_UNSTATED}",
-    )
+        -math.pi, "rad", "least angle of a lever, straight back under the belt", (-2 * math.pi, 0.0),
+        f"no stop for a lever in Fig. A2; {_UNSTATED}", sd=0.5,
+    )  # fmt: skip
     angle_most: Scalar = parameter(
-        math.pi,
-        unit="rad",
-        meaning="greatest angle of a lever, folded along the body",
-        bounds=(0.0, 2 * math.pi),
-        sd=0.5,
-        source=f"transport posture, Table 6; {_UNSTATED}",
-    )
+        math.pi, "rad", "greatest angle of a lever, folded along the body", (0.0, 2 * math.pi),
+        f"transport posture, Table 6; {_UNSTATED}", sd=0.5,
+    )  # fmt: skip
     current_limit: Scalar = parameter(
-        1000.0,
-        unit="A",
-        meaning="largest current of a motor of the levers that its driver permits",
-        bounds=(0.01, 1e4),
-        relative_sd=0.1,
-        source="no limit on the bench: above any current",
-    )
+        1000.0, "A", "largest current of a motor of the levers that its driver permits", (0.01, 1e4),
+        "no limit on the bench: above any current", relative_sd=0.1,
+    )  # fmt: skip
     share_coulomb: Scalar = parameter(
-        0.4,
-        unit="-",
-        meaning="share of a side's static loss torque of the tracks that each of its two levers' tracks has",
-        bounds=(0.0, 0.5),
-        sd=0.05,
-        source="Table 3: (350 - 70) / 2 of 350 mN·m",
-    )
+        0.4, "-", "share of a side's static loss torque of the tracks that each of its two levers' tracks has",
+        (0.0, 0.5), "Table 3: (350 - 70) / 2 of 350 mN·m", sd=0.05,
+    )  # fmt: skip
     share_viscous: Scalar = parameter(
-        13 / 32,
-        unit="-",
-        meaning="share of a side's pseudo-viscous loss of the tracks that each of its two levers' tracks has",
-        bounds=(0.0, 0.5),
-        sd=0.05,
-        source="Table 3: (16 - 3) / 2 of 16 mN·m·s",
-    )
+        13 / 32, "-", "share of a side's pseudo-viscous loss of the tracks that each of its two levers' tracks has",
+        (0.0, 0.5), "Table 3: (16 - 3) / 2 of 16 mN·m·s", sd=0.05,
+    )  # fmt: skip
 
     def tracks(self, side: Track) -> tuple[Track, Track]:
         """Tracks of a side split into the main one and that of one lever."""

@@ -17,71 +17,16 @@ from mmrjax.derived import steepest_slope
 from mmrjax.fidelities.steady import operating_state
 from mmrjax.model import balances, energy
 from mmrjax.model.conditions import Conditions
-from mmrjax.model.motor import TEMPERATURE_REFERENCE
 from mmrjax.model.params import Index, Scalar
-from mmrjax.model.quantities import CONDITIONS, MM, RPM
+from mmrjax.model.quantities import CONDITIONS, TABLE, Quantity
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import CONVERGED, CUT_OFF, Signals
 from mmrjax.turning.circling import circling_signals
 
-#: Axes of an envelope, which each of its points states.
-AXES = ("payload_kg", "slope_deg", "charge", "ambient_C")
-PAYLOAD, SLOPE, CHARGE, AMBIENT = AXES
-#: Axes that turning on level ground depends on.
-LEVEL = (PAYLOAD, CHARGE, AMBIENT)
-
-WATT_HOUR, MINUTE = 3600.0, 60.0
-
-
-@dataclasses.dataclass(frozen=True)
-class Quantity:
-    """A quantity that a requirement limits.
-
-    Attributes:
-        name: with its unit, as in files; unit: for display; factor: the SI value of one unit.
-        least: True if a bare number is a lower limit, False if it is an upper limit.
-        label: words.
-        group: computation that gives it, one of `GROUPS`.
-        axes: axes of the envelope that it depends on.
-    """
-
-    name: str
-    unit: str
-    factor: float
-    least: bool
-    label: str
-    group: str
-    axes: tuple[str, ...] = AXES
-
-
 #: Quantities that depend on the temperature of the windings.
 OF_HEAT = ("winding_C", "payload_kg")
-#: All quantities that a requirement can name.
-QUANTITIES: dict[str, Quantity] = {
-    q.name: q
-    for q in (
-        Quantity("speed_m_s", "m/s", 1.0, True, "speed", "travel"),
-        Quantity("speed_end_of_charge_m_s", "m/s", 1.0, True, "speed at the end of charge", "travel"),
-        Quantity("slope_deg", "deg", 1.0, True, "steepest slope held", "slope", (PAYLOAD, CHARGE, AMBIENT)),
-        Quantity("payload_kg", "kg", 1.0, True, "largest payload", "payload", (SLOPE, CHARGE, AMBIENT)),
-        Quantity("mass_kg", "kg", 1.0, False, "mass without payload", "mass", ()),
-        Quantity("endurance_min", "min", MINUTE, True, "endurance", "endurance", (PAYLOAD, SLOPE, AMBIENT)),
-        Quantity("winding_C", "°C", 1.0, False, "winding after long running", "travel"),
-        Quantity("gearbox_Nm", "N·m", 1.0, False, "torque of a gearbox", "travel"),
-        Quantity("gearbox_speed_rpm", "rpm", RPM, False, "speed at the gearbox input", "travel"),
-        Quantity("motor_speed_rpm", "rpm", RPM, False, "speed of the motors", "travel"),
-        Quantity("current_A", "A", 1.0, False, "current of all motors", "travel"),
-        Quantity("energy_per_metre_Wh", "Wh/m", WATT_HOUR, False, "energy per metre", "travel"),
-        Quantity("turn_in_place_rad_s", "rad/s", 1.0, True, "yaw rate on the spot", "turn", LEVEL),
-        Quantity("turning_radius_mm", "mm", MM, False, "turning radius around a braked side", "turn", LEVEL),
-        Quantity("side_slope_deg", "deg", 1.0, True, "steepest slope travelled across", "across", (PAYLOAD,)),
-        Quantity("step_mm", "mm", MM, True, "highest step", "posture", (PAYLOAD,)),
-        Quantity("stairs_rise_mm", "mm", MM, True, "highest rise of stairs", "posture", (PAYLOAD,)),
-        Quantity("gap_mm", "mm", MM, True, "widest gap", "posture", (PAYLOAD,)),
-        Quantity("length_mm", "mm", MM, False, "length with levers folded", "posture", ()),
-        Quantity("height_mm", "mm", MM, False, "height with levers folded", "posture", ()),
-    )
-}
+#: All quantities that a requirement can name, by column.
+QUANTITIES: dict[str, Quantity] = {q.column: q for q in TABLE["requirement"]}
 
 
 class Ratings(eqx.Module):
@@ -157,8 +102,8 @@ def with_cells(robot: Robot, cells: Scalar) -> Robot:
 
 def _at(robot: Robot, point: EnvelopePoint, rated: Ratings) -> tuple[Robot, Conditions]:
     """The robot with its winding at ambient temperature, as at the start of a run, and the conditions of a point."""
-    copper = 1 + robot.motor.temperature_coefficient * (point.ambient - TEMPERATURE_REFERENCE)
-    motor = dataclasses.replace(robot.motor, resistance=robot.motor.resistance * copper)
+    warm = robot.motor.resistance * robot.motor.resistance_ratio(point.ambient)
+    motor = dataclasses.replace(robot.motor, resistance=warm)
     robot = with_cells(dataclasses.replace(robot, motor=motor), rated.cells)
     return robot, Conditions(
         configuration=jnp.asarray(point.configuration),
@@ -184,7 +129,7 @@ def heat_left(robot: Robot, point: EnvelopePoint, current: Scalar, limit: Scalar
     1 - I² R_th R (1 + α (T - 25 °C)) / (T - T_a); `robot` as stated, not as returned by `_at`.
     """
     motor = robot.motor
-    hot = motor.resistance * (1 + motor.temperature_coefficient * (limit - TEMPERATURE_REFERENCE))
+    hot = motor.resistance * motor.resistance_ratio(limit)
     return 1 - current**2 * motor.resistance_thermal * hot / jnp.maximum(limit - point.ambient, 1.0)
 
 

@@ -22,16 +22,6 @@ from mmrjax.model.signals import Result
 NONE = 1e-9
 #: Channels of a motion in the plane.
 PLANE = ("speed", "lateral_speed", "yaw_rate")
-#: Columns and their descriptions.
-COLUMNS: dict[str, str] = {
-    "turning_radius_mm": "radius of the circle of the centre of mass, positive to the left; inf: straight",
-    "centre_x_mm": "instantaneous centre of rotation ahead of the centre of mass",
-    "centre_y_mm": "instantaneous centre of rotation to the left of the centre of mass",
-    "effective_width_mm": "effective track width (V_teor,right - V_teor,left) / yaw rate",
-    "power_left_W": "electrical power of the left motor", "power_right_W": "electrical power of the right motor",
-    "winding_left_C": "winding temperature of the left motor after long running",
-    "winding_right_C": "winding temperature of the right motor after long running",
-}  # fmt: skip
 
 
 def turning_radius(ahead: Any, aside: Any, rate: Any) -> Array:

@@ -35,9 +35,9 @@ EQUATION = {
 THE_SIDE = "the side"
 
 
-def amplitude(*, unit: str, meaning: str, bounds: tuple[float, float], sd: float, source: str) -> Any:
+def amplitude(unit: str, meaning: str, bounds: tuple[float, float], source: str, *, sd: float) -> Any:
     """Declares the amplitude of an effect, 0 (absent) by default; see `params.Spec` for the arguments."""
-    return parameter(0.0, unit=unit, meaning=meaning, bounds=bounds, sd=sd, source=source, amplitude=True)
+    return parameter(0.0, unit, meaning, bounds, source, sd=sd, amplitude=True)
 
 
 class Effect(eqx.Module):

@@ -13,13 +13,9 @@ from mmrjax.model.signals import Signals
 def breakaway_parameter() -> Scalar:
     """The breakaway angle θ_s of a bristle, a field of every effect with one."""
     return parameter(
-        0.02,
-        unit="rad",
-        meaning="angle θ_s of the driven shaft until the contacts slide",
-        bounds=(1e-4, 2.0),
-        relative_sd=0.5,
-        source="1 mm of belt, a degree of a geared shaft",
-    )
+        0.02, "rad", "angle θ_s of the driven shaft until the contacts slide", (1e-4, 2.0),
+        "1 mm of belt, a degree of a geared shaft", relative_sd=0.5,
+    )  # fmt: skip
 
 
 class Bristle(Effect):

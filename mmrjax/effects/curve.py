@@ -32,7 +32,7 @@ ROUND = {"yaw": ("N·m", 0.5, "direction_turn")}
 #: The channel `yaw`, a heading, has none: its curve is the one of the balance `yaw`.
 READINGS = {
     c.name: (
-        c.unit_si or c.unit,
+        c.unit_si,
         0.01 * c.range[1] * c.factor,
         "direction_turn" if c in channels.OF_TURNS and c.side is None else "direction",
     )
@@ -170,18 +170,12 @@ def ordinate_weights(x: Scalar, low: Scalar, high: Scalar) -> Float[Array, "... 
 
 
 def _ordinate() -> Scalar:
-    return parameter(
-        1.0, unit="-", meaning="ordinate, over the amplitude", bounds=(-1e3, 1e3), sd=1.0, source="flat until fitted"
-    )
+    return parameter(1.0, "-", "ordinate, over the amplitude", (-1e3, 1e3), "flat until fitted", sd=1.0)
 
 
 def _size(unit: str, size: float) -> Scalar:
     return amplitude(
-        unit=unit,
-        meaning="size of the discrepancy",
-        bounds=(-100 * size, 100 * size),
-        sd=size,
-        source="remainder of the fit; no cause is known",
+        unit, "size of the discrepancy", (-100 * size, 100 * size), "remainder of the fit; no cause is known", sd=size
     )
 
 
@@ -216,21 +210,13 @@ def _curve(place: str, over: str) -> type[Effect]:
 
         amplitude: Scalar = _size(unit, size)
         low: Scalar = parameter(
-            first,
-            unit=unit_x,
-            meaning=f"{over} at the first ordinate",
-            bounds=(-1e4, 1e4),
+            first, unit_x, f"{over} at the first ordinate", (-1e4, 1e4), "lower end of the range of the data",
             sd=0.1 * (last - first),
-            source="lower end of the range of the data",
-        )
+        )  # fmt: skip
         high: Scalar = parameter(
-            last,
-            unit=unit_x,
-            meaning=f"{over} at the last ordinate",
-            bounds=(-1e4, 1e4),
+            last, unit_x, f"{over} at the last ordinate", (-1e4, 1e4), "upper end of the range of the data",
             sd=0.1 * (last - first),
-            source="upper end of the range of the data",
-        )
+        )  # fmt: skip
         y0: Scalar = _ordinate()
         y1: Scalar = _ordinate()
         y2: Scalar = _ordinate()
@@ -268,13 +254,9 @@ def _wave(place: str) -> type[Effect]:
         amplitude: Scalar = _size(unit, size)
         phase: Scalar = phase_parameter()
         order_shaft: Scalar = parameter(
-            1.0,
-            unit="-",
-            meaning="waves a turn of the driving pulley or wheel k",
-            bounds=(0.01, 1000.0),
+            1.0, "-", "waves a turn of the driving pulley or wheel k", (0.01, 1000.0), "the order that the data show",
             relative_sd=0.01,
-            source="the order that the data show",
-        )
+        )  # fmt: skip
         y_sin: Scalar = _ordinate()
         y_cos: Scalar = _ordinate()
 

@@ -28,11 +28,7 @@ class SeriesResistance(ElectricalEffect):
     dissipative = True
 
     amplitude: Scalar = amplitude(
-        unit="ohm",
-        meaning="resistance in series with each motor",
-        bounds=(-0.5, 5.0),
-        sd=0.5,
-        source="bench leads and meters: tenths of an ohm",
+        "ohm", "resistance in series with each motor", (-0.5, 5.0), "bench leads and meters: tenths of an ohm", sd=0.5
     )
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
@@ -52,20 +48,13 @@ class BrushDrop(ElectricalEffect):
     dissipative = True
 
     amplitude: Scalar = amplitude(
-        unit="V",
-        meaning="voltage drop of a pair of brushes",
-        bounds=(-0.5, 3.0),
+        "V", "voltage drop of a pair of brushes", (-0.5, 3.0), "0.2 V (copper-graphite) to 1 V (graphite) a pair",
         sd=0.5,
-        source="0.2 V (copper-graphite) to 1 V (graphite) a pair",
-    )
+    )  # fmt: skip
     current_ohmic: Scalar = parameter(
-        0.1,
-        unit="A",
-        meaning="current I_b below which the contact is ohmic",
-        bounds=(5e-3, 1.0),
+        0.1, "A", "current I_b below which the contact is ohmic", (5e-3, 1.0), "below the no-load current of 165 mA",
         relative_sd=0.5,
-        source="below the no-load current of 165 mA",
-    )
+    )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         return self.amplitude * signals.current / jnp.sqrt(signals.current**2 + self.current_ohmic**2)
@@ -88,12 +77,9 @@ class WindingHeating(ElectricalEffect):
     dissipative = True
 
     amplitude: Scalar = amplitude(
-        unit="-",
-        meaning="share of the settled temperature rise that the run reaches",
-        bounds=(-0.5, 3.0),
-        sd=1.0,
-        source="0 cold, 1 settled; above 1 for a closed housing",
-    )
+        "-", "share of the settled temperature rise that the run reaches", (-0.5, 3.0),
+        "0 cold, 1 settled; above 1 for a closed housing", sd=1.0,
+    )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         motor = robot.motor
@@ -122,28 +108,17 @@ class ThermalDrift(ElectricalEffect):
     memory_unit = "K"
 
     amplitude: Scalar = amplitude(
-        unit="-",
-        meaning="share of the data sheet's temperature rise",
-        bounds=(-1.0, 10.0),
-        sd=1.0,
-        source="1 by the data sheet; more in still air between printed walls",
-    )
+        "-", "share of the data sheet's temperature rise", (-1.0, 10.0),
+        "1 by the data sheet; more in still air between printed walls", sd=1.0,
+    )  # fmt: skip
     time_constant: Scalar = parameter(
-        16.3,
-        unit="s",
-        meaning="thermal time constant of the winding τ",
-        bounds=(1.0, 600.0),
+        16.3, "s", "thermal time constant of the winding τ", (1.0, 600.0), "maker's sheet of RE30 310007",
         relative_sd=0.3,
-        source="maker's sheet of RE30 310007",
-    )
+    )  # fmt: skip
     resistance_thermal: Scalar = parameter(
-        1.7,
-        unit="K/W",
-        meaning="thermal resistance winding to housing R_wh",
-        bounds=(0.1, 20.0),
+        1.7, "K/W", "thermal resistance winding to housing R_wh", (0.1, 20.0), "maker's sheet of RE30 310007",
         relative_sd=0.2,
-        source="maker's sheet of RE30 310007",
-    )
+    )  # fmt: skip
 
     def settled(self, robot: Robot, signals: Signals) -> Scalar:
         return self.resistance_thermal * robot.motor.voltage_winding(signals.current) * signals.current
@@ -173,12 +148,9 @@ class CoastDecay(ElectricalEffect):
     needs_duty = True
 
     amplitude: Scalar = amplitude(
-        unit="-",
-        meaning="share of the pauses between pulses in which the motors coast",
-        bounds=(-0.5, 1.5),
-        sd=0.5,
-        source="0 slow decay, 1 fast decay with the current ending at once",
-    )
+        "-", "share of the pauses between pulses in which the motors coast", (-0.5, 1.5),
+        "0 slow decay, 1 fast decay with the current ending at once", sd=0.5,
+    )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         return -self.amplitude * signals.pause * robot.motor.voltage_back(signals.speed_motor)

@@ -36,12 +36,9 @@ class GearLoadLoss(GearboxEffect):
     dissipative = True
 
     amplitude: Scalar = amplitude(
-        unit="-",
-        meaning="share of the output torque lost beyond eq. (19)",
-        bounds=(-0.2, 0.5),
-        sd=0.05,
-        source="η_rm of two or three planet stages: 0.70 to 0.80",
-    )
+        "-", "share of the output torque lost beyond eq. (19)", (-0.2, 0.5),
+        "η_rm of two or three planet stages: 0.70 to 0.80", sd=0.05,
+    )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         load = torque_output(robot, signals)
@@ -62,11 +59,7 @@ class GearQuadraticLoss(GearboxEffect):
     dissipative = True
 
     amplitude: Scalar = amplitude(
-        unit="1/N/m",
-        meaning="loss torque over squared output torque",
-        bounds=(-0.05, 0.3),
-        sd=0.03,
-        source="at 2 N·m 6 % of the load",
+        "1/N/m", "loss torque over squared output torque", (-0.05, 0.3), "at 2 N·m 6 % of the load", sd=0.03
     )
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
@@ -87,20 +80,13 @@ class StribeckGear(GearboxEffect):
     dissipative = True
 
     amplitude: Scalar = amplitude(
-        unit="N·m",
-        meaning="friction torque at rest, at the output",
-        bounds=(-0.1, 1.0),
-        sd=0.05,
-        source="about 1.5 mN·m at the input, times 48 and η_rm",
-    )
+        "N·m", "friction torque at rest, at the output", (-0.1, 1.0),
+        "about 1.5 mN·m at the input, times 48 and η_rm", sd=0.05,
+    )  # fmt: skip
     speed_fade: Scalar = parameter(
-        300.0,
-        unit="rad/s",
-        meaning="input speed ω_s that scales the decay of the excess",
-        bounds=(20.0, 3000.0),
-        relative_sd=0.5,
-        source="grease leaves mixed lubrication at 1000 to 5000 rpm of the input",
-    )
+        300.0, "rad/s", "input speed ω_s that scales the decay of the excess", (20.0, 3000.0),
+        "grease leaves mixed lubrication at 1000 to 5000 rpm of the input", relative_sd=0.5,
+    )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         return self.amplitude * jnp.exp(-jnp.abs(signals.speed_motor) / self.speed_fade) * signals.direction
@@ -122,12 +108,9 @@ class BackdrivingLoss(GearboxEffect):
     dissipative = True
 
     amplitude: Scalar = amplitude(
-        unit="-",
-        meaning="share of the load's torque lost beyond eq. (19) while the load drives",
-        bounds=(-0.2, 1.0),
-        sd=0.1,
-        source="η - (2 - 1/η) = 0.09 for η_rm of Table 2",
-    )
+        "-", "share of the load's torque lost beyond eq. (19) while the load drives", (-0.2, 1.0),
+        "η - (2 - 1/η) = 0.09 for η_rm of Table 2", sd=0.1,
+    )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         driving = at_least(0.0, -torque_output(robot, signals) * signals.direction)
@@ -150,11 +133,7 @@ class BristleLoadLoss(Bristle, GearboxEffect):
     settles_to = "gear_load_loss"
 
     amplitude: Scalar = amplitude(
-        unit="-",
-        meaning="share of the output torque lost through the bristle",
-        bounds=(-0.2, 0.5),
-        sd=0.05,
-        source="as of `gear_load_loss`",
+        "-", "share of the output torque lost through the bristle", (-0.2, 0.5), "as of `gear_load_loss`", sd=0.05
     )
     angle_breakaway: Scalar = breakaway_parameter()
 
@@ -179,12 +158,9 @@ class BristleBackdrivingLoss(Bristle, GearboxEffect):
     settles_to = "backdriving_loss"
 
     amplitude: Scalar = amplitude(
-        unit="-",
-        meaning="share of the load's torque lost through the bristle while the load drives",
-        bounds=(-0.2, 1.0),
-        sd=0.1,
-        source="as of `backdriving_loss`",
-    )
+        "-", "share of the load's torque lost through the bristle while the load drives", (-0.2, 1.0),
+        "as of `backdriving_loss`", sd=0.1,
+    )  # fmt: skip
     angle_breakaway: Scalar = breakaway_parameter()
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:

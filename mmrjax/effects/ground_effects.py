@@ -30,12 +30,9 @@ class SpeedRolling(GroundEffect):
     dissipative = True
 
     amplitude: Scalar = amplitude(
-        unit="s^2/m^2",
-        meaning="rise of the coefficient f over squared speed",
-        bounds=(-0.01, 0.1),
-        sd=0.01,
-        source="at 1 m/s a sixth to a third of f of Table 4",
-    )
+        "s^2/m^2", "rise of the coefficient f over squared speed", (-0.01, 0.1),
+        "at 1 m/s a sixth to a third of f of Table 4", sd=0.01,
+    )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         return self.amplitude * signals.normal * signals.speed**2 * signals.direction_travel
@@ -55,20 +52,13 @@ class AdhesiveDrag(GroundEffect):
     dissipative = True
 
     amplitude: Scalar = amplitude(
-        unit="N",
-        meaning="peeling force of one side at a crawl",
-        bounds=(-0.02, 0.3),
+        "N", "peeling force of one side at a crawl", (-0.02, 0.3), "0.1 J/m^2 over 0.1 m of width, and more if soft",
         sd=0.02,
-        source="0.1 J/m^2 over 0.1 m of width, and more if soft",
-    )
+    )  # fmt: skip
     speed_peel: Scalar = parameter(
-        1e-3,
-        unit="m/s",
-        meaning="speed V_p above which peeling is rate-dependent",
-        bounds=(1e-6, 1.0),
-        relative_sd=1.0,
-        source="rubber on glass at room temperature: micrometres to millimetres per second",
-    )
+        1e-3, "m/s", "speed V_p above which peeling is rate-dependent", (1e-6, 1.0),
+        "rubber on glass at room temperature: micrometres to millimetres per second", relative_sd=1.0,
+    )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         growth = (1 + (signals.speed / self.speed_peel) ** 2) ** 0.3
@@ -89,12 +79,9 @@ class WeightTransfer(GroundEffect):
     dissipative = True
 
     amplitude: Scalar = amplitude(
-        unit="-",
-        meaning="rise of the coefficient f over squared slope",
-        bounds=(-0.2, 2.0),
+        "-", "rise of the coefficient f over squared slope", (-0.2, 2.0), "at 20 deg 0.03, half of f of Table 4",
         sd=0.2,
-        source="at 20 deg 0.03, half of f of Table 4",
-    )
+    )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         return self.amplitude * signals.normal * jnp.tan(signals.slope) ** 2 * signals.direction_travel
@@ -114,20 +101,12 @@ class Sinkage(GroundEffect):
     dissipative = True
 
     amplitude: Scalar = amplitude(
-        unit="-",
-        meaning="rise of the coefficient f at the robot's own mass",
-        bounds=(-0.03, 0.3),
-        sd=0.02,
-        source="a third of f of Table 4",
+        "-", "rise of the coefficient f at the robot's own mass", (-0.03, 0.3), "a third of f of Table 4", sd=0.02
     )
     exponent: Scalar = parameter(
-        1.0,
-        unit="-",
-        meaning="sinkage exponent n",
-        bounds=(0.3, 2.0),
-        relative_sd=0.3,
-        source="0.5 clay, 1 sand, felt and lacquer like springs (Wong 2008, ch. 2)",
-    )
+        1.0, "-", "sinkage exponent n", (0.3, 2.0),
+        "0.5 clay, 1 sand, felt and lacquer like springs (Wong 2008, ch. 2)", relative_sd=0.3,
+    )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         unladen = robot.chassis(signals.configuration).mass
@@ -148,12 +127,9 @@ class SlopeBias(GroundEffect):
     odd_in_travel = True
 
     amplitude: Scalar = amplitude(
-        unit="rad",
-        meaning="excess of the true slope angle over the stated one",
-        bounds=(-0.1, 0.1),
-        sd=9e-3,
-        source="half a degree for an inclinometer on a bench",
-    )
+        "rad", "excess of the true slope angle over the stated one", (-0.1, 0.1),
+        "half a degree for an inclinometer on a bench", sd=9e-3,
+    )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         return self.amplitude * signals.normal
@@ -173,21 +149,10 @@ class GrouserPolygon(Periodic, GroundEffect):
     movers = "tracks"
 
     amplitude: Scalar = amplitude(
-        unit="N",
-        meaning="amplitude of the force of one side",
-        bounds=(-20.0, 20.0),
-        sd=1.0,
-        source="a few percent of the weight of a side",
+        "N", "amplitude of the force of one side", (-20.0, 20.0), "a few percent of the weight of a side", sd=1.0
     )
     phase: Scalar = phase_parameter()
-    pitch: Scalar = parameter(
-        35e-3,
-        unit="m",
-        meaning="pitch p of the grousers",
-        bounds=(5e-3, 0.2),
-        relative_sd=0.01,
-        source="Section 3.2.4",
-    )
+    pitch: Scalar = parameter(35e-3, "m", "pitch p of the grousers", (5e-3, 0.2), "Section 3.2.4", relative_sd=0.01)
 
     def order(self, robot: Robot, configuration: Index) -> Scalar:
         passages = robot.radius_pulley / (self.pitch * robot.gearbox.ratio)

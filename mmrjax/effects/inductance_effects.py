@@ -23,12 +23,9 @@ class ArmatureInductance(Effect):
     transient = True
 
     amplitude: Scalar = amplitude(
-        unit="H",
-        meaning="inductance in series with each motor beyond L_d",
-        bounds=(-1e-4, 5e-3),
+        "H", "inductance in series with each motor beyond L_d", (-1e-4, 5e-3), "output filter of a bench supply",
         sd=1e-4,
-        source="output filter of a bench supply",
-    )
+    )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         return self.amplitude * jnp.ones_like(signals.speed_motor)

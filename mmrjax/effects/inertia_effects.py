@@ -23,12 +23,9 @@ class RotatingInertia(Effect):
     transient = True
 
     amplitude: Scalar = amplitude(
-        unit="kg·m^2",
-        meaning="inertia of one side at the driving wheel beyond J_w",
-        bounds=(-5e-4, 2e-2),
-        sd=5e-4,
-        source="as much again as Table 7's pulleys",
-    )
+        "kg·m^2", "inertia of one side at the driving wheel beyond J_w", (-5e-4, 2e-2),
+        "as much again as Table 7's pulleys", sd=5e-4,
+    )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         return self.amplitude * jnp.ones_like(signals.speed_motor)

@@ -27,12 +27,9 @@ class MassError(MassEffect):
     """
 
     amplitude: Scalar = amplitude(
-        unit="-",
-        meaning="relative error of the stated mass",
-        bounds=(-0.3, 0.3),
+        "-", "relative error of the stated mass", (-0.3, 0.3), "spring balance, cables and mud: a few percent",
         sd=0.03,
-        source="spring balance, cables and mud: a few percent",
-    )
+    )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         return self.amplitude * signals.mass
@@ -51,12 +48,9 @@ class MassOffset(MassEffect):
     movers = "wheels"
 
     amplitude: Scalar = amplitude(
-        unit="kg",
-        meaning="mass of the wheeled robot beyond the stated mass",
-        bounds=(-5.0, 5.0),
-        sd=1.0,
-        source="flippers weigh 4 x (470 + 25) g, wheels 4 x 86 g (Table 7)",
-    )
+        "kg", "mass of the wheeled robot beyond the stated mass", (-5.0, 5.0),
+        "flippers weigh 4 x (470 + 25) g, wheels 4 x 86 g (Table 7)", sd=1.0,
+    )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         return self.amplitude * jnp.ones_like(signals.payload)

@@ -34,12 +34,9 @@ class Windage(MotorEffect):
     dissipative = True
 
     amplitude: Scalar = amplitude(
-        unit="N·m·s^2",
-        meaning="torque over squared motor speed",
-        bounds=(-1e-9, 1e-8),
+        "N·m·s^2", "torque over squared motor speed", (-1e-9, 1e-8), "at 1200 rad/s 0.7 mN·m, a fifth of eq. (14)",
         sd=5e-10,
-        source="at 1200 rad/s 0.7 mN·m, a fifth of eq. (14)",
-    )
+    )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         # ω² with the shaft's smooth sign: |ω| alone has no derivative at rest.
@@ -60,20 +57,13 @@ class StribeckMotor(MotorEffect):
     dissipative = True
 
     amplitude: Scalar = amplitude(
-        unit="N·m",
-        meaning="friction torque at rest beyond the dry friction",
-        bounds=(-3e-3, 2e-2),
-        sd=1.5e-3,
-        source="half of the dry friction of Table 2",
-    )
+        "N·m", "friction torque at rest beyond the dry friction", (-3e-3, 2e-2),
+        "half of the dry friction of Table 2", sd=1.5e-3,
+    )  # fmt: skip
     speed_fade: Scalar = parameter(
-        300.0,
-        unit="rad/s",
-        meaning="motor speed ω_s that scales the decay of the excess",
-        bounds=(20.0, 3000.0),
-        relative_sd=0.5,
-        source="sleeve bearings leave mixed lubrication at 1000 to 5000 rpm",
-    )
+        300.0, "rad/s", "motor speed ω_s that scales the decay of the excess", (20.0, 3000.0),
+        "sleeve bearings leave mixed lubrication at 1000 to 5000 rpm", relative_sd=0.5,
+    )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         return self.amplitude * jnp.exp(-jnp.abs(signals.speed_motor) / self.speed_fade) * signals.direction
@@ -93,20 +83,13 @@ class IronLoss(MotorEffect):
     dissipative = True
 
     amplitude: Scalar = amplitude(
-        unit="N·m",
-        meaning="largest drag torque, reached at ω_c",
-        bounds=(-2e-3, 1e-2),
+        "N·m", "largest drag torque, reached at ω_c", (-2e-3, 1e-2), "a quarter of the no-load torque of 4.3 mN·m",
         sd=1e-3,
-        source="a quarter of the no-load torque of 4.3 mN·m",
-    )
+    )  # fmt: skip
     speed_critical: Scalar = parameter(
-        800.0,
-        unit="rad/s",
-        meaning="motor speed ω_c of the largest drag",
-        bounds=(50.0, 2e4),
-        relative_sd=0.5,
-        source="millimetres of solid steel: 10^2 to 10^4 rad/s",
-    )
+        800.0, "rad/s", "motor speed ω_c of the largest drag", (50.0, 2e4),
+        "millimetres of solid steel: 10^2 to 10^4 rad/s", relative_sd=0.5,
+    )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         share = signals.speed_motor / self.speed_critical
@@ -127,12 +110,9 @@ class TorqueConstantSaturation(MotorEffect):
     driver = "load"
 
     amplitude: Scalar = amplitude(
-        unit="1/A^2",
-        meaning="relative loss of torque constant over squared current",
-        bounds=(-0.01, 0.05),
-        sd=3e-3,
-        source="3 % at 3 A; an ironless rotor saturates little",
-    )
+        "1/A^2", "relative loss of torque constant over squared current", (-0.01, 0.05),
+        "3 % at 3 A; an ironless rotor saturates little", sd=3e-3,
+    )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         return self.amplitude * robot.motor.torque_electromagnetic(signals.current) * signals.current**2
@@ -152,29 +132,17 @@ class Cogging(Periodic, MotorEffect):
     driver = "angle"
 
     amplitude: Scalar = amplitude(
-        unit="N·m",
-        meaning="amplitude of the torque ripple",
-        bounds=(-5e-3, 5e-3),
-        sd=5e-4,
-        source="a tenth of the no-load torque of 4.3 mN·m",
+        "N·m", "amplitude of the torque ripple", (-5e-3, 5e-3), "a tenth of the no-load torque of 4.3 mN·m", sd=5e-4
     )
     phase: Scalar = phase_parameter()
     ripples: Scalar = parameter(
-        26.0,
-        unit="-",
-        meaning="number of ripples n per turn",
-        bounds=(1.0, 100.0),
+        26.0, "-", "number of ripples n per turn", (1.0, 100.0), "twice the 13 segments of the commutator",
         relative_sd=0.01,
-        source="twice the 13 segments of the commutator",
-    )
+    )  # fmt: skip
     rate_fade: Scalar = parameter(
-        1000.0,
-        unit="rad/s",
-        meaning="ripple rate ω_f above which it is faded out",
-        bounds=(10.0, 1e5),
-        relative_sd=0.1,
-        source="a choice of the model, see above",
-    )
+        1000.0, "rad/s", "ripple rate ω_f above which it is faded out", (10.0, 1e5),
+        "a choice of the model, see above", relative_sd=0.1,
+    )  # fmt: skip
 
     def order(self, robot: Robot, configuration: Index) -> Scalar:
         return self.ripples

@@ -20,13 +20,9 @@ STEPS = 12  # integration steps per period: derivatives at amplitude 0 are then 
 def phase_parameter() -> Scalar:
     """The phase of a wave, a field of every periodic effect."""
     return parameter(
-        0.0,
-        unit="rad",
-        meaning="phase φ of the wave at the start of the run",
-        bounds=(-4.0, 4.0),
-        sd=2.0,
-        source="position of the parts at the start: arbitrary",
-    )
+        0.0, "rad", "phase φ of the wave at the start of the run", (-4.0, 4.0),
+        "position of the parts at the start: arbitrary", sd=2.0,
+    )  # fmt: skip
 
 
 class Periodic(Effect):

@@ -56,9 +56,8 @@ def _field(parameter: Parameter, factor: float, limits: float) -> Any:
     spec = parameter.spec
     low, high = spec.bounds
     return params.parameter(
-        factor * float(parameter.value), unit=spec.unit, meaning=spec.meaning, bounds=(low * limits, high * limits),
-        source=spec.source, relative_sd=spec.relative_sd, sd=None if spec.sd is None else spec.sd * factor,
-        amplitude=spec.amplitude,
+        factor * float(parameter.value), spec.unit, spec.meaning, (low * limits, high * limits), spec.source,
+        relative_sd=spec.relative_sd, sd=None if spec.sd is None else spec.sd * factor, amplitude=spec.amplitude,
     )  # fmt: skip
 
 

@@ -44,11 +44,7 @@ class AmmeterGain(SensorEffect):
     of_zero = False
 
     amplitude: Scalar = amplitude(
-        unit="-",
-        meaning="relative error of the current reading",
-        bounds=(-0.2, 0.2),
-        sd=0.02,
-        source="class 2.5 meter, shunt of 1 %",
+        "-", "relative error of the current reading", (-0.2, 0.2), "class 2.5 meter, shunt of 1 %", sd=0.02
     )
 
 
@@ -64,12 +60,9 @@ class AmmeterOffset(SensorEffect):
     of_zero = True
 
     amplitude: Scalar = amplitude(
-        unit="A",
-        meaning="current shown with the motors off",
-        bounds=(-1.0, 2.0),
+        "A", "current shown with the motors off", (-1.0, 2.0), "control electronics on the line: 0.05 to 0.2 A",
         sd=0.1,
-        source="control electronics on the line: 0.05 to 0.2 A",
-    )
+    )  # fmt: skip
 
 
 class EncoderScale(SensorEffect):
@@ -84,12 +77,9 @@ class EncoderScale(SensorEffect):
     of_zero = False
 
     amplitude: Scalar = amplitude(
-        unit="-",
-        meaning="relative error of the motor speed reading",
-        bounds=(-0.1, 0.1),
-        sd=0.01,
-        source="optical tachometer 0.1 %, analogue one 1 to 2 %",
-    )
+        "-", "relative error of the motor speed reading", (-0.1, 0.1),
+        "optical tachometer 0.1 %, analogue one 1 to 2 %", sd=0.01,
+    )  # fmt: skip
 
 
 class SpeedGain(SensorEffect):
@@ -104,17 +94,14 @@ class SpeedGain(SensorEffect):
     of_zero = False
 
     amplitude: Scalar = amplitude(
-        unit="-",
-        meaning="relative error of the speed reading",
-        bounds=(-0.1, 0.1),
+        "-", "relative error of the speed reading", (-0.1, 0.1), "1 to 2 cm in 1 m, a tenth of a second by hand",
         sd=0.02,
-        source="1 to 2 cm in 1 m, a tenth of a second by hand",
-    )
+    )  # fmt: skip
 
 
 def _error(read: Channel, of_zero: bool) -> type[Effect]:
     """The error of scale or zero of a channel's instrument."""
-    largest, unit = (10 * read.zero_error, read.unit_si or read.unit) if of_zero else (0.2, "-")
+    largest, unit = (10 * read.zero_error, read.unit_si) if of_zero else (0.2, "-")
     source = "limits of error of instruments, IEC 60051-2", "class of the instrument: 0.5 to 2.5 %"
     if read.unit_shown == "°C":
         source = "tolerances of thermocouples, IEC 60584-1", "class of the instrument: 1 to 3 K"
@@ -127,12 +114,9 @@ def _error(read: Channel, of_zero: bool) -> type[Effect]:
         odd_in_travel = odd
 
         amplitude: Scalar = amplitude(
-            unit=unit,
-            meaning=f"error of the {read.label} reading" if zero else f"relative error of the {read.label} reading",
-            bounds=(-largest, largest),
-            sd=read.zero_error if zero else 0.02,
-            source=source[1],
-        )
+            unit, f"error of the {read.label} reading" if zero else f"relative error of the {read.label} reading",
+            (-largest, largest), source[1], sd=read.zero_error if zero else 0.02,
+        )  # fmt: skip
 
     Error.__doc__ = f"""Δx = a{"" if zero else " x"} in the reading x of {read.label}.
 

@@ -30,12 +30,9 @@ class RollingRadius(SlipEffect):
     """
 
     amplitude: Scalar = amplitude(
-        unit="-",
-        meaning="relative error of the rolling radius",
-        bounds=(-0.2, 0.2),
-        sd=0.03,
-        source="belt and tyre thickness against radius: a few percent",
-    )
+        "-", "relative error of the rolling radius", (-0.2, 0.2),
+        "belt and tyre thickness against radius: a few percent", sd=0.03,
+    )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         return -self.amplitude * signals.speed_theoretical
@@ -55,12 +52,9 @@ class BeltCreep(SlipEffect):
     dissipative = True
 
     amplitude: Scalar = amplitude(
-        unit="1/N",
-        meaning="creep over traction of a side, 1/(E A)",
-        bounds=(-1e-3, 1e-2),
-        sd=5e-4,
-        source="E A of 1 to 20 kN for narrow rubber with cord; at 22 N 1 %",
-    )
+        "1/N", "creep over traction of a side, 1/(E A)", (-1e-3, 1e-2),
+        "E A of 1 to 20 kN for narrow rubber with cord; at 22 N 1 %", sd=5e-4,
+    )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         return self.amplitude * signals.demand * signals.speed_theoretical * signals.direction
@@ -79,11 +73,7 @@ class NonlinearSlip(SlipEffect):
     dissipative = True
 
     amplitude: Scalar = amplitude(
-        unit="-",
-        meaning="slip at the adhesion limit",
-        bounds=(-0.05, 0.5),
-        sd=0.05,
-        source="slip of tracks at full adhesion: 5 to 20 %",
+        "-", "slip at the adhesion limit", (-0.05, 0.5), "slip of tracks at full adhesion: 5 to 20 %", sd=0.05
     )
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
@@ -102,13 +92,7 @@ class SpeedSlip(SlipEffect):
 
     driver = "speed"
 
-    amplitude: Scalar = amplitude(
-        unit="s/m",
-        meaning="slip over speed",
-        bounds=(-0.1, 0.2),
-        sd=0.02,
-        source="2 % at 1 m/s",
-    )
+    amplitude: Scalar = amplitude("s/m", "slip over speed", (-0.1, 0.2), "2 % at 1 m/s", sd=0.02)
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         return self.amplitude * signals.speed_theoretical**2 * signals.direction
@@ -126,12 +110,9 @@ class LoadSlip(SlipEffect):
     driver = "load"
 
     amplitude: Scalar = amplitude(
-        unit="1/N",
-        meaning="relative loss of rolling radius over load of a side",
-        bounds=(-1e-3, 2e-3),
-        sd=1e-4,
-        source="at 100 N 1 %: tread 5 mm thick yields 0.5 mm",
-    )
+        "1/N", "relative loss of rolling radius over load of a side", (-1e-3, 2e-3),
+        "at 100 N 1 %: tread 5 mm thick yields 0.5 mm", sd=1e-4,
+    )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         return self.amplitude * signals.normal * signals.speed_theoretical
@@ -149,12 +130,9 @@ class PulleyEccentricity(Periodic, SlipEffect):
     driver = "angle"
 
     amplitude: Scalar = amplitude(
-        unit="-",
-        meaning="eccentricity over rolling radius e / r_k",
-        bounds=(-0.1, 0.1),
-        sd=0.01,
-        source="0.2 to 0.5 mm of run-out on a printed or pressed pulley of 38 mm",
-    )
+        "-", "eccentricity over rolling radius e / r_k", (-0.1, 0.1),
+        "0.2 to 0.5 mm of run-out on a printed or pressed pulley of 38 mm", sd=0.01,
+    )  # fmt: skip
     phase: Scalar = phase_parameter()
 
     def order(self, robot: Robot, configuration: Index) -> Scalar:
@@ -183,28 +161,17 @@ class VibrationSlip(SlipEffect):
     resolved = True
 
     amplitude: Scalar = amplitude(
-        unit="m/s",
-        meaning="speed lost at V_1 and half of the adhesion",
-        bounds=(-0.05, 0.5),
-        sd=0.02,
-        source="contacts of the track model oscillate by 1 to 4 % of the speed (docs/explanation/vibration.md)",
-    )
+        "m/s", "speed lost at V_1 and half of the adhesion", (-0.05, 0.5),
+        "contacts of the track model oscillate by 1 to 4 % of the speed (docs/explanation/vibration.md)", sd=0.02,
+    )  # fmt: skip
     exponent: Scalar = parameter(
-        2.0,
-        unit="-",
-        meaning="exponent p of the growth of the oscillation with speed",
-        bounds=(0.0, 5.0),
-        sd=0.7,
-        source="inertia forces grow as the square of the frequency; running gears: 2.1 to 3.4",
-    )
+        2.0, "-", "exponent p of the growth of the oscillation with speed", (0.0, 5.0),
+        "inertia forces grow as the square of the frequency; running gears: 2.1 to 3.4", sd=0.7,
+    )  # fmt: skip
     speed_reference: Scalar = parameter(
-        1.0,
-        unit="m/s",
-        meaning="speed V_1 for which the amplitude is stated",
-        bounds=(1e-3, 100.0),
-        relative_sd=0.01,
-        source="a choice: only the amplitude is fitted",
-    )
+        1.0, "m/s", "speed V_1 for which the amplitude is stated", (1e-3, 100.0),
+        "a choice: only the amplitude is fitted", relative_sd=0.01,
+    )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         used = signals.demand / signals.adhesion_limit

@@ -28,12 +28,9 @@ class SupplySag(SupplyEffect):
     dissipative = True
 
     amplitude: Scalar = amplitude(
-        unit="ohm",
-        meaning="resistance between the source and the motors' junction",
-        bounds=(-0.2, 2.0),
-        sd=0.2,
-        source="bench leads of 1.5 mm^2, connectors and shunt: 0.05 to 0.3 ohm",
-    )
+        "ohm", "resistance between the source and the motors' junction", (-0.2, 2.0),
+        "bench leads of 1.5 mm^2, connectors and shunt: 0.05 to 0.3 ohm", sd=0.2,
+    )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         return self.amplitude * signals.total_current
@@ -56,20 +53,12 @@ class BatterySag(SupplyEffect):
     memory_unit = "A"
 
     amplitude: Scalar = amplitude(
-        unit="ohm",
-        meaning="polarisation resistance of the battery",
-        bounds=(-0.1, 2.0),
-        sd=0.2,
-        source="half of the 8 x 0.049 ohm of Table 1",
+        "ohm", "polarisation resistance of the battery", (-0.1, 2.0), "half of the 8 x 0.049 ohm of Table 1", sd=0.2
     )
     time_constant: Scalar = parameter(
-        20.0,
-        unit="s",
-        meaning="time constant of the polarisation τ",
-        bounds=(0.5, 1000.0),
+        20.0, "s", "time constant of the polarisation τ", (0.5, 1000.0), "lithium cells of a few Ah: 10 to 60 s",
         relative_sd=0.5,
-        source="lithium cells of a few Ah: 10 to 60 s",
-    )
+    )  # fmt: skip
 
     def settled(self, robot: Robot, signals: Signals) -> Scalar:
         return signals.total_current

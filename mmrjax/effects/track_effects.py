@@ -32,12 +32,9 @@ class Churning(TrackEffect):
     dissipative = True
 
     amplitude: Scalar = amplitude(
-        unit="N·m·s^2",
-        meaning="torque over squared pulley speed",
-        bounds=(-1e-3, 1e-2),
+        "N·m·s^2", "torque over squared pulley speed", (-1e-3, 1e-2), "at 25 rad/s a tenth to the whole of eq. (24)",
         sd=5e-4,
-        source="at 25 rad/s a tenth to the whole of eq. (24)",
-    )
+    )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         # ω² with the shaft's smooth sign: |ω| alone has no derivative at rest.
@@ -56,20 +53,12 @@ class StribeckTrack(TrackEffect):
     dissipative = True
 
     amplitude: Scalar = amplitude(
-        unit="N·m",
-        meaning="loss torque at rest beyond M_t0",
-        bounds=(-0.1, 1.0),
-        sd=0.1,
-        source="a third of M_t0 of Table 3",
+        "N·m", "loss torque at rest beyond M_t0", (-0.1, 1.0), "a third of M_t0 of Table 3", sd=0.1
     )
     speed_fade: Scalar = parameter(
-        8.0,
-        unit="rad/s",
-        meaning="pulley speed ω_s that scales the decay of the excess",
-        bounds=(0.5, 80.0),
-        relative_sd=0.5,
-        source="belt speeds of 0.1 to 0.5 m/s",
-    )
+        8.0, "rad/s", "pulley speed ω_s that scales the decay of the excess", (0.5, 80.0),
+        "belt speeds of 0.1 to 0.5 m/s", relative_sd=0.5,
+    )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         return self.amplitude * jnp.exp(-jnp.abs(signals.speed_wheel) / self.speed_fade) * signals.direction
@@ -89,12 +78,9 @@ class TensionFriction(TrackEffect):
     dissipative = True
 
     amplitude: Scalar = amplitude(
-        unit="-",
-        meaning="loss torque over torque of the traction",
-        bounds=(-0.2, 1.0),
-        sd=0.1,
-        source="1 - efficiency of a rubber track's final drive: 5 to 15 %",
-    )
+        "-", "loss torque over torque of the traction", (-0.2, 1.0),
+        "1 - efficiency of a rubber track's final drive: 5 to 15 %", sd=0.1,
+    )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         radius = robot.chassis(signals.configuration).radius
@@ -117,12 +103,9 @@ class CentrifugalTension(TrackEffect):
     dissipative = True
 
     amplitude: Scalar = amplitude(
-        unit="s^2/m^2",
-        meaning="mass of the belt per length over its rest tension",
-        bounds=(-0.1, 0.5),
-        sd=0.05,
-        source="0.005 for a taut belt, 0.05 for a slack one",
-    )
+        "s^2/m^2", "mass of the belt per length over its rest tension", (-0.1, 0.5),
+        "0.005 for a taut belt, 0.05 for a slack one", sd=0.05,
+    )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         loss = robot.chassis(signals.configuration).track.loss_coulomb
@@ -144,20 +127,12 @@ class BendingLoss(TrackEffect):
     dissipative = True
 
     amplitude: Scalar = amplitude(
-        unit="N·m",
-        meaning="largest loss torque, reached at ω_r",
-        bounds=(-0.1, 1.0),
-        sd=0.05,
-        source="a seventh of M_t0 of Table 3",
+        "N·m", "largest loss torque, reached at ω_r", (-0.1, 1.0), "a seventh of M_t0 of Table 3", sd=0.05
     )
     speed_relaxation: Scalar = parameter(
-        8.0,
-        unit="rad/s",
-        meaning="pulley speed ω_r of the largest loss",
-        bounds=(0.5, 200.0),
-        relative_sd=0.5,
-        source="relaxation over a tenth of a second, about the bend's duration",
-    )
+        8.0, "rad/s", "pulley speed ω_r of the largest loss", (0.5, 200.0),
+        "relaxation over a tenth of a second, about the bend's duration", relative_sd=0.5,
+    )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         share = signals.speed_wheel / self.speed_relaxation
@@ -182,28 +157,16 @@ class StickSlip(TrackEffect):
     memory_unit = "-"
 
     amplitude: Scalar = amplitude(
-        unit="N·m",
-        meaning="break-away torque of a side beyond M_t0",
-        bounds=(-0.2, 2.0),
-        sd=0.1,
-        source="a third of M_t0 of Table 3",
+        "N·m", "break-away torque of a side beyond M_t0", (-0.2, 2.0), "a third of M_t0 of Table 3", sd=0.1
     )
     angle_breakaway: Scalar = parameter(
-        0.01,
-        unit="rad",
-        meaning="angle θ_s of the pulley until the contacts release",
-        bounds=(1e-4, 1.0),
-        relative_sd=0.5,
-        source="0.4 mm of belt: shear of teeth and seals",
-    )
+        0.01, "rad", "angle θ_s of the pulley until the contacts release", (1e-4, 1.0),
+        "0.4 mm of belt: shear of teeth and seals", relative_sd=0.5,
+    )  # fmt: skip
     speed_fade: Scalar = parameter(
-        3.0,
-        unit="rad/s",
-        meaning="pulley speed ω_s above which the excess vanishes",
-        bounds=(0.05, 8.0),
+        3.0, "rad/s", "pulley speed ω_s above which the excess vanishes", (0.05, 8.0), "belt speed of 0.1 m/s",
         relative_sd=0.5,
-        source="belt speed of 0.1 m/s",
-    )
+    )  # fmt: skip
 
     def _excess(self, signals: Signals) -> Scalar:
         return jnp.exp(-((signals.speed_wheel / self.speed_fade) ** 2))
@@ -237,12 +200,9 @@ class DirectionalFriction(TrackEffect):
     needs_reverse = True
 
     amplitude: Scalar = amplitude(
-        unit="N·m",
-        meaning="loss torque forward beyond the mean of both directions",
-        bounds=(-0.5, 0.5),
+        "N·m", "loss torque forward beyond the mean of both directions", (-0.5, 0.5), "a seventh of M_t0 of Table 3",
         sd=0.05,
-        source="a seventh of M_t0 of Table 3",
-    )
+    )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         return self.amplitude * signals.direction**2
@@ -263,30 +223,18 @@ class StribeckExponent(TrackEffect):
     dissipative = True
 
     amplitude: Scalar = amplitude(
-        unit="N·m",
-        meaning="loss torque at rest beyond M_t0",
-        bounds=(-0.1, 1.0),
-        sd=0.1,
-        source="a third of M_t0 of Table 3",
+        "N·m", "loss torque at rest beyond M_t0", (-0.1, 1.0), "a third of M_t0 of Table 3", sd=0.1
     )
     # The loop frees the first of two shapes, ω_s. For a curve with any δ from 1/2 to 2, after dry and viscous
     # friction are fitted, δ = 1 and δ = 2 with ω_s free leave half the residual of a free δ at one ω_s and δ = 1.
     speed_fade: Scalar = parameter(
-        8.0,
-        unit="rad/s",
-        meaning="shaft speed ω_s that scales the decay of the excess",
-        bounds=(0.05, 80.0),
-        relative_sd=0.5,
-        source="belt speeds of 0.1 to 0.5 m/s",
-    )
+        8.0, "rad/s", "shaft speed ω_s that scales the decay of the excess", (0.05, 80.0),
+        "belt speeds of 0.1 to 0.5 m/s", relative_sd=0.5,
+    )  # fmt: skip
     exponent: Scalar = parameter(
-        2.0,
-        unit="-",
-        meaning="exponent δ of the speed",
-        bounds=(0.5, 4.0),
-        relative_sd=0.5,
-        source="1/2 to 2 in the survey, and much larger for boundary lubricants",
-    )
+        2.0, "-", "exponent δ of the speed", (0.5, 4.0),
+        "1/2 to 2 in the survey, and much larger for boundary lubricants", relative_sd=0.5,
+    )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         share = (signals.speed_wheel / self.speed_fade) ** 2 + 1e-3**2
@@ -309,12 +257,9 @@ class DirectionalViscous(TrackEffect):
     needs_reverse = True
 
     amplitude: Scalar = amplitude(
-        unit="N·m·s",
-        meaning="viscous loss forward beyond the mean of both directions",
-        bounds=(-0.05, 0.05),
-        sd=5e-3,
-        source="a third of the viscous loss of Table 3",
-    )
+        "N·m·s", "viscous loss forward beyond the mean of both directions", (-0.05, 0.05),
+        "a third of the viscous loss of Table 3", sd=5e-3,
+    )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         # The shaft's smooth sign: |ω| has no derivative at rest.
@@ -337,11 +282,7 @@ class TorqueOffset(TrackEffect):
     settles_to = "directional_friction"
 
     amplitude: Scalar = amplitude(
-        unit="N·m",
-        meaning="torque that acts against forward rotation",
-        bounds=(-0.5, 0.5),
-        sd=0.05,
-        source="a seventh of M_t0 of Table 3",
+        "N·m", "torque that acts against forward rotation", (-0.5, 0.5), "a seventh of M_t0 of Table 3", sd=0.05
     )
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
@@ -363,11 +304,7 @@ class Presliding(Bristle, TrackEffect):
     transient = True
 
     amplitude: Scalar = amplitude(
-        unit="N·m",
-        meaning="dry loss that acts through bristles",
-        bounds=(-0.5, 2.0),
-        sd=0.1,
-        source="a third of M_t0 of Table 3",
+        "N·m", "dry loss that acts through bristles", (-0.5, 2.0), "a third of M_t0 of Table 3", sd=0.1
     )
     angle_breakaway: Scalar = breakaway_parameter()
 
@@ -389,11 +326,7 @@ class AngleFriction(Periodic, TrackEffect):
     driver = "angle"
 
     amplitude: Scalar = amplitude(
-        unit="N·m",
-        meaning="amplitude of the dry loss over a turn",
-        bounds=(-0.5, 0.5),
-        sd=0.05,
-        source="a seventh of M_t0 of Table 3",
+        "N·m", "amplitude of the dry loss over a turn", (-0.5, 0.5), "a seventh of M_t0 of Table 3", sd=0.05
     )
     phase: Scalar = phase_parameter()
 
@@ -423,12 +356,9 @@ class PositionFriction(TrackEffect):
     memory_unit = "rad"
 
     amplitude: Scalar = amplitude(
-        unit="N·m/rad",
-        meaning="dry loss over the angle of the driven shaft",
-        bounds=(-0.1, 0.1),
-        sd=0.01,
-        source="over ten radians a third of M_t0 of Table 3",
-    )
+        "N·m/rad", "dry loss over the angle of the driven shaft", (-0.1, 0.1),
+        "over ten radians a third of M_t0 of Table 3", sd=0.01,
+    )  # fmt: skip
 
     def initial(self, robot: Robot, angle: Scalar) -> Scalar:
         return angle
@@ -460,20 +390,13 @@ class DirectionalStribeck(TrackEffect):
     needs_reverse = True
 
     amplitude: Scalar = amplitude(
-        unit="N·m",
-        meaning="excess at low speed forward, beyond the mean of both directions",
-        bounds=(-0.5, 0.5),
-        sd=0.05,
-        source="half of a common `stribeck_track`",
-    )
+        "N·m", "excess at low speed forward, beyond the mean of both directions", (-0.5, 0.5),
+        "half of a common `stribeck_track`", sd=0.05,
+    )  # fmt: skip
     speed_fade: Scalar = parameter(
-        8.0,
-        unit="rad/s",
-        meaning="shaft speed ω_s that scales the decay of the excess",
-        bounds=(0.5, 80.0),
-        relative_sd=0.5,
-        source="belt speeds of 0.1 to 0.5 m/s",
-    )
+        8.0, "rad/s", "shaft speed ω_s that scales the decay of the excess", (0.5, 80.0),
+        "belt speeds of 0.1 to 0.5 m/s", relative_sd=0.5,
+    )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         excess = jnp.exp(-jnp.abs(signals.speed_wheel) / self.speed_fade)

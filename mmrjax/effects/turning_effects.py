@@ -25,12 +25,9 @@ class SideFriction(Effect):
     driver = THE_SIDE
 
     amplitude: Scalar = amplitude(
-        unit="N·m",
-        meaning="half the difference of the sides' dry friction at the motor, positive if the left has more",
-        bounds=(-1.0, 1.0),
-        sd=1.5e-3,
-        source="half of the dry friction of Table 2",
-    )
+        "N·m", "half the difference of the sides' dry friction at the motor, positive if the left has more",
+        (-1.0, 1.0), "half of the dry friction of Table 2", sd=1.5e-3,
+    )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         return self.amplitude * signals.side * signals.direction
@@ -49,12 +46,9 @@ class SideTorque(Effect):
     rests_on = ("motor.torque_constant",)
 
     amplitude: Scalar = amplitude(
-        unit="-",
-        meaning="half the relative difference of the sides' torque constants, positive if the left is weaker",
-        bounds=(-0.5, 0.5),
-        sd=0.05,
-        source="makers' tolerances of 5 to 10 %",
-    )
+        "-", "half the relative difference of the sides' torque constants, positive if the left is weaker",
+        (-0.5, 0.5), "makers' tolerances of 5 to 10 %", sd=0.05,
+    )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         return self.amplitude * signals.side * robot.motor.torque_electromagnetic(signals.current)
@@ -73,12 +67,9 @@ class SideVoltage(Effect):
     driver = THE_SIDE
 
     amplitude: Scalar = amplitude(
-        unit="-",
-        meaning="half the relative difference of the sides' voltages, positive if the left gets less",
-        bounds=(-0.5, 0.5),
-        sd=0.03,
-        source="drivers' gains and dead times: a few percent",
-    )
+        "-", "half the relative difference of the sides' voltages, positive if the left gets less", (-0.5, 0.5),
+        "drivers' gains and dead times: a few percent", sd=0.03,
+    )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         winding = robot.motor.voltage_winding(signals.current, signals.temperature)
@@ -99,12 +90,9 @@ class TurningResistance(Effect):
     dissipative = True
 
     amplitude: Scalar = amplitude(
-        unit="m·s",
-        meaning="moment against the turn over load and yaw rate",
-        bounds=(-0.01, 0.5),
-        sd=1e-3,
-        source="a tenth of the friction's moment φ_y L/4 at 4 rad/s (Table 5: 0.03 m)",
-    )
+        "m·s", "moment against the turn over load and yaw rate", (-0.01, 0.5),
+        "a tenth of the friction's moment φ_y L/4 at 4 rad/s (Table 5: 0.03 m)", sd=1e-3,
+    )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         return self.amplitude * signals.normal * signals.yaw_rate
@@ -125,12 +113,9 @@ class SideRadius(Effect):
     driver = THE_SIDE
 
     amplitude: Scalar = amplitude(
-        unit="-",
-        meaning="half the relative difference of the sides' rolling radii, positive if the left's is smaller",
-        bounds=(-0.2, 0.2),
-        sd=0.01,
-        source="wear and pressure: a percent or two",
-    )
+        "-", "half the relative difference of the sides' rolling radii, positive if the left's is smaller",
+        (-0.2, 0.2), "wear and pressure: a percent or two", sd=0.01,
+    )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         return self.amplitude * signals.side * signals.speed_theoretical
@@ -151,11 +136,7 @@ class LateralGrip(Effect):
     dissipative = True
 
     amplitude: Scalar = amplitude(
-        unit="s/rad",
-        meaning="relative rise of the lateral friction over the yaw rate",
-        bounds=(-0.1, 2.0),
-        sd=0.05,
-        source="a fifth at 4 rad/s",
+        "s/rad", "relative rise of the lateral friction over the yaw rate", (-0.1, 2.0), "a fifth at 4 rad/s", sd=0.05
     )
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:

@@ -17,6 +17,7 @@ from mmrjax.fidelities import Facts
 from mmrjax.model import balances, channels
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar
+from mmrjax.model.quantities import VOLTAGE
 from mmrjax.model.rig import Rig
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Result, Signals
@@ -60,7 +61,7 @@ class History(eqx.Module):
             reading, signals = _shown(robot, signals, apart=True), balances.mean_of_sides(signals)
         else:
             reading = _shown(robot, signals)
-        if not robot.knows(channels.VOLTAGE):
+        if not robot.knows(VOLTAGE):
             nan = jnp.full_like(signals.current, jnp.nan)
             volts = ("voltage", "voltage_source", "voltage_drop", "voltage_left", "inductance")
             unknown: dict[str, Any] = dict.fromkeys(volts, nan)

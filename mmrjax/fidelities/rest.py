@@ -45,14 +45,14 @@ def smallest(*values: Scalar) -> Array:
 def travel_direction(robot: Robot, conditions: Conditions) -> Array:
     """Direction in which a robot can travel, 1 forward or -1 backward, from the torque on its shafts at rest.
 
-    The torque is that of the motors at stall current, within the driver's limit, less gravity's. Friction can hold the
-    robot but not reverse it. With an imposed motor speed, the direction of that speed.
+    The torque is that of the motors at stall current, within the driver's limit, less gravity's. Friction can hold
+    the robot but not reverse it. With an imposed motor speed, the direction of that speed.
     """
     if conditions.motor_speed is not None:
         return jax.lax.stop_gradient(jnp.where(conditions.motor_speed >= 0, 1.0, -1.0))
     chassis = robot.chassis(conditions.configuration)
     mass = chassis.mass + conditions.payload if conditions.total_mass is None else conditions.total_mass
-    stall = voltage_at_rest(robot, conditions) / robot.motor.resistance
+    stall = robot.motor.current_stall(voltage_at_rest(robot, conditions))
     if not conditions.voltage_follows:
         most = robot.driver.current_limit * (1 + jnp.abs(conditions.duty) * (1 / STEEPNESS))
         stall = one_sided.clip(stall, -most, most)
@@ -250,7 +250,7 @@ def current_settled(robot: Robot, conditions: Conditions, state: State) -> Scala
         none = jnp.zeros_like(state.speed)
         return balances.driven_signals(without_diode(robot), conditions, here, none).voltage_left - held
 
-    guess = left(jnp.zeros_like(state.current)) / robot.motor.resistance
+    guess = robot.motor.current_stall(left(jnp.zeros_like(state.current)))
     first, second = left(0.5 * guess), left(guess)
     slope = (second - first) / jnp.where(guess == 0, 1.0, 0.5 * guess)
     wanted = guess - jnp.where(guess == 0, 0.0, second / jnp.where(guess == 0, 1.0, slope))

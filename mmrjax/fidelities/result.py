@@ -11,9 +11,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int
 
 from mmrjax.fidelities import outputs
-from mmrjax.model import balances, channels, ground
+from mmrjax.model import balances, ground
 from mmrjax.model.motor import UNLIMITED
 from mmrjax.model.params import Scalar
+from mmrjax.model.quantities import HEAT
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import CONVERGED, FLAGS, REVERSES, ROLLS_BACK, Result, Signals, safe_quotient
 from mmrjax.numerics.one_sided import magnitude
@@ -31,7 +32,7 @@ def result_of_signals(robot: Robot, signals: Signals, status: Int[Array, "..."])
     power_ground = sides * signals.traction * signals.speed
     temperature = robot.motor.temperature_settled(signals.current * robot.driver.ripple(signals.duty) ** 0.5)
     limit = robot.motor.temperature_limit
-    hot = (temperature > limit) & (limit < UNLIMITED) & robot.knows(channels.HEAT)  # settled or not
+    hot = (temperature > limit) & (limit < UNLIMITED) & robot.knows(HEAT)  # settled or not
     flags = flag_mask({**exceeded_limits(robot, signals), "winding_hot": hot})
     found = Result(
         reading=balances.sensor(robot, signals),

@@ -265,10 +265,10 @@ class Results(_Numbers):
             rows: largest number of lines.
         """
         content = {name: np.ravel(values) for name, values in self.to_dict().items()}
-        rows_of: tuple[outputs.Output | mission_batch.MissionOutput, ...] = (
+        rows_of = (
             *outputs.output_table(self.channels), *mission_batch.OUTPUTS, *mission_batch.OF_TURNS,
         )  # fmt: skip
-        about = {**_CONDITIONS, **_WORDS, **{o.column: (o.label, o.unit, o.resolution) for o in rows_of}}
+        about = {**_CONDITIONS, **_WORDS, **{o.column: (o.label, o.unit_shown, o.resolution) for o in rows_of}}
         if columns is None and self.mission is not None:
             columns = ["configuration", *mission_batch.USUAL, "status"]
         elif columns is None:

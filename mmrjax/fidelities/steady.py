@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import operator
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
@@ -297,15 +296,11 @@ def steady_batch(robot: Robot, conditions: Conditions) -> Result:
     return _over_points(steady, robot, conditions)
 
 
-def _getters() -> dict[str, Callable[[Result], Array]]:
-    codes = {name: operator.attrgetter(name) for name in CODES}
-    return {**{output.name: output.get for output in outputs.output_table(channels.EVERY)}, **codes}
-
-
 def _check_outputs(names: Iterable[str]) -> None:
+    known = (*outputs.output_names(channels.EVERY), *CODES)
     for name in names:
-        if name not in _getters():
-            raise KeyError(f"no output {name}; there are {', '.join(_getters())}")
+        if name not in known:
+            raise KeyError(f"no output {name}; there are {', '.join(known)}")
 
 
 @compiled
@@ -327,7 +322,7 @@ def steady_outputs(robot: Robot, conditions: Conditions, names: tuple[str, ...])
 
     def one(robot: Robot, conditions: Conditions) -> dict[str, Array]:
         answer = steady(robot, conditions)
-        return {name: jnp.asarray(_getters()[name](answer)) for name in names}
+        return {name: jnp.asarray(getattr(answer, name)) for name in names}
 
     return _over_points(one, robot, conditions)
 

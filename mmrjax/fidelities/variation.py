@@ -191,9 +191,9 @@ def _evaluate(
 
 def pick_outputs(run: Run, shown: tuple[Channel, ...], names: tuple[str, ...]) -> dict[str, Array]:
     """Outputs of a batch by name, as from `evaluate_points`, of a rig with these channels."""
-    rows = {row.name: row for row in table_of_outputs.output_table(shown)}
+    rows = table_of_outputs.output_names(shown)
     _known(names, (*rows, *run.columns))
-    found = {n: rows[n].get(run.result) if n in rows else run.columns[n] for n in names if n != FLAGS}
+    found = {n: getattr(run.result, n) if n in rows else run.columns[n] for n in names if n != FLAGS}
     further = {FLAGS: run.result.flags} if FLAGS in names else {}
     return {**found, **further, STATUS: run.result.status}
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -17,86 +15,21 @@ from mmrjax.compile.programs import has_tracer
 from mmrjax.fidelities.base import Run
 from mmrjax.missions.mission import TOLERANCE, Mission, Start, Totals, mission
 from mmrjax.missions.profile import Profile
-from mmrjax.model import energy
 from mmrjax.model.channels import SIDES
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar
-from mmrjax.model.quantities import MM, RPM
+from mmrjax.model.quantities import SINKS, TABLE
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import BATTERY_EMPTY, CUT_OFF
 
 #: The fidelity that follows profiles.
 MODEL = "drive"
-JOULE_PER_WH = 3600.0
 #: Steps of a segment that fit at first, least number in all, and largest number for all runs together.
 ROOM, LEAST_KEPT, MOST_KEPT = 64, 4096, 2**20
 
 
-@dataclasses.dataclass(frozen=True)
-class MissionOutput:
-    """One number of a mission.
-
-    Attributes:
-        name: noun; column: in tables, with the unit in the name; unit: of the column; factor: the SI value of one.
-        label: words in tables and reports; resolution: digits after the point in reports [unit].
-    """
-
-    name: str
-    column: str
-    unit: str
-    factor: float
-    label: str
-    resolution: int
-
-
-def _wh(name: str, label: str) -> MissionOutput:
-    return MissionOutput(name, f"{name}_Wh", "Wh", JOULE_PER_WH, label, 3)
-
-
-#: Numbers of a mission in the order of columns, in SI from `mission_numbers`.
-OUTPUTS: tuple[MissionOutput, ...] = (
-    MissionOutput("duration", "duration_s", "s", 1.0, "duration", 1),
-    MissionOutput("distance", "distance_m", "m", 1.0, "distance travelled, either way", 2),
-    MissionOutput("displacement", "displacement_m", "m", 1.0, "displacement, forward less backward", 2),
-    _wh("energy", "energy"),
-    MissionOutput("energy_per_metre", "energy_per_metre_Wh", "Wh/m", JOULE_PER_WH, "energy per metre", 5),
-    _wh("energy_drawn", "energy drawn"),
-    _wh("energy_returned", "energy returned"),
-    MissionOutput("rms_current", "rms_current_A", "A", 1.0, "rms current, all motors", 3),
-    MissionOutput("peak_current", "peak_current_A", "A", 1.0, "peak current, all motors", 2),
-    MissionOutput("rms_torque", "rms_torque_Nm", "N·m", 1.0, "rms torque, one gearbox output", 3),
-    MissionOutput("peak_torque", "peak_torque_Nm", "N·m", 1.0, "peak torque, one gearbox output", 3),
-    MissionOutput("peak_speed", "peak_speed_mm_s", "mm/s", MM, "peak speed", 1),
-    MissionOutput("peak_motor_speed", "peak_motor_speed_rpm", "rpm", RPM, "peak motor speed", 1),
-    MissionOutput("winding_peak", "winding_peak_C", "°C", 1.0, "hottest winding", 1),
-    MissionOutput("cell_low", "cell_low_V", "V", 1.0, "lowest cell voltage", 3),
-    MissionOutput("state_of_charge", "state_of_charge", "-", 1.0, "state of charge at the end", 4),
-    MissionOutput("winding_end", "winding_end_C", "°C", 1.0, "winding at the end", 1),
-    MissionOutput("housing_end", "housing_end_C", "°C", 1.0, "housing at the end", 1),
-    MissionOutput("endurance", "endurance_s", "s", 1.0, "endurance at this duty", 0),
-    MissionOutput("range", "range_m", "m", 1.0, "range at this duty", 0),
-    *(_wh(f"energy_to_{name}", f"energy to: {meaning}") for name, meaning in energy.SINKS.items()),
-    _wh("energy_stored", "rise of the energy in motion"),
-    MissionOutput(
-        "unaccounted_share", "unaccounted_share", "-", 1.0, "energy unaccounted for, of that turned over", 9
-    ),
-)
-#: Further numbers of a mission with separate sides.
-OF_TURNS: tuple[MissionOutput, ...] = (
-    MissionOutput("turned", "turned_deg", "deg", math.pi / 180, "turned by, positive to the left", 1),
-    MissionOutput("place_x", "place_x_m", "m", 1.0, "moved uphill, or ahead of the start", 2),
-    MissionOutput("place_y", "place_y_m", "m", 1.0, "moved to the left of the start", 2),
-    MissionOutput("peak_yaw_rate", "peak_yaw_rate_rad_s", "rad/s", 1.0, "peak yaw rate", 3),
-    *(MissionOutput(f"rms_current_{s}", f"rms_current_{s}_A", "A", 1.0, f"rms current, {s} motor", 3) for s in SIDES),
-    *(
-        MissionOutput(f"peak_current_{s}", f"peak_current_{s}_A", "A", 1.0, f"peak current, {s} motor", 2)
-        for s in SIDES
-    ),
-    *(
-        MissionOutput(f"winding_peak_{s}", f"winding_peak_{s}_C", "°C", 1.0, f"hottest winding, {s}", 1)
-        for s in SIDES
-    ),
-)
+#: Numbers of a mission in the order of columns, in SI from `mission_numbers`; further ones with separate sides.
+OUTPUTS, OF_TURNS = TABLE["mission"], TABLE["mission of sides"]
 
 
 def mission_columns(turns: bool = False) -> tuple[str, ...]:
@@ -127,7 +60,7 @@ def mission_totals(found: Totals, peaks: Mapping[str, Array]) -> dict[str, Array
     A segment that was not reached has NaN.
     """
     by_segment, ran = found.of, found.time > 0
-    turned = by_segment["drawn"] + by_segment["returned"] + sum(jnp.abs(by_segment[name]) for name in energy.SINKS)
+    turned = by_segment["drawn"] + by_segment["returned"] + sum(jnp.abs(by_segment[name]) for name in SINKS)
     still = by_segment["path"] <= 1e-6  # m
     numbers = {
         "duration": found.time,
@@ -147,7 +80,7 @@ def mission_totals(found: Totals, peaks: Mapping[str, Array]) -> dict[str, Array
         "peak_motor_speed": peaks["motor_speed"],
         "winding_peak": peaks["temperature"],
         "cell_low": jnp.where(jnp.isfinite(peaks["cell_low"]), peaks["cell_low"], jnp.nan),
-        **{f"energy_to_{name}": by_segment[name] for name in energy.SINKS},
+        **{f"energy_to_{name}": by_segment[name] for name in SINKS},
         "energy_stored": found.stored,
         "unaccounted_share": _quotient(found.unaccounted, turned),
     }

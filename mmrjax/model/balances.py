@@ -136,8 +136,8 @@ def supply(robot: Robot, conditions: Conditions, signals: Signals) -> Signals:
     )
     back = robot.motor.voltage_back(signals.speed_motor)
     voltage = robot.driver.voltage(source - effects_sum(robot, signals, "supply"), signals.duty, signals.pause, back)
-    duties = (conditions.polarity * duty for duty in (conditions.duty, signals.duty))
-    conducts = robot.driver.conducts(*duties, signals.current, voltage - back, conditions.open)
+    demanded, limited = (conditions.polarity * duty for duty in (conditions.duty, signals.duty))
+    conducts = robot.driver.conducts(demanded, limited, signals.current, voltage - back, conditions.open)
     voltage = jnp.where(conducts == 1, voltage, back + conducts * (voltage - back))
     return _fill(signals, voltage_source=source, voltage=voltage)
 

@@ -31,26 +31,18 @@ class Chassis(eqx.Module):
     ground: Ground
     on_tracks: Scalar = eqx.field(converter=as_float)
     mass: Scalar = parameter(
-        unit="kg",
-        meaning="mass of the robot without payload",
-        bounds=(0.01, 1e4),
-        relative_sd=0.02,
-        source="Table 7 (Table A2 prints 13.1 for 4W2T; see paper-notes)",
-    )
+        None, "kg", "mass of the robot without payload", (0.01, 1e4),
+        "Table 7 (Table A2 prints 13.1 for 4W2T; see paper-notes)", relative_sd=0.02,
+    )  # fmt: skip
     radius: Scalar = parameter(
-        unit="m",
-        meaning="rolling radius of driving pulley or wheel r_k",
-        bounds=(1e-3, 2.0),
+        None, "m", "rolling radius of driving pulley or wheel r_k", (1e-3, 2.0),
+        "48 teeth of 5 mm (6T2A; Table 6 prints the diameter over the grousers); D_w/2, Table 6 (4W2T)",
         relative_sd=0.005,
-        source="48 teeth of 5 mm (6T2A; Table 6 prints the diameter over the grousers); D_w/2, Table 6 (4W2T)",
-    )
+    )  # fmt: skip
     inertia: Scalar = parameter(
-        unit="kg·m^2",
-        meaning="inertia J_w of one side's parts that turn with the driving wheel, eq. (31)",
-        bounds=(0.0, 100.0),
-        relative_sd=0.1,
-        source="Table 7: pulleys, wheels, and the tracks' mass at r_k",
-    )
+        None, "kg·m^2", "inertia J_w of one side's parts that turn with the driving wheel, eq. (31)", (0.0, 100.0),
+        "Table 7: pulleys, wheels, and the tracks' mass at r_k", relative_sd=0.1,
+    )  # fmt: skip
 
     turning: Turning = eqx.field(default_factory=Turning, kw_only=True)
 

@@ -21,6 +21,8 @@ Number = float | Sequence[float] | np.ndarray | Array
 
 #: Conditions that can be stated for each side.
 OF_SIDES = ("duty_left", "duty_right", "open_left", "open_right", "motor_speed_left", "motor_speed_right")
+#: Conditions that may be true or false.
+SWITCHES = ("battery", "open", "open_left", "open_right")
 #: Conditions that free a robot to turn if they are stated.
 OF_TURNS = (*OF_SIDES, "heading_deg")
 
@@ -161,17 +163,20 @@ class Conditions(eqx.Module):
         which: Any = configuration
         if not isinstance(configuration, jax.Array | Named):
             words = np.asarray(configuration)
-            which = Named.of(words) if words.dtype.kind == "U" else words
-        which = which if isinstance(which, Named) else _number(which, int)
-        given = (voltage, slope_deg, payload, battery, discharge, adhesion, order, duty, open)
-        numbers = [_number(v) for v in given]
+            which = Named.of(words) if words.dtype.kind == "U" else configuration
+        which = which if isinstance(which, Named) else _number("configuration", which, int)
+        given = {
+            "voltage": voltage, "slope_deg": slope_deg, "payload": payload, "battery": battery,
+            "discharge": discharge, "adhesion": adhesion, "order": order, "duty": duty, "open": open,
+        }  # fmt: skip
+        numbers = [_number(name, v) for name, v in given.items()]
         others = {"total_mass": total_mass, "motor_speed": motor_speed, "motor_acceleration": motor_acceleration}
         others |= {"motor_current": motor_current, "heading_deg": heading_deg, "adhesion_lateral": adhesion_lateral}
         others |= {"duty_left": duty_left, "duty_right": duty_right, "open_left": open_left, "open_right": open_right}
         others |= {"motor_speed_left": motor_speed_left, "motor_speed_right": motor_speed_right}
         others |= {"levers_front_deg": levers_front_deg, "levers_rear_deg": levers_rear_deg}
         others |= {"load_torque": load_torque}
-        optional = {name: _number(value) for name, value in others.items() if value is not None}
+        optional = {name: _number(name, value) for name, value in others.items() if value is not None}
         shapes = [x.shape for x in (which, *numbers, *optional.values())]
         try:
             shape = np.broadcast_shapes(*shapes)
@@ -183,7 +188,7 @@ class Conditions(eqx.Module):
         self.configuration = jax.tree.map(lambda x: _broadcast(x, shape), which)
         # an equal number for all runs is stored once: most fields of a large batch are 0 or 1
         shared: dict[float, Array] = {}
-        for k, value in enumerate(given):
+        for k, value in enumerate(given.values()):
             if not isinstance(value, float):
                 numbers[k] = _broadcast(numbers[k], shape)
                 continue
@@ -195,7 +200,7 @@ class Conditions(eqx.Module):
         held = {name: _broadcast(x, shape) for name, x in optional.items()}
         for name in others:
             setattr(self, name, held.get(name))
-        self.begin = None if begin is None else _broadcast(_number(begin, int), shape)
+        self.begin = None if begin is None else _broadcast(_number("begin", begin, int), shape)
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -272,9 +277,20 @@ def sides_contradiction(stated: Collection[str]) -> str:
     return f"{known}: got it without {lacking}; state both"
 
 
-def _number(x: Any, kind: type = float) -> Any:
-    """Array of numbers of that kind; NumPy input stays NumPy's, so that no JAX operation is compiled for it."""
-    return jnp.asarray(x, kind) if isinstance(x, jax.Array) else np.asarray(x, kind)
+def _number(name: str, x: Any, kind: type = float) -> Any:
+    """Array of numbers of that kind; NumPy input stays NumPy's, so that no JAX operation is compiled for it.
+
+    Raises:
+        UsageError: words, dates, complex numbers, truth values of a quantity, or parts of a whole number.
+    """
+    if isinstance(x, jax.Array):
+        return jnp.asarray(x, kind)
+    stated = np.asarray(x)
+    whole = kind is float or stated.dtype.kind in "biu" or (stated.dtype.kind == "f" and not (stated % 1).any())
+    if stated.dtype.kind not in ("biuf" if name in SWITCHES else "iuf") or not whole:
+        expected = "numbers" if kind is float else "whole numbers" + ", or names" * (name == "configuration")
+        raise UsageError(f"Conditions: {name}: got {x!r}; expected {expected}")
+    return stated.astype(kind)
 
 
 def _broadcast(x: Any, shape: tuple[int, ...]) -> Any:

@@ -35,34 +35,18 @@ class Friction(eqx.Module):
     """
 
     static: Scalar = parameter(
-        unit="-",
-        meaning="static coefficient μ_s, the largest adhesion",
-        bounds=(0.01, 3.0),
-        relative_sd=0.3,
-        source="Table 5, φ_x on lacquered wood (surface of the bench)",
-    )
+        None, "-", "static coefficient μ_s, the largest adhesion", (0.01, 3.0),
+        "Table 5, φ_x on lacquered wood (surface of the bench)", relative_sd=0.3,
+    )  # fmt: skip
     dynamic: Scalar = parameter(
-        unit="-",
-        meaning="dynamic coefficient μ_d",
-        bounds=(0.005, 3.0),
+        None, "-", "dynamic coefficient μ_d", (0.005, 3.0), "assumed 0.8 of μ_s; the paper prints none",
         relative_sd=0.3,
-        source="assumed 0.8 of μ_s; the paper prints none",
-    )
+    )  # fmt: skip
     speed_static: Scalar = parameter(
-        0.02,
-        unit="m/s",
-        meaning="sliding speed V_s that reaches μ_s",
-        bounds=(1e-4, 2.0),
-        relative_sd=1.0,
-        source=_SLIPS,
+        0.02, "m/s", "sliding speed V_s that reaches μ_s", (1e-4, 2.0), _SLIPS, relative_sd=1.0
     )
     speed_dynamic: Scalar = parameter(
-        0.2,
-        unit="m/s",
-        meaning="sliding speed V_d above which μ_d holds",
-        bounds=(1e-3, 20.0),
-        relative_sd=0.5,
-        source=_PACKAGE,
+        0.2, "m/s", "sliding speed V_d above which μ_d holds", (1e-3, 20.0), _PACKAGE, relative_sd=0.5
     )
 
     @property

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -42,35 +43,24 @@ class Driver(eqx.Module):
     """
 
     current_limit: Scalar = parameter(
-        1000.0,
-        unit="A",
-        meaning="largest current of one motor that the driver permits",
-        bounds=(0.01, 1e4),
-        relative_sd=0.1,
-        source="no limit on the bench: above any current",
-    )
+        1000.0, "A", "largest current of one motor that the driver permits", (0.01, 1e4),
+        "no limit on the bench: above any current", relative_sd=0.1,
+    )  # fmt: skip
     gain: Scalar = parameter(
-        4.0,
-        unit="-",
-        meaning="proportional gain of the speed controller, in multiples of the speed constant C_E",
-        bounds=(0.0, 1e3),
-        relative_sd=0.1,
-        source="assumed; the paper has no controller",
-    )
+        4.0, "-", "proportional gain of the speed controller, in multiples of the speed constant C_E", (0.0, 1e3),
+        "assumed; the paper has no controller", relative_sd=0.1,
+    )  # fmt: skip
     time_reset: Scalar = parameter(
-        0.05,
-        unit="s",
-        meaning="reset time of the speed controller: time in which its integral repeats the proportional action",
-        bounds=(1e-3, 1e3),
-        relative_sd=0.1,
-        source="assumed; the paper has no controller",
-    )
+        0.05, "s", "reset time of the speed controller: time in which its integral repeats the proportional action",
+        (1e-3, 1e3), "assumed; the paper has no controller", relative_sd=0.1,
+    )  # fmt: skip
     returns_current: bool = eqx.field(default=True, static=True)
     decay: str = eqx.field(default=SLOW, static=True)
 
     def unlimited(self) -> Driver:
         """Same driver without limit and diode."""
-        return dataclasses.replace(self, current_limit=None, returns_current=True)
+        without: dict[str, Any] = {"current_limit": None, "returns_current": True}
+        return dataclasses.replace(self, **without)
 
     def voltage(self, source: Scalar, duty: Scalar, pause: Scalar, back: Scalar) -> Scalar:
         """Mean voltage at the motors [V]; `pause`: share of a period without pulses [-]; `back`: back-EMF E [V]."""

@@ -10,23 +10,10 @@ import jax.numpy as jnp
 from mmrjax.model.balances import Travel, effects_sum, power_drawn
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar
+from mmrjax.model.quantities import SINKS as SINKS
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import GRAVITY, PlaneMotion, Signals
 from mmrjax.numerics.trigonometry import sine
-
-#: Sinks of energy, in the order of the drive chain: name and description.
-SINKS: dict[str, str] = {
-    "battery": "heat in the battery's cells",
-    "other": "other consumers on the battery",
-    "driver": "driver and wiring: open bridge, diode, and drops on the way to the motors",
-    "winding": "heat in windings, leads and brushes",
-    "motor": "friction of the motors",
-    "gearbox": "losses of the gearboxes",
-    "track": "losses of tracks and guides",
-    "sliding": "sliding over the ground",
-    "rolling": "rolling resistance",
-    "lift": "lifting robot and payload (comes back downhill)",
-}
 
 
 def source_power(robot: Robot, conditions: Conditions, signals: Signals) -> Scalar:

@@ -26,37 +26,20 @@ class Gearbox(eqx.Module):
     """
 
     ratio: Scalar = parameter(
-        48.0,
-        unit="-",
-        meaning="total ratio motor to driving wheel i_r",
-        bounds=(1.0, 1e4),
-        relative_sd=0.002,
-        source="GP32C 576/25 and a belt stage 25/12; Tables A1, A2 simulated give 47.97-48.04",
-    )
+        48.0, "-", "total ratio motor to driving wheel i_r", (1.0, 1e4),
+        "GP32C 576/25 and a belt stage 25/12; Tables A1, A2 simulated give 47.97-48.04", relative_sd=0.002,
+    )  # fmt: skip
     efficiency_load: Scalar = parameter(
-        0.74,
-        unit="-",
-        meaning="efficiency for losses proportional to load η_rm, eq. (19)",
-        bounds=(0.05, 1.0),
-        relative_sd=0.03,
-        source="Table 2 (catalogue 0.75)",
-    )
+        0.74, "-", "efficiency for losses proportional to load η_rm, eq. (19)", (0.05, 1.0),
+        "Table 2 (catalogue 0.75)", relative_sd=0.03,
+    )  # fmt: skip
     friction_coulomb: Scalar = parameter(
-        0.3e-3,
-        unit="N·m",
-        meaning="idle Coulomb torque at the input M_rf0, eq. (20)",
-        bounds=(0.0, 10.0),
-        relative_sd=0.15,
-        source="Table 2",
+        0.3e-3, "N·m", "idle Coulomb torque at the input M_rf0, eq. (20)", (0.0, 10.0), "Table 2", relative_sd=0.15
     )
     friction_viscous: Scalar = parameter(
-        1.4e-6,
-        unit="N·m·s",
-        meaning="idle viscous friction at the input K_fr, eq. (20)",
-        bounds=(0.0, 1.0),
+        1.4e-6, "N·m·s", "idle viscous friction at the input K_fr, eq. (20)", (0.0, 1.0), "Table 2: 1.4e-3 mN·m·s",
         relative_sd=0.15,
-        source="Table 2: 1.4e-3 mN·m·s",
-    )
+    )  # fmt: skip
     speed_limit: float = eqx.field(default=8_000 * 0.10471975511965977, static=True)  # 8000 rpm input, catalogue
     # GP32C 166936, maker's sheet: at its output 3 N·m continuous, 3.75 short-term; times the belt stage 25/12 [N·m]
     torque_limit: float | None = eqx.field(default=3.0 * 25 / 12, static=True)

@@ -19,11 +19,7 @@ class Ground(eqx.Module):
 
     friction: Friction
     rolling_resistance: Scalar = parameter(
-        unit="-",
-        meaning="rolling resistance coefficient f, eq. (5)",
-        bounds=(0.0, 1.0),
-        relative_sd=0.15,
-        source="Table 4",
+        None, "-", "rolling resistance coefficient f, eq. (5)", (0.0, 1.0), "Table 4", relative_sd=0.15
     )
 
     def force_resistance(self, normal: Scalar, direction: Scalar) -> Scalar:

@@ -25,92 +25,40 @@ class Motor(eqx.Module):
     """U_e = C_E ω + I R + L dI/dt; M_d = C_m I - (M_df0 sign ω + K_fd ω)."""
 
     resistance: Scalar = parameter(
-        0.611,
-        unit="ohm",
-        meaning="terminal resistance R_rot, eq. (15)",
-        bounds=(1e-3, 1e3),
-        relative_sd=0.05,
-        source=_SHEET,
+        0.611, "ohm", "terminal resistance R_rot, eq. (15)", (1e-3, 1e3), _SHEET, relative_sd=0.05
     )
     inductance: Scalar = parameter(
-        0.119e-3,
-        unit="H",
-        meaning="terminal inductance L_d, eq. (15)",
-        bounds=(1e-7, 10.0),
-        relative_sd=0.1,
-        source=_SHEET,
+        0.119e-3, "H", "terminal inductance L_d, eq. (15)", (1e-7, 10.0), _SHEET, relative_sd=0.1
     )
     torque_constant: Scalar = parameter(
-        25.9e-3,
-        unit="N·m/A",
-        meaning="torque constant C_m, eq. (17), and speed constant C_E in V·s/rad, eq. (16)",
-        bounds=(1e-4, 10.0),
-        relative_sd=0.02,
-        source=f"{_SHEET}; 369 rpm/V is the same number",
-    )
+        25.9e-3, "N·m/A", "torque constant C_m, eq. (17), and speed constant C_E in V·s/rad, eq. (16)", (1e-4, 10.0),
+        f"{_SHEET}; 369 rpm/V is the same number", relative_sd=0.02,
+    )  # fmt: skip
     friction_coulomb: Scalar = parameter(
-        2.7e-3,
-        unit="N·m",
-        meaning="dry friction torque M_df0, eq. (14)",
-        bounds=(0.0, 10.0),
-        relative_sd=0.15,
-        source="Table 2",
+        2.7e-3, "N·m", "dry friction torque M_df0, eq. (14)", (0.0, 10.0), "Table 2", relative_sd=0.15
     )
     friction_viscous: Scalar = parameter(
-        5.5e-7,
-        unit="N·m·s",
-        meaning="viscous friction K_fd, eq. (14)",
-        bounds=(0.0, 1.0),
-        relative_sd=0.15,
-        source="Table 2: 5.5e-4 mN·m·s",
+        5.5e-7, "N·m·s", "viscous friction K_fd, eq. (14)", (0.0, 1.0), "Table 2: 5.5e-4 mN·m·s", relative_sd=0.15
     )
     inertia: Scalar = parameter(
-        33.5e-7,
-        unit="kg·m^2",
-        meaning="rotor inertia J_d, eqs. (3), (31)",
-        bounds=(0.0, 1.0),
-        relative_sd=0.05,
-        source=f"{_SHEET}: 33.5 g·cm^2",
+        33.5e-7, "kg·m^2", "rotor inertia J_d, eqs. (3), (31)", (0.0, 1.0), f"{_SHEET}: 33.5 g·cm^2", relative_sd=0.05
     )
     resistance_thermal_winding: Scalar = parameter(
-        1.7,
-        unit="K/W",
-        meaning="thermal resistance winding to housing",
-        bounds=(0.0, 100.0),
-        relative_sd=0.2,
-        source=_SHEET,
+        1.7, "K/W", "thermal resistance winding to housing", (0.0, 100.0), _SHEET, relative_sd=0.2
     )
     resistance_thermal_housing: Scalar = parameter(
-        6.0,
-        unit="K/W",
-        meaning="thermal resistance housing to ambient",
-        bounds=(0.0, 100.0),
-        relative_sd=0.2,
-        source=_SHEET,
+        6.0, "K/W", "thermal resistance housing to ambient", (0.0, 100.0), _SHEET, relative_sd=0.2
     )
     time_constant_winding: Scalar = parameter(
-        16.3,
-        unit="s",
-        meaning="thermal time constant of the winding at a constant housing temperature",
-        bounds=(0.1, 1e4),
+        16.3, "s", "thermal time constant of the winding at a constant housing temperature", (0.1, 1e4), _SHEET,
         relative_sd=0.2,
-        source=_SHEET,
-    )
+    )  # fmt: skip
     time_constant_housing: Scalar = parameter(
-        593.0,
-        unit="s",
-        meaning="thermal time constant of the motor: its housing's capacity times the resistance to ambient",
-        bounds=(1.0, 1e5),
-        relative_sd=0.2,
-        source=_SHEET,
-    )
+        593.0, "s", "thermal time constant of the motor: its housing's capacity times the resistance to ambient",
+        (1.0, 1e5), _SHEET, relative_sd=0.2,
+    )  # fmt: skip
     temperature_ambient: Scalar = parameter(
-        25.0,
-        unit="°C",
-        meaning="ambient temperature",
-        bounds=(-50.0, 80.0),
-        sd=5.0,
-        source="reference temperature of the maker's sheet",
+        25.0, "°C", "ambient temperature", (-50.0, 80.0), "reference temperature of the maker's sheet", sd=5.0
     )
     temperature_limit: float = eqx.field(default=125.0, static=True)  # winding [°C], maker's sheet
     #: α of copper [1/K]: IEC 60028 (1925), at 20 °C; makers take it from 25 °C, where it is 2 % less
@@ -125,14 +73,18 @@ class Motor(eqx.Module):
     def voltage_winding(self, current: Scalar, temperature: Scalar | None = None) -> Scalar:
         """Voltage across the winding's resistance I R [V], eq. (15).
 
-        If its `temperature` [°C] is given, R follows that of copper: R (1 + α (T - 25 °C)).
+        If its `temperature` [°C] is given, R follows that of copper.
         """
         drop = current * self.resistance
-        return (
-            drop
-            if temperature is None
-            else drop * (1 + self.temperature_coefficient * (temperature - TEMPERATURE_REFERENCE))
-        )
+        return drop if temperature is None else drop * self.resistance_ratio(temperature)
+
+    def resistance_ratio(self, temperature: Scalar) -> Scalar:
+        """Ratio of the winding's resistance at a `temperature` T [°C] to the stated one, 1 + α (T - 25 °C)."""
+        return 1 + self.temperature_coefficient * (temperature - TEMPERATURE_REFERENCE)
+
+    def current_stall(self, voltage: Scalar) -> Scalar:
+        """Current of the motor at rest at a `voltage` [A]."""
+        return voltage / self.resistance
 
     def torque_electromagnetic(self, current: Scalar) -> Scalar:
         """M_de = C_m I [N·m], eq. (17)."""
@@ -159,16 +111,15 @@ class Motor(eqx.Module):
         rise = self.resistance_thermal * self.resistance * current**2
         left = 1 - self.temperature_coefficient * rise
         finite = left > 0
-        settled = self.temperature_ambient + rise * (
-            1 + self.temperature_coefficient * (self.temperature_ambient - TEMPERATURE_REFERENCE)
-        ) / jnp.where(finite, left, 1.0)
+        ratio = self.resistance_ratio(self.temperature_ambient)
+        settled = self.temperature_ambient + rise * ratio / jnp.where(finite, left, 1.0)
         return jnp.where(finite, settled, jnp.inf)
 
     @property
     def current_continuous(self) -> Scalar:
         """Current with a final winding temperature at the permissible limit [A], with the rise of its resistance."""
         allowed = jnp.maximum(self.temperature_limit - self.temperature_ambient, 1.0)
-        hot = self.resistance * (1 + self.temperature_coefficient * (self.temperature_limit - TEMPERATURE_REFERENCE))
+        hot = self.resistance * self.resistance_ratio(self.temperature_limit)
         return jnp.sqrt(allowed / jnp.maximum(self.resistance_thermal * hot, 1e-9))
 
     def heating(self, power: Scalar, winding: Scalar, housing: Scalar) -> tuple[Scalar, Scalar]:

@@ -50,18 +50,22 @@ class Spec:
 
 
 def parameter(
-    default: float | None = None,
-    *,
+    default: float | None,
     unit: str,
     meaning: str,
     bounds: tuple[float, float],
     source: str,
+    *,
     relative_sd: float | None = None,
     sd: float | None = None,
     amplitude: bool = False,
     scanned: float | None = None,
 ) -> Any:
-    """Declares a differentiable scalar of a component; see `Spec` for the arguments."""
+    """Declares a differentiable scalar of a component; see `Spec` for the arguments.
+
+    Args:
+        default: value of a component that does not state it; None: it has to.
+    """
     if (relative_sd is None) == (sd is None):
         raise ValueError("a parameter states either relative_sd or sd")
     spec = Spec(unit, meaning, bounds, source, relative_sd, sd, amplitude, scanned)

@@ -25,53 +25,27 @@ class Battery(eqx.Module):
     """
 
     curvature: Scalar = parameter(
-        7e-8 / COULOMB_PER_MAH**2,
-        unit="V/C^2",
-        meaning="A of the cell's no-load voltage, eq. (13)",
-        bounds=(0.0, 1e-6),
-        relative_sd=0.1,
-        source="Table 1: 7e-8 V/mAh^2",
-    )
+        7e-8 / COULOMB_PER_MAH**2, "V/C^2", "A of the cell's no-load voltage, eq. (13)", (0.0, 1e-6),
+        "Table 1: 7e-8 V/mAh^2", relative_sd=0.1,
+    )  # fmt: skip
     slope: Scalar = parameter(
-        -5e-4 / COULOMB_PER_MAH,
-        unit="V/C",
-        meaning="B of the cell's no-load voltage, eq. (13)",
-        bounds=(-1e-2, 0.0),
-        relative_sd=0.1,
-        source="Table 1: -5e-4 V/mAh",
-    )
+        -5e-4 / COULOMB_PER_MAH, "V/C", "B of the cell's no-load voltage, eq. (13)", (-1e-2, 0.0),
+        "Table 1: -5e-4 V/mAh", relative_sd=0.1,
+    )  # fmt: skip
     voltage_full: Scalar = parameter(
-        4.17,
-        unit="V",
-        meaning="no-load voltage of a full cell, eq. (13)",
-        bounds=(0.5, 10.0),
-        relative_sd=0.01,
-        source="Table 1",
+        4.17, "V", "no-load voltage of a full cell, eq. (13)", (0.5, 10.0), "Table 1", relative_sd=0.01
     )
     resistance: Scalar = parameter(
-        0.049,
-        unit="ohm",
-        meaning="self-resistance of a cell, eq. (12)",
-        bounds=(0.0, 5.0),
-        relative_sd=0.2,
-        source="Table 1 (8 cells: 0.392, Table A4 rounds to 0.4)",
-    )
+        0.049, "ohm", "self-resistance of a cell, eq. (12)", (0.0, 5.0),
+        "Table 1 (8 cells: 0.392, Table A4 rounds to 0.4)", relative_sd=0.2,
+    )  # fmt: skip
     current_other: Scalar = parameter(
-        1.5,
-        unit="A",
-        meaning="current of all other consumers I_p, eq. (10)",
-        bounds=(0.0, 50.0),
-        relative_sd=0.2,
-        source="Table A4",
+        1.5, "A", "current of all other consumers I_p, eq. (10)", (0.0, 50.0), "Table A4", relative_sd=0.2
     )
     capacity: Scalar = parameter(
-        CAPACITY,
-        unit="C",
-        meaning="charge taken from a full battery until it is empty",
-        bounds=(1.0, 1e6),
-        relative_sd=0.05,
-        source="type designation XP2200SL: 2200 mAh",
-    )
+        CAPACITY, "C", "charge taken from a full battery until it is empty", (1.0, 1e6),
+        "type designation XP2200SL: 2200 mAh", relative_sd=0.05,
+    )  # fmt: skip
     capacity_curve: float = eqx.field(default=CAPACITY, static=True)  # C_n, of the cell that A and B belong to [C]
     cells: int = eqx.field(default=8, static=True)
     voltage_charge: float = eqx.field(default=4.2, static=True)  # highest of a cell [V], Section 3.3: fully charged

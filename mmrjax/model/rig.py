@@ -65,20 +65,11 @@ class Begin(eqx.Module):
     """Start of a run that does not begin at rest: its shafts turn, and its load rolls with them."""
 
     motor_speed: Scalar = parameter(
-        0.0,
-        unit="rad/s",
-        meaning="speed of the motor shafts at the first sample",
-        bounds=(-1e5, 1e5),
+        0.0, "rad/s", "speed of the motor shafts at the first sample", (-1e5, 1e5), "the first samples of the run",
         sd=10.0,
-        source="the first samples of the run",
-    )
+    )  # fmt: skip
     angle: Scalar = parameter(
-        0.0,
-        unit="rad",
-        meaning="angle of the output at the first sample",
-        bounds=(-1e5, 1e5),
-        sd=0.1,
-        source="the first samples of the run",
+        0.0, "rad", "angle of the output at the first sample", (-1e5, 1e5), "the first samples of the run", sd=0.1
     )
 
 
@@ -122,14 +113,9 @@ class Rig(eqx.Module):
     """
 
     delay: Scalar = parameter(
-        0.0,
-        unit="s",
-        meaning="dead time between a value in the imposed quantity's column and its action",
-        bounds=(-10.0, 10.0),
-        sd=0.02,
-        source="stated by the owner of the rig",
-        scanned=0.0,
-    )
+        0.0, "s", "dead time between a value in the imposed quantity's column and its action", (-10.0, 10.0),
+        "stated by the owner of the rig", sd=0.02, scanned=0.0,
+    )  # fmt: skip
     begins: Begins | None = None
     imposed: str = eqx.field(default=IMPOSED[0], static=True)
     channels: tuple[str, ...] = eqx.field(default=channels.USUAL, static=True)

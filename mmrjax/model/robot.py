@@ -19,6 +19,7 @@ from mmrjax.model.motor import Motor
 from mmrjax.model.paper_tables import RADIUS_PULLEY
 from mmrjax.model.params import Index, Scalar, as_float
 from mmrjax.model.power import Battery
+from mmrjax.model.quantities import HEAT, WARMING
 from mmrjax.model.rig import Rig
 from mmrjax.model.shaft import Shaft
 from mmrjax.undercarriage.running_gear import RunningGear
@@ -151,12 +152,12 @@ class Robot(eqx.Module):
     @property
     def current_continuous(self) -> Scalar:
         """Continuous current of one motor that its winding permits [A]; inf if its thermal data are unknown."""
-        return self.motor.current_continuous if self.knows(channels.HEAT) else jnp.inf
+        return self.motor.current_continuous if self.knows(HEAT) else jnp.inf
 
     def heating(self, power: Scalar, winding: Scalar, housing: Scalar) -> tuple[Scalar, Scalar]:
         """Rates of the temperatures of winding and housing [K/s], as in `Motor.heating`; 0 if unknown."""
         rates = self.motor.heating(power, winding, housing)
-        return rates if self.knows(channels.WARMING) else (jnp.zeros_like(rates[0]), jnp.zeros_like(rates[1]))
+        return rates if self.knows(WARMING) else (jnp.zeros_like(rates[0]), jnp.zeros_like(rates[1]))
 
     @property
     def shows_travel(self) -> bool:

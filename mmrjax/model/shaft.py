@@ -33,69 +33,34 @@ class Shaft(eqx.Module):
     mass: ClassVar[float] = 0.0
     speed_grip: ClassVar[float] = math.inf
     inertia: Scalar = parameter(
-        unit="kg·m^2",
-        meaning="inertia J of all parts that turn with the output of one drive",
-        bounds=(0.0, 1e4),
+        None, "kg·m^2", "inertia J of all parts that turn with the output of one drive", (0.0, 1e4), _STATED,
         relative_sd=0.2,
-        source=_STATED,
-    )
+    )  # fmt: skip
     loss_coulomb: Scalar = parameter(
-        unit="N·m",
-        meaning="dry friction torque M_0 at the output",
-        bounds=(0.0, 1e4),
-        relative_sd=0.5,
-        source=_STATED,
+        None, "N·m", "dry friction torque M_0 at the output", (0.0, 1e4), _STATED, relative_sd=0.5
     )
     loss_viscous: Scalar = parameter(
-        0.0,
-        unit="N·m·s",
-        meaning="viscous friction K at the output",
-        bounds=(0.0, 1e4),
-        relative_sd=0.5,
-        source=_STATED,
+        0.0, "N·m·s", "viscous friction K at the output", (0.0, 1e4), _STATED, relative_sd=0.5
     )
     torque_constant: Scalar = parameter(
-        0.0,
-        unit="N·m",
-        meaning="torque M_c that acts against forward rotation at any speed, such as a winch's weight",
-        bounds=(-1e4, 1e4),
-        relative_sd=0.2,
-        source=_STATED,
-    )
+        0.0, "N·m", "torque M_c that acts against forward rotation at any speed, such as a winch's weight",
+        (-1e4, 1e4), _STATED, relative_sd=0.2,
+    )  # fmt: skip
     torque_gravity: Scalar = parameter(
-        0.0,
-        unit="N·m",
-        meaning="largest torque of gravity on an arm m g l",
-        bounds=(0.0, 1e4),
-        relative_sd=0.1,
-        source=_STATED,
+        0.0, "N·m", "largest torque of gravity on an arm m g l", (0.0, 1e4), _STATED, relative_sd=0.1
     )
     angle_zero: Scalar = parameter(
-        0.0,
-        unit="rad",
-        meaning="hanging angle θ_0 of the arm, from the start of a run",
-        bounds=(-6.3, 6.3),
-        sd=0.05,
-        source=_STATED,
+        0.0, "rad", "hanging angle θ_0 of the arm, from the start of a run", (-6.3, 6.3), _STATED, sd=0.05,
         scanned=1.0,
-    )
+    )  # fmt: skip
     backlash: Scalar = parameter(
-        0.0,
-        unit="rad",
-        meaning="backlash of gearbox and couplings at the output, from flank to flank",
-        bounds=(0.0, 1.0),
-        relative_sd=0.3,
-        source=_STATED,
-        scanned=0.0,
-    )
+        0.0, "rad", "backlash of gearbox and couplings at the output, from flank to flank", (0.0, 1.0), _STATED,
+        relative_sd=0.3, scanned=0.0,
+    )  # fmt: skip
     radius: Scalar = parameter(
-        1.0,
-        unit="m",
-        meaning="travel per radian of the output: radius of a drum, lead of a screw / 2π",
-        bounds=(1e-6, 10.0),
+        1.0, "m", "travel per radian of the output: radius of a drum, lead of a screw / 2π", (1e-6, 10.0), _STATED,
         relative_sd=0.005,
-        source=_STATED,
-    )
+    )  # fmt: skip
     speed_rest: float = eqx.field(default=0.01, static=True)
 
     @property

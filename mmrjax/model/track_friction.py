@@ -11,34 +11,20 @@ class Track(eqx.Module):
     """M_t = M_t0 sign ω_k + K_ft ω_k at the pulley, and F' = μ_t R_g on the lower guide."""
 
     loss_coulomb: Scalar = parameter(
-        unit="N·m",
-        meaning="static loss torque of a side's tracks M_t0, eq. (24)",
-        bounds=(0.0, 1e3),
-        relative_sd=0.15,
-        source="Table 3: 350 mN·m for three tracks, 70 for one",
-    )
+        None, "N·m", "static loss torque of a side's tracks M_t0, eq. (24)", (0.0, 1e3),
+        "Table 3: 350 mN·m for three tracks, 70 for one", relative_sd=0.15,
+    )  # fmt: skip
     loss_viscous: Scalar = parameter(
-        unit="N·m·s",
-        meaning="pseudo-viscous loss of a side's tracks K_ft, eq. (24)",
-        bounds=(0.0, 100.0),
-        relative_sd=0.15,
-        source="Table 3: 16 mN·m·s for three tracks, 3 for one",
-    )
+        None, "N·m·s", "pseudo-viscous loss of a side's tracks K_ft, eq. (24)", (0.0, 100.0),
+        "Table 3: 16 mN·m·s for three tracks, 3 for one", relative_sd=0.15,
+    )  # fmt: skip
     guide_friction: Scalar = parameter(
-        0.20,
-        unit="-",
-        meaning="track-guide friction coefficient μ_t, eq. (26)",
-        bounds=(0.0, 2.0),
-        relative_sd=0.2,
-        source="Table 4",
+        0.20, "-", "track-guide friction coefficient μ_t, eq. (26)", (0.0, 2.0), "Table 4", relative_sd=0.2
     )
     guide_share: Scalar = parameter(
-        unit="-",
-        meaning="share of the weight that the guides carry (the pulleys carry the rest)",
-        bounds=(0.0, 1.0),
-        sd=0.2,
-        source="Table A1 simulated lies between 0 and 1 of the weight; wheels carry all of it in 4W2T",
-    )
+        None, "-", "share of the weight that the guides carry (the pulleys carry the rest)", (0.0, 1.0),
+        "Table A1 simulated lies between 0 and 1 of the weight; wheels carry all of it in 4W2T", sd=0.2,
+    )  # fmt: skip
 
     def torque_loss(self, speed_wheel: Scalar, direction: Scalar) -> Scalar:
         """Internal loss torque M_t [N·m], eq. (24), at pulley speed [rad/s]."""

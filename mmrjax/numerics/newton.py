@@ -212,7 +212,8 @@ def root(
     Returns:
         y, and whether it converged within `MAX_STEPS` turns; False for a residual that is not finite.
     """
-    function, own = _function(residual), jax.tree.map(jnp.asarray, own)
+    function: Any = _function(residual)
+    own = jax.tree.map(jnp.asarray, own)
 
     def search(start: Vector, shared: Any, own: Any) -> tuple[Vector, Array]:
         method: Any = FewUnknowns(atol=tolerance, apart=apart)

@@ -61,37 +61,21 @@ class Turning(eqx.Module):
     """
 
     width: Scalar = parameter(
-        0.243,
-        unit="m",
-        meaning="distance B of the contact lines of left and right side",
-        bounds=(0.0, 5.0),
-        sd=0.012,
-        source=f"middle of {BETWEEN:g} and {OVER:g} m, the widths between and over the tracks (Table 6: B_b, B_T)",
-    )
+        0.243, "m", "distance B of the contact lines of left and right side", (0.0, 5.0),
+        f"middle of {BETWEEN:g} and {OVER:g} m, the widths between and over the tracks (Table 6: B_b, B_T)", sd=0.012,
+    )  # fmt: skip
     lateral: Scalar = parameter(
-        1.0,
-        unit="-",
-        meaning="lateral friction over longitudinal φ_y/φ_x",
-        bounds=(0.02, 10.0),
-        relative_sd=0.2,
-        source="Table 5, lacquered wood (surface of the bench)",
-    )
+        1.0, "-", "lateral friction over longitudinal φ_y/φ_x", (0.02, 10.0),
+        "Table 5, lacquered wood (surface of the bench)", relative_sd=0.2,
+    )  # fmt: skip
     rule: Scalar = parameter(
-        1.0,
-        unit="-",
-        meaning="rule of the direction of friction, a: 1 along (φ_x u_x, φ_y u_y), 2 maximum dissipation",
-        bounds=(0.0, 3.0),
-        sd=0.5,
-        source="assumed; the paper has no lateral sliding",
-    )
+        1.0, "-", "rule of the direction of friction, a: 1 along (φ_x u_x, φ_y u_y), 2 maximum dissipation",
+        (0.0, 3.0), "assumed; the paper has no lateral sliding", sd=0.5,
+    )  # fmt: skip
     inertia: Scalar = parameter(
-        0.2,
-        unit="kg·m^2",
-        meaning="moment of inertia in yaw J_ψ of the robot without payload",
-        bounds=(0.0, 1e4),
-        relative_sd=0.2,
-        source="sum of Table 7's parts in their places of Table 6",
-    )
+        0.2, "kg·m^2", "moment of inertia in yaw J_ψ of the robot without payload", (0.0, 1e4),
+        "sum of Table 7's parts in their places of Table 6", relative_sd=0.2,
+    )  # fmt: skip
     nodes: int = eqx.field(default=16, static=True)
 
 

@@ -11,12 +11,12 @@ from calibration.inference import blocks, priors
 from calibration.inference.calibration import calibrate as run
 from calibration.inference.result import CalibrationResult
 from calibration.inference.simulation_errors import OF_SIZE
+from calibration.words import fit_words
 from mmrjax.errors import count_noun
 from sweeps import config as configuration
 from sweeps.console import print_message, print_output, step_reporter
 from sweeps.inputs import load_robot, read_runs
 from sweeps.pages import words
-from sweeps.report.words import fit_words
 from sweeps.skeleton import finish_run_folder, page_writer
 from sweeps.store import open_folder
 

@@ -11,8 +11,8 @@ from calibration.data import requirements_file, robot_file
 from calibration.data.input_errors import BadConfiguration
 from calibration.described import in_words
 from calibration.sizing import sheet
-from mmrjax.derived.requirements import CHARGE, OF_HEAT
-from mmrjax.model.channels import HEAT
+from mmrjax.derived.requirements import OF_HEAT
+from mmrjax.model.quantities import CHARGE, HEAT
 from mmrjax.model.robot import Robot
 from sweeps import capabilities
 from sweeps import config as configuration

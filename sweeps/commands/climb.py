@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
-from rich.table import Table
 
 from calibration.data import robot_file, terrains
 from calibration.data.contradictions import without_levers
@@ -28,18 +27,17 @@ from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
 from sweeps import config as configuration
 from sweeps.config_campaign import SIZE
-from sweeps.console import print_output, progress_bar
+from sweeps.console import progress_bar
 from sweeps.inputs import check_configurations, load_robot
 from sweeps.points import imposed, scale
 from sweeps.points.climbs import NEAR, SLOW, SOUGHT, climb_refusal
-from sweeps.results.climb_results import VERDICTS, Along, ClimbResult
-from sweeps.skeleton import finish_run_folder, page_writer
+from sweeps.report import climb_report
+from sweeps.results.climb_results import Along, ClimbResult
+from sweeps.skeleton import finish_run_folder, print_report
 from sweeps.store import open_folder
 
 #: Runs of a round of a search.
 ROUND = 12
-#: Outputs whose derivatives are printed.
-SHOWN = ("margin_success", "crest_time_s", "crest_energy_J", "crest_current_rms_A")
 #: Widths over which slopes are taken, in the units of axes; of others this share of their value.
 WIDTHS, WIDTH = {"payload": 0.2, "levers_front_deg": 1.0, "levers_rear_deg": 1.0, SIZE: 1.0}, 0.02
 
@@ -81,11 +79,9 @@ def climb_obstacle(config: configuration.Climb, out: Path | None, force: bool) -
             from sweeps.pages import climb_figures
 
             climb_figures.render_climb(found, folder.partial / "climb.gif")
-        print_climb(found)
+        shown = print_report(climb_report.climb_document(found, file), file)
         manifest = {"seed": None, "verdict": found.verdict}
-        return finish_run_folder(
-            folder, config, manifest, solved=found.verdict != "failed", page=page_writer("climb", found, file)
-        )
+        return finish_run_folder(folder, config, manifest, solved=found.verdict != "failed", page=shown)
 
 
 def _climbed(
@@ -270,28 +266,3 @@ def _sequence(config: configuration.Climb, robot: Robot, name: str) -> Sequence:
             if why := terrains.lever_start_refusal(robot, float(np.degrees(angle))):
                 raise BadConfiguration(f"levers {option}: {why}")
     return found
-
-
-def print_climb(found: ClimbResult) -> None:
-    """The answer, and what it took; for a person."""
-    print_output(found.statement())
-    shown = Table(box=None, pad_edge=False, show_header=False)
-    for key, value in found.numbers().items():
-        stem, _, unit = key.rpartition("_")
-        shown.add_row(stem.replace("_", " "), f"{value:.3g}", unit)
-    print_output(shown)
-    if found.derivatives is not None and found.along is not None:
-        _print_derivatives(found.along, found.derivatives)
-    if found.tried:
-        print_output(", ".join(f"{size:g} mm {VERDICTS[verdict][0]}" for size, verdict in found.tried))
-
-
-def _print_derivatives(along: Along, found: Derivatives) -> None:
-    """Some derivatives, with slopes of runs side by side in brackets; all are in derivatives.csv."""
-    shown = Table(title="derivative (slope over the width, ± sd)", title_justify="left", box=None, pad_edge=False)
-    for heading in ("by", "width", *SHOWN):
-        shown.add_column(heading)
-    for k, (name, unit, _, width) in enumerate(along.rows):
-        rows = ((found.by[n][k], found.slope[n][k], found.slope_sd[n][k]) for n in SHOWN)
-        shown.add_row(name, f"{width:.2g} {unit}", *(f"{d:.2g} ({s:.2g} ± {sd:.1g})" for d, s, sd in rows))
-    print_output(shown)

@@ -54,22 +54,22 @@ def compare_with_table(
             comparison = add_second_robot(
                 comparison, stated.channels, run.evaluate_runs(other, runs, config, folder=None)
             )
-        folder.write_table("comparison.csv", comparison)
         notes = (*missing_readings_notes(comparison, stated.channels), *said)
+        of_draws: list[str] = []
+        if drawn is not None and config.posterior is not None:
+            spread = uncertainty.simulate_draws(robot, drawn, runs, config, config.posterior, folder)
+            of_draws = uncertainty.interval_ranges(table, spread)
+            table |= spread.columns
+            ends = (uncertainty.SD, uncertainty.LOWER, uncertainty.UPPER)
+            comparison |= {
+                f"simulated_{key}": table[key] for c in robot.channels for e in ends if (key := c.column + e)
+            }
+        folder.write_table("comparison.csv", comparison)
         found = Comparison(
             comparison, summary, stated.channels, Path(runs.source).name, config.model, capabilities.shown_name(file),
-            fit_of(file, runs), notes=notes, against=_name_of(config, file, second),
+            fit_of(file, runs), notes=(*notes, *of_draws), against=_name_of(config, file, second),
         )  # fmt: skip
         shown = print_report(comparison_report.comparison_document(found), dataclasses.replace(file, robot=robot))
-        if drawn is not None and config.posterior is not None:
-            ends_of = uncertainty.simulate_draws(robot, drawn, runs, config, config.posterior, folder)
-            uncertainty.say_intervals(table, ends_of)
-            table |= ends_of.columns
-            ends = (uncertainty.SD, uncertainty.LOWER, uncertainty.UPPER)
-            kept = [c.column + end for c in robot.channels for end in ends]
-            folder.write_table(
-                "comparison.csv", comparison | {f"simulated_{key}": ends_of.columns[key] for key in kept}
-            )
         further = {"errors": summary, "notes": [*file.remarks, *notes]}
         result = run.SimulationResult("compare", config.model, robot, runs, table, further)
         return run.write_run_folder(folder, config, result, shown)

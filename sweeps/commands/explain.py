@@ -12,6 +12,7 @@ import numpy as np
 
 from calibration.data import effect_file
 from calibration.data.input_errors import BadConfiguration, bound_text
+from calibration.words import effect_words
 from mmrjax import derived, effects
 from mmrjax.effects import Effect
 from mmrjax.errors import similar_words
@@ -22,7 +23,6 @@ from mmrjax.model.params import Parameter, Spec
 from mmrjax.model.signals import Result
 from sweeps.console import print_output
 from sweeps.pages import words
-from sweeps.report.words import effect_words
 from sweeps.results.climb_results import VERDICTS
 
 #: A line of an explanation: heading and text.
@@ -184,7 +184,7 @@ def _channel(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
     yield "is", f"{c.label} [{c.unit_shown}], as its instrument shows it{c.where and f': {c.where}'}"
     yield "column", f"{c.column}, its standard deviation {c.sd_column}, {bound_text(low)} to {bound_text(high)}"
     if c.other_units:
-        yield "other units", ", ".join(unit for unit, _ in c.other_units)
+        yield "other units", ", ".join(c.other_units)
     yield "typical noise", f"{100 * c.sd_share:g} % of the reading, where nobody states it"
     yield "shows in", " and ".join(["settled runs"] * c.settled + ["histories"] * c.over_time)
     wrong = [e for e in library.values() if e.channel == c.name and e.name not in effects.UNNAMED]
@@ -204,15 +204,15 @@ def _condition(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
     low, high = c.range
     yield "is", f"{c.label} [{c.unit_shown or '-'}], {bound_text(low)} to {bound_text(high)}"
     yield "column", c.column
-    if c.other_units or c.percent:
-        yield "other units", ", ".join([unit for unit, _ in c.other_units] + [quantities.PERCENT] * c.percent)
+    if c.other_units:
+        yield "other units", ", ".join(c.other_units)
     if c.field:
         yield "from Python", f"mm.Conditions({c.field}=...)"
 
 
 def _output(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
     for o in (o for o in EVERY_OUTPUT if name in (o.name, o.column)):
-        yield "is", f"{o.label} [{o.unit}]"
+        yield "is", f"{o.label} [{o.unit_shown}]"
         if (said := _attribute(Result, o.name)) and o in outputs.FURTHER:
             yield "equation", said
         where = "missions (--profile)" if o in (*mission_batch.OUTPUTS, *mission_batch.OF_TURNS) else "every run"

@@ -24,12 +24,12 @@ from calibration.discovery.result import REFIT_FILE, DiscoveryResult, Ranking
 from calibration.discovery.settings import fewest_replicates
 from calibration.inference import blocks, observers, priors
 from calibration.inference.simulation_errors import OF_SIZE
+from calibration.words import loop_words
+from calibration.words.step_words import expected_time
 from sweeps import config as configuration
 from sweeps.console import print_message, print_output, step_reporter
 from sweeps.inputs import load_robot, read_runs
 from sweeps.pages import words
-from sweeps.report.words import loop_words
-from sweeps.report.words.step_words import expected_time
 from sweeps.skeleton import finish_run_folder, page_writer
 from sweeps.store import SOLVER_FAILED, RunFolder, open_folder
 

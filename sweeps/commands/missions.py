@@ -9,46 +9,35 @@ from typing import Any
 
 import jax
 import numpy as np
-from rich.table import Table
 
 from calibration.data import profiles
 from calibration.data import runs as records
 from calibration.data.columns import LOAD, ON_SHAFT, SUPPLY
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.profiles import ProfileTable
-from mmrjax.errors import count_noun
 from mmrjax.fidelities import outputs
 from mmrjax.missions import mission_batch
 from mmrjax.missions.mission import Mission
-from mmrjax.missions.mission_batch import JOULE_PER_WH
 from mmrjax.missions.mission_steps import MARKS
 from mmrjax.missions.profile import PAIRS
-from mmrjax.model import balances, channels, ground
+from mmrjax.model import balances, channels, ground, quantities
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.paper_tables import lateral_ratio
 from mmrjax.model.power import COULOMB_PER_MAH
 from mmrjax.model.robot import Robot
-from mmrjax.model.signals import FLAGS, STATUSES
 from sweeps import capabilities
 from sweeps import config as configuration
-from sweeps.console import print_message, print_output, progress_bar
+from sweeps.console import print_message, progress_bar
 from sweeps.inputs import OPTIONS, load_robot, one_run, read_runs
-from sweeps.pages import words
 from sweeps.points import imposed, run
+from sweeps.report import mission_report
 from sweeps.results.mission_results import Missions
-from sweeps.skeleton import page_writer
+from sweeps.skeleton import print_report
 from sweeps.store import open_folder
 
 #: Rows of history.csv: of a run at most, at least, and of all runs together.
 MOST_ROWS, LEAST_ROWS, ALL_ROWS = 20_000, 200, 200_000
-_SHOWN = 6  # runs on the console
 _LASTING = MARKS.index("battery_empty")  # events from here on are kept in history.csv: stops and starts are too many
-#: What the console shows of a mission.
-_PRINTED = (
-    "energy_Wh", "energy_per_metre_Wh", "distance_m", "duration_s", "rms_current_A", "peak_current_A",
-    "rms_torque_Nm", "winding_peak_C", "housing_end_C", "state_of_charge", "endurance_s", "range_m",
-    *(output.column for output in mission_batch.OF_TURNS),
-)  # fmt: skip
 
 
 def simulate_missions(
@@ -98,9 +87,12 @@ def simulate_missions(
         found = run_missions(robot, runs, source, config)
         folder.write_table("segments.csv", capabilities.without_idle(robot, found.segments))
         folder.write_table("history.csv", capabilities.without_idle(robot, found.course))
-        print_missions(found, capabilities.idle_columns(robot))
+        if not found.whole:
+            print_message("history.csv ends before the mission does, which has taken more steps than are kept")
         result = run.SimulationResult("simulate", config.model, robot, runs, found.table, found.to_json())
-        return run.write_run_folder(folder, config, result, page_writer("mission", file, found))
+        return run.write_run_folder(
+            folder, config, result, print_report(mission_report.missions_document(file, found), file)
+        )
 
 
 def _check_robot(robot: Robot) -> None:
@@ -337,20 +329,20 @@ def _course(
     of_shaft = {}
     if not robot.has_ground:
         of_shaft = {
-            "motor_speed_rpm": np.asarray(reading["motor_speed"]) / channels.RPM,
-            "demanded_motor_speed_rpm": demanded * per_speed / channels.RPM,
+            "motor_speed_rpm": np.asarray(reading["motor_speed"]) / quantities.RPM,
+            "demanded_motor_speed_rpm": demanded * per_speed / quantities.RPM,
         }
     return {
         "run_id": np.full(len(picked), name),
         "time_s": course.time + late,
         **{c.column: np.asarray(reading[c.name]) / c.factor for c in robot.channels},
-        "theoretical_speed_mm_s": signals.speed_theoretical / channels.MM,
+        "theoretical_speed_mm_s": signals.speed_theoretical / quantities.MM,
         "slip": np.asarray(ground.slip_ratio(signals.speed, signals.speed_theoretical)),
         "distance_m": course.path,
         "displacement_m": course.distance,
         "voltage_V": signals.voltage,
         "traction_N": float(robot.sides) * signals.traction,
-        "demanded_speed_mm_s": demanded / channels.MM,
+        "demanded_speed_mm_s": demanded / quantities.MM,
         **of_shaft,
         "duty": signals.duty,
         "source_voltage_V": signals.voltage_source,
@@ -359,52 +351,10 @@ def _course(
         **({} if signals.load_torque is None else {LOAD: signals.load_torque}),
         "winding_temperature_C": winding if source.turns else np.asarray(reading["winding_temperature"]),
         "housing_temperature_C": housing,
-        "energy_Wh": course.energy / JOULE_PER_WH,
+        "energy_Wh": course.energy / quantities.SIZES["Wh"],
         "state_of_charge": left if battery else np.full(len(picked), np.nan),
         "cycle": course.segment // source.segments + 1,
         "segment": segment + 1,
         **of_sides,
         "event": np.array([*MARKS, ""])[course.event],
     }
-
-
-def _charge_left(table: dict[str, np.ndarray], status: str) -> str:
-    """At what charge missions were cut off."""
-    left = 100 * table["state_of_charge"][table["status"] == "cut_off"]
-    if status != "cut_off" or not len(left):
-        return ""
-    span = f"{left.min():.1f}" if len(left) == 1 else f"{left.min():.1f} to {left.max():.1f}"
-    return f"; ended with {span} % of the charge left"
-
-
-def print_missions(found: Missions, idle: Collection[str] = ()) -> None:
-    """Print a table of missions, one a column, without `idle` columns; statuses and flags in words."""
-    about = {output.column: output for output in (*mission_batch.OUTPUTS, *mission_batch.OF_TURNS)}
-    table, source = found.table, found.source
-    count = len(table["status"])
-    cycles, each = (f", {source.cycles} cycles", " each") if source.cycles > 1 else ("", "")
-    segments = count_noun(source.segments, "segment")
-    print_output(f"profile {source.source}: {source.duration:g} s{cycles}, {segments}{each}")
-    shown = Table(show_header=False)
-    shown.add_row("configuration", *table["configuration"][:_SHOWN])
-    for key in _PRINTED:
-        heading, form = f"{about[key].label} [{about[key].unit}]", f".{about[key].resolution}f"
-        if key in table and np.isfinite(table[key]).any() and key not in idle:
-            shown.add_row(heading, *("-" if v != v else format(v, form) for v in table[key][:_SHOWN]))
-    shown.add_row("status", *table["status"][:_SHOWN])
-    print_output(shown)
-    for status in dict.fromkeys(table["status"]):
-        if status != STATUSES[0]:
-            print_output(f"{status}: {words.STATUSES[status].why}{_charge_left(table, status)}")
-    for flag in FLAGS:
-        flagged = int(np.sum([flag in str(f).split(";") for f in table["flags"]]))
-        if flagged:
-            said = np.array([flag in str(f).split(";") for f in found.segments["flags"]])
-            where = f"{int(said.sum())} of {len(said)} segments"
-            print_output(
-                f"{flag}: {words.FLAGS[flag]} ({where if count == 1 else f'{flagged} of {count} runs, {where}'})"
-            )
-    if count > _SHOWN:
-        print_output(f"... and {count - _SHOWN} more in runs.csv")
-    if not found.whole:
-        print_message("history.csv ends before the mission does, which has taken more steps than are kept")

@@ -8,7 +8,6 @@ from typing import Any
 
 import jax
 import numpy as np
-from rich.table import Table
 
 from calibration.data import robot_file
 from calibration.data.input_errors import BadConfiguration
@@ -21,7 +20,6 @@ from mmrjax.model.robot import Robot
 from mmrjax.model.signals import STATUSES
 from mmrjax.undercarriage.modes import Mode, modes
 from mmrjax.undercarriage.ripple_peaks import (
-    PERIODS,
     SIGNALS,
     Passing,
     Peak,
@@ -33,13 +31,14 @@ from mmrjax.undercarriage.ripple_peaks import (
 )
 from sweeps import config as configuration
 from sweeps.config import GridPart
-from sweeps.console import print_output, progress_bar
+from sweeps.console import progress_bar
 from sweeps.inputs import check_configurations, load_robot
 from sweeps.pages import words
 from sweeps.points import imposed, run, scale
 from sweeps.points.grid import grid_conditions
-from sweeps.results.resonance_results import SLOW, ResonanceResult, span_text
-from sweeps.skeleton import finish_run_folder, page_writer
+from sweeps.report import resonance_report
+from sweeps.results.resonance_results import SLOW, ResonanceResult
+from sweeps.skeleton import finish_run_folder, print_report
 from sweeps.store import RunFolder, open_folder
 
 CHUNK = 96  # runs in one call
@@ -84,11 +83,9 @@ def map_resonance(config: configuration.Resonance, out: Path | None, force: bool
         table = {**run.condition_table(robot, runs), "table8": of_table8, **columns}
         found = _found(config, robot, what, table)
         _write(folder, config, found)
-        print_resonance(found)
+        shown = print_report(resonance_report.resonance_document(found, file), file)
         manifest, solved = {"seed": None, "statuses": found.statuses}, words.every_run_solved(found.statuses)
-        return finish_run_folder(
-            folder, config, manifest, solved=solved, page=page_writer("resonance", found, file), runs=runs
-        )
+        return finish_run_folder(folder, config, manifest, solved=solved, page=shown, runs=runs)
 
 
 def _grid(config: configuration.Resonance, voltages: tuple[float, ...], payloads: tuple[float, ...]) -> GridPart:
@@ -219,23 +216,3 @@ def _rows(rows: Iterable[dict[str, Any]], kind: type) -> dict[str, np.ndarray]:
     keys = list(rows[0]) if rows else list(kind.__annotations__)
     names = _COLUMNS | {"low": f"low_{unit}", "high": f"high_{unit}"}
     return {names.get(key, key): np.array([row[key] for row in rows]) for key in keys}
-
-
-def print_resonance(found: ResonanceResult) -> None:
-    """Natural frequencies, and which speeds to avoid; for a person."""
-    shown = Table(title="natural frequencies [Hz], mean (range over the belt's position), damping ratio", box=None)
-    shown.title_justify = "left"
-    names = list(dict.fromkeys(m.name for own in found.modes.values() for m in own))
-    shown.add_column("payload [kg]")
-    for name in names:
-        shown.add_column(name)
-    for payload, own in found.modes.items():
-        cells = {m.name: f"{m.frequency:.0f} ({span_text(m.low, m.high, 1)}), {m.damping:.2f}" for m in own}
-        shown.add_row(f"{payload:g}", *(cells.get(name, "-") for name in names))
-    print_output(shown)
-    print_output(found.statement())
-    others = {s: n for s, n in found.statuses.items() if n and s != STATUSES[0]}
-    if others:
-        print_output(f"of {len(found.table['status'])} runs: " + ", ".join(f"{n} {s}" for s, n in others.items()))
-    if SLOW in others:
-        print_output(f"{SLOW}: fewer than {PERIODS} {found.passing.name} passed in the second half of the run")

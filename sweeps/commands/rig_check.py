@@ -17,16 +17,18 @@ from calibration.data.rig_facts import Fact, Origin
 from calibration.data.rig_file import FREE
 from calibration.data.runs import Runs
 from calibration.data.writing import finite_or_null
-from calibration.described import described, sentences
+from calibration.described import describe, sentences
 from calibration.inference import foresight, identifiability, priors
 from calibration.inference.fit_notes import Determination
 from calibration.inference.fit_posterior import undetermined_names
 from calibration.inference.foresight import Determined, Foresight
+from calibration.words import fit_words
 from mmrjax.errors import count_noun
 from mmrjax.model import channels
-from mmrjax.model.channels import HEAT, Channel
+from mmrjax.model.channels import Channel
 from mmrjax.model.driver import FAST
 from mmrjax.model.motor import UNLIMITED
+from mmrjax.model.quantities import HEAT
 from mmrjax.model.robot import Robot
 from mmrjax.model.shaft import Shaft
 from sweeps.commands.rig_template import EXAMPLE
@@ -34,7 +36,6 @@ from sweeps.config import RobotPart
 from sweeps.console import print_output
 from sweeps.inputs import load_robot, read_runs
 from sweeps.pages import words
-from sweeps.report.words import fit_words
 
 
 @dataclasses.dataclass(frozen=True)
@@ -196,7 +197,7 @@ class RigCheck:
     def determined(self, parameter: Determined) -> str:
         """`yes`, `no`, or with which parameters together the table determines one."""
         assert self.foresight is not None
-        return described(Determination.of(parameter.name, parameter.held, self.foresight.together))
+        return describe(Determination.of(parameter.name, parameter.held, self.foresight.together))
 
     def to_json(self) -> dict[str, Any]:
         """The whole, for machines."""

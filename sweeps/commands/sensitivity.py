@@ -23,6 +23,7 @@ from calibration.sensitivity.next_runs import Candidates
 from calibration.sensitivity.result import METHODS, NEGLIGIBLE, Points, SensitivityResult
 from calibration.sensitivity.study import Study, Supply
 from calibration.sensitivity.uncertain_inputs import Inputs
+from calibration.words import sensitivity_words
 from mmrjax.model.conditions import OF_TURNS
 from mmrjax.model.paper_tables import PAYLOADS_KG, SLOPES_DEG, VOLTAGES_V
 from mmrjax.model.power import COULOMB_PER_MAH
@@ -39,7 +40,6 @@ from sweeps.points import imposed
 from sweeps.points.grid import grid_conditions, grid_configurations
 from sweeps.points.job import showing_turns
 from sweeps.points.run import check_runs_bearable
-from sweeps.report.words import sensitivity_words
 from sweeps.skeleton import finish_run_folder, page_writer
 from sweeps.store import open_folder
 
@@ -123,7 +123,7 @@ def _operating_points(
         )
     table8: dict[str, tuple[float, ...]] = {}
     if layout.table8:
-        table8 = CORNERS if config.method in ("sobol", "morris", "shapley") else WHOLE
+        table8 = CORNERS if config.method in ("sobol", "morris") else WHOLE
         if not set(OF_TURNS).isdisjoint(ranges):  # which settle on level ground alone
             table8 = {**table8, "slopes_deg": (0.0,)}
     axes = {key: getattr(config, key) or table8.get(key) for key in (*WHOLE, "motor_speeds_rpm")}

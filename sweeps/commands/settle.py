@@ -14,6 +14,7 @@ from calibration.data.settling import Inertia, Settled
 from calibration.described import sentences
 from calibration.inference import ranges
 from calibration.inference.observers import SettledRuns
+from calibration.words import settle_words
 from mmrjax.model import balances
 from mmrjax.model.channels import Channel
 from mmrjax.model.conditions import Conditions
@@ -22,7 +23,6 @@ from mmrjax.model.signals import State
 from sweeps import config as configuration
 from sweeps.inputs import load_robot, read_runs
 from sweeps.report import settle_report
-from sweeps.report.words import settle_words
 from sweeps.skeleton import finish_run_folder, print_report
 from sweeps.store import open_folder
 

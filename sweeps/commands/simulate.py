@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from rich.table import Table
 
 from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration
@@ -22,21 +20,23 @@ from mmrjax.derived.start_figures import curve_peak
 from mmrjax.fidelities import outputs, start_stages
 from mmrjax.fidelities.base import History, Run
 from mmrjax.fidelities.result import result_of_signals
-from mmrjax.model import channels, ground
-from mmrjax.model.channels import Channel
+from mmrjax.model import channels, ground, quantities
 from mmrjax.model.motor import Motor
 from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import BATTERY_EMPTY, STATUSES
 from sweeps import capabilities
 from sweeps import config as configuration
-from sweeps.console import print_output, progress_bar
+from sweeps.console import progress_bar
 from sweeps.inputs import beside_robot, load_robot, one_run, read_runs
-from sweeps.pages import posture_words, words
+from sweeps.pages import words
 from sweeps.points import run, scale, uncertainty
 from sweeps.points.job import showing_turns
+from sweeps.report import runs_report
+from sweeps.report.runs_report import PEAK
+from sweeps.report.words import posture_words
 from sweeps.results import posture_results
-from sweeps.skeleton import page_writer
+from sweeps.skeleton import print_report
 from sweeps.store import RunFolder, open_folder
 
 _HISTORIES = 1000  # runs of which histories are kept
@@ -45,9 +45,6 @@ _SHOWN = 6  # runs on the console
 OF_SHAFT = ("motor_speed", "output_angle")
 #: The same of a vehicle.
 OF_VEHICLE = ("speed",)
-#: Column of the largest current of all motors together in a run over time (not of the supply, which gives the duty's
-#: share of it).
-PEAK = "peak_current_A"
 #: Columns of the currents of the motors of either side, where sides are driven apart.
 _OF_SIDES = tuple(channels.find_channel(f"motor_current_{side}").column for side in channels.SIDES)
 #: Runs are filled up to a multiple of this, so that tables of about one size share what is compiled.
@@ -81,26 +78,14 @@ def simulate_to_folder(
         table[PERMISSIBLE] = permissible_durations(robot, table)
         stands = posture_results.posture_of_runs(robot, runs, run.conditions_of_runs(robot, runs, config))
         notes = run_remarks(robot, table) + capabilities.unknown_numbers_sentence(robot)
-        found = None
+        further: dict[str, Any] = {"notes": [*file.remarks, *notes]}
+        remarks = list(notes)
         if drawn is not None and config.posterior is not None:
             found = uncertainty.simulate_draws(robot, drawn, runs, config, config.posterior, folder)
             table |= found.columns
-        print_runs(
-            {key: value[:_SHOWN] for key, value in capabilities.without_idle(robot, table).items()}, seen.channels
-        )
-        for note in notes:
-            print_output(note)
-        if found is not None:
-            print_output(
-                f"± one sd over {found.draws} robots drawn from the posterior; 95 % intervals are in runs.csv"
-            )
-            uncertainty.say_lost(found)
-        if len(runs) > _SHOWN:
-            print_output(f"... and {len(runs) - _SHOWN} more in runs.csv")
-        further: dict[str, Any] = {"notes": [*file.remarks, *notes]}
+            remarks += uncertainty.interval_remarks(found)
         if stands is not None:
             folder.write_table("posture.csv", stands.table)
-            print_output(posture_words.posture_sentences(stands))
             further["notes"] += posture_words.tipping_remarks(stands)
         if histories is not None and robot.has_ground:
             further["starts"] = starts_from_standstill(robot, histories, runs)
@@ -108,8 +93,8 @@ def simulate_to_folder(
             further[PEAK] = float(np.nanmax(table[PEAK], initial=0.0))
         result = run.SimulationResult("simulate", config.model, robot, runs, table, further)
         of_page = dataclasses.replace(file, robot=seen)
-        shown = page_writer("runs", of_page, model=config.model, runs=table, histories=histories, stands=stands)
-        return run.write_run_folder(folder, config, result, shown)
+        document = runs_report.runs_document(of_page, config.model, table, histories, stands, remarks)
+        return run.write_run_folder(folder, config, result, print_report(document, of_page))
 
 
 def _simulated(
@@ -250,7 +235,7 @@ def history_table(robot: Robot, history: History, runs: records.Runs) -> dict[st
         "run_id": np.repeat(_names(runs), history.time.shape[-1]),
         "time_s": np.ravel(history.time),
         **{c.column: np.ravel(history.reading[c.name]) / c.factor for c in shown},
-        "theoretical_speed_mm_s": np.ravel(signals.speed_theoretical) / channels.MM,
+        "theoretical_speed_mm_s": np.ravel(signals.speed_theoretical) / quantities.MM,
         "slip": np.ravel(ground.slip_ratio(signals.speed, signals.speed_theoretical)),
         "displacement_m": np.ravel(history.distance),
         "voltage_V": np.ravel(signals.voltage),
@@ -287,45 +272,3 @@ def reactions_table(history: History, runs: records.Runs) -> dict[str, np.ndarra
         values = getattr(loads, name)
         table |= {f"{name}_{k + 1:02d}_N": values[..., k].ravel() for k in range(values.shape[-1])}
     return table
-
-
-def print_runs(table: dict[str, np.ndarray], shown: Sequence[Channel]) -> None:
-    """Operating points, one a column."""
-    rows = {
-        "configuration": ("configuration", ""), "supply_voltage_V": ("supply voltage [V]", "g"),
-        **({} if "supply_voltage_V" in table else {"motor_speed_rpm": ("motor speed [rpm]", ".1f")}),
-        "total_mass_kg": ("total mass [kg]", "g"), "slope_deg": ("slope [deg]", "g"),
-        "load_torque_Nm": ("load torque [N·m]", "g"),
-        "duty_left": ("duty, left", ".4g"), "duty_right": ("duty, right", ".4g"),
-        "heading_deg": ("heading [deg]", "g"),
-        **{c.column: (f"{c.label} [{c.unit}]", f".{c.resolution}f") for c in shown},
-        PEAK: ("peak current, all motors [A]", ".1f"), "displacement_m": ("displacement [m]", ".2f"),
-        "time_end_s": ("time [s]", ".6g"), "voltage_cell_V": ("voltage of a cell [V]", ".3f"),
-        "slip": ("slip", ".4f"),
-        "power_supply_W": ("power from supply P_e [W]", ".2f"), "power_motor_W": ("at motor shafts N_d [W]", ".2f"),
-        "power_gear_W": ("at gearbox outputs N_r [W]", ".2f"), "power_ground_W": ("to the ground N_t [W]", ".2f"),
-        "winding_settled_C": ("winding, long running [°C]", ".0f"),
-        PERMISSIBLE: ("permissible at this current for [s]", ".3g"), "adhesion_used": ("adhesion used", ".3f"),
-        "status": ("status", ""), "flags": ("limits exceeded", ""),
-    }  # fmt: skip
-    printed = Table(show_header=False)
-    absent = {"supply_voltage_V": "battery"}
-    for key, (heading, form) in rows.items():
-        if key not in table or (key == "voltage_cell_V" and not np.nan_to_num(table[key]).any()):
-            continue
-        cells = [
-            str(v).replace(";", "\n") if not form
-            else absent.get(key, "-") if v != v
-            else (words.FOR_EVER if key == PERMISSIBLE else words.NONE_SETTLES) if np.isinf(v)
-            else format(v, f"z{form}")
-            for v in table[key]
-        ]  # fmt: skip
-        if form and key + uncertainty.SD in table:
-            digits = int(form.strip(".f"))
-            pairs = zip(table[key], table[key + uncertainty.SD], strict=True)
-            cells = ["-" if v != v else uncertainty.with_sd(v, sd, digits) for v, sd in pairs]
-        printed.add_row(heading, *cells)
-    print_output(printed)
-    for status in dict.fromkeys(table["status"]):
-        if status != STATUSES[0]:
-            print_output(f"{status}: {words.STATUSES[status].why}")

@@ -7,17 +7,15 @@ import errno
 import math
 import shutil
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.table import Table
 
 from calibration.data import profiles, robot_file
 from calibration.data.input_errors import BadConfiguration, InputError
 from calibration.data.robot_file import RobotFile
-from mmrjax.errors import count_noun
 from mmrjax.model.signals import STATUSES
 from sweeps import config_campaign, skeleton
 from sweeps.config import Sweep
@@ -31,7 +29,10 @@ from sweeps.points.job import laid_out, prepare_job, showing_turns
 from sweeps.points.sampled_design import Blocks
 from sweeps.points.tasks import task_of
 from sweeps.points.zarr_store import STORE, Done, Layout, SweepStore
-from sweeps.skeleton import page_writer
+from sweeps.report import campaign_report, sweep_report
+from sweeps.report.document import Column, Table
+from sweeps.report.run_tables import endings_table
+from sweeps.report.terminal_renderer import print_table
 from sweeps.store import DONE, SOLVER_FAILED, default_path, open_folder
 
 #: Most runs of which a grid leaves a table, runs.csv; of more it leaves a store, in a tenth of the time and bytes.
@@ -76,15 +77,14 @@ def _into_table(config: Sweep, file: RobotFile, out: Path | None, force: bool) -
     drawn = None if config.posterior is None else beside_robot(file)
     with open_folder("sweep", config, robot, out, force) as folder:
         table = run.evaluate_runs(robot, runs, config, folder)
-        print_counts(run.runs_by_status(table), "runs")
+        notes: list[str] = []
         if drawn is not None and config.posterior is not None:
             found = uncertainty.simulate_draws(robot, drawn, runs, config, config.posterior, folder)
-            uncertainty.say_intervals(table, found)
+            notes = uncertainty.interval_ranges(table, found)
             table |= found.columns
         result = run.SimulationResult("sweep", config.model, robot, runs, table)
-        return run.write_run_folder(
-            folder, config, result, page_writer("sweep", file, model=config.model, runs=table)
-        )
+        shown = skeleton.print_report(sweep_report.sweep_document(file, config.model, table, notes), file)
+        return run.write_run_folder(folder, config, result, shown)
 
 
 def _into_store(config: Campaign, file: RobotFile, where: str, out: Path | None, force: bool, options: How) -> int:
@@ -144,7 +144,6 @@ def dry_run(job: scale.Job, layout: Layout, path: Path) -> None:
         spent.append(time.perf_counter() - start)
     each = min(spent[1:]) / compiled.size
     design = job.plan.design
-    shown = Table(show_header=False)
     dimensions = " x ".join(f"{n} {name}" for n, name in zip(design.shape, design.dimensions, strict=True))
     free = _free(path)
     rows = {
@@ -154,9 +153,7 @@ def dry_run(job: scale.Job, layout: Layout, path: Path) -> None:
         "time": f"about {duration_text(each * blocks.points * len(blocks))} once compiled, {1 / each:,.0f} points/s "
         f"(timed here on {compiled.size:,} points); compiling {duration_text(max(spent[0] - spent[1], 0.0))}",
     }
-    for heading, text in rows.items():
-        shown.add_row(heading, text)
-    print_output(shown)
+    print_table(Table("dry-run", (Column("a sweep of"), Column("")), list(rows.items())))
     _refuse_without_space(layout.size, 1.0, path)
 
 
@@ -278,7 +275,7 @@ def finish_sweep(
             print_message(str(export.export_runs(kind, store.path, store.layout)))
     counts = points_by_status(done.values())
     if not left:
-        print_counts(counts, "points", job.task.model)
+        print_table(endings_table(counts, "points", job.task.model))
         print_output(str(store.path))
     return DONE if words.every_run_solved(counts) else SOLVER_FAILED
 
@@ -290,9 +287,9 @@ def write_sweep_folder(store: SweepStore, config: Campaign, file: RobotFile, job
     )
     found = sweep_summary(store.layout, job, store.done().values())
     store.write_json("result.json", found)
-    print_counts(found["statuses"], "points", job.task.model)
     manifest = {"statuses": found["statuses"], "seed": config.samples.get("seed", 0), "hashes": same["data"]}
-    skeleton.finish_run_folder(store, config, manifest, page=page_writer("campaign", file, store.layout, found))
+    document = campaign_report.campaign_document(file, store.layout, found, store.partial / STORE)
+    skeleton.finish_run_folder(store, config, manifest, page=skeleton.print_report(document, file))
 
 
 def sweep_summary(layout: Layout, job: scale.Job, done: Iterable[Done]) -> dict[str, Any]:
@@ -324,15 +321,3 @@ def points_by_status(done: Iterable[Done]) -> dict[str, int]:
     """Number of points by status; every status is included."""
     total = np.sum([d.statuses for d in done], axis=0, dtype=int)
     return dict(zip(STATUSES, np.broadcast_to(total, len(STATUSES)).tolist(), strict=True))
-
-
-def print_counts(counts: Mapping[str, int], things: str, model: str = "") -> None:
-    """Print the number of runs or points by status, in words."""
-    total = count_noun(sum(counts.values()), things.removesuffix("s"))
-    shown = Table(title=total, title_justify="left")
-    for heading in ("status", things, "meaning"):
-        shown.add_column(heading, justify="right" if heading == things else "left")
-    for status, count in counts.items():
-        if count:
-            shown.add_row(status, f"{count:,}", words.VERDICTS.get((model, status)) or words.STATUSES[status].why)
-    print_output(shown)

@@ -9,7 +9,6 @@ from typing import Any
 import jax
 import numpy as np
 import scipy.optimize
-from rich.table import Table
 
 from calibration.data import sides
 from calibration.data.columns import SIDES, SUPPLY
@@ -20,18 +19,19 @@ from mmrjax.derived import turning_figures
 from mmrjax.fidelities import outputs
 from mmrjax.fidelities.base import History, Run
 from mmrjax.fidelities.rest import voltage_at_rest
-from mmrjax.model import channels
+from mmrjax.model import channels, quantities
 from mmrjax.model.channels import Channel
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.robot import Robot
 from sweeps import capabilities
 from sweeps import config as configuration
-from sweeps.console import print_output, progress_bar, report_stage
+from sweeps.console import progress_bar, report_stage
 from sweeps.inputs import load_robot, one_run
-from sweeps.pages import posture_words, turn_words
 from sweeps.points import imposed, run, scale
+from sweeps.report import turn_report
+from sweeps.report.words import posture_words, turn_words
 from sweeps.results import posture_results
-from sweeps.skeleton import page_writer
+from sweeps.skeleton import print_report
 from sweeps.store import open_folder
 
 #: Duties of the inner side, as shares of the outer one's, over which a settled turn is shown.
@@ -84,21 +84,16 @@ def simulate_turn(config: configuration.Simulate, given: str | dict[str, Any], o
             folder.write_table("history.csv", history_table(history, shown))
         own = {name: np.asarray(values) for name, values in first.columns.items()}
         table = {**run.condition_table(robot, runs), **_columns(robot, shown, asked, first), **own}
-        turn = {name: _number(table[name][0]) for name in turning_figures.COLUMNS}
-        facts = turn_words.turn_in_words(robot, {name: values[0] for name, values in table.items()}, _ended(history))
-        print_output(facts.answer)
-        if facts.sides:
-            print_sides(facts.sides)
-        for note in facts.notes:
-            print_output(f"- {note}")
+        turn = {name: _number(table[name][0]) for name in (q.column for q in quantities.TABLE["turn"])}
         with report_stage(stages, stages, "posture"):
             stands = posture_results.posture_of_runs(robot, runs, asked)
+        notes = []
         if stands is not None:
             folder.write_table("posture.csv", stands.table)
-            print_output(posture_words.posture_sentences(stands))
+            notes.append(posture_words.posture_sentences(stands))
         result = run.SimulationResult("simulate", config.model, robot, runs, table, {"turn": turn})
-        shows = page_writer("turn", file, model=config.model, run=table, facts=facts, history=history, turns=turns)
-        return run.write_run_folder(folder, config, result, shows)
+        document = turn_report.turn_document(file, config.model, table, _ended(history), history, turns, notes)
+        return run.write_run_folder(folder, config, result, print_report(document, file))
 
 
 #: Of a demanded turn: as how much wider a robot slides than it is, to begin with; what its load takes, in shares of
@@ -245,13 +240,3 @@ def history_table(history: History, shown: tuple[Channel, ...]) -> dict[str, np.
 
 def _number(value: Any) -> float | None:
     return float(value) if np.isfinite(value) else None
-
-
-def print_sides(sides: list[tuple[str, str, str]]) -> None:
-    """Print the table of the left and right side."""
-    shown = Table(box=None, pad_edge=False)
-    for heading in ("", "left", "right"):
-        shown.add_column(heading, justify="left" if not heading else "right")
-    for row in sides:
-        shown.add_row(*row)
-    print_output(shown)

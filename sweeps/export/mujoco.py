@@ -425,6 +425,7 @@ def mujoco_module() -> Any:
             f"--to mujoco: got MuJoCo {found.__version__}, which has no <dcmotor>; expected {_version()} or later: "
             "pip install -U mujoco"
         )
+    found.set_mju_user_warning(lambda text: None)  # else MuJoCo writes a file in the working folder
     return found
 
 

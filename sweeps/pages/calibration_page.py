@@ -7,12 +7,12 @@ from pathlib import Path
 from calibration.data.columns import Layout
 from calibration.inference.identifiability import HELD
 from calibration.inference.result import CalibrationResult
+from calibration.words import fit_words
 from sweeps.pages import calibration_figures, cluster_figures, comparison_figures
 from sweeps.pages.page import Album, channel_columns, first_rows, render_page, unnamed_curves
 from sweeps.pages.time_overlay import time_overlay
 from sweeps.pages.words import words_shown
 from sweeps.report.condition_columns import condition_formats
-from sweeps.report.words import fit_words
 
 
 def write_calibration_page(folder: Path, found: CalibrationResult, *, robot_name: str) -> Path:

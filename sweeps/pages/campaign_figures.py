@@ -14,6 +14,8 @@ from matplotlib.figure import Figure
 
 from sweeps.pages.figure_style import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, SKY, VERMILION, corner_note, new_figure
 from sweeps.pages.words import short_name
+from sweeps.points.climbs import SIZE
+from sweeps.points.zarr_store import Layout
 
 #: Bins of a histogram, and along a name at most; at least, and points of each that more need.
 BARS, BINS = 40, 24
@@ -28,6 +30,20 @@ class Varied(NamedTuple):
     values: np.ndarray
     label: str
     words: tuple[str, ...] = ()
+
+
+def varied_names(values: np.ndarray, layout: Layout) -> dict[str, Varied]:
+    """Varied names of a store with their values at some points, shape (points, names)."""
+    units = {n: layout.coordinates[n].get("units", "").removeprefix("1") for n in layout.design.names}
+    return {
+        n: Varied(values[:, k], f"{n} [{units[n]}]" if units[n] else n, layout.labels.get(n, ()))
+        for k, n in enumerate(layout.design.names)
+    }
+
+
+def draw_output(output: np.ndarray, label: str, values: np.ndarray, layout: Layout) -> Figure:
+    """How an output of a store spreads, and how it follows what varies."""
+    return draw_output_spread(output, label, varied_names(values, layout))
 
 
 def draw_output_spread(output: np.ndarray, label: str, varied: Mapping[str, Varied]) -> Figure:
@@ -48,6 +64,19 @@ def draw_output_spread(output: np.ndarray, label: str, varied: Mapping[str, Vari
     if len(names) == 2:
         _map(fig, others[2], varied[names[0]], varied[names[1]], output, label)
     return fig
+
+
+def draw_verdicts(codes: np.ndarray, names: Sequence[str], values: np.ndarray, layout: Layout, first: str) -> Figure:
+    """Verdicts of climbs over an axis and the size of the obstacle; of other axes at their first values.
+
+    Args:
+        codes: of the points; names: of the codes; values: of what varies, shape (points, names); first: of the axis.
+    """
+    design = layout.design
+    rest = [k for k, n in enumerate(design.names) if n not in (SIZE, first)]
+    at_first = np.all(values[:, rest] == [design.axes[design.names[k]][0] for k in rest], axis=1)
+    varied = varied_names(values[at_first], layout)
+    return draw_grid_statuses(codes[at_first], names, varied[first], varied[SIZE])
 
 
 def draw_grid_statuses(codes: np.ndarray, names: Sequence[str], across: Varied, up: Varied) -> Figure:

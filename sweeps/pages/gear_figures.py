@@ -94,13 +94,30 @@ def members_with_gear(
     return answer
 
 
+def ripple_numbers(gear: Gear) -> dict[str, Any]:
+    """What ripples in a run, by how much and how often."""
+    tail, signals = gear.tail(TAIL), gear.signals
+    drawn, travel, reaction = (
+        ripple.ripple(gear.time[tail], x[tail]) for x in (signals.total_current, signals.speed, signals.normal)
+    )
+    return {
+        "configuration": gear.name,
+        "pitch": "grousers, S_g = 35 mm" if gear.on_tracks else "teeth, S_t = 5 mm",
+        "period_ms": 1e3 * drawn.period,
+        "equation_ms": 1e3 * gear.period,
+        "current_percent": 100 * drawn.amplitude,
+        "speed_percent": 100 * travel.amplitude,
+        "reaction_percent": 100 * reaction.amplitude,
+        "guide_percent": 100 * gear.guide_share if gear.on_tracks else None,
+    }
+
+
 def current_ripple(shown: list[Gear], title: str = "{}") -> tuple[Figure, list[dict[str, Any]]]:
     """Total current at the end of each run, and what ripples by how much."""
     fig, grid = new_figure(1, len(shown), 3.0)
     look = configuration_looks(gear.name for gear in shown)
-    facts = []
     for axes, gear in zip(grid[0], shown, strict=True):
-        last, tail, expected = gear.tail(SHOWN), gear.tail(TAIL), gear.period
+        last, expected = gear.tail(SHOWN), gear.period
         time, current = gear.time[last], gear.signals.total_current[last]
         axes.plot(1e3 * (time - time[0]), current, color=look[gear.name][0])
         axes.axhline(current.mean(), color=FAINT, lw=0.9)
@@ -114,23 +131,7 @@ def current_ripple(shown: list[Gear], title: str = "{}") -> tuple[Figure, list[d
         axes.annotate("", (start, level), (start + 1e3 * expected, level), arrowprops=arrow)
         axes.text(start, level + 0.05 * span, f"{1e3 * expected:.1f} ms, eq. (34)", fontsize=8.5, va="bottom")
         axes.set_title(title.format(gear.name))
-        signals = gear.signals
-        drawn, travel, reaction = (
-            ripple.ripple(gear.time[tail], x[tail]) for x in (signals.total_current, signals.speed, signals.normal)
-        )
-        facts.append(
-            {
-                "configuration": gear.name,
-                "pitch": "grousers, S_g = 35 mm" if gear.on_tracks else "teeth, S_t = 5 mm",
-                "period_ms": 1e3 * drawn.period,
-                "equation_ms": 1e3 * expected,
-                "current_percent": 100 * drawn.amplitude,
-                "speed_percent": 100 * travel.amplitude,
-                "reaction_percent": 100 * reaction.amplitude,
-                "guide_percent": 100 * gear.guide_share if gear.on_tracks else None,
-            }
-        )
-    return fig, facts
+    return fig, [ripple_numbers(gear) for gear in shown]
 
 
 def draw_touchdowns(gear: Gear, title: str = "grousers land (dotted)") -> Figure:

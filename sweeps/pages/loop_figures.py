@@ -28,8 +28,8 @@ from sweeps.pages.figure_style import (
     legend_columns,
     new_figure,
 )
-from sweeps.pages.sweep_figures import UNITS, imposed_column
 from sweeps.pages.words import short_name
+from sweeps.report.condition_columns import UNITS, imposed_column
 
 #: Effects on the ladder and on the map of look-alikes.
 RUNGS, ALIKE = 20, 14

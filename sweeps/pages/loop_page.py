@@ -10,12 +10,13 @@ import numpy as np
 
 import mmrjax as mm
 from calibration.data.columns import Layout
-from calibration.described import described
+from calibration.described import describe
 from calibration.discovery.result import DiscoveryResult
 from calibration.inference import blocks
 from calibration.inference.details import Detail, EquationDefects, TimeStatistics
 from calibration.inference.fit_notes import Copied, Determination, FarFromPrior, Repeats
 from calibration.inference.simulation_errors import root_mean_square
+from calibration.words import loop_words
 from mmrjax.effects import BY_NAME
 from mmrjax.model import params
 from mmrjax.model.robot import Robot
@@ -24,8 +25,6 @@ from sweeps.pages.page import Album, channel_columns, first_rows, render_page, u
 from sweeps.pages.time_overlay import time_overlay
 from sweeps.pages.words import GLOSSARY, words_shown
 from sweeps.report.condition_columns import condition_formats
-from sweeps.report.words import loop_words
-from sweeps.report.words.note_words import describe
 
 #: Change of an rms error that is marked [%].
 NOTABLE = 0.05
@@ -249,7 +248,7 @@ def write_loop_page(folder: Path, found: DiscoveryResult, *, robot_name: str) ->
         closed=loop_figures.closed_equations(table) if sized and isinstance(found.detail, EquationDefects) else [],
         rms=found.rms,
         determined={
-            n: described(Determination.of(n, p.held_by_prior, found.together)) for n, p in found.base_shift.items()
+            n: describe(Determination.of(n, p.held_by_prior, found.together)) for n, p in found.base_shift.items()
         },
         shift=lambda z: "bad" if abs(z) > 3 else "fair" if abs(z) > 2 else "",
     )

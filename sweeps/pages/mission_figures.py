@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from mmrjax.model.channels import SIDES
 from mmrjax.model.energy import SINKS
+from sweeps.pages import words
 from sweeps.pages.figure_style import (
     BLUE,
     FAINT,
@@ -28,19 +29,11 @@ from sweeps.points.imposed import UNLIMITED
 
 #: Units of a time axis: how long a mission is for it [s], its size [s], its name.
 _TIMES = ((7200.0, 3600.0, "h"), (600.0, 60.0, "min"), (0.0, 1.0, "s"))
-#: Names of where energy goes, as bars have room for, and the colour of each.
-_BARS = {
-    "battery": ("cells of the battery", INK), "other": ("other consumers", FAINT), "driver": ("driver", FAINT),
-    "winding": ("windings, brushes, leads", VERMILION), "motor": ("friction of the motors", ORANGE),
-    "gearbox": ("gearboxes", PURPLE), "track": ("tracks and guides", BLUE),
-    "sliding": ("sliding over the ground", SKY), "rolling": ("rolling resistance", SKY),
-    "lift": ("lift (net of what comes back)", GREEN),
+#: Colours of where energy goes.
+_COLOURS = {
+    "battery": INK, "other": FAINT, "driver": FAINT, "winding": VERMILION, "motor": ORANGE, "gearbox": PURPLE,
+    "track": BLUE, "sliding": SKY, "rolling": SKY, "lift": GREEN,
 }  # fmt: skip
-
-
-def label_of_sink(name: str) -> str:
-    """Name of a place where energy goes, as in the bars of `draw_mission_energy`."""
-    return _BARS[name][0]
 
 
 def draw_mission_course(
@@ -217,7 +210,7 @@ def draw_mission_energy(run: Mapping[str, Any], on_battery: bool) -> Figure:
     source = "drawn from the battery's charge" if on_battery else "drawn from the supply"
     bars: list[tuple[str, float, str]] = [(source, drawn, INK)]
     for name in SINKS:
-        label, colour = _BARS[name]
+        label, colour = words.SINKS[name], _COLOURS[name]
         bars.append((label, float(run[f"energy_to_{name}_Wh"]), colour))
     bars.append(("left in motion at the end", float(run["energy_stored_Wh"]), FAINT))
     bars.append(("returned to the source", float(run["energy_returned_Wh"]), GREEN))

@@ -31,7 +31,7 @@ from sweeps.pages.figure_style import (
 )
 from sweeps.pages.time_overlay import TimeOverlay
 from sweeps.report.document import PAGE_ROWS as ROWS
-from sweeps.report.document import Column, Note, Section, Table, cell_tone
+from sweeps.report.document import SIDE_BY_SIDE, Column, Note, Section, Table, cell_tone
 from sweeps.report.markup import download_link, marked_html
 
 
@@ -233,6 +233,7 @@ def render_page(
     environment.filters |= {"marked": marked_html, "download": download_link, "tone": cell_tone}
     environment.globals |= {
         "page_rows": ROWS,
+        "side_by_side": SIDE_BY_SIDE,
         "channels": {c.name: (c.label, c.unit) for c in of_channels},
         "status_words": {name: status.short for name, status in words.STATUSES.items()},
         "settled_words": words.SETTLED,

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from calibration.sensitivity.replicates import Estimate
 from calibration.sensitivity.result import NEGLIGIBLE, NextRuns, OutputStudy, SensitivityResult
 from mmrjax.errors import count_noun
-from sweeps.pages.figure_style import BLUE, GREEN, INK, ORANGE, PURPLE, VERMILION, corner_note, new_figure
+from sweeps.pages.figure_style import BLUE, GREEN, INK, ORANGE, VERMILION, corner_note, new_figure
 from sweeps.pages.words import short_name
 
 #: Inputs that a figure shows at most, and operating points of a tornado.
@@ -71,7 +71,7 @@ def tornado_points(study: OutputStudy, found: SensitivityResult) -> list[int]:
 def draw_tornado(study: OutputStudy, found: SensitivityResult) -> Figure:
     """The output with each input alone at the ends of its 95 % interval, at a few operating points."""
     where = tornado_points(study, found)
-    unit, factor = study.row.unit, study.row.factor
+    unit, factor = study.row.unit_shown, study.row.factor
     swing, value = study.swing[:, where] / factor, study.value[where] / factor
     reach = np.nanmax(np.abs(swing - value[:, None]), 0, initial=0.0, where=np.isfinite(swing))
     relative = (reach / np.maximum(reach.max(1, keepdims=True), 1e-300)).sum(0)
@@ -115,7 +115,7 @@ def draw_indices(study: OutputStudy, found: SensitivityResult) -> Figure:
 _WORDS = {
     "first": ("alone (first order)", BLUE), "total": ("with others (total)", ORANGE),
     "lower": ("first order is at least", BLUE), "upper": ("total is at most", ORANGE),
-    "shapley": ("Shapley effect", PURPLE), "mean_absolute_effect": ("μ*, mean size of effects", GREEN),
+    "mean_absolute_effect": ("μ*, mean size of effects", GREEN),
 }  # fmt: skip
 
 
@@ -136,7 +136,7 @@ def _bars(ax: Axes, study: OutputStudy, found: SensitivityResult, top: np.ndarra
         ax.errorbar(value, at, xerr=np.maximum(ends, 0.0), fmt="none", ecolor=INK, elinewidth=0.9, capsize=1.5)
     ax.set_yticks(-np.arange(len(top)), [short_name(found.names[k]) for k in top], fontsize=8.5)
     ax.set_xlim(left=0)
-    unit = "" if study.row.unit == "-" else f" [{study.row.unit}]"
+    unit = "" if study.row.unit_shown == "-" else f" [{study.row.unit_shown}]"
     ax.set_xlabel(
         f"effect over the 95 % range{unit}" if "mean_absolute_effect" in shown else "share of the variance [-]"
     )

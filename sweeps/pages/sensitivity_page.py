@@ -10,9 +10,9 @@ import numpy as np
 
 from calibration.data.robot_file import RobotFile
 from calibration.sensitivity.result import NEGLIGIBLE, OutputStudy, SensitivityResult, interactions
+from calibration.words import sensitivity_words
 from sweeps.pages import sensitivity_figures
 from sweeps.pages.page import Album, printed_number, render_page, robot_section
-from sweeps.report.words import sensitivity_words
 
 #: Pairs of a table of interactions.
 PAIRS = 5
@@ -79,7 +79,7 @@ def _sentence(study: OutputStudy, found: SensitivityResult) -> str:
     who = ", ".join(f"{sensitivity_words.input_in_words(found, found.names[k])} {100 * share[k]:.0f} %" for k in top)
     value, sd = study.value / row.factor, study.sd / row.factor
     finite = np.isfinite(value) & np.isfinite(sd)
-    unit = "" if row.unit == "-" else f" {row.unit}"
+    unit = "" if row.unit_shown == "-" else f" {row.unit_shown}"
     digits = row.resolution
     low, high = value[finite].min(), value[finite].max()
     spans = f"from {low:.{digits}f} to {high:.{digits}f}{unit} over the operating points"
@@ -133,7 +133,7 @@ def _next_runs(found: SensitivityResult) -> dict[str, Any] | None:
     for name, sds in n.output_sd.items():
         row = found.outputs[name].row
         if np.isfinite(sds).all() and sds[0] > 0:
-            unit = "" if row.unit == "-" else f" {row.unit}"
+            unit = "" if row.unit_shown == "-" else f" {row.unit_shown}"
             before, after = sds[0] / row.factor, sds[-1] / row.factor
             outputs.append(
                 {"label": row.label, "before": f"±{_two(before)}{unit}", "after": f"±{_two(after)}{unit}",

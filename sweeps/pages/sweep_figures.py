@@ -15,21 +15,12 @@ from mmrjax.model.channels import Channel
 from sweeps.pages import words
 from sweeps.pages.figure_style import FAINT, INK, axis_label, corner_note, new_figure
 from sweeps.pages.page import printed_reading
+from sweeps.report.condition_columns import UNITS, imposed_column
 
 _PANELS = 3  # voltages drawn of a configuration
 _CELLS = 12  # along an axis up to which cells are labelled
 #: Of text in a cell, which has no part in the layout of the figure.
 _INSIDE: dict[str, Any] = {"ha": "center", "va": "center", "in_layout": False}
-
-
-#: Axis of what is imposed: its unit, and words of several.
-UNITS = {"supply_voltage_V": "V", "motor_speed_rpm": "rpm", "motor_current_A": "A"}
-PLURAL = {"supply_voltage_V": "voltages", "motor_speed_rpm": "motor speeds", "motor_current_A": "motor currents"}
-
-
-def imposed_column(runs: dict[str, np.ndarray]) -> str:
-    """Column of what is imposed in runs: conditions stand before readings."""
-    return next(column for column in runs if column in UNITS)
 
 
 def on_ground(runs: dict[str, np.ndarray]) -> bool:

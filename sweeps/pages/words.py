@@ -123,6 +123,14 @@ LOOP_VERDICTS = {
     "named": "one law of the library is established for each thing that is missing",
 }
 
+#: Names of where the energy of a mission goes, as bars have room for.
+SINKS = {
+    "battery": "cells of the battery", "other": "other consumers", "driver": "driver",
+    "winding": "windings, brushes, leads", "motor": "friction of the motors", "gearbox": "gearboxes",
+    "track": "tracks and guides", "sliding": "sliding over the ground", "rolling": "rolling resistance",
+    "lift": "lift (net of what comes back)",
+}  # fmt: skip
+
 #: Words of the pages, for docs/reference/glossary.md.
 GLOSSARY = {
     "balance": "one of the model's equations, such as volts along the motor's circuit or torque at the "

@@ -11,7 +11,7 @@ import numpy as np
 
 from mmrjax.fidelities import outputs
 from mmrjax.fidelities.variation import STATUS
-from mmrjax.model import channels
+from mmrjax.model import channels, quantities
 from mmrjax.model.power import COULOMB_PER_MAH
 from mmrjax.model.signals import FLAGS, STATUSES
 from sweeps.points.zarr_store import STORE, Layout
@@ -24,7 +24,7 @@ COLUMNS = {
     "payload": ("payload_kg", 1.0),
     "load_torque": ("load_torque_Nm", 1.0),
     "total_mass": ("total_mass_kg", 1.0),
-    "motor_speed": ("motor_speed_rpm", channels.RPM),
+    "motor_speed": ("motor_speed_rpm", quantities.RPM),
     "motor_current": ("motor_current_A", 1.0),
     "discharge": ("discharge_mAh", COULOMB_PER_MAH),
 }

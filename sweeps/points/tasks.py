@@ -72,7 +72,7 @@ def of_fidelity(
         fidelities.get_fidelity(model).columns,
         channels.channel_names(robot.channels),
     )
-    rows: dict[str, tuple[str, str]] = {r.name: (r.unit, r.label) for r in outputs.output_table(robot.channels)}
+    rows: dict[str, tuple[str, str]] = {r.name: (r.unit_shown, r.label) for r in outputs.output_table(robot.channels)}
     rows |= {name: ("", name.replace("_", " ")) for name in own}
     if profiled:
         from mmrjax.missions import mission_batch  # which imports an integrator

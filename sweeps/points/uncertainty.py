@@ -15,7 +15,7 @@ from mmrjax.model.channels import Channel
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import DONE
 from sweeps.config import FidelityPart
-from sweeps.console import print_output, progress_bar
+from sweeps.console import progress_bar
 from sweeps.points import run
 from sweeps.points.sampled_design import Drawn
 from sweeps.store import RunFolder
@@ -91,31 +91,31 @@ def _summary(columns: dict[str, np.ndarray], counts: np.ndarray) -> dict[str, np
     return {**found, SHARE: counts.mean(1)}
 
 
-def say_intervals(table: dict[str, np.ndarray], found: Intervals) -> None:
-    """The range of every channel over the runs, each end with its sd; and how many draws do not converge."""
+def interval_ranges(table: dict[str, np.ndarray], found: Intervals) -> list[str]:
+    """Range of every channel over the runs, each end with its sd; and how many draws do not converge."""
     first = found.channels[0].column
     finite = np.isfinite(found.sd(first)) & np.isfinite(table[first])
-    if finite.any():
-        print_output(f"± one sd over {found.draws} robots drawn from the posterior; 95 % intervals are in the table")
-    for c in found.channels:
-        value, sd = table[c.column], found.sd(c.column)
-        if finite.any():
-            rows = np.flatnonzero(finite)
-            least, most = rows[np.argmin(value[rows])], rows[np.argmax(value[rows])]
-            ends = [with_sd(value[k], sd[k], c.resolution) for k in dict.fromkeys((int(least), int(most)))]
-            print_output(f"{c.label}: {' to '.join(ends)} {c.unit}")
-    say_lost(found)
+    ranges = []
+    for c in found.channels if finite.any() else ():
+        value, sd, rows = table[c.column], found.sd(c.column), np.flatnonzero(finite)
+        least, most = rows[np.argmin(value[rows])], rows[np.argmax(value[rows])]
+        ends = [with_sd(value[k], sd[k], c.resolution) for k in dict.fromkeys((int(least), int(most)))]
+        ranges.append(f"{c.label}: {' to '.join(ends)} {c.unit}")
+    drawn, *lost = interval_remarks(found, "the table")
+    return [*[drawn] * bool(ranges), *ranges, *lost]
 
 
-def say_lost(found: Intervals) -> None:
-    """At how many runs how many draws do not converge, where some do not."""
+def interval_remarks(found: Intervals, place: str = "runs.csv") -> list[str]:
+    """Number of robots that were drawn, and how many of them do not converge at how many runs, if some do not."""
     lost = found.columns[SHARE] < 1
+    remarks = [f"± one sd over {found.draws} robots drawn from the posterior; 95 % intervals are in {place}"]
     if lost.any():
         share = 100 * (1 - found.columns[SHARE].min())
-        print_output(
+        remarks.append(
             f"at {int(lost.sum())} of {len(lost)} runs up to {share:.0f} % of the draws do not converge; intervals "
             "are from the others"
         )
+    return remarks
 
 
 def with_sd(value: float, sd: float, most: int) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from calibration.data.input_errors import three_digits
 from calibration.sizing.sheet import Change, Outcome
 from mmrjax.model.paper_tables import COULOMB_PER_MAH
-from sweeps.report.document import Block, Cell, Column, Document, Figure, Note, Section, Table, deferred_drawing
+from sweeps.report.document import Block, Cell, Document, Figure, Note, Section, Table, columns, deferred_figure
 from sweeps.results.check_results import (
     CheckResult,
     reached_value_text,
@@ -43,22 +43,17 @@ _CHANGES = (
 def check_document(found: CheckResult, robot_name: str, changes: bool = True) -> Document:
     """The report; `changes`: True where changes were searched for."""
     lead = f"Robot: **{robot_name}**. Requirements: **{found.asked.source}**."
-    margins = Figure("margins", found.statement(), _MARGINS, deferred_drawing("check_figures.draw_margins", found))
-    sections = [
-        Section("Requirements", (Note(_CORNERS, terminal=False), requirements_sheet(found.outcomes)), "sheet")
-    ]
+    margins = deferred_figure("margins", found.statement(), _MARGINS, "check_figures.draw_margins", found)
+    sections = [Section("Requirements", (Note(_CORNERS), requirements_sheet(found.outcomes)), "sheet")]
     if changes and found.missed:
         sections.append(Section("Changes that would meet them", _changes(found), "changes"))
-    blocks: tuple[Block, ...] = (Note(lead, "lead", terminal=False), margins, *_postures(found))
+    blocks: tuple[Block, ...] = (Note(lead, "lead"), margins, *_postures(found))
     return Document("Requirements", found.statement(), blocks, tuple(sections))
 
 
 def requirements_sheet(outcomes: Sequence[Outcome], terminal: bool = True) -> Table:
     """Requirements with required and reached values, margins and worst corners."""
-    columns = (
-        Column(""), Column("requirement"), *(Column(name, form="{}") for name in ("required", "value", "margin")),
-        Column("worst corner"), Column("on", terminal=False), Column("source", terminal=False),
-    )  # fmt: skip
+    heads = columns("", "requirement", "required |", "value |", "margin |", "worst corner", "~on", "~source")
     rows = [
         (
             Cell(*(("met", "good") if o.met else ("missed", "bad"))), requirement_label(o),
@@ -67,7 +62,7 @@ def requirements_sheet(outcomes: Sequence[Outcome], terminal: bool = True) -> Ta
         )
         for o in outcomes
     ]  # fmt: skip
-    return Table("requirements", columns, rows, terminal=terminal)
+    return Table("requirements", heads, rows, terminal=terminal)
 
 
 def _postures(found: CheckResult) -> tuple[Figure, ...]:
@@ -76,15 +71,14 @@ def _postures(found: CheckResult) -> tuple[Figure, ...]:
     names = ", ".join(
         f"{requirement_label(o)} {reached_value_text(o)}" for o in found.outcomes if o.requirement.name in found.drawn
     )
-    draw = deferred_drawing("posture_figures.asked_about", found.drawn)
-    return (Figure("postures", f"The robot from the side: {names}", _POSTURES, draw),)
+    title = f"The robot from the side: {names}"
+    return (deferred_figure("postures", title, _POSTURES, "posture_figures.asked_about", found.drawn),)
 
 
 def _changes(found: CheckResult) -> tuple[Note | Table, ...]:
-    columns = (
-        Column("requirement"), Column("parameter"), Column("now", form="{:.4g}"), Column("needed", form="{:.6g}"),
-        Column("unit"), Column("change", "%", "{:+.1f}"), Column("would then be missed"),
-    )  # fmt: skip
+    heads = columns(
+        "requirement", "parameter", "now | .4g", "needed | .6g", "unit", "change [%] | +.1f", "would then be missed"
+    )
     rows: list[tuple[object, ...]] = []
     brief: list[int] = []
     for o in found.missed:
@@ -95,9 +89,9 @@ def _changes(found: CheckResult) -> tuple[Note | Table, ...]:
     title = f"changes of one parameter that would meet them{more}"
     none = f"No change of one parameter within its bounds meets {', '.join(hopeless)}."
     return (
-        Note(_CHANGES, terminal=False),
-        Table("change", columns, rows, title, brief=brief),
-        *([Note(none)] if hopeless else []),
+        Note(_CHANGES),
+        Table("change", heads, rows, title, brief=brief),
+        *([Note(none, terminal=True)] if hopeless else []),
     )  # fmt: skip
 
 

@@ -10,7 +10,18 @@ import numpy as np
 from mmrjax.errors import count_noun
 from sweeps.pages import words
 from sweeps.report.condition_columns import condition_formats
-from sweeps.report.document import Cell, Column, Document, Figure, Note, Section, Table, deferred_drawing, is_missing
+from sweeps.report.document import (
+    Cell,
+    Column,
+    Document,
+    Note,
+    Section,
+    Table,
+    columns,
+    deferred_figure,
+    is_missing,
+    remarks,
+)  # fmt: skip
 from sweeps.results.comparison_results import Comparison
 
 _FITS = {
@@ -35,27 +46,27 @@ def comparison_document(found: Comparison) -> Document:
         f"Robot: **{found.robot_name}**. Fidelity: **{found.model}**. Measured: **{found.source}**, "
         f"{count_noun(len(found.table['status']), 'row')}."
     )
-    draw = deferred_drawing("comparison_figures.errors_over", *known, in_units=True, beside=found.over)
-    parity = Figure(
-        "parity", _bias(found), _PARITY, deferred_drawing("comparison_figures.draw_parity", *known, band=False)
-    )
-    errors = Figure(
+    parity = deferred_figure("parity", _bias(found), _PARITY, "comparison_figures.draw_parity", *known, band=False)
+    errors = deferred_figure(
         "errors",
         _trend(found),
         "**Errors.** A trend along a condition points at what the model lacks. Band: ±2 standard deviations of the "
         "readings, where they are known.",
-        draw,
+        "comparison_figures.errors_over",
+        *known,
+        in_units=True,
+        beside=found.over,
     )
     return Document(
         f"{found.robot_name} against {found.source}",
         comparison_answer(found),
         (
-            Note(lead, "lead", terminal=False),
-            *(Note(text, "warn") for text in _unsolved(found)),
+            Note(lead, "lead"),
+            *(Note(text, "warn", terminal=True) for text in _unsolved(found)),
             _summary(found),
             *([_both_robots(found)] if found.against else []),
-            Note(_ERRORS, "key"),
-            *([Note(found.notes, name="notes")] if found.notes else []),
+            Note(_ERRORS, "key", terminal=True),
+            *remarks(found.notes),
         ),
         (
             *_over_time(found),
@@ -77,8 +88,10 @@ def _over_time(found: Comparison) -> tuple[Section, ...]:
     lines = {"simulated_": found.robot_name, "against_": found.against}
     if not found.against:
         lines = {"simulated_": "simulated"}
-    draw = deferred_drawing("time_overlay.time_overlay", found.table, found.channels, lines)
-    return (Section("Over time", (Figure("overlay", comparison_answer(found), caption, draw),)),)
+    overlay = deferred_figure(
+        "overlay", comparison_answer(found), caption, "time_overlay.time_overlay", found.table, found.channels, lines
+    )
+    return (Section("Over time", (overlay,)),)
 
 
 def comparison_answer(found: Comparison) -> str:
@@ -109,11 +122,9 @@ def _second_robot(found: Comparison) -> str:
 
 
 def _both_robots(found: Comparison) -> Table:
-    columns = (
-        Column("channel"), Column("rows of both", form="{}"), Column(f"rms error, {found.robot_name}", "%", "{:.1f}"),
-        Column(f"rms error, {found.against}", "%", "{:.1f}"),
-    )  # fmt: skip
-    return Table("robots", columns, [(c.label, *found.rms_of_both[c.name]) for c in found.channels])
+    both = (f"rms error, {name} [%] | .1f" for name in (found.robot_name, found.against))
+    heads = columns("channel", "rows of both |", *both)
+    return Table("robots", heads, [(c.label, *found.rms_of_both[c.name]) for c in found.channels])
 
 
 def _seconds(found: Comparison) -> float:
@@ -134,32 +145,31 @@ def _unsolved(found: Comparison) -> list[str]:
 
 
 def _summary(found: Comparison) -> Table:
-    columns = (
-        Column("rows of"), Column("channel"), Column("rows", form="{}"), Column("rms error", form="{}"),
-        Column("rms error", "%", "{:.1f}"), Column("worst", "%", "{:.1f}"), Column("R²", form="{:.3f}"),
-    )  # fmt: skip
+    heads = columns(
+        "rows of", "channel", "rows |", "rms error |", "rms error [%] | .1f", "worst [%] | .1f", "R² | .3f"
+    )
     rows = []
     for group, by_channel in found.summary.items():
         for c in found.channels:
             e = by_channel[c.name]
             rms = None if is_missing(e["rms"]) else f"{e['rms']:.{c.resolution}f} {c.unit}"
             rows.append((group, c.label, e["rows"], rms, e["rms_percent"], e["max_percent"], e["r2"]))
-    return Table("errors", columns, rows)
+    return Table("errors", heads, rows)
 
 
 def _rows(found: Comparison) -> Table:
     table, shown = found.table, condition_formats(found.table, mass=True)
-    columns = [Column("configuration"), *(Column(heading, form=form) for heading, form in shown.values())]
-    columns.append(Column("status"))
+    heads = [Column("configuration"), *(Column(heading, form=form) for heading, form in shown.values())]
+    heads.append(Column("status"))
     cells: list[Any] = [table["configuration"], *(table[c] for c in shown)]
     cells.append([_status(str(s)) for s in table["status"]])
     for c in found.channels:
         measured, simulated = table[c.column], table[f"simulated_{c.column}"]
         form = f"{{:.{max(c.resolution - 1, 0)}f}}"
-        columns += [Column(name, c.unit, form, c.label, terminal=False) for name in ("measured", "simulated")]
-        columns.append(Column("error", c.unit, f"{{:+.{c.resolution}f}}", c.label))
+        heads += [Column(name, c.unit, form, c.label, terminal=False) for name in ("measured", "simulated")]
+        heads.append(Column("error", c.unit, f"{{:+.{c.resolution}f}}", c.label))
         cells += [measured, simulated, simulated - measured]
-    return Table("rowtable", tuple(columns), list(zip(*cells, strict=True)), file="comparison.csv", wide=True)
+    return Table("rowtable", tuple(heads), list(zip(*cells, strict=True)), file="comparison.csv", wide=True)
 
 
 def _status(status: str) -> Cell:

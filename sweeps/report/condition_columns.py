@@ -2,10 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from mmrjax.model import channels
 from mmrjax.model.quantities import SET, Condition
+
+#: Units of what may be imposed on a run, by column.
+UNITS = {"supply_voltage_V": "V", "motor_speed_rpm": "rpm", "motor_current_A": "A"}
+
+
+def imposed_column(runs: Iterable[str]) -> str:
+    """Column of what is imposed in runs: conditions come before readings."""
+    return next(column for column in runs if column in UNITS)
 
 
 def _column(condition: Condition) -> str:

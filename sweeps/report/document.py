@@ -11,7 +11,7 @@ import importlib
 import io
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -20,6 +20,8 @@ import numpy as np
 PAGE_ROWS, TERMINAL_ROWS = 200, 60
 #: Entry of a table for a missing number.
 DASH = "–"
+#: Most rows that are shown side by side.
+SIDE_BY_SIDE = 6
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,7 +37,7 @@ class Note:
     text: str | tuple[str, ...]
     kind: str = ""
     name: str = ""
-    terminal: bool = True
+    terminal: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,9 +75,28 @@ class Column:
         return str(value)
 
 
+def columns(*titles: str) -> tuple[Column, ...]:
+    """Columns from titles such as `speed > error [%] | +.1f`: heading in a group, unit, and format of numbers.
+
+    Without ` | ` a column has text, with nothing behind it texts of numbers; `~` marks a column for the page only.
+    """
+    found = []
+    for title in titles:
+        name, bar, form = title.removeprefix("~").partition(" |")
+        group, _, heading = name.rpartition(" > ")
+        heading, _, unit = heading.removesuffix("]").partition(" [")
+        form = form.strip()
+        form = form if "{" in form or not bar else f"{{:{form}}}"
+        found.append(Column(heading, unit, form, group, not title.startswith("~")))
+    return tuple(found)
+
+
 @dataclasses.dataclass(frozen=True)
 class Cell:
-    """A value with a tone: `good`, `fair`, `bad` or `slides`, shown as a colour on the page."""
+    """A value with a tone, shown as a colour on the page: `good`, `fair`, `bad`, `slides` or `none`.
+
+    A number with the tone `bar` or `over` is a share [%] and has a bar.
+    """
 
     value: Any
     tone: str = ""
@@ -90,6 +111,7 @@ class Table:
         title: for the terminal; file: of the run folder with all rows, named where the table is cut.
         wide: True for small print on the page; terminal: True if the terminal shows it too.
         brief: numbers of the rows that the terminal shows; None for all.
+        sideways: True if a few rows are shown side by side, each under the text of its first cell.
     """
 
     name: str
@@ -100,6 +122,21 @@ class Table:
     wide: bool = False
     terminal: bool = True
     brief: Sequence[int] | None = None
+    sideways: bool = False
+
+    @property
+    def turned(self) -> Table:
+        """The first rows side by side, if the table is `sideways`; else the table itself."""
+        if not self.sideways:
+            return self
+        first, *others = self.columns
+        rows = self.rows[:SIDE_BY_SIDE]
+        heads = (Column(""), *(Column(first.text(row[0]), form="{}") for row in rows))
+        turned = [
+            (column.title, *(Cell(column.text(row[k]), cell_tone(row[k])) for row in rows))
+            for k, column in enumerate(others, 1)
+        ]
+        return dataclasses.replace(self, columns=heads, rows=turned, sideways=False)
 
     @property
     def groups(self) -> list[tuple[str, int]]:
@@ -144,11 +181,16 @@ Block = Note | Table | Figure
 
 @dataclasses.dataclass(frozen=True)
 class Section:
-    """Blocks under a heading; `name`: of the heading's element."""
+    """Blocks under a heading; `name`: of the heading's element; `level`: of the heading.
+
+    `folded`: words of a line that unfolds them, if they are hidden.
+    """
 
     heading: str
     blocks: tuple[Block, ...]
     name: str = ""
+    level: int = 2
+    folded: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -157,17 +199,18 @@ class Document:
 
     Attributes:
         title: of the page; answer: the result in a sentence or two; blocks: what follows it before the first heading.
-        sections: the rest, in order.
+        sections: the rest, in order; page_sections: makes those that only the page has, before them.
     """
 
     title: str
     answer: str
     blocks: tuple[Block, ...]
-    sections: tuple[Section, ...]
+    sections: tuple[Section, ...] = ()
+    page_sections: Callable[[], Iterable[Section]] = tuple
 
     @property
     def every_block(self) -> list[Block]:
-        """All blocks in the order of the page."""
+        """All blocks in order, without those of `page_sections`."""
         return [*self.blocks, *(block for section in self.sections for block in section.blocks)]
 
 
@@ -181,13 +224,23 @@ def is_missing(value: Any) -> bool:
     return value is None or (isinstance(value, float | np.floating) and not math.isfinite(value))
 
 
-def deferred_drawing(name: str, *known: Any, **options: Any) -> Callable[[], Any]:
-    """A function that draws `module.function` of `sweeps/pages`, imported when it is called.
+def remarks(texts: Iterable[str], name: str = "notes") -> tuple[Note, ...]:
+    """A list of remarks for page and terminal, if there are any."""
+    items = tuple(texts)
+    return (Note(items, name=name, terminal=True),) if items else ()
+
+
+def deferred_figure(name: str, alternative: str, caption: str, drawing: str, *known: Any, **options: Any) -> Figure:
+    """A figure that `module.function` of `sweeps/pages` draws, imported when it is drawn.
 
     matplotlib costs half a second, which a command without a page saves.
     """
-    module, _, function = name.partition(".")
-    return lambda: getattr(importlib.import_module(f"sweeps.pages.{module}"), function)(*known, **options)
+    module, _, function = drawing.partition(".")
+
+    def draw() -> Any:
+        return getattr(importlib.import_module(f"sweeps.pages.{module}"), function)(*known, **options)
+
+    return Figure(name, alternative, caption, draw)
 
 
 def plain_text(text: str) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from mmrjax.model import channels
 from sweeps.export.comparison import APPROXIMATED, DROPPED, HELD
 from sweeps.export.formats import Export
-from sweeps.report.document import Cell, Column, Document, Figure, Note, Section, Table, deferred_drawing
+from sweeps.report.document import Cell, Document, Note, Section, Table, columns, deferred_figure, remarks
 from sweeps.report.words import export_words as words
 
 #: Tone of a verdict's cell.
@@ -24,23 +24,20 @@ def export_document(found: Export) -> Document:
     compared = found.comparison
     used = words.USE[found.format].format(name=found.joint.name, at="drive", armature=words.rotor_inertia(found))
     fates = Table(
-        "fates", (Column("term or effect"), Column("verdict"), Column("kept", "%", "{:.0f}"), Column("how")),
+        "fates", columns("term or effect", "verdict", "kept [%] | .0f", "how"),
         [(f.name, Cell(f.verdict, TONES[f.verdict]), 100 * f.kept, f.how) for f in compared.fates],
         "what the format holds",
     )  # fmt: skip
-    readings = Figure(
-        "readings",
-        words.export_statement(found),
-        _RUNS,
-        deferred_drawing("export_figures.draw_export_readings", compared),
+    readings = deferred_figure(
+        "readings", words.export_statement(found), _RUNS, "export_figures.draw_export_readings", compared
     )
     sections = [
-        Section("What the format holds", (fates, Note(_KEPT, "key", terminal=False)), "holds"),
+        Section("What the format holds", (fates, Note(_KEPT, "key")), "holds"),
         Section(
             "Errors",
             (
                 _errors(found),
-                Note(_RIM.format(words.errors_title(found).capitalize()), "key", terminal=False),
+                Note(_RIM.format(words.errors_title(found).capitalize()), "key"),
                 readings,
             ),
             "errors",
@@ -48,36 +45,33 @@ def export_document(found: Export) -> Document:
     ]
     if compared.refitted:
         fitted = [(n, compared.translated[n], v) for n, v in compared.refitted.items()]
-        columns = (Column("name"), Column("translated", form="{:.6g}"), Column("refitted", form="{:.6g}"))
-        table = Table("fitted", columns, fitted, "parameters of the format", terminal=False)
-        sections.append(Section("Parameters of the format", (table, Note(_FITTED, "key", terminal=False))))
+        heads = columns("name", "translated | .6g", "refitted | .6g")
+        table = Table("fitted", heads, fitted, "parameters of the format", terminal=False)
+        sections.append(Section("Parameters of the format", (table, Note(_FITTED, "key"))))
     if found.checks:
-        shown = (Column("check"), Column("value", form="{:.3g}"))
-        checks = Table("checks", shown, list(found.checks.items()), "checks of the files")
+        heads = columns("check", "value | .3g")
+        checks = Table("checks", heads, list(found.checks.items()), "checks of the files")
         sections.append(Section("Checks of the files", (checks,)))
     conditions = (
-        Note(tuple(words.conditions_seen(found)), name="seen", terminal=False),
-        Note(tuple(words.not_tested(found)), name="untested", terminal=False),
+        Note(tuple(words.conditions_seen(found)), name="seen"),
+        Note(tuple(words.not_tested(found)), name="untested"),
     )
     return Document(
         f"{found.joint.file.name} for {found.format}",
         words.export_statement(found),
-        (Note(used, "lead", terminal=False), Note(tuple(words.export_remarks(found)), name="notes")),
+        (Note(used, "lead"), *remarks(words.export_remarks(found))),
         (*sections, _constants(found), Section("Conditions seen, and what was not tested", conditions)),
     )
 
 
 def _errors(found: Export) -> Table:
     names = list(found.comparison.errors[0].percent)
-    columns = (Column("model"), *(Column(channels.find_channel(n).label, "%", "{:.3g}") for n in names))
+    heads = columns("model", *(f"{channels.find_channel(n).label} [%] | .3g" for n in names))
     rows = [(e.label, *(e.percent[n] for n in names)) for e in found.comparison.errors]
-    return Table("error-table", columns, rows, words.errors_title(found))
+    return Table("error-table", heads, rows, words.errors_title(found))
 
 
 def _constants(found: Export) -> Section:
-    columns = (
-        Column("name"), Column("value", form="{:.6g}"), Column("unit"), Column("interval"), Column("meaning"),
-        Column("source"),
-    )  # fmt: skip
+    heads = columns("name", "value | .6g", "unit", "interval", "meaning", "source")
     rows = [(f"`{c.name}`", c.value, c.unit, c.interval or None, c.meaning, c.source) for c in found.constants]
-    return Section("Constants", (Table("constants", columns, rows, wide=True, terminal=False),))
+    return Section("Constants", (Table("constants", heads, rows, wide=True, terminal=False),))

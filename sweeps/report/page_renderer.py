@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ def write_report_page(folder: Path, document: Document, file: RobotFile | None =
         file: of the robot that the page is about: its parameters are the last section.
     """
     album = Album(folder)
+    document = dataclasses.replace(document, sections=(*document.page_sections(), *document.sections))
     for block in document.every_block:
         if isinstance(block, Figure):
             album.add(block.name, block.draw)

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from calibration.data.settling import Settled, Stretch
-from sweeps.report.document import Column, Document, Figure, Note, Section, Table, deferred_drawing
-from sweeps.report.words import settle_words as words
+from calibration.words import settle_words as words
+from sweeps.report.document import Document, Note, Section, Table, columns, deferred_figure, remarks
 
 #: Imposed quantity of a log and its unit.
 IMPOSED = {
@@ -24,37 +24,31 @@ _SDS = (
 
 def settle_document(found: Settled, few: str = "", notes: tuple[str, ...] = ()) -> Document:
     """The report; `few`: sentence of `words.too_few`; notes: further sentences on the settled runs."""
-    next_step = Note("Next: `mmrjax loop settled.csv` with the same `--robot`.", "lead", terminal=False)
-    next_step = Note(few, "lead", "few") if few else next_step
-    remarks = (*words.settle_remarks(found), *notes)
+    next_step = Note("Next: `mmrjax loop settled.csv` with the same `--robot`.", "lead")
+    next_step = Note(few, "lead", "few", terminal=True) if few else next_step
+    said = (*words.settle_remarks(found), *notes)
     left = words.left_out(found.stretches, bool(few))
-    columns = (
-        Column("reason"), Column("stretches", form="{}"), Column("samples", form="{}"),
-        Column("rows, for example", form="{}"), Column("what to do"),
-    )  # fmt: skip
-    log = Figure("log", words.settle_statement(found), _LOG, deferred_drawing("settle_figures.over_log", found))
+    heads = columns("reason", "stretches |", "samples |", "rows, for example |", "what to do")
+    log = deferred_figure("log", words.settle_statement(found), _LOG, "settle_figures.over_log", found)
     sections = [Section("Over the log", (log,))]
     if left:
-        sections.append(Section("Left out", (Table("left", columns, left, "left out"),)))
-    levels = Note(words.levels_and_samples(found), "key", terminal=False)
-    settled = Section("Settled runs", (_settled(found), levels, Note(_SDS, "key", terminal=False)))
+        sections.append(Section("Left out", (Table("left", heads, left, "left out"),)))
+    levels = Note(words.levels_and_samples(found), "key")
+    settled = Section("Settled runs", (_settled(found), levels, Note(_SDS, "key")))
     return Document(
         f"Settled runs of {Path(found.runs.source).name}",
         words.settle_statement(found),
-        (next_step, *([Note(remarks, name="notes")] if remarks else [])),
+        (next_step, *remarks(said)),
         (*sections, settled),
     )
 
 
 def _settled(found: Settled) -> Table:
     imposed, unit = IMPOSED[found.runs.layout.imposed]
-    columns = [
-        Column("where"), Column("samples used", form="{}"), Column("of the level", form="{}"),
-        Column(imposed, unit, "{:.4g}"),
-    ]  # fmt: skip
+    titles = ["where", "samples used |", "of the level |", f"{imposed} [{unit}] | .4g"]
     for signal in found.signals:
         c = signal.channel
-        columns += [Column("mean", c.unit, "{:.5g}", c.label), Column("±", c.unit, "{:.2g}", c.label)]
+        titles += [f"{c.label} > mean [{c.unit}] | .5g", f"{c.label} > ± [{c.unit}] | .2g"]
     rows = [
         (
             f"{s.run or 'log'}, {s.begin:.4g} to {s.end:.4g} s", len(s.rows), available, s.imposed,
@@ -62,7 +56,7 @@ def _settled(found: Settled) -> Table:
         )
         for s, available in _levels(found)
     ]  # fmt: skip
-    return Table("settled", tuple(columns), rows, file="settled.csv", wide=True, terminal=False)
+    return Table("settled", columns(*titles), rows, file="settled.csv", wide=True, terminal=False)
 
 
 def _levels(found: Settled) -> Iterator[tuple[Stretch, int]]:

@@ -12,15 +12,13 @@ from calibration.sizing.design import OBJECTIVES
 from calibration.sizing.design_search import SizedDesign
 from mmrjax.errors import count_noun
 from sweeps.report.check_report import requirements_sheet
-from sweeps.report.document import Cell, Column, Document, Figure, Note, Section, Table, deferred_drawing
+from sweeps.report.document import Cell, Document, Figure, Note, Section, Table, columns, deferred_figure
 from sweeps.results.size_results import SizeResult, design_verdict, missed_limits, objective_text
 
 _HEADINGS = {"mass": "mass", "energy": "energy", "cost": "price of motors and gearboxes"}
-COLUMNS = (
-    Column(""), Column("motor"), Column("gearbox"), Column("total ratio", form="{:.4g}"),
-    Column("radius", "mm", "{:.1f}"), Column("cells"),
-    *(Column(_HEADINGS[name], unit, "{:.4g}") for name, (unit, _) in OBJECTIVES.items()),
-    Column("binding limits, or misses"),
+COLUMNS = columns(
+    "", "motor", "gearbox", "total ratio | .4g", "radius [mm] | .1f", "cells",
+    *(f"{_HEADINGS[name]} [{unit}] | .4g" for name, (unit, _) in OBJECTIVES.items()), "binding limits, or misses",
 )  # fmt: skip
 
 
@@ -52,10 +50,10 @@ def size_document(found: SizeResult, robot_name: str) -> Document:
     return Document(
         "Sizing",
         found.statement(),
-        (Note(lead, "lead", terminal=False), *_limits(found, robot_name), *_front(found)),
+        (Note(lead, "lead"), *_limits(found, robot_name), *_front(found)),
         (
-            Section("Designs", (Note(about, terminal=False), *tables), "designs"),
-            Section("Every motor", (Note(_MOTORS, terminal=False), motors), "motors"),
+            Section("Designs", (Note(about), *tables), "designs"),
+            Section("Every motor", (Note(_MOTORS), motors), "motors"),
         ),
     )
 
@@ -83,9 +81,7 @@ def _limits(found: SizeResult, robot_name: str) -> tuple[Figure, ...]:
     names = [] if best is None else [f"best: {best.drive.motor.name}, ratio {best.ratio:.4g}"]
     charts = dict(zip([*names, f"as it is: {robot_name}"], found.charts, strict=True))
     alternative = "; ".join(f"{name}: {_reach(c)}" for name, c in charts.items())
-    return (
-        Figure("limits", alternative, _LIMITS, deferred_drawing("size_figures.draw_nearest_limits", found, charts)),
-    )
+    return (deferred_figure("limits", alternative, _LIMITS, "size_figures.draw_nearest_limits", found, charts),)
 
 
 def _reach(c: Chart) -> str:
@@ -105,6 +101,6 @@ def _front(found: SizeResult) -> tuple[Figure | Note, ...]:
         f"{objective_text(front[0], first)} to {objective_text(front[-1], second)}"
     )
     return (
-        Note(f"{text}."),
-        Figure("front", text, _FRONT, deferred_drawing("size_figures.draw_pareto_front", found)),
+        Note(f"{text}.", terminal=True),
+        deferred_figure("front", text, _FRONT, "size_figures.draw_pareto_front", found),
     )

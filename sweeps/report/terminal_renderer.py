@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
-
 import rich.table
 from rich.text import Text
 
 from sweeps.console import print_output
-from sweeps.report.document import TERMINAL_ROWS, Document, Note, Table, cell_tone, plain_text
+from sweeps.report.document import SIDE_BY_SIDE, TERMINAL_ROWS, Document, Note, Table, cell_tone, plain_text
 
 #: Styles of cells by tone.
 TONES = {"bad": "red"}
@@ -24,21 +21,25 @@ def print_document(document: Document) -> None:
             for item in items:
                 print_output(plain_text(item))
         elif isinstance(block, Table) and block.terminal and block.rows:
-            rows = block.rows if block.brief is None else [block.rows[k] for k in block.brief]
-            print_output(
-                as_rich(block, rows) if len(rows) <= TERMINAL_ROWS else f"{len(rows):,} rows: see {block.file}"
-            )
+            print_table(block)
 
 
-def as_rich(table: Table, rows: Sequence[Sequence[Any]]) -> rich.table.Table:
-    """Some rows of a table for rich, without the columns that only the page has room for."""
-    shown = rich.table.Table(title=table.title or None, title_justify="left", box=None, pad_edge=False)
-    kept = [k for k, column in enumerate(table.columns) if column.terminal]
+def print_table(table: Table) -> None:
+    """Print a table for a person, without the columns and rows that only the page has room for."""
+    shown = table.turned
+    rows = shown.rows if shown.brief is None else [shown.rows[k] for k in shown.brief]
+    if len(rows) > TERMINAL_ROWS:
+        print_output(f"{len(rows):,} rows: see {table.file}")
+        return
+    printed = rich.table.Table(title=table.title or None, title_justify="left", box=None, pad_edge=False)
+    kept = [k for k, column in enumerate(shown.columns) if column.terminal]
     for k in kept:
-        column = table.columns[k]
-        shown.add_column(plain_text(column.full_title), justify="right" if column.form else "left")
+        column = shown.columns[k]
+        printed.add_column(plain_text(column.full_title), justify="right" if column.form else "left")
     for row in rows:
-        shown.add_row(
-            *(Text(plain_text(table.columns[k].text(row[k])), TONES.get(cell_tone(row[k]), "")) for k in kept)
+        printed.add_row(
+            *(Text(plain_text(shown.columns[k].text(row[k])), TONES.get(cell_tone(row[k]), "")) for k in kept)
         )
-    return shown
+    print_output(printed)
+    if table.sideways and len(table.rows) > SIDE_BY_SIDE:
+        print_output(f"... and {len(table.rows) - SIDE_BY_SIDE} more in {table.file}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -11,12 +12,25 @@ import numpy as np
 
 from calibration.data import input_files
 from calibration.data.input_errors import BadData
-from calibration.data.sources.recorded_signals import Signal, of_arrays, parent_path, path_parts, values_in_memory
+from calibration.data.sources.recorded_signals import (
+    Signal,
+    encodable_text,
+    of_arrays,
+    parent_path,
+    path_parts,
+    unit_of_clock,
+    values_in_memory,
+)
 
 #: Largest JSON file [bytes]: its objects take some ten times as much memory; most levels within one another.
 LARGEST, DEEPEST = 2**28, 16
 #: Column with the test of each row, if a file has several tables with the same columns.
 RUN = "run_id"
+#: Keys that state the sampling of episodes: rates [Hz] and steps [s], with the power that makes a step of them.
+RATES = {
+    **dict.fromkeys(("rate_hz", "sample_rate_hz", "sampling_rate_hz", "frequency_hz", "fps", "fs"), -1),
+    **dict.fromkeys(("dt", "dt_s", "step_s", "time_step_s", "sample_time_s"), 1),
+}
 
 
 def of_json(path: Path, name: str) -> tuple[Signal, ...]:
@@ -29,16 +43,29 @@ def of_json(path: Path, name: str) -> tuple[Signal, ...]:
     try:
         text = content.decode("utf-8-sig")
         try:
-            found = json.loads(text)
+            found = json.loads(text, object_pairs_hook=_object)
         except json.JSONDecodeError:
             lines = [line for line in text.splitlines() if line.strip()]
             if len(lines) < 2 or not lines[0].rstrip().endswith("}"):
                 raise
-            found = [json.loads(line) for line in lines]
+            found = [json.loads(line, object_pairs_hook=_object) for line in lines]
     except (ValueError, RecursionError) as error:
         why = "nested too deep" if isinstance(error, RecursionError) else error
         raise BadData(f"{name}: cannot be read as JSON ({why}); it may be cut off; export it again") from error
     return of_content(found, name)
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object of JSON.
+
+    Raises:
+        ValueError: a key is there twice.
+    """
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        twice = next(key for key, count in collections.Counter(key for key, _ in pairs).items() if count > 1)
+        raise ValueError(f"an object has the key {encodable_text(twice)} twice")
+    return found
 
 
 def of_content(content: Any, name: str) -> tuple[Signal, ...]:
@@ -49,13 +76,13 @@ def of_content(content: Any, name: str) -> tuple[Signal, ...]:
     """
     arrays: dict[str, Any] = {}
     _collect(content, "", arrays, name, 1)
-    arrays = _stacked({at: values for at, values in arrays.items() if len(values)})
+    arrays = _stacked({at: values for at, values in arrays.items() if values.size})
     if not arrays:
         raise BadData(
             f"{name}: holds no list of records and no arrays; expected "
             '[{"time_s": 0.0, ...}, ...] or {"time_s": [...], ...}'
         )
-    return of_arrays({at: (v.shape, v.dtype, values_in_memory(v)) for at, v in arrays.items()})
+    return of_arrays(name, {at: (v.shape, v.dtype, values_in_memory(v)) for at, v in arrays.items()})
 
 
 def _collect(value: Any, at: str, arrays: dict[str, np.ndarray], name: str, depth: int) -> None:
@@ -68,13 +95,30 @@ def _collect(value: Any, at: str, arrays: dict[str, np.ndarray], name: str, dept
             return
         for key, inner in value.items():
             _collect(inner, f"{at}.{key}" if at else str(key), arrays, name, depth + 1)
+        _add_time(value, at, arrays)
     elif isinstance(value, Sequence) and not isinstance(value, str | bytes):
         if value and all(isinstance(each, Mapping) for each in value):
             _records(value, at, arrays, name)
         elif value:
             arrays[at or "values"] = _array(value)
     elif hasattr(value, "__array__"):
-        arrays[at or "values"] = np.asarray(value)
+        arrays[at or "values"] = value if isinstance(value, np.ma.MaskedArray) else np.asarray(value)
+
+
+def _add_time(value: Mapping[str, Any], at: str, arrays: dict[str, np.ndarray]) -> None:
+    """Adds the time of episodes without a clock, if a rate or a step is stated next to them."""
+    steps = [
+        value[key] ** power
+        for key, power in RATES.items()
+        if isinstance(value.get(key), int | float) and value[key] > 0
+    ]
+    for inner in value if steps else ():
+        below = f"{at}.{inner}." if at else f"{inner}."
+        columns = [path[len(below) :] for path in arrays if path.startswith(below)]
+        if RUN in columns and not any(unit_of_clock(column) is not None for column in columns):
+            runs = arrays[below + RUN]
+            first = np.maximum.accumulate(np.where(np.r_[True, runs[1:] != runs[:-1]], np.arange(len(runs)), 0))
+            arrays[f"{below}time_s"] = (np.arange(len(runs)) - first) * steps[0]
 
 
 def _unfolded(value: Mapping[str, Any]) -> Mapping[str, Any] | list[Any]:
@@ -92,12 +136,40 @@ def _unfolded(value: Mapping[str, Any]) -> Mapping[str, Any] | list[Any]:
 
 def _records(records: Sequence[Mapping[str, Any]], at: str, arrays: dict[str, np.ndarray], name: str) -> None:
     """Columns of records; a missing entry is a missing reading."""
+    if (episodes := _episodes(records)) is not None:
+        arrays.update({f"{at}.{key}" if at else key: values for key, values in episodes.items()})
+        return
     columns: dict[str, list[Any]] = {}
     for k, record in enumerate(records):
         for key, value in _leaves(record, "", name, 1):
-            columns.setdefault(key, [None] * len(records))[k] = value
+            if key not in columns:
+                input_files.check_declared(name, len(columns))
+                input_files.check_memory(name, input_files.VALUE * (len(columns) + 1) * len(records))
+                columns[key] = [None] * len(records)
+            columns[key][k] = value
     for key, values in columns.items():
         arrays[f"{at}.{key}" if at else key] = _array(values)
+
+
+def _episodes(records: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray] | None:
+    """Columns of records that each hold lists of numbers of one length, a run each; None for other records.
+
+    A text that differs in every record names the runs, else their number does.
+    """
+    lists = [{key: v for key, v in record.items() if isinstance(v, list) and v} for record in records]
+    lengths = [{len(v) for v in each.values()} for each in lists]
+    flat = all(not isinstance(x, list | Mapping) for each in lists for v in each.values() for x in v[:1])
+    if not flat or any(
+        len(n) != 1 or max(n) < 2 or each.keys() != lists[0].keys() for n, each in zip(lengths, lists, strict=True)
+    ):
+        return None
+    rows = [n.pop() for n in lengths]
+    columns = {key: _array([x for each in lists for x in each[key]]) for key in lists[0]}
+    single = [key for key in records[0] if all(isinstance(r.get(key), str | int | float) for r in records)]
+    texts = {key: [str(record[key]) for record in records] for key in single if isinstance(records[0][key], str)}
+    names = next((v for v in texts.values() if len({*v}) == len(v)), [str(k) for k in range(1, len(records) + 1)])
+    columns |= {key: _array([record[key] for record in records]).repeat(rows) for key in single}
+    return columns | {RUN: np.repeat(names, rows)}
 
 
 def _leaves(record: Mapping[str, Any], at: str, name: str, depth: int) -> Iterable[tuple[str, Any]]:

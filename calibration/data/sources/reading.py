@@ -3,25 +3,30 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from calibration.data import delimited, presets_file
+from calibration.data import delimited, input_files, presets_file
 from calibration.data.columns import SPEED, TIME, WHEN, WORDS, Layout
 from calibration.data.input_errors import BadData
-from calibration.data.named_arrays import NamedArrays, Raw, column_numbers
+from calibration.data.named_arrays import NamedArrays, Raw, column_numbers, column_texts
 from calibration.data.presets_file import Preset
-from calibration.data.sources import in_memory, one_clock, opening
+from calibration.data.sources import one_clock, opening
 from calibration.data.sources.recorded_signals import Signal, Source, find_signal, matching_signals, suggested_paths
+from mmrjax.errors import list_some
 from mmrjax.model import channels, quantities
 
 #: Columns in the form of `Layout.mapped`: name in this program, name in the source, factor from its unit.
 Mapped = tuple[tuple[str, str, float], ...]
 #: Most values of columns without a role; they are read to find correlations with residuals.
 EXTRA_VALUES = 20_000_000
+#: Column with the run of each row.
+RUN = "run_id"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,7 +46,7 @@ def read_columns(source: Any, layout: Layout, columns: Preset | None = None, bet
 
     Args:
         source: a path, perhaps with `::` and the path of signals in the file, or a table in memory
-            (`in_memory.EXPECTED`).
+            (`in_memory.EXPECTED`). A pattern such as `runs/*.csv` names files that are a run each.
         layout: of the table's robot.
         columns: names of the source's columns, in addition to the robot's; they win over these.
         between: `linear` if the imposed quantity follows straight lines between samples, as in `Rig.between_rows`.
@@ -51,8 +56,9 @@ def read_columns(source: Any, layout: Layout, columns: Preset | None = None, bet
             or signals of several lengths.
     """
     if not isinstance(source, str | Path):
-        kind, signals = in_memory.of_object(source)
-        return _of_signals(Source(kind, kind, signals), layout, columns, between)
+        return _of_signals(opening.open_object(source), layout, columns, between)
+    if group := opening.files_of_group(str(source)):
+        return _of_group([read_columns(file, layout, columns, between) for file in group], str(source))
     path, within = opening.split_source(str(source))
     name = path.name or str(source)
     form = opening.format_of(path, name)
@@ -62,6 +68,39 @@ def read_columns(source: Any, layout: Layout, columns: Preset | None = None, bet
     if columns is not None and columns.header:
         arrays = _with_header(arrays, columns)
     return _of_table(arrays, layout, columns)
+
+
+def _of_group(readings: Sequence[Reading], name: str) -> Reading:
+    """Tables of several files as one; each file is a run, named after it.
+
+    Raises:
+        BadData: files with different columns or units.
+    """
+    first = readings[0].arrays
+    for other in readings[1:]:
+        if other.arrays.header != first.header or other.arrays.units != first.units:
+            differing = sorted({*first.header} ^ {*other.arrays.header})
+            raise BadData(
+                f"{name}: {other.arrays.name} and {first.name} differ in "
+                f"{list_some(differing) if differing else 'the order or units of their columns'}; expected the same "
+                "columns in every file"
+            )
+    values = [[r.arrays.values[k] for r in readings] for k in range(len(first.header))]
+    joined = [
+        np.concatenate(parts)
+        if all(isinstance(v, np.ndarray) for v in parts)
+        else list(itertools.chain(*map(column_texts, parts)))
+        for parts in values
+    ]
+    header, units = first.header, first.units
+    if RUN not in header:
+        joined.append([Path(r.arrays.name).stem for r in readings for _ in range(len(r.arrays))])
+        header, units = (*header, RUN), (*units, "") if units else ()
+    digest = hashlib.sha256("".join(r.arrays.digest for r in readings).encode()).hexdigest()
+    notes = tuple(dict.fromkeys(note for r in readings for note in r.arrays.notes))
+    return Reading(
+        NamedArrays(name, header, tuple(joined), units, first.units_from, notes, digest), readings[0].mapped
+    )
 
 
 def read_whole_table(path: Path, within: str = "") -> NamedArrays | None:
@@ -79,7 +118,7 @@ def read_whole_table(path: Path, within: str = "") -> NamedArrays | None:
     for signal in signals.values():
         if signal.refused or signal.clock is not None:
             raise BadData(f"{name}, {signal.path}: {signal.refused or 'has a clock of its own; expected one table'}")
-    _check_memory(name, signals)
+    input_files.check_memory(name, input_files.VALUE * sum(s.length for s in signals.values()))
     values = _in_rows(source, signals)
     units = tuple(quantities.unit_in_column(signal.unit) for signal in signals.values())
     return NamedArrays(
@@ -107,6 +146,7 @@ def _of_table(arrays: NamedArrays, layout: Layout, columns: Preset | None) -> Re
     mapped, notes = columns.mapped(lambda name: name if name in by_name else None, has_readings)
     if arrays.header and not any(theirs in by_name for _, theirs, _ in mapped):
         raise _none_of(arrays.name, columns, arrays.header)
+    columns.check_needed(mapped, layout.imposed_column, arrays.name)
     return Reading(
         dataclasses.replace(arrays, notes=(*arrays.notes, *notes)), presets_file.merge_columns(mapped, layout.mapped)
     )
@@ -128,11 +168,14 @@ def _of_signals(source: Source, layout: Layout, columns: Preset | None, between:
     signals = source.signals
 
     def found(name: str) -> str | None:
-        return name if matching_signals(signals, name) else None
+        matches = matching_signals(signals, name)
+        return matches[0].path if "*" in name and len(matches) == 1 else name if matches else None
 
     mapped, notes = ((), ()) if columns is None else columns.mapped(found)
     if columns is not None and not any(found(theirs) for _, theirs, _ in mapped):
         raise _none_of(source.name, columns, [s.path for s in signals])
+    if columns is not None:
+        columns.check_needed(mapped, layout.imposed_column, source.name)
     mapped = presets_file.merge_columns(mapped, layout.mapped)
     chosen, clock, missing = _chosen(source, mapped, layout)
     for column, signal in chosen.items():
@@ -143,7 +186,8 @@ def _of_signals(source: Source, layout: Layout, columns: Preset | None, between:
             )
     own = [s for s in chosen.values() if s.clock is not None]
     extras = _extras(source, chosen, own)
-    _check_memory(source.name, {**chosen, **extras})
+    size = input_files.VALUE * sum(s.length for s in (*chosen.values(), *extras.values()))
+    input_files.check_memory(source.name, size)
     if own:
         values, more = _on_a_grid(source, chosen, layout, between, clock, mapped)
     else:
@@ -200,16 +244,6 @@ def _extras(source: Source, chosen: Mapping[str, Signal], own: Sequence[Signal])
     if own or sum(s.length for s in others) > EXTRA_VALUES:
         return {}
     return {s.path: s for s in others}
-
-
-def _check_memory(name: str, signals: Mapping[str, Signal]) -> None:
-    """Refuse columns that need more memory than is free."""
-    size, free = opening.VALUE * sum(s.length for s in signals.values()), opening.available_memory()
-    if size > opening.SHARE * free:
-        raise BadData(
-            f"{name}: {len(signals)} columns have {size / 1e9:.3g} GB, and {free / 1e9:.3g} GB of memory are free; "
-            f"expected at most {opening.SHARE * free / 1e9:.3g} GB; give a part of the recording, or every n-th row"
-        )
 
 
 def _in_rows(source: Source, signals: Mapping[str, Signal], rows: int = 0) -> dict[str, np.ndarray]:

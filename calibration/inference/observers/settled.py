@@ -17,11 +17,11 @@ from jaxtyping import Array, Float
 from calibration.data.columns import CURRENT
 from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.data.runs import Runs
-from calibration.described import described
+from calibration.described import describe
 from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
 from calibration.inference.details import EquationDefects
-from calibration.inference.fit_notes import Note, Repeats
+from calibration.inference.fit_notes import Note, Repeats, ThinnedTable
 from calibration.inference.linearization import Linearization, ScoredEffect, balance_probe, finite_or_zero
 from calibration.inference.noise import Noise
 from calibration.inference.observers.base import Diagnosis, Observer, SearchPolicy
@@ -183,8 +183,10 @@ class SettledRuns(Observer):
                 near = runs.layout.nearest(others[0], runs.columns) if others else ""
                 found.append(Repeats(runs.source, (first + 1, second + 1), column, values, known, others, near=near))
         if found and len(alike) == 1:
-            raise BadData(f"{described(found[0])}; no condition varies, so nothing can be fitted")
-        return [dataclasses.replace(found[0], more=len(found) - 1)] if found else []
+            raise BadData(f"{describe(found[0])}; no condition varies, so nothing can be fitted")
+        whole = runs.whole
+        thinned = [] if whole is runs else [ThinnedTable(runs.source, len(whole), len(runs))]
+        return [*thinned, *(dataclasses.replace(each, more=len(found) - 1) for each in found[:1])]
 
     @classmethod
     def check_start(cls, runs: Runs, noise: Noise, robot: Robot) -> list[Note | str]:

@@ -1,9 +1,8 @@
-"""The page of a turn: what either side takes, the path from above, and what other turns take."""
+"""Figures of a turn: the path from above, the course over time, and what other turns take."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,64 +10,17 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from calibration.data.robot_file import RobotFile
 from mmrjax.fidelities.base import History
 from mmrjax.model.quantities import MM, RPM
 from mmrjax.model.robot import Robot
 from sweeps.pages.figure_style import BLUE, FAINT, INK, VERMILION, new_figure
-from sweeps.pages.page import Album, channel_columns, render_page, robot_section
-from sweeps.pages.turn_words import FULL, Turn
-from sweeps.report.condition_columns import condition_formats
+from sweeps.report.words.turn_words import FULL
 
 SIDES = (("left", BLUE), ("right", VERMILION))
 #: Settled turns of a larger radius are drawn as an arc of so many lengths of the robot.
 ARC = 20.0
 #: A path bends by no more between two points that are drawn [rad].
 BEND = 0.05
-
-
-def write_turn_page(
-    folder: Path,
-    file: RobotFile,
-    *,
-    model: str,
-    run: Mapping[str, np.ndarray],
-    facts: Turn,
-    history: History | None,
-    turns: dict[str, np.ndarray] | None,
-) -> Path:
-    """Write `report.html` and `figures/` for one turn.
-
-    Args:
-        run: its row of `runs.csv`; facts: sentences and table rows on it.
-        history: over time, of a fidelity that keeps it; turns: settled ones of other duties of the slower side.
-
-    Returns:
-        The path of the page.
-    """
-    album, robot = Album(folder), file.robot
-    row = {name: values[0] for name, values in run.items()}
-    imposed = {name: values for name, values in run.items() if name not in channel_columns(robot.channels).values()}
-    if history is None:
-        album.add("path", lambda: draw_turn_circle(robot, row))
-    else:
-        place = {c: np.asarray(history.reading[c])[0] for c in ("place_x", "place_y", "yaw")}
-        album.add("path", lambda: draw_path(robot, row, place["place_x"], place["place_y"], place["yaw"]))
-        album.add("course", lambda: draw_turn_course(history))
-    if turns is not None:
-        album.add("turns", lambda: over_yaw_rate(turns, row))
-    return render_page(
-        folder,
-        "turn.html.j2",
-        album,
-        of_channels=robot.channels,
-        title=facts.answer,
-        model=model,
-        facts=facts,
-        about={heading: form.format(row[c]) for c, (heading, form) in condition_formats(imposed, mass=True).items()},
-        settled=history is None,
-        **robot_section(file),
-    )
 
 
 def _outline(axes: Axes, robot: Robot, row: Mapping[str, Any], x: float, y: float, yaw: float, color: str) -> None:
@@ -149,6 +101,11 @@ def draw_path(robot: Robot, row: Mapping[str, Any], x: np.ndarray, y: np.ndarray
         _outline(axes, robot, row, x[k], y[k], yaw[k], color)
     _plan(axes)
     return fig
+
+
+def draw_history_path(robot: Robot, row: Mapping[str, Any], history: History) -> Figure:
+    """The path of a run over time from above."""
+    return draw_path(robot, row, *(np.asarray(history.reading[c])[0] for c in ("place_x", "place_y", "yaw")))
 
 
 def draw_turn_course(history: History) -> Figure:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 
+from sweeps.report.document import Column, Table
 from sweeps.results.posture_results import Postures
 
 #: Columns of the page's table: heading, format.
@@ -24,12 +25,12 @@ COLUMNS = {
 ROWS = 20
 
 
-def posture_table(found: Postures) -> dict[str, Any]:
-    """Headings and rows of the page's table."""
+def posture_table(found: Postures, names: Sequence[str]) -> Table:
+    """Postures of the first runs, a row each."""
     shown = {c: about for c, about in COLUMNS.items() if c in found.table}
-    rows = range(min(ROWS, len(found.table["pitch_deg"])))
-    cells = [[form.format(found.table[c][k]) for c, (_, form) in shown.items()] for k in rows]
-    return {"headings": [heading for heading, _ in shown.values()], "rows": cells}
+    rows = zip(names[:ROWS], *(found.table[c][:ROWS] for c in shown), strict=True)
+    columns = (Column("run"), *(Column(heading, form=form) for heading, form in shown.values()))
+    return Table("posture", columns, list(rows), file="posture.csv", sideways=True)
 
 
 def posture_sentences(found: Postures) -> str:

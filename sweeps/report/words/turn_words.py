@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -16,29 +15,11 @@ from mmrjax.model.quantities import MM
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import NOT_SETTLED, STATUSES, Result
 from mmrjax.turning.two_sides import BETWEEN, OVER
-from sweeps import capabilities
 from sweeps.pages import words
 
 FULL = 2 * math.pi  # rad a turn
-#: What either side does: words, column, format.
-ROWS = (
-    ("voltage [V]", "motor_voltage_{}_V", ".2f"),
-    ("current [A]", "motor_current_{}_A", ".3f"),
-    ("motor speed [rpm]", "motor_speed_{}_rpm", ".0f"),
-    ("electrical power [W]", "power_{}_W", ".1f"),
-    ("winding, long running [°C]", "winding_{}_C", ".0f"),
-)
 #: Motor speed below which a motor stands [rpm], speed below which a robot turns on the spot [mm/s].
 STANDS, SPOT = 1.0, 1.0
-
-
-@dataclasses.dataclass(frozen=True)
-class Turn:
-    """Description of a turn: the answer in a sentence, rows for the left and right side, and remarks."""
-
-    answer: str
-    sides: list[tuple[str, str, str]]
-    notes: list[str]
 
 
 def unlike_sides_note(name: str, effects: Sequence[str], turns: str) -> str:
@@ -89,30 +70,28 @@ def turn_not_found_reason(speed: float, rate: float, speeds: np.ndarray, rates: 
     return f"with which it reaches {' and '.join(told)}"
 
 
-def turn_in_words(robot: Robot, row: Mapping[str, Any], ended: Mapping[str, float] | None) -> Turn:
-    """A turn in words.
+def is_going(row: Mapping[str, Any]) -> bool:
+    """True if a turn has a motion, settled or not."""
+    return math.isfinite(float(row["yaw_rate_rad_s"])) and row["status"] in ("converged", "not_settled")
+
+
+def turn_answer(row: Mapping[str, Any], ended: Mapping[str, float] | None) -> str:
+    """A turn in a sentence.
 
     Args:
         row: of the table of runs.
         ended: of a run over time `time_s`, `displacement_m` and `turned_deg` at its end; None: a settled turn.
     """
-    status, known = str(row["status"]), math.isfinite(float(row["yaw_rate_rad_s"]))
-    going = known and status in ("converged", "not_settled")
-    unsettled = ended is None and status == STATUSES[NOT_SETTLED]
-    answer = _moves(row) if going else f"{status}: {words.NO_TURN if unsettled else words.STATUSES[status].why}"
-    if ended is not None and going:
-        answer = (
-            f"After {ended['time_s']:g} s: {ended['displacement_m']:.2f} m from the start, turned by "
-            f"{ended['turned_deg']:.0f}°. {answer if status == 'converged' else _now(row)}"
-        )
-    idle = capabilities.idle_columns(robot)
-    rows = [r for r in ROWS if known and r[1].format(SIDES[0]) not in idle]
-    sides = [(label, *(_number(float(row[c.format(side)]), form) for side in SIDES)) for label, c, form in rows]
-    return Turn(answer, [(a, b, c) for a, b, c in sides], _notes(robot, row) if going else [])
-
-
-def _number(value: float, form: str) -> str:
-    return words.NONE_SETTLES if math.isinf(value) else format(value, f"z{form}")
+    status = str(row["status"])
+    if not is_going(row):
+        unsettled = ended is None and status == STATUSES[NOT_SETTLED]
+        return f"{status}: {words.NO_TURN if unsettled else words.STATUSES[status].why}"
+    if ended is None:
+        return _moves(row)
+    return (
+        f"After {ended['time_s']:g} s: {ended['displacement_m']:.2f} m from the start, turned by "
+        f"{ended['turned_deg']:.0f}°. {_moves(row) if status == 'converged' else _now(row)}"
+    )
 
 
 def _sloping(row: Mapping[str, Any]) -> bool:
@@ -148,7 +127,8 @@ def _moves(row: Mapping[str, Any]) -> str:
     )
 
 
-def _notes(robot: Robot, row: Mapping[str, Any]) -> list[str]:
+def turn_notes(robot: Robot, row: Mapping[str, Any]) -> list[str]:
+    """Remarks on a turn: effective width, motors that stand or are driven, limits that are exceeded."""
     notes = []
     own = float(robot.configurations[str(row["configuration"])].turning.width) / MM
     width = float(row["effective_width_mm"])

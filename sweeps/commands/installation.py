@@ -9,9 +9,6 @@ import tempfile
 import time
 from collections.abc import Callable
 
-from rich.console import Console
-from rich.table import Table
-
 from sweeps import compilation_cache
 from sweeps.console import report_stage
 from sweeps.store import PACKAGES
@@ -24,19 +21,14 @@ def check_installation() -> int:
         "a solved run": _run,
         "derivatives": _derivative, "writing here": _folder,
     }  # fmt: skip
-    table = Table()
-    for heading in ("check", "", "found"):
-        table.add_column(heading)
     healthy = True
     for k, (name, check) in enumerate(checks.items(), 1):
         try:
             with report_stage(k, len(checks), name):
-                found, passed = check(), True
+                line = f"{name}: {check()}"
         except Exception as error:
-            found, passed = f"{type(error).__name__}: {error}", False
-        healthy &= passed
-        table.add_row(name, "ok" if passed else "[red]fails[/red]", found)
-    Console(highlight=False).print(table)
+            line, healthy = f"{name} FAILED: {type(error).__name__}: {error}", False
+        print(line)
     return 0 if healthy else 1
 
 

@@ -15,10 +15,10 @@ from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.settings import FIT, HELD_OUT, WITHOUT_NAME
 from calibration.inference import bases, blocks
 from calibration.inference.series_noise import SeriesNoise
+from calibration.words import fit_words
 from mmrjax import effects
 from mmrjax.errors import count_noun
 from mmrjax.model import channels
-from sweeps.report.words import fit_words
 
 if TYPE_CHECKING:
     from calibration.discovery.discover import LoopStages

@@ -20,7 +20,6 @@ METHODS = {
     "sobol": "shares of the variance, alone and with others",
     "morris": "screening by elementary effects",
     "derivative": "bounds of those shares from exact gradients",
-    "shapley": "shares of the variance of correlated inputs",
 }
 
 
@@ -112,22 +111,11 @@ def sample_left_out(note: sensitivity_notes.SampleLeftOut) -> str:
     )
 
 
-def inert_inputs(note: sensitivity_notes.Inert) -> str:
-    """Inputs with only zero derivatives."""
-    names = ", ".join(note.inputs)
-    if note.correlated:
-        return (
-            "every derivative by them is exactly zero where one was taken, so that what effect they have is that of "
-            f"inputs they are correlated with: {names}"
-        )
-    return f"not sampled, since every derivative by them is exactly zero where one was taken: {names}"
-
-
 #: Kind of note → a sentence with its fields, or a function that makes one.
 SAID: dict[type, str | Callable[[Any], str]] = {
     sensitivity_notes.Sampling: sampling_scope,
     sensitivity_notes.PointsLeftOut: points_left_out,
     sensitivity_notes.SampleLeftOut: sample_left_out,
-    sensitivity_notes.Inert: inert_inputs,
+    sensitivity_notes.Inert: "not sampled, because every computed derivative by them is zero: {inputs}",
     sensitivity_notes.Tied: "kept at their ratio to another input, and part of what it does: {inputs}",
 }

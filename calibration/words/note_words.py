@@ -1,9 +1,8 @@
-"""`describe`: the sentence of each note of a table, a fit, the loop or a study, and of each result."""
+"""Tables of `calibration.described.describe`: the sentence of each kind of note and of each result."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 from calibration.data.settling import Settled
 from calibration.discovery import instructions, loop_notes
@@ -13,7 +12,7 @@ from calibration.inference import result as fit_results
 from calibration.inference.lack_of_fit import Adequacy
 from calibration.inference.residual_clusters import ResidualCluster
 from calibration.sensitivity.result import SensitivityResult
-from sweeps.report.words import (
+from calibration.words import (
     experiment_words,
     fit_words,
     loop_words,
@@ -61,29 +60,3 @@ PARTS: dict[tuple[type, str], Callable[..., str]] = {
     (loop_results.DiscoveryResult, "refit header"): loop_words.refit_header,
     (loop_results.DiscoveryResult, "standing"): loop_words.naming_reasons,
 }
-
-
-def describe(found: Any, part: str = "", *about: str) -> str:
-    """English sentence of a note or a result, such as a calibration's `remarks` or what `discover` returns.
-
-    Args:
-        found: a note, a result, or a sentence, which is returned as it is.
-        part: of a result: `header` of its robot's file, or `standing` of the loop's names; "": its answer.
-        about: the robot's name, for a header.
-
-    Returns:
-        The sentence; "" where there is nothing to report.
-
-    Raises:
-        TypeError: nothing is known about this kind of object or part.
-    """
-    if isinstance(found, str):
-        return found
-    said = PARTS.get((type(found), part)) if part else (NOTES | RESULTS).get(type(found))
-    if said is None:
-        kind = type(found).__name__ + (f", {part}" if part else "")
-        raise TypeError(f"describe: got {kind}; expected a note or a result of calibrate, discover or sensitivity")
-    if isinstance(said, str):
-        listed = {name: ", ".join(x) if isinstance(x, tuple) else x for name, x in vars(found).items()}
-        return said.format(**listed)
-    return said(found, *about)

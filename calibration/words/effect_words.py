@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from calibration.words.experiment_words import ACTS, DOING
 from mmrjax.effects import OF_TURNS, Effect
 from mmrjax.effects.base import THE_SIDE
 from mmrjax.model.channels import find_channel
-from sweeps.report.words.experiment_words import ACTS, DOING
 
 #: Tests that isolate a balance: rows of `experiments.DOING`, `weigh`, and of a channel of `sensor` rows of `ACTS`.
 ISOLATED_BY = {

@@ -1,0 +1,1 @@
+"""English sentences of notes and results: the one place below the commands that writes them."""

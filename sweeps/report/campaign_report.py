@@ -1,0 +1,162 @@
+"""The report of a sweep into a store: how the points ended, what came out, and what it follows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calibration.data.robot_file import RobotFile
+from mmrjax.climbing.climb_simulation import OVER
+from mmrjax.errors import count_noun
+from mmrjax.fidelities.variation import STATUS
+from mmrjax.model import signals
+from sweeps.pages import words
+from sweeps.points.climbs import LARGEST, SIZE, VERDICT
+from sweeps.points.zarr_store import STORE, Layout
+from sweeps.report import run_tables
+from sweeps.report.document import Block, Column, Document, Figure, Note, Section, Table, columns, deferred_figure
+from sweeps.results.climb_results import VERDICTS
+
+#: Points, and chunks that they come from, that figures and quantiles are made of; outputs that are drawn.
+THINNED, CHUNKS, DRAWN = 200_000, 100, 6
+_SPREAD = (
+    "**{}**: how often; median and 5-95 % over the two names that explain most of its variance; median over both."
+)
+_VERDICTS = (
+    "**Verdicts** over the first name that varies and the size of the obstacle; whatever else varies is at its first "
+    "value."
+)
+
+
+def campaign_document(file: RobotFile, layout: Layout, result: dict[str, Any], store: Path) -> Document:
+    """The report of a store whose every chunk is done.
+
+    Args:
+        result: `result.json`; store: folder of the arrays.
+    """
+    counts, model, total = result["statuses"], result["model"], result["points"]
+    reached = sum(counts.get(s, 0) for s in words.SETTLED)
+    what = words.VERDICTS.get((model, "converged"), "have an operating point")
+    return Document(
+        f"Sweep of {count_noun(total, 'point')}",
+        f"{count_noun(total, 'point')}: {reached:,} {what}.",
+        (
+            run_tables.lead_note(file, model, f"All points are in `{STORE}`."),
+            run_tables.endings_table(counts, "points", model),
+        ),
+        page_sections=lambda: _sections(store, layout, result["outputs"]),
+    )
+
+
+def _sections(store: Path, layout: Layout, extremes: dict[str, Any]) -> Iterable[Section]:
+    values, found = sample_points(store, layout)
+    yield Section("What varies", (_varied(layout, values),), "varied")
+    if VERDICT in found:
+        yield Section("How the climbs ended", _verdicts(values, found, layout), "verdicts")
+    yield Section("What came out", tuple(_outputs(values, found, layout, extremes)), "outputs")
+
+
+def _outputs(
+    values: np.ndarray, found: dict[str, np.ndarray], layout: Layout, extremes: dict[str, Any]
+) -> Iterable[Block]:
+    """Outputs with their extremes and quantiles; the first of them are drawn."""
+    settled = np.isin(found[STATUS], signals.DONE)
+    rows, figures = list[tuple[Any, ...]](), list[Figure]()
+    for variable in (v for v in layout.variables if "units" in v.attributes):
+        name, label = variable.name, variable.attributes["long_name"]
+        unit = variable.attributes["units"].removeprefix("1")
+        usable = settled & np.isfinite(found[name])
+        numbers = found[name][usable].astype(float)
+        quantiles = np.quantile(numbers, (0.05, 0.5, 0.95)) if len(numbers) else [None] * 3
+        rows.append((label, unit, extremes[name]["least"], *quantiles, extremes[name]["greatest"]))
+        if len(numbers) and len(figures) < DRAWN:
+            figures.append(
+                deferred_figure(
+                    f"spread_{name}", f"{label} over what varies", _SPREAD.format(label.capitalize()),
+                    "campaign_figures.draw_output", numbers, Column(label, unit).title, values[usable], layout,
+                )
+            )  # fmt: skip
+    drawn = "" if len(values) == layout.design.points else " drawn at random"
+    text = (
+        f"Least and greatest of all points; quantiles and figures of {len(values):,} points{drawn}, of those that "
+        "settled."
+    )
+    heads = columns("output", "unit", "least | .4g", "5 % | .4g", "median | .4g", "95 % | .4g", "greatest | .4g")
+    yield Note(text)
+    yield Table("ranges", heads, rows)
+    yield from figures
+
+
+def _verdicts(values: np.ndarray, found: dict[str, np.ndarray], layout: Layout) -> tuple[Block, ...]:
+    """The largest obstacle, the number of climbs by outcome, and these over size and the first other axis."""
+    codes, design = found[VERDICT].astype(int), layout.design
+    meanings = next(v.attributes for v in layout.variables if v.name == VERDICT)["flag_meanings"].split()
+    rows = [(f"`{meanings[k]}`", int((codes == k).sum()), *VERDICTS[meanings[k]]) for k in np.unique(codes)]
+    heads = columns("verdict", "points | ,", "the robot", "meaning")
+    others = [n for n in design.axes if n != SIZE and len(design.axes[n]) > 1][:1]
+    figure = deferred_figure(
+        "endings", "Verdicts over what varies and the size of the obstacle", _VERDICTS,
+        "campaign_figures.draw_verdicts", codes, meanings, values, layout, *others,
+    )  # fmt: skip
+    drawn = (figure,) * bool(others and SIZE in design.axes)
+    return Note(_largest(values, found, layout), "answer", "largest"), Table("endings", heads, rows), *drawn
+
+
+def _largest(values: np.ndarray, found: dict[str, np.ndarray], layout: Layout) -> str:
+    """Largest obstacle climbed and its first point, in words."""
+    names = layout.design.names
+    sizes = found[LARGEST] if LARGEST in found else values[:, names.index(SIZE)] * (found[VERDICT] == OVER)
+    k = int(np.argmax(sizes))
+    if sizes[k] <= 0:
+        return "No obstacle is got over."
+    at = []
+    for name, value in zip(names, values[k], strict=True):
+        labels, unit = layout.labels.get(name), layout.coordinates[name].get("units", "").removeprefix("1")
+        at.append(f"{name} {labels[int(value)] if labels else f'{value:.4g} {unit}'.strip()}")
+    rest = ", ".join(words for name, words in zip(names, at, strict=True) if name != SIZE)
+    return f"The largest obstacle that is got over: {sizes[k]:.4g} mm{', at ' if rest else ''}{rest}."
+
+
+def sample_points(store: Path, layout: Layout) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Some of the points, at random and always the same ones.
+
+    Returns:
+        Values of what varies, shape (points, names), and outputs by name.
+    """
+    import zarr
+
+    group: Any = zarr.open_group(store, mode="r")
+    rng, blocks = np.random.default_rng(0), layout.blocks
+    chunks = np.sort(rng.permutation(len(blocks))[:CHUNKS])
+    each = -(-THINNED // len(chunks))
+    values: list[np.ndarray] = []
+    found: dict[str, list[np.ndarray]] = {v.name: [] for v in layout.variables}
+    for chunk in map(int, chunks):
+        box, count = blocks.box(chunk), blocks.count(chunk)
+        rows = np.sort(rng.permutation(count)[:each]) if count > each else np.arange(count)
+        values.append(layout.design.block(box)[rows])
+        for variable in layout.variables:
+            found[variable.name].append(group[variable.name][box].ravel()[rows])
+    return np.concatenate(values), {name: np.concatenate(parts) for name, parts in found.items()}
+
+
+def _varied(layout: Layout, values: np.ndarray) -> Table:
+    """Varied names, in words, a row each."""
+    rows = []
+    for k, name in enumerate(layout.design.names):
+        about = layout.coordinates[name]
+        axis, labels = layout.design.axes.get(name), layout.labels.get(name)
+        if axis is None:
+            low, high = values[:, k].min(), values[:, k].max()
+            text = f"{layout.design.shape[-1]:,} samples, {low:.4g} to {high:.4g}"
+        elif labels is not None:
+            text = ", ".join(labels[int(v)] for v in axis)
+        elif len(axis) <= 8:
+            text = ", ".join(f"{v:.4g}" for v in axis)
+        else:
+            text = f"{axis.min():.4g} to {axis.max():.4g}, {len(axis):,} values"
+        rows.append((f"`{name}`", about["long_name"], about.get("units", "").removeprefix("1"), text))
+    return Table("names", columns("name", "meaning", "unit", "values"), rows)

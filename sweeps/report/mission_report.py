@@ -1,0 +1,263 @@
+"""The report of `simulate` over a profile: the mission over time, where its energy goes, its segments, its limits."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+
+from calibration.data.profiles import CONTROLLED, YAW_RATE
+from calibration.data.robot_file import RobotFile
+from mmrjax.errors import count_noun
+from mmrjax.missions.profile import PAIRS
+from mmrjax.model import channels
+from mmrjax.model.energy import SINKS
+from mmrjax.model.quantities import RPM, TABLE, WARMING
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import FLAGS
+from sweeps import capabilities
+from sweeps.pages import words
+from sweeps.report import run_tables
+from sweeps.report.document import Block, Column, Document, Note, Section, Table, columns, deferred_figure, remarks
+from sweeps.report.run_tables import quantity_column
+from sweeps.report.runs_report import run_headings
+from sweeps.results.mission_results import Missions
+
+#: Segments of a cycle that a page has room for.
+SEGMENTS = 60
+#: Numbers of each run, in the order of the table.
+_RUNS = (
+    "energy_Wh", "energy_per_metre_Wh", "distance_m", "duration_s", "rms_current_A", "peak_current_A",
+    "rms_torque_Nm", "winding_peak_C", "housing_end_C", "state_of_charge", "endurance_s", "range_m",
+    *(output.column for output in TABLE["mission of sides"]), "status", "flags",
+)  # fmt: skip
+#: Those of each segment.
+_OF_SEGMENTS = ("energy_Wh", "distance_m", "rms_current_A", "peak_current_A", "winding_peak_C")
+_COURSE = (
+    "**The mission over time.** Speed follows what is demanded (dashed) as far as the driver's voltage and limits "
+    "let it. The current is that of all motors together; its highest peak is marked. {} instants are drawn, each "
+    "segment's peak of current among them; the same are in `history.csv`."
+)
+_CUT = " The mission took more steps than are kept: the course ends before it does, its numbers do not."
+_PATH = (
+    "**The path** of the centre of mass: the robot at the start, half way through the rows of `history.csv` and at "
+    "the end. It turned by {:.0f}°, positive to the left."
+)
+_SIDES = "**Either side.** Rms currents {:.2f} A left and {:.2f} A right."
+_HEAT = " Hottest windings {:.1f} and {:.1f} °C."
+_ENERGY = (
+    "**Energy taken from the {}, and where it went.** Shares are of what was drawn; everything below the first bar "
+    "adds up to it. {} Energy unaccounted for by the integration: {:.0e} of what was turned over."
+)
+_NO_RETURN = "Nothing came back to the source"
+_SETTLES = (
+    "A segment **settles** where the robot travels steadily, or stands as it should, at its end; it is **not "
+    "settled** where a ramp ends while the speed still changes, as it was asked to. Energy is the source's, on "
+    "balance: what came back is taken off."
+)
+
+
+def missions_document(file: RobotFile, found: Missions) -> Document:
+    """The report of finished missions; in detail the first run."""
+    table, source = found.table, found.source
+    shown = capabilities.without_idle(file.robot, table)
+    first, names = {key: value[0] for key, value in table.items()}, _names(table)
+    fed = "battery" if np.isfinite(first["state_of_charge"]) else "supply"
+    cycles, each = (f", {source.cycles} cycles", " each") if source.cycles > 1 else ("", "")
+    between = "linear" if source.linear else "held"
+    lead = (
+        f"Profile **{source.source}**: {source.duration:g} s{cycles}, {count_noun(source.segments, 'segment')}"
+        f"{each}, values {between} between rows; fed by its {fed}."
+    )
+    detail = f"In detail the first of {len(names)} runs: **{names[0]}**." if len(names) > 1 else ""
+    runs = run_tables.quantity_table(
+        "runs", shown, _RUNS, first=[(Column("run"), names)], file="runs.csv", sideways=True
+    )
+    endings = run_tables.endings_table(Counter(map(str, table["status"])))
+    whole = len(names) == 1 and first["status"] == "converged"
+    return Document(
+        f"Mission {source.source}" + ("" if len(names) > 1 else f" of {names[0]}"),
+        mission_answer(first),
+        (
+            run_tables.lead_note(file, more=detail),
+            Note(lead, terminal=True),
+            *remarks(_exceeded(found), "flags"),
+            runs,
+            *([] if whole else [endings]),
+            *remarks(_charge_left(table)),
+        ),
+        page_sections=lambda: _sections(file.robot, found, first),
+    )
+
+
+def _sections(robot: Robot, found: Missions, first: Mapping[str, Any]) -> Iterable[Section]:
+    """The first run over time, from above, its energy and its segments."""
+    source, name, limit = found.source, found.segments["run_id"][0], float(robot.motor.temperature_limit)
+    mine = found.course["run_id"] == name
+    rows = {key: value[mine] for key, value in capabilities.without_idle(robot, found.course).items()}
+    cycle = float(source.time[-1] - source.time[0]) if source.cycles > 1 else None
+    course = deferred_figure(
+        "course", "speed, current, temperatures and charge over time",
+        _COURSE.format(len(rows["time_s"])) + ("" if found.whole else _CUT),
+        "mission_figures.draw_mission_course", rows, cycle, limit, source.linear, float(robot.sides),
+    )  # fmt: skip
+    limits = run_tables.limits_table(mission_limits(robot, first), "this mission")
+    yield Section("Over time", (course, limits, Note(run_tables.WARMING_SHARE, "key")), "course-section")
+    if source.turns:
+        yield Section("From above", _from_above(robot, first, rows), "path-section")
+    back, on_battery = float(first["energy_returned_Wh"]), bool(np.isfinite(first["state_of_charge"]))
+    returned = f"{back:.3g} Wh came back to the source." if back > 1e-6 * first["energy_drawn_Wh"] else (
+        f"{_NO_RETURN}; what driven motors give feeds the other consumers first." if on_battery else f"{_NO_RETURN}."
+    )  # fmt: skip
+    caption = _ENERGY.format(
+        "battery's charge" if on_battery else "supply", returned, abs(first["unaccounted_share"])
+    )
+    energy = deferred_figure(
+        "energy", mission_answer(first), caption, "mission_figures.draw_mission_energy", first, on_battery
+    )
+    yield Section("Where the energy goes", (energy,), "energy-section")
+    yield Section(
+        "Segments", (_segments(found, name, capabilities.idle_columns(robot)), Note(_SETTLES, "key")),
+        "segments-section",
+    )  # fmt: skip
+
+
+def _from_above(robot: Robot, first: Mapping[str, Any], rows: Mapping[str, np.ndarray]) -> tuple[Block, ...]:
+    place = rows["x_mm"] / 1e3, rows["y_mm"] / 1e3, np.radians(rows["yaw_deg"])
+    sides = [[first[f"{name}_{side}_{unit}"] for side in channels.SIDES]
+             for name, unit in (("rms_current", "A"), ("winding_peak", "C"))]  # fmt: skip
+    caption = _SIDES.format(*sides[0]) + (_HEAT.format(*sides[1]) if robot.knows(WARMING) else "")
+    return (
+        deferred_figure(
+            "path", "the path of the robot from above", _PATH.format(first["turned_deg"]), "turn_figures.draw_path",
+            robot, first, *place,
+        ),
+        deferred_figure(
+            "sides", "current and duty of either side and the yaw rate over time", caption,
+            "mission_figures.of_sides", rows,
+        ),
+    )  # fmt: skip
+
+
+def _names(runs: dict[str, np.ndarray]) -> list[str]:
+    """Headings of runs; what the profile states in the place of a run's condition is left out."""
+    parts = (label.split(", ") for label in run_headings(runs))
+    return [", ".join([head, *(p for p in rest if not p.startswith("nan"))]) for head, *rest in parts]
+
+
+def mission_answer(run: Mapping[str, Any]) -> str:
+    """One sentence: energy of the mission, its largest shares, and how long the battery lasts."""
+    drawn = float(run["energy_drawn_Wh"])
+    text = f"The mission takes {float(run['energy_Wh']):.3g} Wh"
+    if np.isfinite(run.get("distance_m", np.nan)) and run["distance_m"] > 0:
+        text += f" over {run['distance_m']:.0f} m"
+    if drawn > 0:
+        shares = {words.SINKS[name]: float(run[f"energy_to_{name}_Wh"]) / drawn for name in SINKS}
+        largest = sorted(shares, key=lambda label: -shares[label])[:2]
+        parts = [f"{label} {100 * shares[label]:.0f} %" for label in largest if shares[label] > 0]
+        text += f" ({', '.join(parts)})"
+    if np.isfinite(run["endurance_s"]):
+        text += f"; a full battery lasts {run['endurance_s'] / 60:.0f} min"
+    status = str(run["status"])
+    return text + ("." if status == "converged" else f". It ends early: {words.status_meaning(status)}.")
+
+
+def mission_limits(robot: Robot, run: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Use of each limit by a mission."""
+    motor, gearbox, heat = robot.motor, robot.gearbox, robot.knows(WARMING)
+    speed, unknown = run["peak_motor_speed_rpm"], 0.0 if heat else np.nan
+    asked = [
+        ("hottest winding", run["winding_peak_C"] + unknown, motor.temperature_limit, "{:.0f} °C"),
+        ("motor speed", speed, float(motor.speed_limit) / RPM, "{:.0f} rpm"),
+        ("gearbox input speed", speed, float(gearbox.speed_limit) / RPM, "{:.0f} rpm"),
+        ("rms current, one motor", run["rms_current_A"] / float(robot.sides) + unknown, robot.current_continuous,
+         "{:.2f} A"),
+        ("rms torque, one gearbox", run["rms_torque_Nm"], gearbox.torque_limit or np.nan, "{:.2f} N·m"),
+    ]  # fmt: skip
+    used = run_tables.use_of_limits(asked, float(motor.temperature_ambient))
+    low, cutoff = float(run["cell_low_V"]), float(robot.battery.voltage_cutoff)
+    if np.isfinite(low):
+        line = {"words": "lowest cell (not below)", "value": f"{low:.2f} V", "limit": f"{cutoff:.2f} V"}
+        used.append(line | {"percent": 100 * cutoff / low})
+    return used
+
+
+def _exceeded(found: Missions) -> Iterable[str]:
+    """Limits that were exceeded, in words, and in how many runs and segments."""
+    raised = [str(f).split(";") for f in found.segments["flags"]]
+    runs = [str(f).split(";") for f in found.table["flags"]]
+    for flag in FLAGS:
+        count = sum(flag in f for f in runs)
+        if count:
+            of_runs = f"{count} of {len(runs)} runs, " * (len(runs) > 1)
+            segments = sum(flag in f for f in raised)
+            yield f"`{flag}`: {words.FLAGS[flag]} ({of_runs}{segments} of {len(raised)} segments)"
+
+
+def _charge_left(table: Mapping[str, np.ndarray]) -> Iterable[str]:
+    """Charge at which missions were cut off, if any was."""
+    left = 100 * table["state_of_charge"][table["status"] == "cut_off"]
+    if len(left):
+        span = f"{left.min():.1f}" if len(left) == 1 else f"{left.min():.1f} to {left.max():.1f}"
+        yield f"cut off: ended with {span} % of the charge left"
+
+
+def _segments(found: Missions, name: str, idle: set[str]) -> Table:
+    """Segments of one run: the first cycle, and totals over all cycles."""
+    source, many = found.source, found.source.cycles > 1
+    shown = [c for c in _OF_SEGMENTS if c not in idle]
+    totals = [c for c in shown if c != "rms_current_A"] if many else []
+    rows = {key: value[found.segments["run_id"] == name] for key, value in found.segments.items()}
+    whole, answer = float(np.sum(rows["energy_Wh"])), []
+    for k in range(min(source.segments, SEGMENTS)):
+        mine = {key: value[rows["segment"] == k + 1] for key, value in rows.items()}
+        if not len(mine["status"]):
+            continue
+        ends = Counter(map(words.short_status, map(str, mine["status"])))
+        flags = dict.fromkeys(flag for f in mine["flags"] for flag in str(f).split(";") if flag)
+        begin, end = (float(source.time[j] - source.time[0]) for j in (k, k + 1))
+        sums = [np.sum(mine[c]) if c in ("energy_Wh", "distance_m") else np.max(mine[c]) for c in totals]
+        shares = [100 * float(np.sum(mine["energy_Wh"])) / whole if whole > 0 else None] if many else []
+        answer.append(
+            (
+                f"{k + 1}: {begin:g} to {end:g} s", source.modes[k].replace("_", " "), _demand(found, k),
+                *(mine[c][0] for c in shown), *sums, *shares,
+                ", ".join(f"{s} ({n})" if many else s for s, n in ends.items()),
+                ", ".join(words.FLAGS[f] for f in flags) or "none",
+            )
+        )  # fmt: skip
+    first = "first cycle" if many else "this segment"
+    heads = (
+        *columns("segment", "mode", "asked"), *(quantity_column(c, group=first) for c in shown),
+        *(quantity_column(c, group="all cycles") for c in totals),
+        *columns(*["all cycles > share of energy [%] | .1f"] * many, "ends", "limits exceeded"),
+    )  # fmt: skip
+    return Table("segments", heads, answer, file="segments.csv", wide=True)
+
+
+def _demand(found: Missions, k: int) -> str:
+    """Demand of the profile in a segment, in words."""
+    source = found.source
+    last = k + 1 if source.linear else k
+
+    def span(values: np.ndarray, factor: float, unit: str) -> str:
+        begin, end = float(values[k]) / factor, float(values[last]) / factor
+        unit = unit if unit == "°" else f"\u00a0{unit}"
+        return f"{begin:g}{unit}" if abs(begin - end) < 1e-9 else f"{begin:g} to {end:g}{unit}"
+
+    mode = source.modes[k]
+    said = []
+    if mode in CONTROLLED:
+        channel = channels.find_channel(mode)
+        said.append(span(source.demand, channel.factor, channel.unit))
+        if mode == "speed" and YAW_RATE in source.values:
+            said.append(span(source.values[YAW_RATE], 1.0, channels.find_channel(YAW_RATE).unit))
+    elif mode == "voltage":
+        shares = [(name, 0.01, "% duty") for name in ("duty", *PAIRS[0])] + [(name, 1.0, "V") for name in PAIRS[1]]
+        spans = [span(source.values[name], one, unit) for name, one, unit in shares if name in source.values]
+        said.append(" and ".join(spans) or "100 % duty")
+    units = {"voltage": "V", "slope_deg": "°", "payload": "kg", "load_torque": "N·m", "current_other": "A"}
+    said += [span(source.values[name], 1.0, unit) for name, unit in units.items() if name in source.values]
+    return ", ".join([*said, *([source.surface[k]] if source.surface else [])])

@@ -1,0 +1,172 @@
+"""Blocks that reports of simulated runs share: how runs ended, limits, and quantities in words of the registries."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from calibration.data.robot_file import RobotFile
+from mmrjax.model.channels import Channel
+from mmrjax.model.quantities import TABLE
+from sweeps import capabilities
+from sweeps.pages import words
+from sweeps.points import uncertainty
+from sweeps.points.imposed import UNLIMITED
+from sweeps.report.condition_columns import CONDITIONS
+from sweeps.report.document import Cell, Column, Note, Table, columns
+
+#: Quantities by column, of several of one column that of runs.
+_REGISTERED = {
+    q.column: q
+    for place in ("derived", "mission of sides", "mission", "run", "channel of a turn", "channel")
+    for q in TABLE[place]
+}
+#: Columns of runs without a row in a registry: heading, unit, format.
+_OTHERS = {
+    "configuration": ("configuration", "", ""),
+    "status": ("status", "", ""),
+    "flags": ("limits exceeded", "", ""),
+    "time_end_s": ("time at the end", "s", "{:.6g}"),
+    "permissible_time_s": ("permissible at this current for", "s", "{:.3g}"),
+}
+WARMING_SHARE = "Winding: share of the temperature rise that it may have above its surroundings."
+#: What a number that is infinite, or missing, means in some columns.
+_ENDLESS = {"permissible_time_s": words.FOR_EVER}
+_MISSING = {"supply_voltage_V": "battery", "flags": "none"}
+
+
+def quantity_column(name: str, **options: Any) -> Column:
+    """The column of a quantity in a report, from the name of its column in a table of runs."""
+    if name in _REGISTERED:
+        q = _REGISTERED[name]
+        return Column(q.label, q.unit_shown.replace("-", ""), f"{{:.{q.resolution}f}}", **options)
+    if name in CONDITIONS:
+        title, form = CONDITIONS[name]
+        heading, _, unit = title.removesuffix("]").partition(" [")
+        return Column(heading, unit, form, **options)
+    heading, unit, form = _OTHERS[name]
+    return Column(heading, unit, form, **options)
+
+
+def quantity_cells(table: Mapping[str, np.ndarray], name: str) -> list[Any]:
+    """Cells of a column, each with its standard deviation if the table has one; infinite numbers in words."""
+    values, spread = table[name], table.get(name + uncertainty.SD)
+    if spread is not None:
+        digits = _REGISTERED[name].resolution
+        return [
+            None if math.isnan(v) else uncertainty.with_sd(v, s, digits) for v, s in zip(values, spread, strict=True)
+        ]
+    if name == "status":
+        return [Cell(s, "" if s in words.SETTLED else "slides") for s in map(str, values)]
+    if values.dtype.kind != "f":
+        return [_MISSING.get(name, "") if v == "" else v for v in values]
+    endless, missing = _ENDLESS.get(name, words.NONE_SETTLES), _MISSING.get(name)
+    return [missing if math.isnan(v) else endless if math.isinf(v) else v for v in values]
+
+
+def quantity_table(name: str, table: Mapping[str, np.ndarray], names: Iterable[str], **options: Any) -> Table:
+    """The quantities `names` that a table of runs has numbers of, a row for each run.
+
+    Args:
+        name: of the table; options: further fields of it, and its `first` columns with their cells.
+    """
+    first: Sequence[tuple[Column, Sequence[Any]]] = options.pop("first", ())
+    shown = [n for n in dict.fromkeys(names) if n in table and (n == "supply_voltage_V" or not _is_empty(table[n]))]
+    heads = (*(column for column, _ in first), *map(quantity_column, shown))
+    cells = [*(cells for _, cells in first), *(quantity_cells(table, n) for n in shown)]
+    return Table(name, heads, list(zip(*cells, strict=True)), **options)
+
+
+def _is_empty(values: np.ndarray) -> bool:
+    return values.dtype.kind == "f" and bool(np.isnan(values).all())
+
+
+def reading_text(value: Any, channel: Channel) -> str:
+    """A reading with one digit less than its channel's resolution; a dash for a missing one."""
+    return Column("", form=f"{{:.{max(channel.resolution - 1, 0)}f}}").text(value)
+
+
+def reading_columns(shown: Iterable[Channel], kinds: Mapping[str, str]) -> list[tuple[str, Column]]:
+    """Columns of readings, grouped by channel, with their names in a table.
+
+    Args:
+        kinds: heading of each kind of reading, by the prefix of its column, such as `{"": "measured"}`.
+    """
+    return [
+        (f"{prefix}{c.column}", Column(heading, c.unit, f"{{:.{max(c.resolution - 1, 0)}f}}", c.label))
+        for c in shown
+        for prefix, heading in kinds.items()
+    ]
+
+
+def lead_note(file: RobotFile, model: str = "", more: str = "") -> Note:
+    """The line below the answer: robot, fidelity and a further sentence."""
+    parts = [f"Robot: **{capabilities.shown_name(file)}**.", f"Fidelity: **{model}**." * bool(model), more]
+    return Note(" ".join(filter(None, parts)), "lead")
+
+
+def endings_table(
+    counts: Mapping[str, int],
+    things: str = "runs",
+    model: str = "",
+    meanings: Mapping[str, str] = MappingProxyType({}),
+    **more: Mapping[str, Any],
+) -> Table:
+    """How runs or points ended: statuses that occurred, in words, with their number.
+
+    Args:
+        counts: by status; meanings: of statuses that are no fidelity's; more: further columns, each by status.
+    """
+    total, reached = sum(counts.values()), [s for s, n in counts.items() if n]
+    further = (f"~{name.replace('_', ' ')}" for name in more)
+    heads = columns("ended", f"{things} | ,", "share [%] | .3g", "~status", "meaning", *further)
+    meant = {s: meanings.get(s) or words.VERDICTS.get((model, s)) or words.status_meaning(s) for s in reached}
+    rows = [
+        (
+            Cell(words.short_status(s), "good" if s in words.SETTLED else "bad"), counts[s], 100 * counts[s] / total,
+            f"`{s}`", meant[s], *(m.get(s) for m in more.values()),
+        )
+        for s in reached
+    ]  # fmt: skip
+    return Table("statuses", heads, rows)
+
+
+def limits_table(limits: Sequence[Mapping[str, Any]], what: str) -> Table:
+    """Use of each limit: its value, the limit and the share of it that is used."""
+    heads = columns("limit of", f"{what} |", "limit |", "used | {:.0f} %")
+    rows = [(limit["words"], limit["value"], limit["limit"], _used(limit)) for limit in limits]
+    return Table("limits", heads, rows, terminal=False)
+
+
+def use_of_limits(asked: Iterable[tuple[str, Any, Any, str]], ambient: float) -> list[dict[str, Any]]:
+    """Use of each known limit: words, its value, the limit, and the share of it [%].
+
+    A winding has the share of its permissible temperature rise.
+
+    Args:
+        asked: words, value, limit, and format with the unit; NaN: unknown; ambient: temperature [°C].
+    """
+    return [
+        {
+            "words": name, "value": words.NONE_SETTLES if math.isinf(value) else form.format(float(value)),
+            "limit": form.format(float(limit)),
+            "percent": warming_share(value, limit, ambient) if "°C" in form else 100 * abs(value) / float(limit),
+        }
+        for name, value, limit, form in asked
+        if not (math.isnan(value) or math.isnan(limit) or limit >= UNLIMITED)
+    ]  # fmt: skip
+
+
+def warming_share(value: float, limit: float, ambient: float) -> float:
+    """Share of what a winding may warm up by above the surroundings [%]."""
+    return 100 * (value - ambient) / max(limit - ambient, 1.0)
+
+
+def _used(limit: Mapping[str, Any]) -> Cell | str:
+    if limit["percent"] is None:
+        return f"not judged: the robot's file states no `{limit['unstated']}`"
+    return Cell(limit["percent"], "over" if limit["percent"] > 100 else "bar")

@@ -1,0 +1,327 @@
+"""The report of `simulate`: each run's readings, its limits, its history from standstill, where its power goes."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from calibration.data.robot_file import RobotFile
+from mmrjax.fidelities.base import Run
+from mmrjax.model.channels import Channel
+from mmrjax.model.quantities import MM, RPM, VOLTAGE
+from mmrjax.model.robot import Robot
+from sweeps import capabilities
+from sweeps.pages import words
+from sweeps.report import run_tables
+from sweeps.report.condition_columns import imposed_column
+from sweeps.report.document import (
+    SIDE_BY_SIDE,
+    Block,
+    Column,
+    Document,
+    Note,
+    Section,
+    Table,
+    columns,
+    deferred_figure,
+    remarks,
+)  # fmt: skip
+from sweeps.report.words import posture_words
+from sweeps.results.posture_results import Postures
+
+#: Column of the largest current of all motors together in a run over time.
+PEAK = "peak_current_A"
+#: Quantities of a run before and after its readings, in the order of the table.
+_CONDITIONS = ("total_mass_kg", "slope_deg", "load_torque_Nm", "duty_left", "duty_right", "heading_deg")
+_FURTHER = (
+    PEAK, "displacement_m", "time_end_s", "voltage_cell_V", "slip", "power_supply_W", "power_motor_W", "power_gear_W",
+    "power_ground_W", "power_lift_W", "winding_settled_C", "permissible_time_s", "adhesion_used", "status", "flags",
+)  # fmt: skip
+HISTORIES, CHAINS, GEARS = 4, 12, 2  # runs that a figure has room for
+_COURSES = "**What the instruments show over time**, of each run from rest."
+_HISTORY = (
+    "**Current and speeds over time.** Each run on its own slope, as its heading says; a run that goes backward is "
+    "drawn with backward positive. Stage I, starting: inrush until the movers slide fastest. Stage II, acceleration "
+    "with slipping: the shafts are up to speed, the robot is not, and friction pulls it along. Stage III, uniform: "
+    "sliding is back within V_s of the friction law."
+)
+_AVERAGED = " Samples are means over {:g} ms: the current's peak is higher for an instant."
+_SLIP = (
+    "**Slip over the start.** Left, the robot's speed V_x (1) and that of its movers V_x_teor = r_k ω_k (2); the "
+    "area between is way that the movers lose. Right, the slip s = 1 − V_x / V_x_teor. Dashed: its mean over each "
+    "stage, and over the acceleration time t′, 1 − ∫V_x dt / ∫V_x_teor dt."
+)
+_RIPPLE = (
+    "**Total current at the end of the run, enlarged.** On tracks it repeats with the grousers' pitch, eq. (34); on "
+    "wheels only the belt's teeth are left."
+)
+_TOUCHDOWN = (
+    "**What a grouser does when it lands.** Below, the load on each grouser (one line each) as it passes under the "
+    "robot."
+)
+_REACTIONS = "**Normal reactions of one side.** On tracks grousers come and go; on wheels two contacts stay."
+_POSTURE = (
+    "**The robot from the side**, as its levers stand in the first run: left at rest on its ground, right on the "
+    "highest step on which it stands with its centre of mass (dot) over the edge. A higher step it does not get over "
+    "slowly, whatever the friction, with its levers held like this."
+)
+_STEPS = (
+    "**Highest step and margin of tipping over the angles of the levers**, 0° along the wheelbase outward, positive "
+    "up, ±180° folded; right the posture of the highest. Geometry alone: friction and torque may allow less."
+)
+_CHAIN = "**Power from the supply at the end of the run, split along the chain.** "
+_ON_GROUND = "Only the green part lifts the robot; everything else is lost. Downhill the slope gives power too."
+_ON_SHAFT = "What the gearboxes pass on is the load's: its friction, and what it lifts."
+
+
+def runs_document(
+    file: RobotFile,
+    model: str,
+    runs: dict[str, np.ndarray],
+    histories: Run | None = None,
+    stands: Postures | None = None,
+    notes: Sequence[str] = (),
+) -> Document:
+    """The report of a few finished runs.
+
+    Args:
+        runs: the finished table of runs; histories: the same as a batch with its history, if it is kept.
+        stands: in which posture, where the runs state levers; notes: remarks on the runs.
+    """
+    robot, names = file.robot, run_headings(runs)
+    single, first = len(names) == 1, {key: value[0] for key, value in runs.items()}
+    used = limits_used(robot, first) if single else []
+    endings = run_tables.endings_table(Counter(map(str, runs["status"])))
+    table = capabilities.without_idle(robot, runs)
+    shown_columns = (imposed_column(table), *_CONDITIONS, *(c.column for c in robot.channels), *_FURTHER)
+    if not np.nan_to_num(table.get("voltage_cell_V", 0.0)).any():
+        table.pop("voltage_cell_V", None)
+    blocks: list[Block] = [run_tables.lead_note(file, model, "From standstill." if histories is not None else "")]
+    blocks += [run_tables.limits_table(used, "this run"), Note(run_tables.WARMING_SHARE, "key")] if used else []
+    shown = run_tables.quantity_table(
+        "runs", table, shown_columns, first=[(Column("run"), names)], file="runs.csv", wide=len(names) > SIDE_BY_SIDE,
+        sideways=True,
+    )  # fmt: skip
+    of_runs = Section("The run" if single else "The runs", (shown,), "runs-section")
+    blocks += [] if single and first["status"] in words.SETTLED else [endings]
+    blocks += remarks([*notes, *([] if stands is None else [posture_words.posture_sentences(stands)])])
+
+    def sections() -> Iterable[Section]:
+        if histories is not None:
+            yield from _histories(robot, runs, names, histories)
+        if stands is not None:
+            yield _posture(stands, names)
+        yield Section("Where the power goes", tuple(_power_chain(robot, runs, names)), "chain")
+
+    title = f"Run of {names[0]}" if single else f"{len(names)} runs"
+    return Document(title, runs_answer(runs, robot.channels, used), tuple(blocks), (of_runs,), sections)
+
+
+def runs_answer(runs: dict[str, np.ndarray], channels: Sequence[Channel], used: Sequence[Mapping[str, Any]]) -> str:
+    """One sentence: readings of a single run and its most used limit, or how many of several runs settle.
+
+    Args:
+        used: limits of a single run, as `limits_used` returns them.
+    """
+    settled = np.isin(runs["status"], words.SETTLED)
+    if len(settled) > 1:
+        over = int((settled & (runs["flags"] != "")).sum())
+        beyond = f"{over} of them {'exceeds' if over == 1 else 'exceed'} a limit"
+        rest = f"; {beyond if over else 'all within every limit'}" if settled.any() else ""
+        return f"{settled.sum()} of {len(settled)} runs have an operating point{rest}."
+    if not settled[0]:
+        return f"No operating point: {words.status_meaning(str(runs['status'][0]))}."
+    readings = ", ".join(f"{c.label} {run_tables.reading_text(runs[c.column][0], c)} {c.unit}" for c in channels)
+    judged = [limit for limit in used if limit["percent"] is not None]
+    readings = readings[0].upper() + readings[1:]
+    if not judged:
+        return f"{readings}."
+    nearest = max(judged, key=lambda limit: limit["percent"])
+    verb = "exceeds its limit" if nearest["percent"] > 100 else "is the nearest limit"
+    return f"{readings}; {nearest['words']} {verb} ({nearest['percent']:.0f} % of {nearest['limit']})."
+
+
+def run_headings(runs: Mapping[str, np.ndarray]) -> list[str]:
+    """A heading for each run: its name where it has one, and its conditions."""
+    found = [conditions_in_words(runs, k) for k in range(len(runs["status"]))]
+    return [f"{runs['run_id'][k]}: {at}" for k, at in enumerate(found)] if "run_id" in runs else found
+
+
+def conditions_in_words(table: Mapping[str, np.ndarray], row: int) -> str:
+    """The conditions of a row in words: what is imposed, and on a vehicle payload, slope and a rig's surface."""
+    parts = [str(table["configuration"][row])]
+    if "supply_voltage_V" in table:
+        parts.append("battery" if math.isnan(volts := float(table["supply_voltage_V"][row])) else f"{volts:g} V")
+    elif "motor_speed_rpm" in table:
+        parts.append(f"{table['motor_speed_rpm'][row]:g} rpm")
+    elif "motor_current_A" in table and "simulated_motor_current_A" not in table:
+        parts.append(f"{table['motor_current_A'][row]:g} A")
+    if "payload_kg" in table:
+        parts += [f"{table['payload_kg'][row]:g} kg", f"{table['slope_deg'][row]:g}°"]
+    if "load_torque_Nm" in table:
+        parts.append(f"{table['load_torque_Nm'][row]:.4g} N·m")
+    if "duty_left" in table:
+        parts.append(f"duties {table['duty_left'][row]:.3g} and {table['duty_right'][row]:.3g}")
+    return ", ".join(parts)
+
+
+def _histories(robot: Robot, runs: Mapping[str, np.ndarray], names: list[str], histories: Run) -> Iterable[Section]:
+    """Runs over time: as instruments show them, or from standstill on a ground, with what the running gear does."""
+    from sweeps.pages import gear_figures, history_figures
+
+    which = [robot.configurations.index(str(c)) for c in runs["configuration"]]
+    history, status = histories.history, np.asarray(histories.result.status)
+    assert history is not None  # the fidelity was asked for it
+    cut = (Note(f"The first {HISTORIES} of {len(names)} runs; all are in `history.csv`."),) * (len(names) > HISTORIES)
+    if not robot.has_ground:
+        if any(c.over_time for c in robot.channels):
+            shown = history_figures.members_as_read(robot.channels, history, status, names[:HISTORIES])
+            names_of = [c.name for c in robot.channels]
+            ends = [
+                (s.name, words.short_status(s.status), *(read(n) for n in names_of for read in (s.largest, s.last)))
+                for s in shown
+            ]
+            read_heads = run_tables.reading_columns(robot.channels, {"": "largest", "last_": "at the end"})
+            table = Table("courses-table", (*columns("run", "ends"), *(column for _, column in read_heads)), ends)
+            figure = deferred_figure("courses", "channels over time", _COURSES, "history_figures.over_time", shown)
+            yield Section("Over time", (*cut, figure, table), "history-section")
+        return
+    starts = history_figures.members_from_standstill(robot, history, status, which, names[:HISTORIES])
+    caption = _HISTORY
+    if history.reactions is not None:
+        caption += _AVERAGED.format(1e3 * float(history.time[0, 1] - history.time[0, 0]))
+    figure = deferred_figure(
+        "history", "current and speeds from standstill", caption, "history_figures.from_standstill", starts
+    )
+    slip = deferred_figure(
+        "slip", "slip over the stages of a start", _SLIP, "history_figures.slip_over_start", starts
+    )
+    yield Section("From standstill", (*cut, figure, _starts(starts), slip), "history-section")
+    if history.reactions is None:
+        return
+    share = np.asarray(histories.columns["guide_share"])
+    gears = gear_figures.members_with_gear(robot, history, status, share, which, names[:GEARS])
+    # A ripple is of steady travel: the contacts have stopped sliding before the part that is looked at.
+    ripples = [g for g, s in zip(gears, starts, strict=False) if s.gets_under_way and g.settled_since(s.slipping)]
+    if ripples:
+        yield Section("Inside the running gear", tuple(_gear(ripples)), "gear")
+
+
+def _starts(starts: Sequence[Any]) -> Table:
+    """Stages, currents and slip of each start; without stages where a run does not get under way."""
+    mean_slips = (f"mean slip > {share} [%] | .1f" for share in ("stage I", "stage II", "stage III", "over t′"))
+    heads = columns(
+        "run", "ends", "stage I until [s] | .3f", "stage II until [s] | .3f", "t′: V within 1 % of its end [s] | .3f",
+        "peak current [A] | .1f", "current at the end [A] | .2f", "V at the end [mm/s] | .0f", *mean_slips,
+    )  # fmt: skip
+    rows = []
+    for s in starts:
+        numbers: list[float | None] = [None] * 10
+        if s.time.size:
+            under_way = (s.starting, s.slipping, s.settled), (*s.stages.slip, s.stages.over_settling)
+            times, slips = under_way if s.gets_under_way else ([None] * 3, [math.nan] * 4)
+            ends = (s.sense * x for x in (s.peak, *s.ended))
+            numbers = [*times, *ends, *(100 * x for x in slips)]
+        rows.append((s.name, words.short_status(s.status), *numbers))
+    return Table("starts", heads, rows)
+
+
+def _gear(ripples: Sequence[Any]) -> Iterable[Block]:
+    """Ripple of currents, speeds and reactions at the end of runs."""
+    from sweeps.pages import gear_figures
+
+    heads = columns(
+        "run", "repeats with", "period found [ms] | .2f", "eq. (34) [ms] | .2f", "current ripple ± [%] | .2g",
+        "speed ripple ± [%] | .2g", "reaction ripple ± [%] | .2g", "weight on the guides [%] | .1f",
+    )  # fmt: skip
+    yield deferred_figure(
+        "ripple", "ripple of the total current at the end", _RIPPLE, "gear_figures.current_ripple", ripples
+    )
+    yield Table("ripple-table", heads, [tuple(gear_figures.ripple_numbers(g).values()) for g in ripples])
+    for gear in [g for g in ripples if g.on_tracks][:1]:
+        title = f"{gear.name}: touchdowns dotted"
+        alternative = "current and reactions when grousers touch down"
+        yield deferred_figure("touchdown", alternative, _TOUCHDOWN, "gear_figures.draw_touchdowns", gear, title)
+    yield deferred_figure(
+        "reactions", "normal reactions of one side", _REACTIONS, "gear_figures.draw_reactions", ripples
+    )
+
+
+def _posture(stands: Postures, names: Sequence[str]) -> Section:
+    figures = [
+        deferred_figure(
+            "posture", "the robot from the side, at rest and on its highest step", _POSTURE,
+            "posture_figures.rest_and_step", stands,
+        ),
+        deferred_figure(
+            "steps", "highest step and margin of tipping over the angles of the levers", _STEPS,
+            "posture_figures.draw_highest_steps", stands.over,
+        ),
+    ]  # fmt: skip
+    blocks: tuple[Block, ...] = (*figures[: 1 + (len(names) == 1)], posture_words.posture_table(stands, names))
+    return Section("Posture", blocks, "posture-section")
+
+
+def _power_chain(robot: Robot, runs: dict[str, np.ndarray], names: Sequence[str]) -> Iterable[Block]:
+    from sweeps.pages import power_figures
+
+    chain = np.flatnonzero(power_figures.drawable_runs(runs) & np.isin(runs["status"], words.SETTLED))[:CHAINS]
+    if not chain.size:
+        none = "No run ends in steady travel." if robot.has_ground else "No run ends turning steadily."
+        unknown = [] if robot.knows(VOLTAGE) else capabilities.unknown_numbers_sentence(robot)
+        yield Note(f"{'. '.join(unknown).capitalize()}." if unknown else none)
+        return
+    if len(chain) < len(names):
+        yield Note(f"{len(chain)} of {len(names)} runs: the first {CHAINS} that end in steady travel.")
+    caption = _CHAIN + (_ON_GROUND if robot.has_ground else _ON_SHAFT)
+    yield deferred_figure(
+        "power", "power of the supply, split along the chain", caption,
+        "power_figures.draw_power_chain", {key: value[chain] for key, value in runs.items()},
+        [names[k] for k in chain], robot.has_ground,
+    )  # fmt: skip
+
+
+def limits_used(robot: Robot, run: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Use of each limit by a run; an inrush without a stated limit has no share."""
+    idle = capabilities.idle_columns(robot)
+    radius = float(robot.configurations[str(run["configuration"])].radius)
+    shaft = float(run["theoretical_speed_mm_s"]) * MM / radius * float(robot.gearbox.ratio) / RPM
+    turning = abs(shaft) > 1e-9
+    torque = (
+        float(run["power_gear_W"]) / (float(robot.sides) * shaft * RPM) * float(robot.gearbox.ratio)
+        if turning
+        else math.nan
+    )
+    cell = math.nan if "voltage_cell_V" in idle else float(run["voltage_cell_V"]) or math.nan  # 0: none feeds it
+    gear = f"gearbox torque at {'the driving wheel' if robot.has_ground else 'its output'}"
+    asked = [
+        ("adhesion", math.nan if "adhesion_used" in idle else float(run["adhesion_used"]), 1.0, "{:.2f}"),
+        ("motor speed", shaft, float(robot.motor.speed_limit) / RPM, "{:.0f} rpm"),
+        ("gearbox input speed", shaft, float(robot.gearbox.speed_limit) / RPM, "{:.0f} rpm"),
+        ("winding, long running", run["winding_settled_C"], robot.motor.temperature_limit, "{:.0f} °C"),
+        (gear, torque, robot.gearbox.torque_limit or math.nan, "{:.2f} N·m"),
+        ("voltage of a cell, charged", cell, robot.battery.voltage_charge, "{:.2f} V"),
+    ]
+    found = run_tables.use_of_limits(asked, float(robot.motor.temperature_ambient))
+    if PEAK in run and not math.isnan(peak := float(run[PEAK])):
+        most = inrush_limit(robot, math.isnan(float(run.get("supply_voltage_V", math.nan))))
+        found.append({
+            "words": "largest current of the start, all motors", "value": f"{peak:.1f} A",
+            "limit": "not stated" if most is None else f"{most:.1f} A",
+            "percent": None if most is None else 100 * peak / most,
+            "unstated": "driver.current_limit" + ", battery.current_limit" * bool(run.get("voltage_cell_V")),
+        })  # fmt: skip
+    return found
+
+
+def inrush_limit(robot: Robot, on_battery: bool) -> float | None:
+    """Largest current of the driver, or of the battery less other consumers, for all motors [A]; None: not stated."""
+    most, battery = float(robot.driver.current_limit), robot.battery
+    stated = [float(robot.sides) * most] if most < float(type(robot.driver)().current_limit) else []
+    if on_battery and battery.current_limit is not None:
+        stated.append(battery.current_limit - float(battery.current_other))
+    return min(stated, default=None)

@@ -1,0 +1,125 @@
+"""The report of a sweep: how its runs ended, which limits they exceed, and every channel over the grid."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from calibration.data.robot_file import RobotFile
+from mmrjax.errors import count_noun
+from sweeps import capabilities
+from sweeps.pages import words
+from sweeps.report import run_tables
+from sweeps.report.condition_columns import imposed_column
+from sweeps.report.document import Document, Note, Section, Table, columns, deferred_figure, remarks
+from sweeps.report.run_tables import quantity_column
+
+Runs = dict[str, np.ndarray]
+_MAPS = (
+    "Hatched or crossed: no operating point, with the status that says why. Where several runs share a place, their "
+    "median. Of more than three voltages or speeds, three are drawn; all runs are in `runs.csv`."
+)
+
+
+def sweep_document(file: RobotFile, model: str, runs: Runs, notes: Sequence[str] = ()) -> Document:
+    """The report of a finished sweep of any grid."""
+    shown = capabilities.without_idle(file.robot, runs)
+    statuses = Counter(map(str, runs["status"]))
+    known = [*words.STATUSES, *(statuses.keys() - words.STATUSES.keys())]
+    over = {s: int(((runs["status"] == s) & (runs["flags"] != "")).sum()) for s in known}
+    where = {s: "" if s in words.SETTLED else _where(runs, runs["status"] == s) for s in known}
+    maps = (
+        deferred_figure(
+            f"sweep_{c.name}", f"{c.label} over the grid", f"**{c.label.capitalize()}** [{c.unit}].",
+            "sweep_figures.draw_sweep", runs, c,
+        )
+        for c in file.robot.channels
+    )  # fmt: skip
+    axes = "; ".join(_levels(runs, c) for c in _axes(runs))
+    extremes = (*(c.column for c in file.robot.channels), "slip", "winding_settled_C")
+    return Document(
+        f"Sweep of {count_noun(len(runs['status']), 'run')}",
+        sweep_answer(runs),
+        (
+            run_tables.lead_note(file, model, f"Varied: {axes}."),
+            run_tables.endings_table({s: statuses[s] for s in known}, beyond_a_limit=over, where=where),
+            _limits(runs),
+            _extremes(shown, extremes),
+            *remarks(notes),
+        ),
+        (Section("Over the grid", (Note(_MAPS), *maps), "maps"),),
+    )
+
+
+def sweep_answer(runs: Runs) -> str:
+    """One sentence: runs that have an operating point, and how many of them stay within every limit."""
+    total = len(runs["status"])
+    settled = np.isin(runs["status"], words.SETTLED)
+    over = settled & (runs["flags"] != "")
+    verb = "has" if 1 in (total, settled.sum()) else "have"
+    first = f"{settled.sum()} of {count_noun(total, 'run')} {verb} an operating point"
+    if not over.any():
+        return f"{first}; all within every limit." if settled.any() else f"{first}."
+    raised = Counter(flag for flags in runs["flags"][over] for flag in str(flags).split(";"))
+    most, times = raised.most_common(1)[0]
+    return (
+        f"{first}; {over.sum()} of them {'exceeds' if over.sum() == 1 else 'exceed'} a limit, most often: "
+        f"{words.FLAGS.get(most, most)} ({count_noun(times, 'run')})."
+    )
+
+
+def _limits(runs: Runs) -> Table:
+    """Limits that some runs exceed, with the number of runs and their places."""
+    kinds, which = np.unique(runs["flags"], return_inverse=True)
+    rows = []
+    for flag, meaning in words.FLAGS.items():
+        over = np.array([flag in str(f).split(";") for f in kinds])[which]
+        if over.any():
+            rows.append((f"{meaning} (`{flag}`)", int(over.sum()), _where(runs, over)))
+    heads = columns("limit exceeded", "runs | ,", "~where")
+    return Table("limits", heads, rows)
+
+
+def _axes(runs: Runs) -> list[str]:
+    """Columns of the axes that runs have: on the battery no voltage, and no readings."""
+    axes = ("configuration", imposed_column(runs), "payload_kg", "slope_deg", "load_torque_Nm")
+    return [c for c in axes if c in runs and (runs[c].dtype.kind not in "fiu" or not np.isnan(runs[c]).all())]
+
+
+def _levels(runs: Runs, name: str, pick: np.ndarray | slice = slice(None), most: int = 8) -> str:
+    """Levels of an axis at the picked runs, in words: `slope 0, 10°`."""
+    values, column = runs[name][pick], quantity_column(name)
+    levels = np.unique(values)
+    if levels.dtype.kind not in "fiu":
+        return ", ".join(dict.fromkeys(map(str, values)))
+    unit = column.unit if column.unit == "°" else f" {column.unit}"
+    if levels.size > most:
+        return f"{column.heading} {levels[0]:.3g} to {levels[-1]:.3g}{unit} ({levels.size} values)"
+    return f"{column.heading} {', '.join(f'{v:.4g}' for v in levels)}{unit}"
+
+
+def _where(runs: Runs, pick: np.ndarray) -> str:
+    """Ranges of slope and imposed quantity of the picked runs, by configuration, in words."""
+    parts = []
+    for kind in dict.fromkeys(map(str, runs["configuration"][pick])):
+        mine = pick & (runs["configuration"] == kind)
+        names = [c for c in ("slope_deg", imposed_column(runs)) if c in runs and not np.isnan(runs[c][mine]).all()]
+        ranges = "; ".join(_levels(runs, c, mine, 4) for c in names)
+        parts.append(f"{int(mine.sum())} of {kind} ({ranges})")
+    return ", ".join(parts)
+
+
+def _extremes(runs: Runs, names: Iterable[str]) -> Table:
+    """The settled runs with the largest readings, slip and winding temperature."""
+    settled = np.nonzero(np.isin(runs["status"], words.SETTLED))[0]
+    reached = [c for c in names if c in runs and not np.isnan(runs[c][settled]).all()]
+    rows = []
+    for c in reached:
+        k = int(settled[np.nanargmax(np.abs(runs[c][settled]))])
+        column = quantity_column(c)
+        (value,) = run_tables.quantity_cells({c: runs[c][k : k + 1]}, c)
+        place = "; ".join(_levels(runs, axis, slice(k, k + 1)) for axis in _axes(runs))
+        rows.append((f"largest {column.heading}", f"{column.text(value)} {column.unit}".strip(), place))
+    return Table("extremes", columns("extreme of the settled runs", "value |", "at"), rows)
