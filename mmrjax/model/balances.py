@@ -136,8 +136,10 @@ def supply(robot: Robot, conditions: Conditions, signals: Signals) -> Signals:
     )
     back = robot.motor.voltage_back(signals.speed_motor)
     voltage = robot.driver.voltage(source - effects_sum(robot, signals, "supply"), signals.duty, signals.pause, back)
-    blocked = robot.driver.blocks(signals.duty * conditions.polarity, signals.current, conditions.open)
-    return _fill(signals, voltage_source=source, voltage=jnp.where(blocked, back, voltage))
+    demanded, limited = (conditions.polarity * duty for duty in (conditions.duty, signals.duty))
+    conducts = robot.driver.conducts(demanded, limited, signals.current, voltage - back, conditions.open)
+    voltage = jnp.where(conducts == 1, voltage, back + conducts * (voltage - back))
+    return _fill(signals, voltage_source=source, voltage=voltage)
 
 
 def power_drawn(robot: Robot, signals: Signals) -> Scalar:
