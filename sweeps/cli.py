@@ -18,7 +18,7 @@ import typer
 
 from calibration.data.input_errors import BadConfiguration, InputError
 from mmrjax import SOUND_AT_LEVEL_0, WORKER, __version__, fidelities
-from mmrjax.errors import shorten
+from mmrjax.errors import printable, shorten
 from sweeps import config, config_campaign
 from sweeps import options as made
 from sweeps.flags import options_of_fields as flags_of
@@ -802,7 +802,7 @@ def _answered(error: BaseException) -> int:
     import traceback
 
     with contextlib.suppress(OSError):
-        traceback.print_exception(error)
+        print(printable("".join(traceback.format_exception(error))), end="", file=sys.stderr)
     return _fail(f"internal error: {error}", 1)
 
 
@@ -827,5 +827,5 @@ def _no_number(error: Any) -> str:
 
 def _fail(message: str, code: int) -> int:
     with contextlib.suppress(OSError):  # of a standard error that takes no more
-        print(f"mmrjax: {shorten(' '.join(message.splitlines()))}", file=sys.stderr)
+        print(f"mmrjax: {shorten(printable(' '.join(message.splitlines())))}", file=sys.stderr)
     return code

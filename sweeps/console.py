@@ -8,7 +8,7 @@ import sys
 import textwrap
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import IO, Any, cast
 
@@ -23,9 +23,11 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.segment import Segment
 from rich.text import Text
 
-from calibration.data.writing import naming_file
+from calibration.data.writing import json_text, naming_file
+from mmrjax.errors import printable
 
 #: Widest line of text on a terminal.
 COLUMNS = 80
@@ -33,8 +35,19 @@ COLUMNS = 80
 SILENCE, FIRST = 2.0, 1.0
 #: What results are printed to, as an error calls it.
 OUTPUT = "standard output"
+
+
+class _Outlet(Console):
+    """A console that replaces what a terminal would obey: names, units and cells come from files of others."""
+
+    def render(self, renderable: Any, options: Any = None) -> Iterator[Segment]:
+        """Segments of text, each `printable`."""
+        for segment in super().render(renderable, options):
+            yield segment if segment.control else segment._replace(text=printable(segment.text))
+
+
 _WIDTH = None if sys.stdout is not None and sys.stdout.isatty() else 120  # a file has no width of its own
-_out = Console(highlight=False, soft_wrap=True, markup=False, width=_WIDTH)
+_out = _Outlet(highlight=False, soft_wrap=True, markup=False, width=_WIDTH)
 
 
 class _Messages(io.TextIOBase):
@@ -57,13 +70,19 @@ class _Messages(io.TextIOBase):
 
 
 MESSAGES = _Messages()
-_err = Console(file=cast(IO[str], MESSAGES), highlight=False, soft_wrap=True, markup=False)
+_err = _Outlet(file=cast(IO[str], MESSAGES), highlight=False, soft_wrap=True, markup=False)
 
 
 def print_output(what: Any) -> None:
     """Print text or a table to stdout."""
     with naming_file(OUTPUT):
         _out.print(wrap_for_terminal(what) if isinstance(what, str) and sys.stdout.isatty() else what)
+
+
+def print_json(content: Mapping[str, Any]) -> None:
+    """Print JSON to stdout."""
+    with naming_file(OUTPUT):
+        print(json_text(content))
 
 
 def print_message(text: str) -> None:
@@ -75,7 +94,7 @@ def print_message(text: str) -> None:
 def rewrite_line(text: str) -> None:
     """Write the last line of a terminal anew; a file, which keeps every line, gets none."""
     if MESSAGES.isatty():
-        MESSAGES.write(f"\r\x1b[K{text[: COLUMNS - 1]}")
+        MESSAGES.write(f"\r\x1b[K{printable(text)[: COLUMNS - 1]}")
         MESSAGES.flush()
 
 

@@ -300,6 +300,7 @@ KEPT = {
     ("sweeps/cli.py", "sys.stdout"): "where it is closed, once a process",
     ("sweeps/cli.py", "sys.stderr"): "where it is closed, once a process",
     ("sweeps/cli.py", "jax.config"): "a switch of jax, once a process",
+    ("sweeps/export/jax_actuator.py", "jax.config"): "set back after a program is lowered",
     (
         "sweeps/points/cluster.py",
         "_compiled",

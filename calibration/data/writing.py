@@ -7,6 +7,7 @@ import csv
 import io
 import json
 import math
+import re
 import shutil
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -15,6 +16,7 @@ from typing import Any, TextIO
 import numpy as np
 
 from calibration.data import frames
+from mmrjax.errors import printable
 
 
 @contextlib.contextmanager
@@ -61,8 +63,30 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Write a JSON file; numbers that are not finite become null."""
-    write_text(path, json.dumps(finite_or_null(content), indent=2, ensure_ascii=False) + "\n")
+    """Write a JSON file, `json_text`."""
+    write_text(path, json_text(content) + "\n")
+
+
+def json_text(content: Mapping[str, Any]) -> str:
+    """Data as JSON: numbers that are not finite become null, characters that are not `printable` their escapes."""
+    text = json.dumps(finite_or_null(content), indent=2, ensure_ascii=False)
+    shown = printable(text)
+    pairs = zip(text, shown, strict=True)
+    return text if shown == text else "".join(a if a == b else json.dumps(a)[1:-1] for a, b in pairs)
+
+
+def toml_value(value: Any) -> str:
+    """A value as TOML, a text with escapes for characters that are not `printable`."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        text = json.dumps(value.encode("utf-8", "replace").decode(), ensure_ascii=False)
+        return "".join(c if c.isprintable() else f"\\U{ord(c):08x}" for c in text)
+    if isinstance(value, tuple | list):
+        return "[" + ", ".join(map(toml_value, value)) + "]"
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{toml_value(name)} = {toml_value(v)}" for name, v in value.items()) + "}"
+    return repr(value)
 
 
 def write_table(path: Path, columns: Mapping[str, np.ndarray], tables: str = "csv") -> None:
@@ -89,15 +113,32 @@ def table_text(columns: Mapping[str, np.ndarray]) -> str:
 
 def _write_rows(stream: TextIO, columns: Mapping[str, np.ndarray]) -> None:
     writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(columns)
+    writer.writerow(map(cell_text, columns))
     writer.writerows(zip(*(map(cell_text, column) for column in columns.values()), strict=True))
 
 
+#: Words that a spreadsheet would run as formulas, and those that already have our mark.
+_FORMULA = re.compile(r"'*[=+\-@\t\r]")
+
+
 def cell_text(value: Any) -> str:
-    """A cell of a table."""
+    """A cell of a table; a word that a spreadsheet would run as a formula gets an apostrophe (`cell_word`)."""
     if isinstance(value, float | np.floating):
         return f"{value:.9g}" if math.isfinite(value) else ""
-    return str(value)
+    text = printable(str(value)).replace("\n", " ")
+    return f"'{text}" if isinstance(value, str) and _FORMULA.match(text) and not _is_number(text) else text
+
+
+def cell_word(text: str) -> str:
+    """A cell as it was before `cell_text` marked it."""
+    return text[1:] if text.startswith("'") and _FORMULA.match(text) else text
+
+
+def _is_number(text: str) -> bool:
+    with contextlib.suppress(ValueError):
+        float(text)
+        return True
+    return False
 
 
 def finite_or_null(value: Any) -> Any:
