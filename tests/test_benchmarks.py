@@ -75,6 +75,7 @@ SMALL = {
     "draw_mutants.py": "--number 1",
     "drive.py": "--batches 2 --repeats 1",
     "effects.py": "--check",
+    "weight.py": None,  # tests/test_weight.py
     "everything.py": None,  # test_a_killed_tier_counts_what_has_finished
     "fastsim_comparison.py": None,  # tests/test_fastsim_comparison.py
     "free_chain.py": None,  # a chain of 168 masses takes half a minute
