@@ -147,7 +147,7 @@ def commands() -> str:
     parts = [
         "# Commands",
         "Each command writes a run folder and prints its path on the last line. `mmrjax COMMAND --help` prints the "
-        "common options, `--help-all` every option. Options marked `*` appear in `--help-all` only.",
+        "common options. Options marked `*` appear with `--help-all` only, which commands with such options have.",
         MADE,
     ]
     for name, command in _commands():

@@ -105,7 +105,7 @@ def _carried(robot: Robot, conditions: Conditions, state: State, direction: Scal
     signals = balances.settled_signals(robot, conditions, state, direction)[0]
     limit = signals.adhesion_limit
     carried = dataclasses.replace(signals, traction=jnp.clip(signals.demand, -limit, limit))
-    return balances.gearbox(robot, robot.chassis(conditions.configuration), carried)
+    return balances.gearbox(robot, robot.chassis(conditions.configuration), carried, settled=True)
 
 
 def standing_signals(robot: Robot, conditions: Conditions, state: State) -> Signals:
@@ -148,6 +148,7 @@ def standing_signals(robot: Robot, conditions: Conditions, state: State) -> Sign
         torque_load=torque,
         torque_gear=torque,
         torque_output=torque,
+        torque_carried=torque,
         torque_input=torque / gear.ratio,
         torque_net=none,
         speed_sliding=none,
