@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections.abc import Iterable
@@ -14,7 +13,7 @@ from pydantic_core import PydanticCustomError
 
 from calibration.data import presets_file
 from calibration.data.columns import ROWS
-from calibration.data.input_errors import BadConfiguration, allowed_words, parse_number
+from calibration.data.input_errors import SEEDS, BadConfiguration, allowed_words, parse_number
 from calibration.data.input_files import toml_content, toml_text
 from calibration.inference import solvers
 from mmrjax import fidelities
@@ -37,7 +36,7 @@ Voltage = Annotated[float, Field(ge=_VOLTAGE[0], le=_VOLTAGE[1], allow_inf_nan=F
 PROFILED = "drive"
 #: Longest run of `simulate` where none is stated [s]: short enough that the start is seen.
 SHOWN = 5.0
-Seed = Annotated[int, Field(ge=0, le=2**32 - 1)]
+Seed = Annotated[int, Field(ge=0, le=SEEDS)]
 
 
 def option_field(default: Any, description: str, **extra: Any) -> Any:
@@ -286,7 +285,7 @@ class InferencePart(Part):
         "times too), and without such assumes 2, 0.5, 1 %, halved and doubled",
     )
     rows: Annotated[int, Field(ge=100, le=1_000_000)] = option_field(
-        ROWS, "Largest number of rows used of a log over time; a longer log is thinned evenly in time"
+        ROWS, "Largest number of rows used; more are thinned evenly, those of a log in time, others over conditions"
     )
     seed: Seed = option_field(0, "Random seed")
 
@@ -933,6 +932,8 @@ def parse_axis(option: str, text: str | None) -> tuple[float, ...] | None:
 
 def as_toml(config: Part) -> str:
     """The resolved configuration; `--config` accepts it."""
+    from calibration.data.writing import toml_value  # with NumPy, which --help does not wait for
+
     lines = []
     values = config.model_dump()
     values["set"] = values.pop("set")  # tables come last
@@ -942,19 +943,7 @@ def as_toml(config: Part) -> str:
     for key, value in values.items():
         if value is None or key in tables:  # None is left to the fidelity or the robot
             continue
-        lines.append(f"{key} = {_toml(value)}")
+        lines.append(f"{key} = {toml_value(value)}")
     for key, table in tables.items():
-        lines += ["", f"[{key}]", *(f'"{name}" = {_toml(value)}' for name, value in table.items())]
+        lines += ["", f"[{key}]", *(f"{toml_value(name)} = {toml_value(value)}" for name, value in table.items())]
     return "\n".join(lines) + "\n"
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False)
-    if isinstance(value, tuple | list):
-        return "[" + ", ".join(_toml(v) for v in value) + "]"
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{json.dumps(name)} = {_toml(v)}" for name, v in value.items()) + "}"
-    return repr(value)

@@ -15,7 +15,7 @@ import rich.text
 import typer
 
 from calibration.data.input_errors import BadConfiguration
-from mmrjax import SOUND_AT_LEVEL_0, fidelities
+from mmrjax import SOUND_AT_LEVEL_0, errors, fidelities
 from sweeps import cli, config
 from sweeps.points import scale
 from tests.commands import rows as table
@@ -129,7 +129,7 @@ USAGE = {
     "misspelt option": (["sweep", "--slope", "5"], r"No such option: --slope"),
     "unknown command": (["swep"], r"No such command"),
     "slope of 95": (["sweep", "--slopes", "0,95"], r"--slopes: got 95\.0; expected -45 to 45"),
-    "voltage below all": (["sweep", "--voltages=-300"], r"--voltages: got -300\.0; expected -100 to 100"),
+    "voltage below all": (["sweep", "--voltages=-30000"], r"--voltages: got -30000\.0; expected -10000 to 10000"),
     "NaN": (["sweep", "--payloads", "nan"], r"--payloads: got nan"),
     "no numbers": (
         ["sweep", "--slopes", "steep"],
@@ -764,11 +764,12 @@ def test_memory_exhausted_is_one_sentence_and_leaves_nothing(mmrjax, tmp_path, m
     assert "Traceback" not in err and not any(tmp_path.iterdir())
 
 
-def test_a_message_with_long_paths_is_whole(capsys):
-    message = (
-        f"{'/data' * 30}/log.csv: got none; run mmrjax loop {'/data' * 30}/log.csv --robot {'/rigs' * 30}/r.toml, or"
-    )
-    assert cli._fail(message, 4) == 4 and capsys.readouterr().err == f"mmrjax: {message}\n"
+def test_a_message_has_at_most_400_characters_and_keeps_its_end(capsys):
+    whole = f"{'/data' * 30}/log.csv: got none; run mmrjax loop {'/data' * 30}/log.csv"
+    assert cli._fail(whole, 4) == 4 and capsys.readouterr().err == f"mmrjax: {whole}\n"
+    assert cli._fail(f"x: got {'many words ' * 99}; expected fewer", 2) == 2
+    err = capsys.readouterr().err
+    assert len(err) <= len("mmrjax: \n") + errors.LONGEST == 409 and err.endswith("; expected fewer\n")
 
 
 def test_too_little_memory_is_refused_at_once(mmrjax, tmp_path, monkeypatch):

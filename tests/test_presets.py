@@ -14,6 +14,7 @@ from calibration.data.input_errors import BadConfiguration, BadData
 
 RIG = """
 base = "none"
+imposed = "{imposed}"
 channels = [{channels}]
 [motor]
 resistance = 2.0
@@ -33,8 +34,10 @@ VESC = {
 }  # fmt: skip
 
 
-def robot(tmp_path, *channels):
-    (tmp_path / "rig.toml").write_text(RIG.format(channels=", ".join(f'"{c}"' for c in channels)), encoding="utf-8")
+def robot(tmp_path, *channels, imposed="voltage"):
+    (tmp_path / "rig.toml").write_text(
+        RIG.format(imposed=imposed, channels=", ".join(f'"{c}"' for c in channels)), encoding="utf-8"
+    )
     return robot_file.read_robot(tmp_path / "rig.toml")
 
 
@@ -156,3 +159,16 @@ def test_a_file_of_another_logger_is_refused_with_its_columns(tmp_path):
         records.read_runs(
             {"a": [1.0, 2.0], "b": [1.0, 2.0]}, robot(tmp_path, "motor_speed"), columns="vesc,pole_pairs=7"
         )
+
+
+@pytest.mark.parametrize(("imposed", "refused"), [("voltage", True), ("motor_speed", False)])
+def test_a_supply_without_its_duty_does_not_drive_the_motor(tmp_path, imposed, refused):
+    text = "input_voltage,erpm,current_motor\n40,7000,3\n41,8000,4\n"
+    (tmp_path / "log.csv").write_text(text)
+    channels = ("motor_speed", "motor_current") if refused else ("motor_current",)
+    rig = robot(tmp_path, *channels, imposed=imposed)
+    if refused:
+        with pytest.raises(BadData, match=r"has no duty_cycle; --columns vesc needs it for duty"):
+            records.read_runs(tmp_path / "log.csv", rig, columns="vesc,pole_pairs=7")
+    else:
+        assert len(records.read_runs(tmp_path / "log.csv", rig, columns="vesc,pole_pairs=7")) == 2

@@ -85,7 +85,7 @@ def test_uneven_steps_and_repeats_count_as_they_are():
     assert used == 4 and np.abs(weights @ straight).max() < 1e-12
     repeats = np.array([3.0, 3.0, 3.0])
     weights, _ = series_noise._differences(np.array([1.0, 2.0, 4.0]), repeats, [np.arange(3)])
-    np.testing.assert_allclose(weights, [[-0.5, 1.0, -0.5]])
+    np.testing.assert_allclose(weights.toarray(), [[-0.5, 1.0, -0.5]])
 
 
 def test_a_display_shows_nothing_finer_than_its_step():

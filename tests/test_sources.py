@@ -14,7 +14,7 @@ import pytest
 import samples
 import xarray as xr
 
-from calibration.data import contents, delimited, profiles, robot_file, terrains
+from calibration.data import contents, delimited, input_files, profiles, robot_file, terrains
 from calibration.data import runs as records
 from calibration.data.input_errors import BadData
 from calibration.data.sources import one_clock, opening
@@ -380,11 +380,11 @@ def test_a_library_that_is_missing_is_named_with_the_extra(tmp_path, robot, monk
 
 def test_a_recording_larger_than_memory_is_refused_before_it_is_read(tmp_path, robot, monkeypatch):
     samples.parquet(tmp_path / "log.parquet", samples.table())
-    monkeypatch.setattr(opening, "available_memory", lambda: 1e4)
+    monkeypatch.setattr(input_files, "available_memory", lambda: 1e4)
     with pytest.raises(BadData, match="GB of memory are free"):
         records.read_runs(tmp_path / "log.parquet", robot, columns=COLUMNS)
-    monkeypatch.setattr(opening, "available_memory", lambda: 1e3)
-    assert "more values than the free memory" in contents.inspect_source(tmp_path / "log.parquet").signals[0].refused
+    monkeypatch.setattr(input_files, "available_memory", lambda: 1e3)
+    assert "memory are free" in contents.inspect_source(tmp_path / "log.parquet").signals[0].refused
 
 
 @pytest.mark.parametrize("source", [3, None, [1, 2], {}, pd.Series([1.0]), pd.DataFrame()])

@@ -208,8 +208,9 @@ REPRODUCTION = ("sweeps", "paper")
 #: what shows slip.
 SPELLED = {
     ("calibration/discovery/menu.py", "TURNING, STANDING"),
+    ("calibration/data/proposals.py", "MEANINGS"),  # words in the names of other people's signals
+    ("calibration/data/proposals.py", "BY_UNIT"),
     ("calibration/words/effect_words.py", "CHECKED_BY"),  # which act checks which instrument
-    ("calibration/data/contents.py", "MEANINGS"),  # words in the names of other people's signals
     ("calibration/inference/blocks.py", "BLOCKS"),  # what is imposed may be a channel's column
     ("calibration/inference/observers/settled_ends.py", "_slides_at_end"),  # the two that show slip
 }
@@ -296,7 +297,11 @@ KEPT = {
     ("calibration/discovery/scales.py", "_nominal"): "pure: signals of the nominal robot",
     ("sweeps/report/catalogue.py", "_content"): "a packaged file",
     ("sweeps/cli.py", "os.environ"): "set for jax, before it is imported",
+    ("sweeps/cli.py", "sys.unraisablehook"): "repeats an interrupt that a callback lost, while a command works",
+    ("sweeps/cli.py", "sys.stdout"): "where it is closed, once a process",
+    ("sweeps/cli.py", "sys.stderr"): "where it is closed, once a process",
     ("sweeps/cli.py", "jax.config"): "a switch of jax, once a process",
+    ("sweeps/export/jax_actuator.py", "jax.config"): "set back after a program is lowered",
     (
         "sweeps/points/cluster.py",
         "_compiled",

@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 from worlds import rigs
 
-from calibration.data import columns
-from calibration.data.input_errors import BadConfiguration
+from calibration.data import columns, input_files
+from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.data.runs import Runs
-from calibration.data.thinning import FIRST, thin_log
+from calibration.data.thinning import FIRST, thin_rows
 from calibration.described import describe
 from calibration.discovery import discover
 from calibration.inference import calibration as calibrate
 from calibration.inference import foresight
-from calibration.inference.fit_notes import Thinned
+from calibration.inference.fit_notes import Thinned, ThinnedTable
 from calibration.inference.noise import infer_noise
-from calibration.inference.observers import Histories
+from calibration.inference.observers import Histories, SettledRuns
 from mmrjax.model import paper_robots
 from sweeps.commands import rig_check
 
@@ -44,16 +44,51 @@ def log(runs=2, rows=ROWS, voltage=None):
     return Runs("log.csv", {name: values[mixed] for name, values in columns.items()})
 
 
+def settled(runs):
+    """Its rows as settled runs."""
+    return dataclasses.replace(runs, columns={k: v for k, v in runs.columns.items() if k not in ("time_s", "run_id")})
+
+
 def test_of_few_rows_all_are_read():
     runs = log()
-    assert thin_log(runs, len(runs)) is runs
-    settled = dataclasses.replace(runs, columns={k: v for k, v in runs.columns.items() if k != "time_s"})
-    assert thin_log(settled, 10) is settled
+    assert thin_rows(runs, len(runs)) is runs and thin_rows(settled(runs), len(runs)).log is None
+
+
+def test_rows_of_a_table_are_taken_evenly_over_its_conditions():
+    rng = np.random.default_rng(4)
+    slopes, volts = np.repeat([0.0, 5.0, 10.0], 1000), rng.uniform(10, 30, 3000)
+    table = settled(log(1, 3000))
+    mixed = rng.permutation(3000)
+    columns = table.columns | {"slope_deg": slopes[mixed], "supply_voltage_V": volts[mixed]}
+    table = dataclasses.replace(table, columns=columns)
+    some = thin_rows(table, 300)
+    assert 250 < len(some) <= 310 and some.whole is table
+    for slope in (0.0, 5.0, 10.0):
+        assert 0.2 < np.mean(some["slope_deg"] == slope) < 0.45
+    share = np.histogram(some["supply_voltage_V"], np.linspace(10, 30, 9))[0] / len(some)
+    assert share.min() > 0.1 and share.max() < 0.15  # an eighth in each
+    kept = np.flatnonzero(np.isin(table["supply_voltage_V"], some["supply_voltage_V"]))
+    np.testing.assert_array_equal(table["supply_voltage_V"][kept], some["supply_voltage_V"])  # in the file's order
+    notes = [
+        n for n in SettledRuns.check(some, infer_noise(some, SettledRuns.sizes(some))) if isinstance(n, ThinnedTable)
+    ]
+    assert notes == [ThinnedTable("log.csv", 3000, len(some))]
+    assert f"{len(some)} of 3000 rows" in describe(notes[0])
+
+
+def test_more_settled_rows_than_memory_holds_are_refused(monkeypatch):
+    table = settled(log(1, 3000))
+    monkeypatch.setattr(input_files, "available_memory", lambda: 2e8)
+    with pytest.raises(
+        BadData, match=r"log.csv: 3,000 rows need 0.3 GB, and 0.2 GB of memory are free; .* 2000 rows"
+    ):
+        thin_rows(table)
+    assert len(thin_rows(table, 2000)) <= 2010
 
 
 def test_rows_are_taken_evenly_of_each_run():
     runs = log()
-    some = thin_log(runs, 100)
+    some = thin_rows(runs, 100)
     assert some.log is runs and some.whole is runs and runs.whole is runs
     for name in ("run0", "run1"):
         time = np.sort(some["time_s"][some.run_names == name])
@@ -71,7 +106,7 @@ def test_channels_that_are_read_by_turns_are_all_kept():
     columns["motor_speed_rpm"] = np.where(row % 3 == 0, columns["motor_speed_rpm"], np.nan)
     columns["total_current_A"] = np.where(row % 3 == 1, columns["total_current_A"], np.nan)
     columns["speed_mm_s"] = np.full(len(row), np.nan)
-    some = thin_log(dataclasses.replace(runs, columns=columns), 50)
+    some = thin_rows(dataclasses.replace(runs, columns=columns), 50)
     read = np.isfinite(some.measured()).sum(0)
     assert abs(read[0] - read[1]) <= 2 and read[:2].min() >= len(some) // 2 - FIRST and read[2] == 0
 
@@ -92,7 +127,7 @@ def held(observed, at):
 @pytest.mark.parametrize("drive", DRIVES)
 def test_what_drives_a_run_is_that_of_the_log(drive):
     whole = log(1, voltage=DRIVES[drive])
-    some = thin_log(whole, 40)
+    some = thin_rows(whole, 40)
     every, few, alone = (
         Histories.of(x, paper_robots.nominal()) for x in (whole, some, dataclasses.replace(some, log=None))
     )
@@ -112,10 +147,10 @@ def test_a_slope_that_changes_between_readings_acts_from_its_row_on():
     row = np.round(whole["time_s"] / EVERY).astype(int)
     time = EVERY * (row + np.where(row > 0, 0.2 * np.random.default_rng(7).random(ROWS)[row], 0.0))
     whole = dataclasses.replace(whole, columns={**whole.columns, "time_s": time})
-    read = set((thin_log(whole, 40)["time_s"] / EVERY).astype(int))
+    read = set((thin_rows(whole, 40)["time_s"] / EVERY).astype(int))
     change = next(k for k in range(100, ROWS) if not read & {k - 1, k, k + 1})
     columns = {**whole.columns, "slope_deg": np.where(row < change, 0.0, 5.0)}
-    few = Histories.of(thin_log(dataclasses.replace(whole, columns=columns), 40), paper_robots.nominal())
+    few = Histories.of(thin_rows(dataclasses.replace(whole, columns=columns), 40), paper_robots.nominal())
     times, slopes, at = np.asarray(few.times[0]), np.asarray(few.conditions.slope[0]), time[row == change]
     np.testing.assert_allclose(np.rad2deg(slopes), np.where(times < at - 1e-9, 0.0, 5.0), atol=1e-9)
     assert np.abs(times - at).min() < 1e-9
@@ -127,7 +162,7 @@ def test_a_slope_that_changes_between_readings_acts_from_its_row_on():
 def test_a_run_shows_what_it_shows_in_the_whole_log(drive):
     """Its readings are those of the whole log at the same rows, to what its longer steps make."""
     whole, robot = log(1, voltage=DRIVES[drive]), paper_robots.nominal()
-    some = thin_log(whole, 40)
+    some = thin_rows(whole, 40)
     shown = [np.asarray(jax.jit(lambda o: o(robot).reading)(Histories.of(x, robot))) for x in (whole, some)]
     at = [int(np.flatnonzero(whole["time_s"] == t)[0]) for t in some["time_s"]]
     off = np.abs(shown[1] - shown[0][at]) / np.abs(shown[0]).max(0)
@@ -136,7 +171,7 @@ def test_a_run_shows_what_it_shows_in_the_whole_log(drive):
 
 def test_that_a_log_is_thinned_is_said():
     runs = log()
-    some = thin_log(runs, 100)
+    some = thin_rows(runs, 100)
     said = [
         n for x in (some, runs) for n in Histories.check(x, infer_noise(x, Histories.sizes(x))) if type(n) is Thinned
     ]
@@ -151,7 +186,7 @@ def test_rig_check_says_how_many_rows_are_used(tmp_path, monkeypatch, capsys):
     rigs.log(world, rng).write(tmp_path / "log.csv")
 
     def foresee(runs, robot):
-        runs = thin_log(runs)
+        runs = thin_rows(runs)
         return foresight.Foresight((), ("converged",) * len(runs), ("columns",) * len(runs.channels), (), (), robot)
 
     monkeypatch.setattr(rig_check.foresight, "predict_identifiability", foresee)
@@ -182,8 +217,8 @@ def test_python_takes_as_many_rows_as_the_command_line(monkeypatch, way, rows):
     with pytest.raises(InterruptedError):
         call(runs, paper_robots.nominal(), **({} if rows is None else {"rows": rows}))
     (used,) = seen
-    wanted = thin_log(runs, columns.ROWS if rows is None else rows)
+    wanted = thin_rows(runs, columns.ROWS if rows is None else rows)
     np.testing.assert_array_equal(used["time_s"], wanted["time_s"])
-    assert len(used) < len(runs) == len(used.whole) == len(thin_log(used, 50).whole)
+    assert len(used) < len(runs) == len(used.whole) == len(thin_rows(used, 50).whole)
     with pytest.raises(BadConfiguration, match="rows: got 0; expected 1 or more"):
         call(runs, paper_robots.nominal(), rows=0)

@@ -102,12 +102,11 @@ def test_a_window_integrates_by_parts():
 
 def test_windows_end_before_what_they_may_not_hold():
     time = np.arange(40) * 0.01
-    usable, broken = np.ones(40, bool), np.zeros(40, bool)
-    usable[12], broken[25] = False, True
-    found = [set(rows) for rows, _ in shown_states.windows_of_run(time, usable, broken)]
+    piece = np.where(np.arange(40) < 25, 0, 1)
+    piece[12] = -1
+    found = [set(rows) for rows, _ in shown_states.windows_of_run(time, piece, 0.1)]
     assert any(max(rows) < 12 for rows in found) and any(min(rows) >= 25 for rows in found)
     assert not any(12 in rows or {24, 25} <= rows for rows in found)
-    assert not shown_states.windows_of_run(time * 100, usable, broken)  # too far apart to show how states change
 
 
 def test_base_parameters_are_those_of_the_log(space, before):
@@ -156,16 +155,15 @@ def test_noise_of_windows_is_that_of_their_readings(space, before):
 
 def test_windows_across_a_jump_are_wrong(space, before, monkeypatch):
     names, plan = space.bare.coordinates.names, shown_states.plan_of(space.bare)
-    cut = shown_states.windows_of_log(space.bare, plan, shown_states.motion_rates(space.bare, plan))
-    volts = np.asarray(space.bare.observe.of_rows.voltage)
+    rows, _, cut = shown_states.rows_and_windows(space.bare, plan)
+    volts = np.asarray(rows.conditions.voltage)
     for w in cut:
-        for weight in w.weight:
-            inside = w.rows[np.flatnonzero(weight)]
-            assert np.ptp(volts[inside]) == 0
+        assert np.max(np.ptp(np.where(w.weight > 0, volts[w.rows], volts[w.rows[:, 4:5]]), axis=1)) < 1e-9
     monkeypatch.setattr(shown_states, "JUMP", 9.0)
+    monkeypatch.setattr(weak_form, "CHANCE", np.inf)  # else they count less, as noise that no reading has
     wrong, k = weak_form.weak_form(space.bare).z, names.index("motor.inductance")
     right, wrong = (space.coordinates.base.value(z[: space.free])[k] for z in (before.base.z, wrong))
-    assert right == pytest.approx(4e-4, rel=0.3) and wrong > 5 * right
+    assert right == pytest.approx(4e-4, rel=0.3) and wrong > 3 * right
 
 
 @pytest.mark.parametrize("imposed, channel", [("motor_current", "motor_speed"), ("motor_speed", "motor_current")])
@@ -173,6 +171,8 @@ def test_a_current_or_a_speed_may_be_imposed(tmp_path, imposed, channel):
     """Torques alone are shown then: inertia over the torque constant, and the effect where rows follow a speed that
     turns between them; lines between rows of an imposed one differ from it by more than the effect."""
     text = RIG.replace('imposed = "voltage"', f'imposed = "{imposed}"')
+    if imposed == "motor_current":  # samples of a current that changes between them, half a row earlier than if held
+        text += f'[rig]\ndelay = "{-EVERY / 2} ± 0"\n'
     (tmp_path / "rig.toml").write_text(text.replace('"motor_current", "motor_speed"', f'"{channel}"'), "utf-8")
     robot = robot_file.read_robot(tmp_path / "rig.toml")
     columns = motor(noise=(0.0, 1.0) if imposed == "motor_speed" else (1.0, 0.0))
@@ -198,11 +198,14 @@ def test_logs_of_an_angle_alone_are_twice_integrated(tmp_path, kind, made):
     robot = written(tmp_path, kind, made)
     runs = records.read_runs(str(tmp_path / "log.csv"), robot=robot).of(robot)
     found = weak_form.weak_form(posed(runs, robot, np.maximum(0.003 * Histories.sizes(runs), 1e-9)).bare)
+    if kind == "servo":  # whose log has no noise
+        assert np.all(np.abs(found.z) < 0.1)
     assert found is not None and np.all(np.abs(found.z) < 4)
 
 
 def test_a_log_that_does_not_show_its_states_is_none(space):
     assert weak_form.weak_form(without(space.bare, "motor_speed")) is None
+    assert shown_states.plan_or_lacking(without(space.bare, "motor_speed")) is shown_states.Lacking.MOTION
     assert shown_states.plan_of(without(space.bare, "motor_current")).electrical is False
 
 

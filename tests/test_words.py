@@ -66,6 +66,7 @@ SAMPLES = [
     of_fit.EndsEarly(("a", "b"), 0.01, 0.4),
     of_fit.EndsEarly(("a",), 0.01, float("nan")),
     of_fit.Thinned("log.csv", 25000, 3600),
+    of_fit.ThinnedTable("runs.csv", 50000, 3847),
     of_fit.NeverGrips(("a",), 0.31),
     of_fit.CoarseSteps(90.0, 0.03),
     of_fit.StopsOnSlope(("a", "b")),

@@ -3,39 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
-import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from calibration.data import delimited, presets_file
+from calibration.data import delimited, presets_file, proposals
 from calibration.data.columns import Layout
 from calibration.data.input_errors import BadData
 from calibration.data.named_arrays import NamedArrays, column_numbers
-from calibration.data.sources import in_memory, one_clock, opening
+from calibration.data.sources import one_clock, opening
 from calibration.data.sources.recorded_signals import Clock, Signal, Source, unit_of_clock, values_in_memory
-from mmrjax.model import channels, quantities
+from mmrjax.model import channels
 
 #: Least gap between samples, in usual steps.
 GAP = 5.0
-#: Words in the name of a signal, and its possible columns, without their unit. The first match wins.
-MEANINGS = (
-    (r"duty|pwm", ("duty",)),
-    (r"(supply|bus|bat|input|vin|vbus|pack).*(volt|_v\b)|vbat|vbus|volt|\bu\b|^v$", ("supply_voltage",)),
-    (r"(bat|input|supply|bus|total|dc|pack).*(cur|amp|_a\b)|ibat|ibus", ("total_current",)),
-    (r"motor.*(cur|amp)|iq\b|q_a\b|phase|cur|amps?\b|\bi\b", ("total_current",)),
-    (r"(wheel|output|joint|load).*(vel|speed|rpm|omega)", ("output_speed",)),
-    (r"erpm", ()),
-    (r"rpm|motor.*(vel|speed)|omega|(vel|speed)|^n$", ("motor_speed",)),
-    (r"torque|\btau\b", ("output_torque",)),
-    (r"angle|theta|position|\bpos\b", ("output_angle",)),
-    (r"slope|incline|grade|pitch", ("slope",)),
-    (r"payload", ("payload",)),
-    (r"winding|motor.*temp", ("winding_temperature",)),
-    (r"run_?id|episode|trial", ("run_id",)),
-)  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,7 +81,7 @@ def inspect_source(source: str | Path | Any) -> Contents:
         _facts(signal, signal.clock or (None if signal is table else _clock(table)), times)
         for signal in found.signals
     )
-    clocks = {s.clock.name for s in found.signals if s.clock is not None}
+    clocks = {id(s.clock) for s in found.signals if s.clock is not None}
     notes = list(found.notes)
     for signal in found.signals:
         time = times.get(id(signal.clock)) if signal.clock is not None else None
@@ -108,7 +91,8 @@ def inspect_source(source: str | Path | Any) -> Contents:
     if len(clocks) > 1:
         notes.append(f"{found.name}: signals have {len(clocks)} clocks; rows become those of the densest channel")
     still = {fact.path for fact in facts if fact.least == fact.greatest}
-    moving = sorted(found.signals, key=lambda signal: signal.path in still)  # of several, the first that changes
+    read = (dataclasses.replace(s, refused=f.refused) for s, f in zip(found.signals, facts, strict=True))
+    moving = sorted(read, key=lambda signal: signal.path in still)  # of several, the first that changes
     lines = dict(_proposed(moving))
     proposed = tuple(lines[s.path] for s in found.signals if s.path in lines)
     return Contents(found.name, found.kind, facts, tuple(notes), preset, () if preset else proposed)
@@ -116,8 +100,7 @@ def inspect_source(source: str | Path | Any) -> Contents:
 
 def _source(source: Any) -> Source:
     if not isinstance(source, str | Path):
-        kind, signals = in_memory.of_object(source)
-        return Source(kind, kind, signals)
+        return opening.open_object(source)
     path, within = opening.split_source(str(source))
     name = path.name or str(source)
     if not path.exists():
@@ -147,7 +130,9 @@ def _clock_of_table(source: Source) -> Signal | None:
     """The signal of a table that is its time, by its name."""
     if any(s.clock is not None for s in source.signals):
         return None
-    return next((s for s in source.signals if _unit_of_time(s.name) is not None and not s.words), None)
+    return next(
+        (s for s in source.signals if _unit_of_time(s.name) is not None and not s.words and not s.refused), None
+    )
 
 
 def _clock(signal: Signal | None) -> Clock | None:
@@ -167,12 +152,10 @@ def _facts(signal: Signal, clock: Clock | None, times: dict[int, tuple[np.ndarra
     )
     if signal.refused or not signal.length:
         return found
-    if opening.VALUE * signal.length > opening.SHARE * opening.available_memory():
-        return dataclasses.replace(found, refused="has more values than the free memory holds")
     try:
         values = signal.load()
     except BadData as error:
-        return dataclasses.replace(found, refused=str(error))
+        return dataclasses.replace(found, refused=str(error).partition(f"{signal.path}: ")[2] or str(error))
     if values.dtype.kind in "US":
         return dataclasses.replace(found, words=tuple(map(str, dict.fromkeys(values[:10_000].tolist())))[:5])
     if values.dtype.kind in "mM":
@@ -194,7 +177,10 @@ def _facts(signal: Signal, clock: Clock | None, times: dict[int, tuple[np.ndarra
 
 
 def _seconds(clock: Clock) -> tuple[np.ndarray, str] | str:
-    found = one_clock.clock_seconds(clock)
+    try:
+        found = one_clock.clock_seconds(clock)
+    except BadData as error:
+        return str(error)
     back = np.flatnonzero(np.diff(found.time) < 0)
     if back.size:
         return f"{clock.name} goes back at sample {back[0] + 2}"
@@ -202,34 +188,14 @@ def _seconds(clock: Clock) -> tuple[np.ndarray, str] | str:
 
 
 def _proposed(signals: Sequence[Signal]) -> Iterator[tuple[str, str]]:
-    """Paths of signals with a recognised name, each with its line of a table `[columns]`."""
-    layout = Layout(channels=channels.EVERY)
-    every = layout.quantities()
-    spelled, taken = set(layout.spellings()), set[str]()
-    for signal in signals:
-        if signal.refused or signal.name in spelled:
-            taken |= {signal.name.rpartition("_")[0]}
-            continue
-        unit = _unit_of_time(signal.name)
-        if unit is not None and signal.clock is None and "time" not in taken:
-            unit = "s" if signal.words else unit or one_clock.guessed_unit(np.asarray(signal.load(), float))
-            yield signal.path, f'time_{unit} = "{signal.path}"'
-            taken.add("time")
-            continue
-        stems = next((stems for pattern, stems in MEANINGS if re.search(pattern, signal.name.casefold())), None)
-        if stems is None:  # for a field named data, the topic has the name
-            stems = next((stems for pattern, stems in MEANINGS if re.search(pattern, signal.path.casefold())), ())
-        for stem in stems:
-            column = next((c for c, q in every.items() if (q.stem or q.name) == stem or c == stem), stem)
-            if stem in taken or (signal.words and stem != "run_id"):
-                continue
-            units = {} if column not in every else every[column].columns()
-            stated = (
-                quantities.unit_in_column(signal.unit)
-                if signal.unit
-                else quantities.unit_at_end(signal.name, set(units.values())) or ""
-            )
-            mine = next((c for c, u in units.items() if u == stated), column)
-            doubt = "" if stated and mine in units and units[mine] == stated else "  # unit not stated: check it"
-            yield signal.path, f'{mine} = "{signal.path}"{doubt if units else ""}'
-            taken.add(stem)
+    """Paths of signals that may be columns, each with its line of a table `[columns]`: the time, then the others."""
+    spelled = set(Layout(channels=channels.EVERY).spellings())
+    if not any(s.name in spelled and s.name.startswith("time_") for s in signals):
+        time = next(
+            (s for s in signals if _unit_of_time(s.name) is not None and s.clock is None and not s.refused), None
+        )
+        if time is not None:
+            unit = "s" if time.words else _unit_of_time(time.name)
+            unit = unit or one_clock.guessed_unit(np.asarray(time.load(), float))
+            yield time.path, f'time_{unit} = "{time.path}"'
+    yield from proposals.propose_columns([s for s in signals if _unit_of_time(s.name) is None], spelled)

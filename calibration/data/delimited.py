@@ -16,11 +16,14 @@ from calibration.data import input_files
 from calibration.data.columns import WORDS
 from calibration.data.input_errors import BadData
 from calibration.data.named_arrays import NamedArrays, Raw, cell_number
+from calibration.data.writing import cell_word
 from mmrjax.errors import count_noun
 from mmrjax.model import channels, quantities
 
 #: Size of a file from which on plain tables are read as arrays at once [bytes].
 LONG = 2_000_000
+#: Memory of a cell that is read as text [bytes].
+CELL = 80
 #: Separators of cells other than a comma, and a word for each.
 SEPARATORS = {";": "semicolons", "\t": "tabs"}
 _SEPARATOR = re.compile(r"[,;\t]")
@@ -47,8 +50,11 @@ def read_csv_columns(path: Path, name: str) -> NamedArrays:
     if len(content) >= LONG and (plain := _plain(name, content)) is not None:
         return plain
     decoded, encoded = decode_text(name, content)
-    rows, notes = split_cells(name, below_comments([line for line in decoded.splitlines() if line.strip()]))
+    input_files.check_memory(name, CELL * sum(decoded.count(mark) for mark in (",", *SEPARATORS)))
+    lines = below_comments([line for line in decoded.splitlines() if line.strip()])
+    rows, notes = split_cells(name, lines)
     header, body = (rows[0], rows[1:]) if rows else ([], [])
+    input_files.check_declared(name, len(header))
     units = row_of_units(header, body[0]) if body else ()
     if units:
         body = body[1:]
@@ -81,7 +87,8 @@ def _plain(name: str, content: bytes) -> NamedArrays | None:
         first = content[: content.find(b"\n", end + 1)].decode().splitlines()
     except UnicodeDecodeError:
         return None
-    header, row = ([cell.strip() for cell in line.split(",")] for line in (*first, "", "")[:2])
+    input_files.check_declared(name, first[0].count(",") + 1)
+    header, row = ([cell_word(cell.strip()) for cell in line.split(",")] for line in (*first, "", "")[:2])
     if len(header) < 2 or not all(header) or len(header) != len(row) or row_of_units(header, row):
         return None
     import pyarrow as pa
@@ -108,7 +115,7 @@ def _plain(name: str, content: bytes) -> NamedArrays | None:
             found = column.cast(pa.float64()).to_numpy()
         except pa.ArrowInvalid:  # some cell states no number
             found = np.full(1, np.nan)
-        values.append([cell.strip() for cell in column.to_pylist()] if np.isnan(found).any() else found)
+        values.append([cell_word(cell.strip()) for cell in column.to_pylist()] if np.isnan(found).any() else found)
     if empty is None or compute.any(empty).as_py():  # rows of separators alone
         return None
     return NamedArrays(name, tuple(header), tuple(values), digest=hashlib.sha256(content).hexdigest())
@@ -182,7 +189,7 @@ def split_cells(name: str, lines: Sequence[str]) -> tuple[list[list[str]], tuple
     header = lines[0] if lines else ""
     mark = next((m for m in SEPARATORS if m in header and "," not in header), ",")
     try:
-        rows = [[cell.strip() for cell in row] for row in csv.reader(lines, delimiter=mark)]
+        rows = [[cell_word(cell.strip()) for cell in row] for row in csv.reader(lines, delimiter=mark)]
     except csv.Error as error:
         raise BadData(
             f"{name}: cannot be read as CSV ({error}); look for a quotation mark that is not closed, or a cell of "

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import math
+import numbers
 from typing import Any
 
 from mmrjax.errors import allowed_words as allowed_words
-from mmrjax.errors import shorten
+from mmrjax.errors import printable, shorten
+
+#: Largest random seed.
+SEEDS = 2**32 - 1
 
 
 class InputError(Exception):
     """Error of input from outside; the message is one sentence for a person."""
 
     def __init__(self, message: str) -> None:
-        """Keeps the message `shortened`."""
-        super().__init__(shorten(message))
+        """Keeps the message, `shorten` and `printable`."""
+        super().__init__(shorten(printable(message)))
 
     exit_code = 2
 
@@ -55,6 +59,17 @@ def three_digits(value: float) -> str:
 def is_number(value: Any) -> bool:
     """True if a value of a TOML file or of Python is a number; true and false are not."""
     return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def stated_count(value: Any, where: str, low: int, high: int) -> int:
+    """A whole number of a TOML file or of Python.
+
+    Raises:
+        BadConfiguration: something else, or out of bounds.
+    """
+    if isinstance(value, bool) or not isinstance(value, numbers.Integral) or not low <= int(value) <= high:
+        raise BadConfiguration(f"{where}: got {value!r}; expected a whole number from {low} to {high}")
+    return int(value)
 
 
 def stated_number(

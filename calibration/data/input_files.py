@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import os
 import re
 import stat
 import tomllib
@@ -26,6 +27,12 @@ TEXTS = {
 }  # fmt: skip
 #: Largest table and largest TOML file [bytes], most keys of a TOML file and most tables within one another.
 LARGEST, LARGEST_TOML, KEYS, DEEPEST = 2**31, 2**22, 2_000, 16
+#: Most signals of a recording, or columns of a table.
+COLUMNS = 20_000
+#: Bytes of a value, and largest share of the free memory for values; copies and checks use the rest.
+VALUE, SHARE = 8, 0.3
+#: Most bytes of values for each byte of a file (deflate reaches 1,032), and bytes that every file may declare.
+RATIO, SMALL = 1_100, 2**28
 #: Whole numbers that a TOML file may hold (TOML 1.0: 64 bits).
 WHOLE = 2**63
 #: Names of kinds of files that are not read.
@@ -67,10 +74,68 @@ def _opened(path: Path, where: str | Path, kind: type[InputError], largest: floa
             raise kind(f"{where}: is {what}; expected a file")
         if found.st_size > largest:
             raise kind(f"{where}: has {found.st_size / 1e6:,.0f} MB; expected at most {largest / 1e6:,.0f} MB")
+        if math.isfinite(largest):
+            check_memory(where, found.st_size)
         with path.open("rb") as stream:
             yield stream
     except (OSError, ValueError) as error:  # a name with a null byte
         raise kind(f"{where}: cannot be read ({getattr(error, 'strerror', None) or error})") from error
+
+
+def check_declared(where: str | Path, columns: int, size: float = 0.0, held: float = math.inf) -> None:
+    """Refuses sizes that a source declares, before its values are read.
+
+    Args:
+        where: opens the message of an error; columns: number of signals or columns.
+        size: of all values [bytes]; held: size of the file that has them [bytes].
+
+    Raises:
+        BadData: more than `COLUMNS` columns, or more values than a file of this size can hold.
+    """
+    if columns > COLUMNS:
+        raise BadData(f"{where}: has {columns:,} columns; expected at most {COLUMNS:,}; export those that you need")
+    if size > max(RATIO * held, SMALL):
+        raise BadData(
+            f"{where}: declares {size / 1e9:.3g} GB of values in a file of {held:,.0f} bytes; expected a file that "
+            "holds its values; it may be cut off or damaged; export or copy it again"
+        )
+
+
+def check_memory(where: str | Path, size: float) -> None:
+    """Refuses values that need more than `SHARE` of the free memory, before they are read.
+
+    Args:
+        where: opens the message of an error; size: of the values [bytes].
+
+    Raises:
+        BadData: they do.
+    """
+    if size > SHARE * (free := available_memory()):
+        raise BadData(
+            f"{where}: its values need {size / 1e9:.3g} GB, and {free / 1e9:.3g} GB of memory are free; expected at "
+            f"most {SHARE * free / 1e9:.3g} GB; give a part of the recording, or every n-th row"
+        )
+
+
+def available_memory() -> float:
+    """Free memory of this process [bytes]: of the system, and below a limit of its address space (`ulimit -v`).
+
+    Infinite if the system does not report it.
+    """
+    try:
+        free = float(os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+        with contextlib.suppress(OSError, StopIteration):  # with what the system can take back from caches of files
+            lines = Path("/proc/meminfo").read_text("ascii").splitlines()
+            free = float(next(line for line in lines if line.startswith("MemAvailable")).split()[1]) * 1024
+        with contextlib.suppress(ImportError, OSError):
+            import resource
+
+            limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+            used = int(Path("/proc/self/statm").read_text("ascii").split()[0]) * os.sysconf("SC_PAGE_SIZE")
+            free = free if limit == resource.RLIM_INFINITY else min(free, float(limit - used))
+        return free
+    except (ValueError, OSError, AttributeError):
+        return math.inf
 
 
 def csv_bytes(path: Path, where: str | Path) -> bytes:

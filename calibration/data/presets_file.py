@@ -13,7 +13,7 @@ from typing import Any
 
 from calibration.data import input_files
 from calibration.data.columns import Layout
-from calibration.data.input_errors import BadConfiguration, allowed_words, parse_number, stated_number
+from calibration.data.input_errors import BadConfiguration, BadData, allowed_words, parse_number, stated_number
 from mmrjax.model import channels
 
 #: Presets that come with the package, in `calibration/data/presets/`.
@@ -23,7 +23,7 @@ PACKAGED = (
 #: Columns of a packaged preset that a source has at least for it to be recognised.
 OF_A_PRESET = 3
 #: Keys of a preset, and of one of its columns.
-KEYS, KEYS_OF_COLUMN = ("columns", "ask", "header"), ("column", "factor", "per", "times", "note")
+KEYS, KEYS_OF_COLUMN = ("columns", "ask", "header"), ("column", "factor", "per", "times", "note", "needs")
 #: Keys of a number that a preset asks for.
 KEYS_OF_NUMBER = ("about", "usual")
 #: Between the name of a preset and the numbers that it asks for, `vesc,pole_pairs=7`.
@@ -38,12 +38,14 @@ class PresetColumn:
         mine: name of the column; theirs: names that it may have in the file, `*` for any text; the first that the
             file has is read.
         factor: from its unit to the unit of `mine`; note: its meaning, for a note.
+        needs: column of this program without which it is not what drives the motor; empty: none.
     """
 
     mine: str
     theirs: tuple[str, ...]
     factor: float = 1.0
     note: str = ""
+    needs: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,6 +82,26 @@ class Preset:
             elif self.name not in PACKAGED:  # a packaged preset has columns of several loggers
                 mapped.append((column.mine, column.theirs[0], column.factor))
         return tuple(mapped), tuple(notes)
+
+    def check_needed(self, mapped: Iterable[tuple[str, str, float]], imposed: str, name: str) -> None:
+        """Refuses a source whose imposed column means nothing without another one that the source lacks.
+
+        Args:
+            mapped: columns of the source; imposed: the column that drives the motor; name: of the source.
+
+        Raises:
+            BadData: it lacks that column.
+        """
+        present = {mine: theirs for mine, theirs, _ in mapped}
+        by_name = {column.mine: column for column in self.columns}
+        for mine in present:
+            if mine == imposed and (needs := by_name[mine].needs) and needs not in present:
+                wanted = " or ".join(by_name[needs].theirs)
+                raise BadData(
+                    f"{name}: has no {wanted}; --columns {self.name} needs it for {needs}, because {present[mine]} "
+                    "alone is not the voltage at the motor; record it, or impose the speed or the current (imposed "
+                    "in the rig's file)"
+                )
 
 
 def of_columns(columns: Mapping[str, Any], where: str = "the stated table") -> Preset:
@@ -237,7 +259,10 @@ def _column(mine: str, theirs: Any, where: str, numbers: Mapping[str, float]) ->
     note = table.get("note", "")
     if not isinstance(note, str):
         raise BadConfiguration(f"{where}.note: got {note!r}; expected a sentence")
-    return PresetColumn(mine, tuple(_filled(name, where, numbers) for name in names), factor, note)
+    needs = table.get("needs", "")
+    if not isinstance(needs, str):
+        raise BadConfiguration(f"{where}.needs: got {needs!r}; expected the name of a column")
+    return PresetColumn(mine, tuple(_filled(name, where, numbers) for name in names), factor, note, needs)
 
 
 def _filled(name: str, where: str, numbers: Mapping[str, float]) -> str:

@@ -15,13 +15,14 @@ from calibration.data.input_errors import three_digits
 from calibration.data.robot_file import RobotFile
 from calibration.data.runs import Runs
 from mmrjax.errors import count_noun
-from mmrjax.model import params
+from mmrjax.model import channels, params
 from mmrjax.model.quantities import RPM, VOLTAGE
 from mmrjax.model.robot import Robot
 from mmrjax.model.shaft import Shaft
 from mmrjax.model.signals import GRAVITY
 
 BATTERY = "battery"
+OUTPUT_SPEED = channels.find_channel("output_speed").column
 #: Least ratio of a gearbox with three stages or more, and the largest efficiency that makers state for these.
 STAGES, EFFICIENCY = 100.0, 0.85
 #: Least duration of a change of speed, in time constants, that the motors and load do not explain; fewest samples.
@@ -71,8 +72,9 @@ def _motor(robot: Robot) -> Iterator[Fact]:
         odd = "" if fastest < 2 * motor.speed_limit else "more than twice motor.speed_limit; look at torque_constant"
         yield Fact(f"speed without load at {three_digits(voltage)} V", f"{three_digits(fastest / RPM)} rpm", odd)
     if with_resistance and voltage is not None:
-        odd = _within(voltage / resistance, 0.02, 1000, "look at motor.resistance")
-        yield Fact(f"stall current at {three_digits(voltage)} V", f"{three_digits(voltage / resistance)} A", odd)
+        stall = float(motor.current_stall(voltage))
+        odd = _within(stall, 0.02, 1000, "look at motor.resistance")
+        yield Fact(f"stall current at {three_digits(voltage)} V", f"{three_digits(stall)} A", odd)
     if with_constant and with_resistance:
         size = constant**2 / resistance
         odd = _within(
@@ -119,7 +121,7 @@ def _drawn(robot: Robot, what: str, torque: float, places: str) -> Iterator[Fact
     current, limit = _current(robot, torque), robot.motor.voltage_limit
     odd = _within(current, 0, 200, f"look at {places}, and the gearbox")
     if limit is not None and robot.knows(["motor.resistance"]):
-        stall = limit / float(robot.motor.resistance)
+        stall = float(robot.motor.current_stall(limit))
         if current > stall:
             odd = (
                 f"above the stall current {three_digits(stall)} A at {three_digits(limit)} V, so it stands; "
@@ -172,7 +174,7 @@ def _vehicle(robot: Robot, name: str) -> Iterator[Fact]:
     limit = robot.motor.voltage_limit
     if limit is None or not robot.knows(["motor.resistance"]):
         return
-    pull = _torque(robot, limit / float(robot.motor.resistance)) - float(load.track.loss_coulomb)
+    pull = _torque(robot, float(robot.motor.current_stall(limit))) - float(load.track.loss_coulomb)
     climb = pull * sides / (radius * mass * GRAVITY) - rolling - guide
     odd = "" if climb > 0 else "its motors cannot move it; look at mass, ratio, torque_constant and resistance"
     angle = "any" if climb >= 1 else f"{math.degrees(math.asin(max(climb, 0.0))):.0f}°"
@@ -353,6 +355,38 @@ def saturation_sentence(runs: Runs) -> str:
     )
 
 
+#: Ratio of speeds to the robot's file beyond which the unit of one of its columns is doubted.
+OTHER_UNIT = 3.0
+
+
+def doubtful_speed(runs: Runs, robot: Robot) -> str:
+    """Reason to doubt the unit of an imposed voltage or of the speed; empty without evidence.
+
+    The speed is far above that at which the motors' back-EMF equals the voltage. A load keeps it below, so only rows
+    without current or without a brake's torque show a speed that is far too small.
+    """
+    column = next((c for c in (SPEED, OUTPUT_SPEED) if runs.has(c)), None)
+    if robot.rig.imposed != "voltage" or not robot.knows(VOLTAGE) or column is None:
+        return ""
+    ratio = float(robot.gearbox.ratio) if column == OUTPUT_SPEED else 1.0
+    reached = np.abs(applied_drive(runs)) / float(robot.motor.torque_constant) / RPM / ratio
+    read, shown = runs[column], np.isfinite(runs[column]) & (reached > 0)
+    shown &= np.abs(np.nan_to_num(read)) > 0
+    if not shown.any():
+        return ""
+    share = float(np.median(np.abs(read[shown]) / reached[shown]))
+    braked = runs.has(LOAD) and bool((runs[LOAD] != 0).all())
+    if share < OTHER_UNIT and (braked or robot.has_ground or share > 1 / OTHER_UNIT / 100):
+        return ""
+    row = int(np.flatnonzero(shown)[0])
+    theirs, supply = (runs.headings.get(c, c) for c in (column, SUPPLY))
+    return (
+        f"{runs.source} row {row + 1}, {theirs}: got {three_digits(abs(read[row]))} rpm, where the file's torque "
+        f"constant turns the motors at up to {three_digits(reached[row])} rpm; check the units of {theirs} and "
+        f"{supply}, and motor.torque_constant"
+    )
+
+
 #: Multiple of the torque at stall beyond which a brake's torque is taken to be in another unit.
 BEYOND = 3.0
 
@@ -389,6 +423,7 @@ def log_doubts(runs: Runs, robot: Robot) -> tuple[str, ...]:
         doubtful_time(runs, robot),
         doubtful_current(runs, robot),
         doubtful_torque(runs, robot),
+        doubtful_speed(runs, robot),
     )
     return tuple(filter(None, every))
 

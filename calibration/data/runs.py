@@ -31,6 +31,7 @@ from calibration.data.columns import CONDITIONS, DUTY, SUPPLY, TIME, WHEN, Colum
 from calibration.data.input_errors import BadConfiguration, BadData, bound_text
 from calibration.data.named_arrays import NamedArrays, Raw, column_numbers, column_texts, missing_readings
 from calibration.data.sources import opening, reading
+from calibration.data.sources.in_memory import EXPECTED
 from calibration.data.sources.reading import Mapped
 from calibration.data.table import Runs
 from mmrjax.model.quantities import MM, RPM
@@ -81,6 +82,8 @@ def read_runs(
         with resources.as_file(resources.files("calibration") / "data" / PACKAGED[str(source)]) as path:
             arrays, mapped = delimited.read_csv_columns(path, str(source)), layout.mapped
     else:
+        if isinstance(source, str) and not source:
+            raise BadData(f"the source: got an empty path; expected {EXPECTED}")
         named = isinstance(source, str | Path) and not opening.files_of_group(str(source))
         if named and not opening.split_source(str(source))[0].exists():
             raise BadData(f"{source}: no such file and no packaged table; packaged: {', '.join(PACKAGED)}")

@@ -1,4 +1,4 @@
-"""Selection of rows whose readings a fit uses, for logs with too many rows."""
+"""Selection of rows whose readings a fit uses, for tables and logs with too many rows."""
 
 from __future__ import annotations
 
@@ -6,32 +6,62 @@ import dataclasses
 
 import numpy as np
 
+from calibration.data import input_files
 from calibration.data.columns import ROWS
-from calibration.data.input_errors import BadConfiguration
+from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.data.table import Runs
+from mmrjax.errors import count_noun
+from mmrjax.model.robot import Robot
 
 #: Rows at the start of a run whose readings are always used: they show its initial state.
 FIRST = 5
+#: Memory that a loop takes for each settled row [bytes]: the base fit took 61 kB at 50 000 rows of a bench.
+ROW = 100_000
 
 
-def thin_log(runs: Runs, most: int = ROWS) -> Runs:
-    """Returns a log with about `most` of its rows, if it has more; `Runs.log` keeps the drive in all rows.
+def used_rows(runs: Runs, robot: Robot, most: int = ROWS) -> Runs:
+    """Returns the rows of a robot's runs that a fit uses, with the robot's channels.
 
-    Each run keeps its first rows, its last row, and one row of every few in between. Of neighbouring rows, it keeps
-    the one with readings of the channels with the fewest readings so far, else the first. A table without `time_s`
-    is returned unchanged.
+    Raises:
+        BadConfiguration: other objects than `Runs` and a `Robot`; or as `thin_rows`.
+        BadData: as `Runs.of` and `thin_rows`.
+    """
+    for name, value, kind in (("runs", runs, Runs), ("robot", robot, Robot)):
+        if not isinstance(value, kind):
+            example = "mmrjax.read_runs(source, robot)" if kind is Runs else "mmrjax.read_robot(file)"
+            raise BadConfiguration(f"{name}: got {type(value).__name__}; expected {kind.__name__} of {example}")
+    return thin_rows(runs.of(robot), most)
+
+
+def thin_rows(runs: Runs, most: int = ROWS) -> Runs:
+    """Returns runs with about `most` of their rows, if they have more; `Runs.log` keeps all rows.
+
+    Of a log, each run keeps its first rows, its last row, and one row of every few in between. A table without
+    `time_s` is sorted by its conditions, the imposed quantity first, and treated as one run, so that the rows kept
+    are spread evenly over the conditions. Of neighbouring rows, the one with readings of the channels with the fewest
+    readings so far is kept, else the first.
 
     Raises:
         BadConfiguration: `most` is less than 1.
+        BadData: settled rows that need more memory than is free.
     """
     if most < 1:
         raise BadConfiguration(f"rows: got {most}; expected 1 or more")
-    if not runs.sampled or len(runs) <= most:
+    need, free = 0.0 if runs.sampled else float(ROW * min(len(runs), most)), input_files.available_memory()
+    if need > free:
+        raise BadData(
+            f"{runs.source}: {count_noun(min(len(runs), most), 'row')} need {need / 1e9:.3g} GB, and "
+            f"{free / 1e9:.3g} GB of memory are free; expected at most {free / ROW:.0f} rows; state --rows"
+        )
+    if len(runs) <= most:
         return runs
     apart, kept = -(-len(runs) // most), []
     read = np.isfinite(runs.measured())
-    for name in dict.fromkeys(runs.run_names.tolist()):
-        rows = runs.in_order(name)
+    if runs.sampled:
+        ordered = [runs.in_order(name) for name in dict.fromkeys(runs.run_names.tolist())]
+    else:
+        ordered = [np.lexsort([runs[column] for column in reversed(("configuration", *runs.axes))])]
+    for rows in ordered:
         kept.append(rows[_evenly(read[rows], apart)])
     return dataclasses.replace(runs.where(np.sort(np.concatenate(kept))), log=runs.whole)
 

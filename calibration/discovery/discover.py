@@ -21,7 +21,7 @@ from calibration.data.effect_file import Library
 from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.data.posterior_file import Posterior
 from calibration.data.runs import Runs
-from calibration.data.thinning import thin_log
+from calibration.data.thinning import used_rows
 from calibration.described import describe, in_words
 from calibration.discovery import findings, kept, menu, prediction, preference, scales
 from calibration.discovery.active_set import CandidateSpace, candidate_space
@@ -166,7 +166,8 @@ def discover(
         replicates: of the bootstrap; seed: random seed.
         prefer: criterion for the leader of a class, `fit` or `held-out`.
         forbidden: kinds of experiments (`menu.KINDS`) and configurations that are not proposed.
-        rows: number of rows of a log over time above which readings are thinned evenly in time; a note reports it.
+        rows: number of rows above which they are thinned evenly, those of a log in time and those of a table over its
+            conditions; a note reports it.
         progress: callback for progress messages; keep: function that stores each stage when it ends.
         left: remaining time after the verdict [s], for which verdicts at other noises are awaited; None: no limit.
 
@@ -190,7 +191,7 @@ def discover(
     silent = channels.channel_names(known.silent)
     factors = FACTORS.get(known.word, ())
     # Verdicts at other noises use the programs of the first one, so they run in parallel on other cores.
-    others = Threads(2, kept.BESIDE)
+    others = Threads(2)
     sensitivity, outstanding = list[Sensitivity](), list[float]()
     try:
         if factors:
@@ -278,9 +279,7 @@ def prepare_loop(
     A campaign that needs only verdicts continues with `LoopInput.trace`, and so follows the same path as users.
     """
     menu.check_forbidden(forbidden, robot)
-    if not robot.rig.inherits:
-        scales.precompute_nominal()
-    runs = thin_log(runs.of(robot), rows)
+    runs = used_rows(runs, robot, rows)
     distinct, numbers, notes = without_copies(runs)
     kind = observers.observer_kind(distinct)
     if len(distinct) < kind.fewest:
@@ -288,7 +287,8 @@ def prepare_loop(
             f"{runs.source}: {count_noun(len(distinct), kind.word)} cannot show what a model lacks; at least "
             f"{kind.fewest} are needed"
         )
-    ready = preparation.prepare(distinct, robot, noise, stated)
+    with scales.nominal_ahead(robot):
+        ready = preparation.prepare(distinct, robot, noise, stated)
     for note in ready.checked:
         if isinstance(note, NothingVaries) or (isinstance(note, Copied) and not note.tied):
             raise BadData(describe(note))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 
-from calibration.data.input_errors import BadConfiguration, allowed_words
+from calibration.data.input_errors import SEEDS, BadConfiguration, allowed_words, stated_count
 from calibration.inference.observers import Observer
 
 #: Family-wise error of the test for a missing effect, divided among the kinds of evidence: single effects, curves,
@@ -110,8 +110,10 @@ def settings_for(kind: type[Observer], replicates: int = 500, seed: int = 0, pre
     """Settings for data of a kind.
 
     Raises:
-        BadConfiguration: `prefer` is not one of `PREFERENCES`.
+        BadConfiguration: `prefer` is not one of `PREFERENCES`; a number of replicates or a seed that is not allowed.
     """
+    stated_count(replicates, "replicates", 1, 100_000)
+    stated_count(seed, "seed", 0, SEEDS)
     if prefer not in PREFERENCES:
         raise BadConfiguration(f"--prefer: got {prefer}; {allowed_words(prefer, PREFERENCES)}")
     shares = dict(zip(kind.evidence, SHARES[kind.evidence], strict=True))

@@ -375,14 +375,25 @@ def order_collinearity(
     _, cell = np.unique(values, axis=0, return_inverse=True)
     few = cell.max() + 1 <= FEW_CELLS * len(x)
     smooth = [VARIABLES["slope"]] * (VARIABLES["slope"] in conditions) if few else conditions
-    terms = list(np.eye(len(x))[cell.ravel() if few else which.ravel()].T)
-    for column in smooth:
-        terms += list(legendre.legvander(scale_to_unit_range(columns[column], weight)[counts], DEGREE)[:, 1:].T)
-    matrix = np.stack(terms, 1).astype(float)
-    left = x - matrix @ np.linalg.lstsq(matrix, x, rcond=None)[0]
-    rank = int(np.linalg.matrix_rank(matrix))
+    level = cell.ravel() if few else which.ravel()
+    each = [legendre.legvander(scale_to_unit_range(columns[c], weight)[counts], DEGREE)[:, 1:] for c in smooth]
+    terms = np.concatenate([np.zeros((len(x), 1)), *each], 1)
+    # Without the means of each level: a matrix with a column for each level would be rows times rows.
+    count = np.bincount(level)
+    inner, left = (v - (_level_sums(level, v) / count[:, None])[level] for v in (terms, x[:, None]))
+    ways, size, _ = np.linalg.svd(inner, full_matrices=False)
+    ways = ways[:, size > len(x) * np.finfo(float).eps * np.linalg.norm(terms)]
+    left = left - ways @ (ways.T @ left)
+    rank = len(count) + ways.shape[1]
     freedom = (len(x) - 1) / max(len(x) - rank, 1)
     return float(1 - freedom * np.sum(left**2) / np.sum((x - x.mean()) ** 2))
+
+
+def _level_sums(level: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Sum of the rows of each level, shape (levels, columns)."""
+    found = np.zeros((int(level.max()) + 1, values.shape[1]))
+    np.add.at(found, level, values)
+    return found
 
 
 def wave_families(

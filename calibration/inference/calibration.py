@@ -13,9 +13,9 @@ import numpy as np
 
 from calibration.data import surfaces
 from calibration.data.columns import ROWS
-from calibration.data.input_errors import BadConfiguration
+from calibration.data.input_errors import SEEDS, BadConfiguration, stated_count
 from calibration.data.runs import Runs
-from calibration.data.thinning import thin_log
+from calibration.data.thinning import used_rows
 from calibration.described import in_words
 from calibration.inference import blocks as holdout
 from calibration.inference import (
@@ -49,6 +49,8 @@ from mmrjax.model.signals import FLAGS, STATUSES
 
 #: Members of a generation if parameters are free that `steady` does not read.
 POPULATION = 256
+#: Largest values of arguments.
+LARGEST = {"starts": 100_000, "population": 1_000_000, "generations": 10_000, "seed": SEEDS}
 #: Default fidelity for time histories.
 OF_HISTORIES = "drive"
 #: Parameters with another meaning in the resolved running gear: prefixes after the configuration's name.
@@ -94,7 +96,8 @@ def calibrate(
         seed: random seed of the starts and of all other draws; profiles: True to profile each parameter.
         blocks: kinds of blocks to hold out; True: all that are informative for such data.
             Defaults of these two depend on the kind of data and the fidelity.
-        rows: number of rows of a log over time above which readings are thinned evenly in time; a note reports it.
+        rows: number of rows above which they are thinned evenly, those of a log in time and those of a table over its
+            conditions; a note reports it.
         solver: an optimistix solver, or the name of one (`solvers.NAMES`), for the searches from the starts; None
             takes ours, which also serves all fits that begin at the optimum (profiles, blocks). For any other
             solver, penalties on adhesion are cut off at 0.
@@ -102,14 +105,23 @@ def calibrate(
 
     Raises:
         BadData: data that cannot be fitted, see `checks.check_data`.
-        BadConfiguration: an unknown fidelity, parameter or solver; an invalid prior or noise, or a prior of a mass
-            that the table states; rows that no robot near the priors reaches; or a call inside `jax.jit` while JAX
-            uses single precision.
+        BadConfiguration: an unknown fidelity, parameter or solver; a number that is not allowed; an invalid prior or
+            noise, or a prior of a mass that the table states; rows that no robot near the priors reaches; or a call
+            inside `jax.jit` while JAX uses single precision.
     """
     if not is_double():
         raise BadConfiguration(f"calibrate: {SINGLE}")
+    counts = {
+        "starts": (starts, 1),
+        "population": (population, 0),
+        "generations": (generations, 1),
+        "seed": (seed, 0),
+    }
+    for name, (value, low) in counts.items():
+        if value is not None:
+            stated_count(value, name, low, LARGEST[name])
     solver = solvers.solver_by_name(solver) if isinstance(solver, str) else solver
-    runs, told = thin_log(runs.of(robot), rows), in_words(tell)
+    runs, told = used_rows(runs, robot, rows), in_words(tell)
     plan = _make_plan(runs, model, starts, profiles, blocks)
     choose = functools.partial(_free_names, runs, plan, free, fix)
     ready = prepare(runs, robot, noise, stated, assume=False, choose=choose)

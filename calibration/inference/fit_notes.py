@@ -275,6 +275,14 @@ class Thinned(Note):
     kept: int
 
 
+class ThinnedTable(Note):
+    """A table of settled runs with more rows than are used; `kept` of its `rows` are read."""
+
+    source: str
+    rows: int
+    kept: int
+
+
 class CoarseSteps(Note):
     """Histories of a duration [s] that makes their steps [s] too coarse for waves of a shaft."""
 

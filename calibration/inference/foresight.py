@@ -10,7 +10,7 @@ import numpy as np
 from calibration.data.columns import ROWS
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.runs import Runs
-from calibration.data.thinning import thin_log
+from calibration.data.thinning import used_rows
 from calibration.inference import identifiability, observers, optimizers, priors
 from calibration.inference.fit_notes import (
     Copied,
@@ -85,13 +85,13 @@ def predict_identifiability(runs: Runs, robot: Robot, noise: str | None = None, 
 
     Args:
         noise: as `noise.parse_noise`; None takes the file's sd columns, or shares of the readings.
-        rows: number of rows of a log over time above which readings are thinned.
+        rows: number of rows above which they are thinned.
 
     Raises:
         BadData: data that cannot be used.
         BadConfiguration: no parameter of the robot can be freed.
     """
-    runs = thin_log(runs.of(robot), rows)
+    runs = used_rows(runs, robot, rows)
     ready = prepare(runs, robot, noise)
     observe, robot, known = ready.observe, ready.robot, ready.noise
     present = {robot.configurations.names[k] for k in runs.configurations(robot)}

@@ -49,6 +49,8 @@ LATELY = 5
 AGREE, SAME = 3, 0.01
 #: Largest number of cores for parallel searches.
 CORES = min(4, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
+#: Most rows of a table, times searches, in one batch.
+AT_ONCE = 2**14
 
 Z = Float[Array, " parameters"]
 #: An array of JAX or NumPy.
@@ -633,7 +635,9 @@ def _with_values(x: np.ndarray, places: np.ndarray, values: np.ndarray) -> np.nd
 def search_starts(
     problem: Problem, starts: Float[Array, "starts parameters"], data: Data, solver: Solver | None = None
 ) -> tuple[Optimum, Int[Array, "starts rows"], Int[Array, "starts rows"]]:
-    """A search from each start: in one vmapped batch by our solver, one after another by any other `solver`.
+    """A search from each start: in vmapped batches by our solver, one after another by any other `solver`.
+
+    Batches of `AT_ONCE` rows bound the memory, and an interrupt is obeyed between them.
 
     Returns:
         The end of each search, and the status of each row at its start and at its end.
@@ -642,7 +646,10 @@ def search_starts(
         optima, start, end = search_with_solver(problem, starts, data, solver)
         return optima, start.status, end.status
     if not problem.observe.apart:
-        return _search_starts(problem, starts, data)
+        size = min(len(starts), max(1, AT_ONCE // len(data.measured)))
+        filled = np.resize(starts, (-(-len(starts) // size) * size, starts.shape[1]))  # one program for all batches
+        parts = [jax.device_get(_search_starts(problem, z, data)) for z in filled.reshape(-1, size, starts.shape[1])]
+        return jax.tree.map(lambda *x: np.concatenate(x)[: len(starts)], *parts)
     tables = (np.repeat(np.asarray(x)[None], len(starts), 0) for x in (data.weight, data.measured, data.centre))
     members = Member(np.asarray(starts), *tables)
     problem = dataclasses.replace(problem, data=data)
@@ -652,8 +659,8 @@ def search_starts(
 
 
 @compiled
-def _search_starts(problem: Problem, starts: Array, data: Data) -> tuple[Optimum, Array, Array]:
-    def search(z: Z) -> tuple[Optimum, Array, Array]:
+def _search_starts(problem: Problem, starts: Array | np.ndarray, data: Data) -> tuple[Optimum, Array, Array]:
+    def search(z: Any) -> tuple[Optimum, Array, Array]:
         optimum, seen = levenberg_marquardt(problem, z, data)
         return optimum, problem.observation(z).status, seen.status
 

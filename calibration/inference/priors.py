@@ -496,6 +496,8 @@ def _coordinate_of_parameter(
             f"--prior {parameter.name}: got {bound_text(mean)}; expected {bound_text(low)} to "
             f"{bound_text(high)} {spec.unit}"
         )
+    if stated is not None and not 0 < sd < math.inf:
+        raise BadConfiguration(f"--prior {parameter.name}: got a standard deviation of {sd:g}; expected more than 0")
     if sd <= 0:
         raise BadConfiguration(
             f"--free {parameter.name}: its prior has no width (nominal value 0 with a relative sd); "

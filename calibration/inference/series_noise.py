@@ -12,6 +12,7 @@ import dataclasses
 
 import numpy as np
 from jaxtyping import Float
+from scipy import sparse
 
 from calibration.data.columns import DRIVEN
 from calibration.data.instruments import display_step
@@ -105,15 +106,15 @@ def _noise_of_channel(
     least = float(display_step(measured, channel) / np.sqrt(12))
     forms = []
     for in_share in (False, True):
-        scale = weights * (sizes if in_share else 1.0)
-        spread = np.sqrt(np.sum(scale**2, 1))
-        unit, scale = difference / spread, scale / spread[:, None]
+        scale = weights.multiply(sizes[None]) if in_share else weights
+        spread = np.sqrt(scale.power(2).sum(1))
+        unit, scale = difference / spread, sparse.csr_array(scale.multiply(1 / spread[:, None]))
         sound = _without_wrong_readings(unit)
         unit, scale = unit[sound], scale[sound]
         count = len(unit)
         size = float(np.sqrt(np.mean(unit**2)))
         together = scale @ scale.T
-        freedom = count**2 / float(np.sum(together**2))
+        freedom = count**2 / float(together.power(2).sum())
         likely = -freedom * float(np.mean(np.log(np.maximum(size * spread[sound], np.finfo(float).tiny))))
         forms.append((likely, size, freedom))
     likely, size, freedom = np.array(forms).T
@@ -122,7 +123,7 @@ def _noise_of_channel(
     return SeriesNoise(channel, float(floor), float(share), float(probability @ freedom), axis, used, least)
 
 
-def _differences(measured: np.ndarray, x: np.ndarray, series: list[np.ndarray]) -> tuple[np.ndarray, int]:
+def _differences(measured: np.ndarray, x: np.ndarray, series: list[np.ndarray]) -> tuple[sparse.csr_array, int]:
     """Difference of each reading from the line between its neighbours, as weights of all readings, shape
     (differences, rows); and the number of series with any."""
     differences, used = [], 0
@@ -132,12 +133,12 @@ def _differences(measured: np.ndarray, x: np.ndarray, series: list[np.ndarray]) 
         before, middle, after = rows[:-2], rows[1:-1], rows[2:]
         wide = x[after] - x[before]
         share = np.where(wide > 0, (x[after] - x[middle]) / np.where(wide > 0, wide, 1.0), 0.5)
-        weights = np.zeros((len(middle), len(measured)))
-        k = np.arange(len(middle))
-        weights[k, middle], weights[k, before], weights[k, after] = 1.0, -share, share - 1.0
-        differences.append(weights)
+        k = np.tile(np.arange(len(middle)), 3)
+        weights = np.concatenate([-share, np.ones(len(middle)), share - 1.0])
+        at = k, np.concatenate([before, middle, after])
+        differences.append(sparse.csr_array((weights, at), (len(middle), len(measured))))
         used += bool(len(middle))
-    return np.concatenate(differences) if differences else np.zeros((0, len(measured))), used
+    return sparse.csr_array(sparse.vstack(differences)) if differences else sparse.csr_array((0, len(measured))), used
 
 
 def _without_wrong_readings(unit: np.ndarray) -> np.ndarray:

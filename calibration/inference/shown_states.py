@@ -1,41 +1,56 @@
-"""States of a robot that a log shows, row by row, and windows of its runs for the equations.
+"""States that a log shows, and windows of its runs for the equations.
 
-No window contains a jump of an imposed quantity, a gap between rows, or rest. After a jump the current rises within a
-fraction of the time between rows, and friction at rest is not a function of speed.
+A point is the mean of neighbouring rows, so that no row is left out of a long log and a window has a few dozen
+points. No window contains a jump of an imposed quantity, a gap between rows, or rest. After a jump the current rises
+within a fraction of the time between rows, and friction at rest is not a function of speed.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import operator
 from collections.abc import Mapping
+from enum import StrEnum
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from calibration.inference.priors import DELAY
 from calibration.inference.problem import Problem
 from mmrjax.model import balances
 from mmrjax.model.channels import Channel
 from mmrjax.model.conditions import Conditions
+from mmrjax.model.params import Scalar
 from mmrjax.model.quantities import CURRENT, VOLTAGE
 from mmrjax.model.signals import State
 
-#: Length of a window in times between rows, and its limits [s]; its fewest rows; distance between the starts of
-#: windows, as a share of their length.
-LONG, LENGTHS, FEWEST, APART = 16, (0.15, 0.3), 9, 0.25
+#: Length of a window in correlation times of the motion and in rows, at least; its points, about; its fewest rows;
+#: distance between the starts of windows, as a share of their length.
+CORRELATED, LONG, POINTS, FEWEST, APART = 0.35, 16, 32, 9, 0.25
 #: Jump of an imposed quantity as a share of its largest value, and the same for the acceleration of an imposed speed,
 #: with which the current jumps; a time between rows that is a gap, over the usual one.
 JUMP, KINK, GAP = 0.05, 0.3, 3.0
 #: Speed below which a shaft may be at rest: in sds of its reading, and as a share of the largest.
 REST_SD, REST = 5.0, 0.01
-#: Range of an unknown delay within which a jump may act [prior sd].
-DELAYED = 2.0
-#: Length of a window [s] beyond which it does not show changes of the states.
-LONGEST = 1.0
+#: Noise of the slope of an angle, as a share of its usual size; most rows whose slope it is.
+STEEP, STEEPEST = 0.02, 201
+#: Width added to both ends of an interval, so that a single row has one [rows].
+EDGE = 1e-4
+#: Fields of `Conditions` with a mean over an interval; others are those at its middle.
+IMPOSED = "voltage", "duty", "motor_current", "motor_speed", "motor_acceleration", "load_torque"
+
+
+class Lacking(StrEnum):
+    """Reasons why a log does not show the states of its equations."""
+
+    MOTION = "motion"  # no speed or angle
+    SIGN = "sign"  # an instrument shows only a magnitude
+    SLACK = "slack"  # backlash: motor and load move apart
+    TURN = "turn"  # of a robot that turns
+    FOLLOWER = "follower"  # a speed is imposed, and no channel follows it
 
 
 class Plan(eqx.Module):
@@ -69,31 +84,38 @@ class Plan(eqx.Module):
 
 def plan_of(problem: Problem) -> Plan | None:
     """Returns the plan of a log; None if the log does not show the states."""
+    found = plan_or_lacking(problem)
+    return found if isinstance(found, Plan) else None
+
+
+def plan_or_lacking(problem: Problem) -> Plan | Lacking:
+    """Returns the plan of a log, or the reason why there is none."""
     robot, counts = problem.base, np.asarray(problem.data.weight).sum(0) > 0
     shown = {k: c for k, c in enumerate(problem.channels) if counts[k]}
-    if robot.loose or robot.rig.turns or {c.name for c in shown.values()} & robot.rig.magnitudes:
-        return None
+    if robot.rig.turns:
+        return Lacking.TURN
+    if robot.loose:
+        return Lacking.SLACK
+    if {c.name for c in shown.values()} & robot.rig.magnitudes:
+        return Lacking.SIGN
     imposed = robot.rig.imposed
     pulsed = np.ptp(np.asarray(problem.observe.of_rows.duty)) > 0  # type: ignore[attr-defined]
     drawn = "total_current"  # proportional to the duty of pulses
     currents = {k: c.name == drawn for k, c in shown.items() if c.rests_on == CURRENT}
+    voltages = [k for k, c in shown.items() if c.rests_on == VOLTAGE]
     speeds = [k for k, c in shown.items() if c.zero_at_rest and c.settled]
     angles = [k for k, c in shown.items() if c.zero_at_rest and not c.settled]
     if imposed == "motor_speed":
-        others = (*currents, *_voltages(shown))
-        return Plan(-1, -1, False, False, others, imposed) if others else None
-    if not (speeds or angles):
-        return None
-    motion = (*speeds, *angles)[0]
+        others = (*currents, *voltages)
+        return Plan(-1, -1, False, False, others, imposed) if others else Lacking.FOLLOWER
     current = next(iter(sorted(currents, key=lambda k: currents[k])), -1) if imposed == "voltage" else -1
     current = -1 if current >= 0 and pulsed and currents[current] else current
+    if not (speeds or angles):
+        return Lacking.MOTION
+    motion = (*speeds, *angles)[0]
     slips = [k for k in speeds[1:] if robot.has_ground and _travels(shown[k]) and not _travels(shown[motion])]
-    others = (*slips, *(_voltages(shown) if imposed == "motor_current" else ()))
+    others = (*slips, *(voltages if imposed == "motor_current" else ()))
     return Plan(current, motion, not speeds, _travels(shown[motion]), others, imposed)
-
-
-def _voltages(shown: dict[int, Channel]) -> list[int]:
-    return [k for k, c in shown.items() if c.rests_on == VOLTAGE]
 
 
 def _travels(channel: Channel) -> bool:
@@ -102,113 +124,348 @@ def _travels(channel: Channel) -> bool:
 
 
 class Rows(eqx.Module):
-    """Conditions, readings and states of each row, shape (rows, ...).
+    """Conditions, readings and states at each point of a log, shape (points, ...).
 
     Attributes:
-        conditions: from the row on; shown: readings [SI].
+        conditions: means over `cell`; shown: readings [SI], means of their rows; sd: of these means.
         rate: slope of the channel of the motion, if that is an angle [SI/s]; way: of travel, 0 if it may be at rest.
-        angle: of the output since the run's first row [rad]; since: time since the row before [s], 0 for the first.
+        angle: of the output since the run's first row [rad]; since: time since the point before [s], 0 for the first
+            of a run; time: since the run's start [s].
+        first: a row of the table at the point.
+        delay: of the rig, at which the conditions were taken [s]; drift: their derivatives by the delay, by field;
+            reach: change of the delay within which these hold [s].
         memory: of the robot's effects that have one, by their names.
     """
 
     conditions: Conditions
-    shown: Float[Array, "rows channels"]
-    rate: Float[Array, " rows"]
-    way: Float[Array, " rows"]
-    angle: Float[Array, " rows"]
-    since: Float[Array, " rows"]
-    memory: Mapping[str, Float[Array, " rows"]] = eqx.field(default_factory=dict)
+    shown: Float[Array, "points channels"]
+    sd: Float[Array, "points channels"]
+    rate: Float[Array, " points"]
+    way: Float[Array, " points"]
+    angle: Float[Array, " points"]
+    since: Float[Array, " points"]
+    time: Float[Array, " points"]
+    first: Int[Array, " points"]
+    delay: Float[Array, " points"]
+    reach: Float[Array, " points"]
+    drift: Mapping[str, Float[Array, " points"]]
+    memory: Mapping[str, Float[Array, " points"]] = eqx.field(default_factory=dict)
+
+    def imposed(self, delay: Scalar) -> Conditions:
+        """Conditions at another delay, or the nearest within `reach` of theirs; traceable."""
+        conditions, late = self.conditions, jnp.clip(delay - self.delay, -self.reach, self.reach)
+        for name, drift in self.drift.items():
+            conditions = replaced(conditions, name, getattr(conditions, name) + late * drift)
+        return conditions
+
+
+def replaced(conditions: Conditions, name: str, value: Any) -> Conditions:
+    """Conditions with another value of a field; unlike a new one, this changes no shape of others."""
+    return eqx.tree_at(operator.attrgetter(name), conditions, value)
+
+
+@dataclasses.dataclass(frozen=True)
+class Course:
+    """Imposed quantities over time, as integrals, so that each interval has a mean at any delay.
+
+    Attributes:
+        time: of knots of all runs, one run after the other [s]; values: from each on; integrals: up to each. Both by
+            field of `Conditions`.
+        cell: beginning and end of the interval of each point, in the same clock.
+    """
+
+    time: np.ndarray
+    values: dict[str, np.ndarray]
+    integrals: dict[str, np.ndarray]
+    cell: np.ndarray
+
+    def at(self, delay: float) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+        """Mean of each quantity at each point, if it acts `delay` [s] later than its column states, and its slope."""
+        low, high = (edge - delay for edge in self.cell.T)
+        mean, drift = {}, {}
+        for name, x in self.integrals.items():
+            mean[name] = (np.interp(high, self.time, x) - np.interp(low, self.time, x)) / (high - low)
+            ends = [self.values[name][np.searchsorted(self.time, t, side="right") - 1] for t in (low, high)]
+            drift[name] = (ends[0] - ends[1]) / (high - low)
+        return mean, drift
 
 
 @dataclasses.dataclass(frozen=True)
 class Windows:
-    """Windows over the rows of one run: rows of the table, and Δt w, Δt w', Δt w'' there, shape (windows, rows)."""
+    """Windows of one run: indices of their points, and Δt w, Δt w', Δt w'' and Δt there, shape (windows, length).
 
+    The last point of a shorter window is repeated with zero weights.
+    """
+
+    run: int
     rows: np.ndarray
     weight: np.ndarray
     slope: np.ndarray
     bend: np.ndarray
+    steps: np.ndarray
 
 
 def window_function(share: np.ndarray, length: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """w = sin⁴ π s, w' and w'' of a window at shares s of its length [s]; 0 outside.
+    """w = sin⁸ π s, w' and w'' of a window at shares s of its length [s]; 0 outside.
 
-    The first three derivatives are 0 at its ends.
+    Sums over rows integrate w'' times an angle without bias only if the window ends smoothly. With sin⁴ the inertia
+    of 100 logs of an angle alone was off by 6 posterior sds, with sin⁸ by 0.1.
     """
     s, c = np.sin(np.pi * share), np.cos(np.pi * share)
     inside = (share > 0) & (share < 1)
     rise = np.pi / length
-    derivatives = s**4, 4 * rise * s**3 * c, 4 * rise**2 * s**2 * (3 * c**2 - s**2)
+    derivatives = s**8, 8 * rise * s**7 * c, 8 * rise**2 * s**6 * (7 * c**2 - s**2)
     return tuple(np.where(inside, x, 0.0) for x in derivatives)  # type: ignore[return-value]
 
 
-def windows_of_run(time: np.ndarray, usable: np.ndarray, broken: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Returns the windows of one run, each as (indices of its rows, their positions as shares of its length).
+def windows_of_run(time: np.ndarray, piece: np.ndarray, length: float) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Returns the windows of one run, each as (indices of its points, their positions as shares of its length).
 
     Args:
-        time: of the rows [s], increasing; usable: True for rows that may be in a window.
-        broken: True for rows that may not be in a window together with the previous row.
+        time: of the points [s], increasing; piece: of each, -1 for points in no window; a window is within one piece.
+        length: of a window [s]; a shorter piece has one window of its own length.
     """
-    if len(time) < 2:
-        return []
-    usual, windows = float(np.median(np.diff(time))), list[tuple[np.ndarray, np.ndarray]]()
-    if (FEWEST - 1) * usual > LONGEST:
-        return windows
-    starts = usable & (np.r_[True, ~usable[:-1]] | broken)
-    piece = np.cumsum(starts)
-    for k in np.unique(piece[usable]):
-        rows = np.flatnonzero((piece == k) & usable)
-        if len(rows) < FEWEST:
+    windows = list[tuple[np.ndarray, np.ndarray]]()
+    starts = np.flatnonzero(np.r_[True, np.diff(piece) != 0])
+    for begin, end in zip(starts, np.r_[starts[1:], len(piece)], strict=True):
+        if piece[begin] < 0 or end - begin < FEWEST:
             continue
-        whole = time[rows[-1]] - time[rows[0]]
-        length = min(max(float(np.clip(LONG * usual, *LENGTHS)), (FEWEST - 1) * usual), whole)
-        count = int((whole - length) / (APART * length)) + 1
-        for begin in time[rows[0]] + np.linspace(0.0, whole - length, count):
-            inside = rows[(time[rows] >= begin - 1e-9) & (time[rows] <= begin + length + 1e-9)]
-            if len(inside) >= FEWEST - 1:
-                windows.append((inside, (time[inside] - begin) / length))
+        times = time[begin:end]
+        whole = times[-1] - times[0]
+        each = min(length, whole)
+        for first in times[0] + np.linspace(0.0, whole - each, int((whole - each) / (APART * each)) + 1):
+            low, high = np.searchsorted(times, (first - 1e-9, first + each + 1e-9))
+            if high - low >= FEWEST - 1:
+                windows.append((np.arange(begin + low, begin + high), (times[low:high] - first) / each))
     return windows
 
 
-def windows_of_log(problem: Problem, plan: Plan, rate: np.ndarray) -> list[Windows]:
-    """Returns the windows of each run."""
-    observe: Any = problem.observe
-    time, weight = np.asarray(observe.time), np.asarray(problem.data.weight)
-    measured, sd = np.asarray(problem.data.measured), np.asarray(problem.data.sd)
-    states = [k for k in (plan.current, plan.motion if plan.mechanical else -1, *plan.others) if k >= 0]
-    moves = travel_directions(problem, plan, measured, sd, rate)
-    late = _longest_delay(problem)
-    windows = []
-    for r, every in enumerate(np.asarray(observe.rows_of)):
-        rows = every[every >= 0]
-        rows = rows[np.all(weight[rows][:, states] > 0, 1)]
-        if len(rows) < FEWEST:
+def correlation_time(time: np.ndarray, speed: np.ndarray, noise: float) -> float:
+    """Lag at which the mean squared change of a speed equals its variance [s]; 0 if shorter than the time of a row.
+
+    Args:
+        noise: sd of the readings of the speed, which does not count.
+    """
+    size = float(np.var(speed)) - noise**2
+    if len(time) < FEWEST or size <= 0:
+        return 0.0
+    lags = np.unique(np.geomspace(1, len(time) // 2, 60).astype(int))
+    changed = np.array([np.mean((speed[k:] - speed[:-k]) ** 2) for k in lags]) - 2 * noise**2
+    beyond = np.flatnonzero(changed >= size)
+    lag = lags[beyond[0]] if len(beyond) else lags[-1]
+    return 0.0 if lag == 1 else float(lag * np.median(np.diff(time)))
+
+
+def slopes_of(time: np.ndarray, values: np.ndarray, piece: np.ndarray, count: int) -> np.ndarray:
+    """Slope at each point of a cubic over the `count` points around it, within its piece."""
+    out = np.zeros(len(time))
+    for begin, end in _stretches(piece):
+        wide = min(count, end - begin)
+        if wide < FEWEST // 2:
+            out[begin:end] = np.gradient(values[begin:end], time[begin:end]) if wide > 1 else 0.0
             continue
-        times, usable = time[rows], moves[rows] != 0
-        gap = np.r_[False, np.diff(times) > GAP * np.median(np.diff(times))]
-        turned = np.r_[False, np.diff(moves[rows]) != 0]
-        broken = gap | turned
-        for jump in _jumps(observe, r):
-            # A reading at the instant of a jump still shows the state before it.
-            usable &= ~((times > jump + 1e-9) & (times <= jump + late + 1e-9))
-            broken |= np.r_[False, (times[:-1] <= jump + 1e-9) & (times[1:] > jump + 1e-9)]
-        made = windows_of_run(times, usable, broken)
-        step = np.gradient(times)
-        whole = np.zeros((3, len(made), len(rows)))
-        for k, (inside, share) in enumerate(made):
-            length = (times[inside[-1]] - times[inside[0]]) / max(share[-1] - share[0], 1e-12)
-            whole[:, k, inside] = np.array(window_function(share, length)) * step[inside]
-        if made:
-            windows.append(Windows(rows, *whole))
-    return windows
+        low = np.clip(np.arange(begin, end) - wide // 2, begin, end - wide)
+        for part in np.array_split(np.arange(end - begin), 1 + (end - begin) * wide // 1_000_000):
+            near, here = low[part][:, None] + np.arange(wide), (begin + part)[:, None]
+            away = time[near] - time[here]
+            scale = np.abs(away).max()
+            powers = (away / scale)[:, :, None] ** np.arange(4)
+            normal = np.einsum("nwi,nwj->nij", powers, powers)
+            rise = np.einsum("nwi,nw->ni", powers, values[near] - values[here])
+            out[begin + part] = np.linalg.solve(normal, rise[..., None])[:, 1, 0] / scale
+    return out
 
 
-def _longest_delay(problem: Problem) -> float:
-    """Longest delay between a jump and its effect [s]."""
-    names, delay = problem.coordinates.names, abs(float(np.max(np.asarray(problem.base.rig.delay))))
-    if DELAY not in names:
-        return delay
-    return delay + DELAYED * float(np.asarray(problem.coordinates.spread)[names.index(DELAY)])
+def _stretches(piece: np.ndarray) -> zip[tuple[int, int]]:
+    """Beginning and end of each stretch of equal values."""
+    starts = np.flatnonzero(np.r_[len(piece) > 0, np.diff(piece) != 0])
+    return zip(starts.tolist(), [*starts[1:].tolist(), len(piece)], strict=True)
+
+
+def slope_rows(time: np.ndarray, angle: np.ndarray, sd: float) -> tuple[int, float]:
+    """Number of rows over which the slope of an angle has little noise, `STEEP` of its size, and the sd of that."""
+    step, far = float(np.median(np.diff(time))), max(len(time) // 20, 1)
+    speed = float(np.sqrt(np.mean((angle[far:] - angle[:-far]) ** 2))) / (far * step)
+    rows = np.ceil((12 * (sd / max(STEEP * speed * step, 1e-300)) ** 2) ** (1 / 3))
+    rows = int(np.clip(rows, FEWEST, STEEPEST)) | 1
+    return rows, sd * (75 / rows**3) ** 0.5 / step  # of a cubic
+
+
+class _Log:
+    """Arrays of a log, by table row."""
+
+    def __init__(self, problem: Problem, plan: Plan) -> None:
+        observe: Any = problem.observe
+        self.problem, self.plan, self.observe = problem, plan, observe
+        self.time, self.of_rows = np.asarray(observe.time, float), observe.of_rows
+        self.measured, self.sd = (np.asarray(x, float) for x in (problem.data.measured, problem.data.sd))
+        states = [k for k in (plan.current, plan.motion if plan.mechanical else -1, *plan.others) if k >= 0]
+        weight = np.asarray(problem.data.weight)
+        self.every = [rows[rows >= 0] for rows in np.asarray(observe.rows_of)]
+        self.each = [rows[np.all(weight[rows][:, states] > 0, 1)] for rows in self.every]
+        long = [np.diff(self.time[rows]) for rows in self.each if len(rows) > 1]
+        self.step = float(np.median(np.concatenate(long))) if long else 1.0
+
+    def motion(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        """Time and speed over rows of a run, in any unit, and the sd of its noise."""
+        plan, time = self.plan, self.time[rows]
+        if not plan.mechanical:
+            return time, np.asarray(self.of_rows.motor_speed)[rows], 0.0
+        shown, sd = self.measured[rows, plan.motion], float(np.median(self.sd[rows, plan.motion]))
+        if plan.angle:
+            lag = slope_rows(time, shown, sd)[0] // 2
+            apart = time[lag:] - time[:-lag]
+            return time[lag:], (shown[lag:] - shown[:-lag]) / apart, 1.5 * sd / float(np.median(apart))
+        return time, shown, sd
+
+    def length(self) -> float:
+        """Length of a window [s], by the bandwidth of the motion."""
+        lasting = [correlation_time(*self.motion(rows)) for rows in self.each if len(rows) > 2 * FEWEST]
+        return max(CORRELATED * float(np.median(lasting)) if lasting else 0.0, LONG * self.step)
+
+    def points(self, run: int, size: int, delay: float | None) -> dict[str, np.ndarray]:
+        """Means of `size` rows of a run each, within stretches without a gap or a jump.
+
+        Args:
+            delay: of jumps [s]; None for stretches that contain them.
+
+        Returns:
+            By name: row, time, shown, sd, cell as of `Rows`; stretch of each, -1 for points in no window.
+        """
+        rows = self.each[run]
+        times = self.time[rows]
+        broken = np.r_[False, np.diff(times) > GAP * self.step][: len(rows)]
+        # A reading at the instant of a jump still shows the state before it, as does the first of a run.
+        jumps = np.zeros(0) if delay is None else _jumps(self.observe, run) + delay
+        after = np.searchsorted(times, np.r_[times[:1], jumps] + 1e-9)
+        if len(after) * FEWEST < len(rows):  # else a quantity that always jumps is one that changes smoothly
+            broken[after[after < len(rows)]] = True
+        stretch = np.cumsum(broken)
+        begin = np.flatnonzero(np.r_[True, np.diff(stretch) != 0])[: len(rows)]
+        place = np.arange(len(rows)) - begin[stretch] if len(rows) else stretch
+        block = np.cumsum((place % size == 0) | broken) - 1
+        first, count = np.unique(block, return_index=True, return_counts=True)[1:]
+
+        def mean(x: np.ndarray) -> np.ndarray:
+            return np.add.reduceat(x, first, axis=0) / (count if x.ndim == 1 else count[:, None])
+
+        middle = 0.5 * (times[1:] + times[:-1])
+        inner = ~broken[1:]
+        low = np.r_[times[:1], np.where(inner, middle, times[1:])]
+        high = np.r_[np.where(inner, middle, times[:-1]), times[-1:]]
+        last = first + count - 1
+        cell = np.stack([low[first] - EDGE * self.step, high[last] + EDGE * self.step], 1)
+        return {
+            "row": rows[first + count // 2],
+            "time": mean(times),
+            "shown": mean(self.measured[rows]),
+            "sd": np.sqrt(mean(self.sd[rows] ** 2) / count[:, None]),
+            "cell": cell,
+            "stretch": np.where(count == size, stretch[first], -1),
+        }
+
+    def course(self, cells: list[np.ndarray]) -> Course:
+        """Imposed quantities over time; `cells`: of the points of each run."""
+        changing = {
+            name: np.asarray(x, float)
+            for name in IMPOSED
+            if (x := getattr(self.of_rows, name)) is not None and np.ptp(np.asarray(x)) > 0
+        }
+        linear = self.problem.base.rig.between_rows == "linear"
+        knots, moved = list[np.ndarray](), list[np.ndarray]()
+        values, integrals = ({name: list[np.ndarray]() for name in changing} for _ in range(2))
+        for rows, cell in zip(self.every, cells, strict=True):
+            whole = float(self.time[rows[-1]] - self.time[rows[0]]) + 1.0
+            time = np.r_[self.time[rows[0]] - whole, self.time[rows], self.time[rows[-1]] + whole]
+            begin = (knots[-1][-1] if knots else 0.0) + 1.0 - time[0]
+            for name, x in changing.items():
+                shown = x[np.r_[rows[0], rows, rows[-1]]]
+                lines = name == "motor_speed" or (linear and name != "motor_acceleration")
+                mean = 0.5 * (shown[1:] + shown[:-1]) if lines else shown[:-1]
+                integrals[name].append(np.r_[0.0, np.cumsum(np.diff(time) * mean)])
+                values[name].append(shown)
+            knots.append(time + begin)
+            moved.append(cell + begin)
+        held, summed = ({n: np.concatenate(x) for n, x in each.items()} for each in (values, integrals))
+        return Course(np.concatenate(knots), held, summed, np.concatenate(moved))
+
+
+def rows_and_windows(
+    problem: Problem, plan: Plan, delay: float = 0.0, *, across: bool = False
+) -> tuple[Rows, Course, list[Windows]]:
+    """Returns the points of a log, what is imposed there over time, and the windows of its runs.
+
+    Args:
+        delay: between the instant of a jump in its column and its action [s]; across: True for windows that contain
+            jumps.
+    """
+    log = _Log(problem, plan)
+    length = log.length()
+    size = max(1, int(length / (POINTS * log.step)))
+    parts = [log.points(run, size, None if across else delay) for run in range(len(log.each))]
+    count = np.cumsum([0, *(len(p["time"]) for p in parts)])
+    joined = {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
+    run = np.repeat(np.arange(len(parts)), np.diff(count))
+    course = log.course([p["cell"] for p in parts])
+    mean, drift = course.at(delay)
+    conditions: Any = jax.tree.map(lambda x: np.asarray(x)[joined["row"]], log.of_rows)
+    for name, x in mean.items():
+        conditions = replaced(conditions, name, x)
+    time, shown, sd = joined["time"], joined["shown"], joined["sd"]
+    since = np.where(np.diff(run, prepend=-1) != 0, 0.0, np.diff(time, prepend=0.0))
+    # Points of different runs or on both sides of a jump are apart for slopes, and those of both ways for windows.
+    apart = np.cumsum(np.r_[False, (np.diff(run) != 0) | (np.diff(joined["stretch"]) != 0)])
+    wide, noise, rate = FEWEST, 0.0, np.zeros(len(run))
+    if plan.angle:
+        longest = max(log.each, key=len)
+        angle, sds = (x[longest, plan.motion] for x in (log.measured, log.sd))
+        wide, noise = slope_rows(log.time[longest], angle, float(np.median(sds)))
+        wide = max(FEWEST, wide // size | 1)
+        rate = slopes_of(time, shown[:, plan.motion], apart, wide)
+    way, speed = _ways(problem, plan, conditions, shown, sd, rate, noise)
+    usable = (way != 0) & (joined["stretch"] >= 0)
+    piece = np.where(usable, np.cumsum(np.r_[False, (np.diff(apart) != 0) | (np.diff(way) != 0)]), -1)
+    if plan.angle:
+        rate = slopes_of(time, shown[:, plan.motion], piece, wide)
+    turned = np.cumsum(np.where(since > 0, 0.5 * (speed + np.roll(speed, 1)) * since, 0.0))
+    none = np.zeros(len(run))
+    arrays = shown, sd, rate, way, turned - turned[count[:-1]][run], since, time, joined["row"]
+    late = none + delay, none + log.step, drift
+    windows = [
+        _weights(r, time, windows_of_run(time, np.where(run == r, piece, -1), length)) for r in range(len(parts))
+    ]
+    rows = Rows(*jax.tree.map(jnp.asarray, (conditions, *arrays, *late)))
+    return rows, course, [w for w in windows if len(w.rows)]
+
+
+def _weights(run: int, time: np.ndarray, windows: list[tuple[np.ndarray, np.ndarray]]) -> Windows:
+    """Weights of the windows of a run at their points."""
+    longest = max((len(rows) for rows, _ in windows), default=0)
+    index, values = np.zeros((len(windows), longest), int), np.zeros((4, len(windows), longest))
+    values[3] = 1.0
+    for k, (rows, share) in enumerate(windows):
+        index[k], n = rows[-1], len(rows)
+        length = (time[rows[-1]] - time[rows[0]]) / max(share[-1] - share[0], 1e-12)
+        index[k, :n] = rows
+        values[3, k, :n] = np.gradient(time[rows])
+        plain = np.array(window_function(share, length)) * values[3, k, :n]
+        values[:3, k, :n] = _consistent(plain, share, length)
+    return Windows(run, index, *values)
+
+
+def _consistent(weights: np.ndarray, share: np.ndarray, length: float) -> np.ndarray:
+    """Weights w, w', w'' of a window that integrate polynomials up to the third degree by parts without error.
+
+    Sums over rows at irregular times would not, and an angle is far from 0, so that its sum would be mostly error.
+    """
+    w, powers, at = weights[0], np.arange(4), 2 * share[:, None] - 1
+    basis = at**powers
+    normal = np.linalg.pinv(basis.T @ (w[:, None] * basis))
+    moments = w @ basis
+    once = np.r_[0.0, powers[1:] * moments[:3]] * (2 / length)
+    twice = np.r_[0.0, 0.0, (powers[1:] * powers[:-1])[1:] * moments[:2]] * (2 / length) ** 2
+    change = [-once - weights[1] @ basis, twice - weights[2] @ basis]
+    return np.stack([w, *(x + w * (basis @ (normal @ c)) for x, c in zip(weights[1:], change, strict=True))])
 
 
 def _jumps(observe: Any, run: int) -> np.ndarray:
@@ -224,58 +481,28 @@ def _jumps(observe: Any, run: int) -> np.ndarray:
     return times[1:][jumps]
 
 
-def travel_directions(
-    problem: Problem, plan: Plan, measured: np.ndarray, sd: np.ndarray, rate: np.ndarray
-) -> np.ndarray:
-    """Direction of travel at each row, 0 if the robot may be at rest."""
+def _ways(
+    problem: Problem,
+    plan: Plan,
+    conditions: Any,
+    shown: np.ndarray,
+    sd: np.ndarray,
+    rate: np.ndarray,
+    noise: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Direction of travel at each point, 0 if the robot may be at rest, and the speed of the output [rad/s].
+
+    Args:
+        noise: sd of `rate`.
+    """
     if plan.imposed == "motor_speed":
-        speed = np.asarray(problem.observe.of_rows.motor_speed)  # type: ignore[attr-defined]
-        return np.where(np.abs(speed) > REST * np.abs(speed).max(initial=0.0), np.sign(speed), 0.0)
-    speed = rate if plan.angle else measured[:, plan.motion]
-    limit = REST * np.abs(speed).max(initial=0.0)
-    limit = limit if plan.angle else np.maximum(limit, REST_SD * sd[:, plan.motion])
-    return np.where(np.abs(speed) > limit, np.sign(speed), 0.0)
-
-
-def motion_rates(problem: Problem, plan: Plan) -> np.ndarray:
-    """Rate of the channel of the motion at each row: the slope of a cubic over a window [unit / s]."""
-    observe: Any = problem.observe
-    time, measured = np.asarray(observe.time), np.asarray(problem.data.measured)
-    out = np.zeros(len(time))
-    if not plan.angle:
-        return out
-    for every in np.asarray(observe.rows_of):
-        rows = every[every >= 0]
-        rows = rows[np.asarray(problem.data.weight)[rows, plan.motion] > 0]
-        for k in range(len(rows)):
-            low, high = max(0, k - FEWEST // 2), min(len(rows), k + FEWEST // 2 + 1)
-            near = rows[low:high]
-            if len(near) > 3:
-                out[rows[k]] = np.polyfit(time[near] - time[rows[k]], measured[near, plan.motion], 3)[2]
-    return out
-
-
-def states_by_row(problem: Problem, plan: Plan, rate: np.ndarray) -> Rows:
-    """Returns conditions, readings and states of each row."""
-    observe: Any = problem.observe
-    time, measured = np.asarray(observe.time), np.asarray(problem.data.measured)
-    sd = np.asarray(problem.data.sd)
-    conditions = observe.of_rows
-    since, angle = np.zeros(len(time)), np.zeros(len(time))
-    robot = problem.base
-    for every in np.asarray(observe.rows_of):
-        rows = every[every >= 0]
-        since[rows[1:]] = np.diff(time[rows])
-        if plan.imposed == "motor_speed":
-            wheel = np.asarray(conditions.motor_speed)[rows] / float(robot.gearbox.ratio)
-        else:
-            wheel = (rate if plan.angle else measured[:, plan.motion])[rows] * _wheel_per_unit(problem, plan)
-        steps = 0.5 * (wheel[1:] + wheel[:-1]) * np.diff(time[rows])
-        angle[rows[1:]] = np.cumsum(steps)
-    arrays = [
-        jnp.asarray(x) for x in (measured, rate, travel_directions(problem, plan, measured, sd, rate), angle, since)
-    ]
-    return Rows(jax.tree.map(jnp.asarray, conditions), *arrays)
+        speed, off = conditions.motor_speed / float(problem.base.gearbox.ratio), np.zeros(len(shown))
+    else:
+        per = _wheel_per_unit(problem, plan)
+        speed = per * (rate if plan.angle else shown[:, plan.motion])
+        off = abs(per) * (np.full(len(shown), noise) if plan.angle else sd[:, plan.motion])
+    limit = np.maximum(REST * np.abs(speed).max(initial=0.0), REST_SD * off)
+    return np.where(np.abs(speed) > limit, np.sign(speed), 0.0), speed
 
 
 def _wheel_per_unit(problem: Problem, plan: Plan) -> float:

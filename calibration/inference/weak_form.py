@@ -26,23 +26,26 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import least_squares
 
 from calibration.inference.linearization import ScoredEffect, balance_probe, effect_terms, map_over_shapes
+from calibration.inference.priors import DELAY
 from calibration.inference.problem import Problem
 from calibration.inference.shown_states import (
+    APART,
     Plan,
     Rows,
     Windows,
-    motion_rates,
     plan_of,
-    states_by_row,
-    windows_of_log,
+    replaced,
+    rows_and_windows,
 )
 from mmrjax.compile.compiling import SELDOM, compiled
 from mmrjax.effects import Effect
 from mmrjax.model import balances, channels
+from mmrjax.model.chassis import inertia_reduced
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Signals, State
+from mmrjax.numerics.linear_equations import factorise, solve_factorised
 
 #: Fewest windows for each base parameter of a regression that is used.
 ENOUGH = 4
@@ -51,9 +54,17 @@ ENOUGH = 4
 FLOOR = 0.01
 #: Steps of Newton's method to the current that a voltage drives.
 CURRENT_STEPS = 3
-#: Most steps of the regression, and the relative change of its sum of squares at which it ends; change of a
-#: coordinate for the derivative of the noise, and the change after which that is computed again [prior sd].
-STEPS, SMALL, STEP, FAR = 10, 1e-3, 1e-4, 0.5
+#: Share of the distance to a reading by which a simulated state moves there at each point.
+PULL = 1 / 64
+#: Most steps of the regression with one covariance, and the relative change of its sum of squares at which it ends;
+#: most covariances, largest change between two [prior sd], and the change of a residual at which the last is kept.
+STEPS, SMALL, ROUNDS, FAR, SETTLED = 10, 1e-3, 12, 1.0, 0.02
+#: Longest delay, as a share of a run; most delays of a grid, either way; difference of log L between delays that fit
+#: equally well; farthest coordinates at which the profile of a delay is computed [prior sd]; rows by which a jump may
+#: have come between two rows without a delay.
+TENTH, DELAYS, SAME, NEAR, RESOLVED = 0.1, 200, 3.0, 4.0, 1.5
+#: Sds by which the defects must exceed the noise of the readings for a disturbance.
+CHANCE = 3.0
 
 
 class Terms(eqx.Module):
@@ -86,6 +97,80 @@ def _current(robot: Robot, conditions: Conditions, state: State, way: Scalar) ->
     return current
 
 
+class _Shown(eqx.Module):
+    """States that the readings of a row show.
+
+    Attributes:
+        turning: motor speed [rad/s]; current [A]; unit: reading of the motion per motor speed; per_ampere: reading of
+            the current; errors: of the instruments, by channel.
+    """
+
+    turning: Scalar
+    current: Scalar
+    unit: Scalar
+    per_ampere: Scalar
+    errors: dict[int, Scalar]
+
+
+def _shown_states(plan: Plan, robot: Robot, row: Rows, shown: Array) -> _Shown:
+    """States that the readings of a row show, without slip between them."""
+    conditions, names = row.imposed(robot.rig.delay), channels.channel_names(robot.channels)
+    chassis = robot.chassis(conditions.configuration)
+    none, one = jnp.zeros(()), jnp.ones(())
+
+    def per_unit(k: int, state: State) -> Scalar:
+        return channels.find_channel(names[k]).read(robot, balances.begin_signals(robot, conditions, state))
+
+    current: Scalar = none
+    turning: Scalar = none
+    unit: Scalar = one
+    per_ampere: Scalar = one
+    if conditions.motor_current is not None:
+        current = jnp.asarray(conditions.motor_current)
+    if plan.current >= 0:
+        per_ampere = per_unit(plan.current, State(one, none, none, none, distance=none))
+        current = shown[plan.current] / per_ampere
+    if plan.imposed == "motor_speed":
+        turning = jnp.asarray(conditions.motor_speed)
+    else:
+        rolling = State(none, one, chassis.radius / robot.gearbox.ratio, none, distance=chassis.radius)
+        unit = per_unit(plan.motion, rolling)
+        if plan.angle:
+            unit = unit / robot.gearbox.ratio  # that of the output by the output's
+        turning = (row.rate if plan.angle else shown[plan.motion]) / unit
+    rolls = chassis.radius * turning / robot.gearbox.ratio
+    at = State(current, turning, rolls, none, row.memory, distance=chassis.radius * row.angle)
+    first = balances.begin_signals(robot, conditions, at)
+    errors = {
+        k: balances.effects_sum(robot, first, "sensor", names[k]) for k in (plan.motion, plan.current) if k >= 0
+    }
+    if plan.current >= 0:
+        current = current - errors[plan.current] / per_ampere
+    if plan.motion >= 0 and not plan.angle:
+        turning = turning - errors[plan.motion] / unit
+    return _Shown(turning, current, unit, per_ampere, errors)
+
+
+def _rolling(plan: Plan, robot: Robot, row: Rows, turning: Scalar, current: Scalar) -> tuple[Signals, Scalar]:
+    """Signals of a row with these states, and its current, which the equations give if no channel shows it."""
+    conditions = row.imposed(robot.rig.delay)
+    radius = robot.chassis(conditions.configuration).radius
+    rolls, distance = radius * turning / robot.gearbox.ratio, radius * row.angle
+    state = State(current, turning, rolls, jnp.zeros(()), row.memory, distance=distance)
+    if plan.imposed == "voltage" and plan.current < 0:
+        current = _current(robot, row.conditions, state, row.way)
+    return balances.rolling_signals(
+        robot, row.conditions, dataclasses.replace(state, current=current), row.way
+    ), current
+
+
+def _inertia(robot: Robot, chassis: Any, signals: Signals) -> Scalar:
+    """Inertia at the driving wheel of all that moves with it, driven forward [kg·m²]."""
+    carried = chassis.radius**2 * signals.mass / robot.sides if robot.has_ground else 0.0
+    gear, turning = robot.gearbox, chassis.inertia + signals.inertia_added + carried
+    return inertia_reduced(robot.motor.inertia, gear.ratio, gear.efficiency_load, turning)
+
+
 def row_terms(
     plan: Plan, robot: Robot, row: Rows, shown: Array, probes: frozenset[str] = frozenset()
 ) -> tuple[Array, Array, Signals]:
@@ -95,62 +180,32 @@ def row_terms(
         row: one of `Rows`, without its leading axis; shown: its readings [SI], shape (channels,).
         probes: names of effects that read no signal.
     """
-    conditions, names = row.conditions, channels.channel_names(robot.channels)
-    chassis = robot.chassis(conditions.configuration)
-    none, one = jnp.zeros(()), jnp.ones(())
-
-    def per_unit(k: int, state: State) -> Scalar:
-        return channels.find_channel(names[k]).read(robot, balances.begin_signals(robot, conditions, state))
-
-    if plan.imposed == "motor_speed":
-        turning: Scalar = jnp.asarray(conditions.motor_speed)
-    else:
-        rolling = State(none, one, chassis.radius / robot.gearbox.ratio, none, distance=chassis.radius)
-        unit = per_unit(plan.motion, rolling)  # of an angle: of the output by the output's
-        read = shown[plan.motion] if not plan.angle else row.rate
-        turning = read / unit * (robot.gearbox.ratio if plan.angle else 1.0)
-    if plan.current >= 0:
-        current_per_unit = 1 / per_unit(plan.current, State(one, none, none, none, distance=none))
-        current = shown[plan.current] * current_per_unit
-    elif conditions.motor_current is not None:
-        current = jnp.asarray(conditions.motor_current)
-    else:
-        current = none
-
-    def state_at(turning: Scalar, current: Scalar) -> State:
-        rolls = chassis.radius * turning / robot.gearbox.ratio
-        return State(current, turning, rolls, none, row.memory, distance=chassis.radius * row.angle)
-
-    def signals_at(turning: Scalar) -> tuple[Signals, Scalar]:
-        at = state_at(turning, current)
-        own: Scalar = current
-        if plan.imposed == "voltage" and plan.current < 0:
-            own = _current(robot, conditions, at, row.way)
-        return balances.rolling_signals(robot, conditions, dataclasses.replace(at, current=own), row.way), own
-
-    first = balances.begin_signals(robot, conditions, state_at(turning, current))
-    errors = {
-        k: balances.effects_sum(robot, first, "sensor", names[k]) for k in (plan.motion, plan.current) if k >= 0
-    }
-    if plan.current >= 0:
-        current = current - errors[plan.current] * current_per_unit
-    if plan.motion >= 0 and not plan.angle:
-        turning = turning - errors[plan.motion] / unit
+    names, chassis = channels.channel_names(robot.channels), robot.chassis(row.conditions.configuration)
+    states, none = _shown_states(plan, robot, row, shown), jnp.zeros(())
+    turning = states.turning
     if robot.has_ground and plan.mechanical and plan.travels:
         # The wheels turn faster than the load travels because of slip.
+        first = balances.begin_signals(
+            robot, row.conditions,
+            State(states.current, turning, chassis.radius * turning / robot.gearbox.ratio, none, row.memory,
+                  distance=chassis.radius * row.angle),
+        )  # fmt: skip
         if any(e.balance == "slip" and e.name not in probes for e in robot.effects):
-            first = signals_at(turning)[0]
+            first = _rolling(plan, robot, row, turning, states.current)[0]
         turning = turning + balances.effects_sum(robot, first, "slip") * robot.gearbox.ratio / chassis.radius
-    signals, own = signals_at(turning)
+    signals, current = _rolling(plan, robot, row, turning, states.current)
     f, y = [], []
     if plan.electrical:
         # Divided by the inductance, the rate of the current would be mostly noise, and a large inductance fit best.
         f.append(signals.voltage_left)
-        y.append(signals.inductance * own)
-    if plan.mechanical:  # in the instrument's unit, because a unit that depends on a parameter would shrink with it
-        rise = unit * (1 / robot.gearbox.ratio if plan.angle else 1.0)
-        f.append(rise * signals.acceleration_wheel * robot.gearbox.ratio)
-        y.append(shown[plan.motion] + (-errors[plan.motion] if plan.angle else unit * turning - read))
+        y.append(signals.inductance * current)
+    if plan.mechanical:
+        # A torque, not an acceleration: the derivative by an inertia is then the motion, which states without noise
+        # give. That of an acceleration is a torque, whose model error would enter its own instrument.
+        inertia = _inertia(robot, chassis, signals)
+        read = (shown[plan.motion] - states.errors[plan.motion]) / states.unit if plan.angle else turning
+        f.append(inertia * signals.acceleration_wheel)
+        y.append(inertia * read / robot.gearbox.ratio)
     if plan.others:
         if robot.has_ground:
             creep = chassis.ground.speed_creep(signals.traction, signals.normal, signals.adhesion)
@@ -160,6 +215,48 @@ def row_terms(
         f += [says[names[k]] - shown[k] for k in plan.others]
         y += [none] * len(plan.others)
     return jnp.stack([jnp.asarray(x, float) for x in f]), jnp.stack([jnp.asarray(x, float) for x in y]), signals
+
+
+@functools.partial(compiled, options=SELDOM)
+def simulated_rows(problem: Problem, plan: Plan, rows: Rows, z: Array) -> Rows:
+    """Returns the points with the readings of states without noise, which the equations give at coordinates z.
+
+    Each state follows its equation from point to point, by linearly implicit steps, and is slowly pulled to its
+    readings. It begins at them in each run and after rest. Such states are instruments: their noise is not that of
+    the readings (Janot, Vandanjon and Gautier, Control Eng. Pract. 25 (2014) 85).
+    """
+    if not plan.mechanical:
+        return rows
+    robot = problem.coordinates.robot(problem.base, z)
+    units = jax.vmap(lambda row: _shown_states(plan, robot, row, row.shown))(rows)
+    read, count = jnp.stack([units.turning, units.current], 1), 1 + plan.electrical
+
+    def step(before: tuple[Array, Array], given: tuple[Rows, Array]) -> tuple[tuple[Array, Array], Array]:
+        (x, idle), (row, reading) = before, given
+
+        def rates(x: Array) -> tuple[Array, tuple[Array, Signals]]:
+            signals = _rolling(plan, robot, row, x[0], jnp.append(x, reading[count:])[1])[0]
+            rate = [signals.acceleration_wheel * robot.gearbox.ratio, signals.voltage_left][:count]
+            stacked = jnp.stack([jnp.asarray(r, float) for r in rate])
+            return stacked, (stacked, signals)
+
+        slope, (rate, signals) = jax.jacfwd(rates, has_aux=True)(x)
+        inertia = jnp.stack([jnp.ones(()), jnp.asarray(signals.inductance, float)])[:count]
+        x = x + solve_factorised(factorise(jnp.diag(inertia) - row.since * slope), row.since * rate)
+        x = x + PULL * (reading[:count] - x)
+        rests = (row.since <= 0) | (row.way == 0)
+        x = jnp.where(rests | idle | ~jnp.all(jnp.isfinite(x)), reading[:count], x)
+        return (x, rests), x
+
+    states = jax.lax.scan(step, (read[0, :count], jnp.asarray(True)), (rows, read))[1]
+    shown, rate = rows.shown, rows.rate
+    if plan.electrical:
+        shown = shown.at[:, plan.current].set(states[:, 1] * units.per_ampere)
+    if plan.angle:
+        rate = states[:, 0] * units.unit
+    else:
+        shown = shown.at[:, plan.motion].set(states[:, 0] * units.unit)
+    return dataclasses.replace(rows, shown=shown, rate=rate)
 
 
 @functools.partial(compiled, options=SELDOM)
@@ -240,6 +337,121 @@ def memory_by_row(robot: Robot, rows: Rows, signals: Signals, effects: tuple[Sco
     return [zero if e.effect.memory_size is None else of_effect(e) for e, zero in zip(effects, nothing, strict=True)]
 
 
+# --- a delay --------------------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class Delay:
+    """Delay at which the equations of a log fit best.
+
+    Attributes:
+        value: later action of the imposed quantity than its column states [s], negative for an earlier one.
+        limit: largest that was searched [s]; ended: True if the best is there.
+    """
+
+    value: float
+    limit: float
+    ended: bool
+
+    def start(self, problem: Problem) -> np.ndarray:
+        """Prior mean with this delay, as coordinates: windows without jumps may not show it."""
+        coordinates, z = problem.coordinates, np.array(problem.data.centre)
+        if DELAY in coordinates.names:
+            k = coordinates.names.index(DELAY)
+            z[k] = (self.value - float(coordinates.value(z)[k])) / float(coordinates.spread[k])
+        return z
+
+
+@functools.partial(compiled, options=SELDOM)
+def _by_coordinates(problem: Problem, plan: Plan, rows: Rows, z: Array) -> Array:
+    """Terms f, y and their derivatives by z, shape (2, rows, equations, 1 + coordinates)."""
+
+    def one(row: Rows) -> Array:
+        def of(z: Array) -> tuple[Array, Array]:
+            both = jnp.stack(row_terms(plan, problem.coordinates.robot(problem.base, z), row, row.shown)[:2])
+            return both, both
+
+        slope, value = jax.jacfwd(of, has_aux=True)(z)
+        return jnp.concatenate([value[..., None], slope], -1)
+
+    return jnp.moveaxis(jax.vmap(one)(rows), 1, 0)
+
+
+def _with_imposed(rows: Rows, given: dict[str, np.ndarray]) -> Rows:
+    """Points with other imposed quantities, which no delay changes."""
+    conditions = rows.conditions
+    for name, x in given.items():
+        conditions = replaced(conditions, name, jnp.asarray(x))
+    return dataclasses.replace(rows, conditions=conditions, drift={})
+
+
+def search_delay(problem: Problem, plan: Plan) -> Delay:
+    """Returns the delay of a log by a profile of its regression, over a tenth of a run either way.
+
+    The terms are nearly affine in what is imposed, so few evaluations serve all delays. Windows contain jumps here,
+    because these show a delay best. If no delay fits as well, or shorter ones, as with a periodic input, the shortest
+    is returned.
+    """
+    stated = float(np.max(np.asarray(problem.base.rig.delay)))
+    if DELAY not in problem.coordinates.names:
+        return Delay(stated, 0.0, False)
+    rows, course, cut = rows_and_windows(problem, plan, across=True)
+    time, since = np.asarray(rows.time), np.asarray(rows.since)
+    if not (cut and rows.drift):
+        return Delay(stated, 0.0, False)
+    step = float(np.median(since[since > 0]))
+    limit = TENTH * float(np.median([time[w.rows].max() for w in cut]))
+    grid = np.linspace(-limit, limit, 2 * int(np.clip(limit / step, 8, DELAYS)) + 1)
+    free = [k for k, name in enumerate(problem.coordinates.names) if name != DELAY]
+    z, centre = np.zeros(len(problem.coordinates)), np.asarray(problem.data.centre)
+
+    def fits(delays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Half of what -2 log L of the windows exceeds its least, and the coordinates, at each delay."""
+        prompt = course.at(0.0)[0]
+        moves = [prompt, *({**prompt, n: x + np.ptp(x)} for n, x in prompt.items())]
+        fixed, *others = (
+            np.asarray(_by_coordinates(problem, plan, _with_imposed(rows, x), jnp.asarray(z))) for x in moves
+        )
+        change = {n: (other - fixed) / np.ptp(x) for (n, x), other in zip(prompt.items(), others, strict=True)}
+        # In units of what is imposed, whose factor then is 1: other residuals would shrink with a larger inertia.
+        first = max(change, key=lambda n: float(np.abs(change[n][0, ..., 0]).mean() * np.ptp(prompt[n])))
+        factor = change[first][0].mean(0)  # (equations, 1 + z)
+        acts = np.flatnonzero(np.abs(factor[:, 0]) > 0)
+        unit, growth = factor[acts, None, :1], factor[acts, None, 1:] / factor[acts, None, :1]
+        costs, ends = [], []
+        for delay in delays:
+            means = course.at(float(delay))[0]
+            moved = {n: (means[n] - prompt[n])[:, None, None] for n in change}
+            f, y = (fixed[k] + sum(moved[n] * change[n][k] for n in change) for k in range(2))
+            whole = np.concatenate([_integrated(plan, w, f, y) for w in cut], 1)[acts]  # (equations, windows, 1 + z)
+            whole[..., 1:] -= whole[..., :1] * growth
+            whole /= unit
+            size = np.sqrt(np.mean(whole[..., 0] ** 2, 1))
+            for _ in range(3):  # the noise of each equation is what the regression leaves
+                scaled = whole / np.maximum(size, 1e-300)[:, None, None]
+                flat = scaled.reshape(-1, whole.shape[2])
+                jacobian = np.concatenate([flat[:, 1:][:, free], np.eye(len(free))])
+                target = np.concatenate([flat[:, 0], (z - centre)[free]])
+                move = -np.linalg.lstsq(jacobian, target, rcond=None)[0]
+                left = whole[..., 0] + whole[..., 1:][..., free] @ move
+                size = np.sqrt(np.mean(left**2, 1))
+            costs.append(np.sum(np.log(np.maximum(size, 1e-300))) * whole.shape[1] * APART)
+            ends.append(z.copy())
+            ends[-1][free] += move
+        return np.array(costs) - np.min(costs), np.stack(ends)
+
+    best = 0.0
+    for delays in (grid, grid, None):
+        delays = best + np.linspace(-step, step, 17) if delays is None else delays
+        cost, ends = fits(delays)
+        inner = np.r_[np.inf, cost, np.inf]
+        lows = (inner[1:-1] <= inner[:-2]) & (inner[1:-1] <= inner[2:]) & (cost < SAME)
+        k = int(np.argmin(np.abs(delays)))
+        k = k if cost[k] < SAME else int(np.argmin(np.where(lows, np.abs(delays), np.inf)))
+        best, z = float(delays[k]), np.clip(ends[k], -NEAR, NEAR)
+    return Delay(best if abs(best) > RESOLVED * step else 0.0, limit, bool(abs(best) > limit - step))
+
+
 # --- the regression -------------------------------------------------------------------------------------------
 
 
@@ -272,121 +484,112 @@ def weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> WeakF
     plan = plan_of(problem)
     if plan is None:
         return None
-    rate = motion_rates(problem, plan)
-    cut = windows_of_log(problem, plan, rate)
+    late = search_delay(problem, plan)
+    rows, _, cut = rows_and_windows(problem, plan, late.value)
     equations = plan.electrical + plan.mechanical + len(plan.others)
-    if equations * sum(len(w.weight) for w in cut) < ENOUGH * len(problem.coordinates):
+    if equations * sum(len(w.rows) for w in cut) < ENOUGH * len(problem.coordinates):
         return None
-    rows = states_by_row(problem, plan, rate)
 
-    def terms_at(z: np.ndarray, effects: tuple[ScoredEffect, ...] = ()) -> Terms:
+    sd = np.asarray(rows.sd)
+
+    def terms(rows: Rows, z: np.ndarray, effects: tuple[ScoredEffect, ...] = ()) -> Terms:
         return jax.device_get(_terms(problem, plan, rows, jnp.asarray(z), effects))
 
-    def joined(z: np.ndarray, effects: tuple[ScoredEffect, ...] = ()) -> list[_Joined]:
-        terms = terms_at(z, effects)
-        return [_joined(problem, plan, w, terms) for w in cut]
+    def whole(factors: list[np.ndarray], given: Terms) -> np.ndarray:
+        each = zip(factors, cut, strict=True)
+        return np.concatenate([solve_triangular(x, integrals(plan, w, given), lower=True) for x, w in each])
 
-    grown: list[tuple[np.ndarray, list[np.ndarray]]] = []
+    def of(z: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+        """Residuals and their derivatives, with the covariance and the states without noise at z."""
+        smooth = simulated_rows(problem, plan, rows, jnp.asarray(z))
+        known = terms(smooth, z)
+        read, none = terms(rows, z), np.zeros(equations)
+        plain = [_factor(plan, w, sd, known, none) for w in cut]
+        each = [
+            (integrals(plan, w, read)[:, 0], np.sum(x**2, 1), np.tile(np.sum(w.weight**2 / w.steps, 1), equations))
+            for w, x in zip(cut, plain, strict=True)
+        ]
+        by_equation = (np.concatenate([x.reshape(equations, -1).T for x in part]) for part in zip(*each, strict=True))
+        unknown = disturbances(*by_equation)
+        factors = [_factor(plan, w, sd, known, unknown) for w in cut]
+        offset = whole(factors, read)[:, 0] - whole(factors, known)[:, 0]
 
-    def growth(z: np.ndarray, here: list[_Joined]) -> list[np.ndarray]:
-        """Returns the relative derivative of the sds by each coordinate, computed near z.
+        last: list[tuple[np.ndarray, np.ndarray]] = []
 
-        Without it a larger inertia would always fit better.
-        """
-        if not grown or np.max(np.abs(grown[0][0] - z)) > FAR:
-            moved = [terms_at(z + STEP * one) for one in np.eye(len(z))]
-            sds = [[_sd(_noise(problem, plan, w, t)) for t in moved] for w in cut]
-            found = [np.stack([(m - j.sd) / j.sd for m in each], 1) / STEP for each, j in zip(sds, here, strict=True)]
-            grown[:] = [(z, found)]
-        return grown[0][1]
+        def at(z: np.ndarray) -> np.ndarray:
+            if not last or np.any(last[0][0] != z):
+                mine = whole(factors, terms(smooth, z, effects))
+                mine[:, 0] += offset
+                rest = np.zeros((len(z), mine.shape[1]))
+                rest[:, 0], rest[:, 1 : len(z) + 1] = z - centre, np.eye(len(z))
+                last[:] = [(z.copy(), np.concatenate([mine, rest]))]
+            return last[0][1]
 
-    def made(z: np.ndarray, effects: tuple[ScoredEffect, ...] = ()) -> WeakForm:
-        here, size = joined(z, effects), len(z)
-        whole = np.concatenate([j.whitened(g) for j, g in zip(here, growth(z, here), strict=True)])
-        prior = np.zeros((size, whole.shape[1]))
-        prior[:, 0], prior[:, 1 : size + 1] = z - np.asarray(problem.data.centre), np.eye(size)
-        both = np.concatenate([whole, prior])
-        return WeakForm(z, both[:, 0], both[:, 1 : size + 1], whole[:, size + 1 :], len(whole))
+        return at
 
-    last: list[WeakForm] = []
-
-    def at(z: np.ndarray) -> WeakForm:
-        if not last or np.any(last[0].z != z):
-            last[:] = [made(z.copy())]
-        return last[0]
-
-    # The windows are cut in NumPy. With such a residual, 600 x 12, optimistix's LevenbergMarquardt compiles for a
-    # second and then takes 4.7 times the time of SciPy's (0.5 ms), as each evaluation is a host callback.
+    centre = late.start(problem)
+    z, size = centre, len(centre)
     try:
-        found = least_squares(
-            lambda z: at(z).residual, np.array(problem.data.centre), lambda z: at(z).jacobian, method="lm",
-            max_nfev=STEPS, xtol=SMALL, ftol=SMALL,
-        )  # fmt: skip
-        return made(found.x, effects)
+        for _ in range(ROUNDS):
+            at = of(z)
+            found = least_squares(
+                lambda z: at(z)[:, 0], z, lambda z: at(z)[:, 1 : size + 1], method="lm",  # noqa: B023
+                max_nfev=STEPS, xtol=SMALL, ftol=SMALL,
+            )  # fmt: skip
+            step = (found.x - z) * min(1.0, FAR / max(float(np.abs(found.x - z).max()), 1e-300))
+            z, both = z + step, at(z + step)
+            if np.abs(both[:, 1 : size + 1] @ step).max() < SETTLED:
+                break
     except (np.linalg.LinAlgError, ValueError):  # non-finite numbers
         return None
+    count = len(both) - size
+    return WeakForm(z, both[:, 0], both[:, 1 : size + 1], both[:count, size + 1 :], count)
 
 
-@dataclasses.dataclass(frozen=True)
-class _Joined:
-    """Equations of the windows of a run.
-
-    Attributes:
-        whole: residual, derivatives and signatures, shape (windows, 1 + coordinates + instances).
-        noise: their change by one sd of each reading, shape (windows, readings).
-    """
-
-    whole: np.ndarray
-    noise: np.ndarray
-
-    @property
-    def sd(self) -> np.ndarray:
-        """Noise of each window."""
-        return _sd(self.noise)
-
-    def whitened(self, growth: np.ndarray) -> np.ndarray:
-        """Returns `whole` divided by its noise; `growth`: relative derivative of the noise by each coordinate."""
-        covariance = self.noise @ self.noise.T + np.diag(FLOOR * self.sd**2)
-        whole, count = self.whole.copy(), growth.shape[1]
-        whole[:, 1 : count + 1] -= whole[:, :1] * growth
-        return solve_triangular(np.linalg.cholesky(covariance), whole, lower=True)
+def integrals(plan: Plan, w: Windows, terms: Terms) -> np.ndarray:
+    """Defects of a run's windows, their derivatives and signatures, (windows, 1 + coordinates + instances)."""
+    given = (terms.f[..., None], terms.y[..., None]), terms.by_z, terms.by_effects
+    each = np.concatenate([_integrated(plan, w, np.asarray(f), np.asarray(y)) for f, y in given], 2)
+    return each.reshape(-1, each.shape[2])
 
 
-def _sd(noise: np.ndarray) -> np.ndarray:
-    return np.sqrt(np.maximum(np.sum(noise**2, 1), 1e-300))
+def _integrated(plan: Plan, w: Windows, f: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Integrals of terms over a run's windows, shape (equations, windows, ...)."""
+    slopes = enumerate(_slopes(plan, w, f.shape[1]))
+    integral = functools.partial(np.einsum, "wk,wk...->w...")
+    return np.stack([integral(w.weight, f[w.rows, k]) + integral(slope, y[w.rows, k]) for k, slope in slopes])
 
 
 def _slopes(plan: Plan, w: Windows, equations: int) -> list[np.ndarray]:
-    """Weight of y of each equation in the windows."""
-    slopes = [w.slope] * equations
-    if plan.angle and plan.mechanical:
-        slopes[plan.electrical] = -w.bend
-    return slopes
+    """Weights of y of each equation in the windows."""
+    return [-w.bend if plan.angle and k == plan.electrical else w.slope for k in range(equations)]
 
 
-def _noise(problem: Problem, plan: Plan, w: Windows, terms: Terms) -> np.ndarray:
-    """Change of the windows of a run by one sd of each reading, shape (windows, readings)."""
-    sd = np.asarray(problem.data.sd)[w.rows]
-    by, also = (np.asarray(x)[w.rows] for x in terms.by_reading)
-    slopes = _slopes(plan, w, terms.f.shape[1])
-    shown = [c for c in range(sd.shape[1]) if np.any(by[:, :, c]) or np.any(also[:, :, c])]
-    each = [
-        np.concatenate([(w.weight * by[:, k, c] + slope * also[:, k, c]) * sd[:, c] for c in shown], 1)
-        for k, slope in enumerate(slopes)
-    ]
-    return np.concatenate(each)
+def _factor(plan: Plan, w: Windows, sd: np.ndarray, terms: Terms, unknown: np.ndarray) -> np.ndarray:
+    """Factor of the covariance of a run's windows; `unknown`: torque and voltage without a model (`disturbances`)."""
+    equations = terms.f.shape[1]
+    noise = np.zeros((equations, len(w.rows), len(sd), sd.shape[1] + equations))
+    by, also = terms.by_reading
+    at = np.arange(len(w.rows))[:, None], w.rows
+    for k, slope in enumerate(_slopes(plan, w, equations)):
+        changed = w.weight[..., None] * by[w.rows, k] + slope[..., None] * also[w.rows, k]
+        np.add.at(noise[k, ..., : sd.shape[1]], at, changed * sd[w.rows])
+        np.add.at(noise[k, ..., sd.shape[1] + k], at, unknown[k] * w.weight / np.sqrt(w.steps))
+    flat = noise.reshape(equations * len(w.rows), -1)
+    covariance = flat @ flat.T
+    return np.linalg.cholesky(covariance + np.diag(FLOOR * np.maximum(np.diag(covariance), 1e-300)))
 
 
-def _joined(problem: Problem, plan: Plan, w: Windows, terms: Terms) -> _Joined:
-    """Equations of the windows of a run."""
-    slopes = _slopes(plan, w, terms.f.shape[1])
+def disturbances(defect: np.ndarray, noise: np.ndarray, unit: np.ndarray) -> np.ndarray:
+    """Intensities of white noise in the terms of each equation, in addition to that of the readings.
 
-    def integrated(f: Any, y: Any) -> np.ndarray:
-        return np.concatenate([w.weight @ f[w.rows, k] + slope @ y[w.rows, k] for k, slope in enumerate(slopes)])
+    A model error is not white, but windows that the readings of a precise instrument weight would see only
+    its fastest part, and parameters would follow that. 0 if the readings' noise explains the defects.
 
-    parts = [
-        integrated(terms.f[..., None], terms.y[..., None]),
-        integrated(*terms.by_z),
-        integrated(*terms.by_effects),
-    ]
-    return _Joined(np.concatenate(parts, 1), _noise(problem, plan, w, terms))
+    Args:
+        defect: of each window, shape (windows, equations); noise: its variance by the readings; unit: by white noise
+            of intensity 1.
+    """
+    more = np.mean(defect**2 - noise, 0)
+    chance = CHANCE * np.sqrt(2 * np.sum(noise**2, 0) / APART) / len(defect)
+    return np.where(more > chance, np.sqrt(np.maximum(more, 0.0) / np.mean(unit, 0)), 0.0)

@@ -183,6 +183,8 @@ SAID: dict[type, str | Callable[[Any], str]] = {
     fit_notes.Thinned: "{source}: readings of {kept} of {rows} rows are used, evenly in time, and "
     "what drives the runs "
     "in all of them; --rows uses more or fewer, and settle uses all",
+    fit_notes.ThinnedTable: "{source}: {kept} of {rows} rows are used, spread evenly over the conditions; row "
+    "numbers count these; --rows uses more or fewer",
     fit_notes.CoarseSteps: coarse_steps,
     fit_notes.StopsOnSlope: "run {runs}: the motors are not driven on a slope; histories have smooth "
     "friction at rest, "

@@ -91,7 +91,7 @@ def climb_outputs(robot: Robot, terrain: Terrain, record: ClimbRecord, crest: in
         return x[-2] + share * (x[-1] - x[-2])
 
     driven = until.time >= SETTLES + RISES
-    stall = jnp.where(driven, until.voltage, 1.0) / robot.motor.resistance
+    stall = robot.motor.current_stall(jnp.where(driven, until.voltage, 1.0))
     margins = {
         "margin_reach": reach[-1] if crest is None else jnp.ones(()),
         "margin_upright": smooth_minimum(1 - jnp.abs(until.motion.q[:, PITCH]) / TURNED_OVER),

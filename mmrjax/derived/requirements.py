@@ -17,7 +17,6 @@ from mmrjax.derived import steepest_slope
 from mmrjax.fidelities.steady import operating_state
 from mmrjax.model import balances, energy
 from mmrjax.model.conditions import Conditions
-from mmrjax.model.motor import TEMPERATURE_REFERENCE
 from mmrjax.model.params import Index, Scalar
 from mmrjax.model.quantities import CONDITIONS, TABLE, Quantity
 from mmrjax.model.robot import Robot
@@ -103,8 +102,8 @@ def with_cells(robot: Robot, cells: Scalar) -> Robot:
 
 def _at(robot: Robot, point: EnvelopePoint, rated: Ratings) -> tuple[Robot, Conditions]:
     """The robot with its winding at ambient temperature, as at the start of a run, and the conditions of a point."""
-    copper = 1 + robot.motor.temperature_coefficient * (point.ambient - TEMPERATURE_REFERENCE)
-    motor = dataclasses.replace(robot.motor, resistance=robot.motor.resistance * copper)
+    warm = robot.motor.resistance * robot.motor.resistance_ratio(point.ambient)
+    motor = dataclasses.replace(robot.motor, resistance=warm)
     robot = with_cells(dataclasses.replace(robot, motor=motor), rated.cells)
     return robot, Conditions(
         configuration=jnp.asarray(point.configuration),
@@ -130,7 +129,7 @@ def heat_left(robot: Robot, point: EnvelopePoint, current: Scalar, limit: Scalar
     1 - I² R_th R (1 + α (T - 25 °C)) / (T - T_a); `robot` as stated, not as returned by `_at`.
     """
     motor = robot.motor
-    hot = motor.resistance * (1 + motor.temperature_coefficient * (limit - TEMPERATURE_REFERENCE))
+    hot = motor.resistance * motor.resistance_ratio(limit)
     return 1 - current**2 * motor.resistance_thermal * hot / jnp.maximum(limit - point.ambient, 1.0)
 
 

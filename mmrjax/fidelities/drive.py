@@ -162,7 +162,7 @@ def _initial(robot: Robot, conditions: Conditions) -> Array:
         share = jnp.abs(conditions.duty) if robot.driver.decay == FAST else 1.0
         left = left - share * robot.motor.voltage_back(turning)
     open_circuit = (conditions.open > 0.5) | (conditions.motor_speed is not None)
-    current = jnp.where(open_circuit, 0.0, left / robot.motor.resistance)
+    current = jnp.where(open_circuit, 0.0, robot.motor.current_stall(left))
     return jnp.stack([jnp.asarray(x, float) for x in (current, turning, rolling, radius * begin.angle)])
 
 

@@ -210,6 +210,9 @@ def _check_robot(robot: Robot) -> None:
     concrete = [p for p in params.walk_parameters(robot) if not isinstance(p.value, jax.core.Tracer)]
     for parameter, value in zip(concrete, jax.device_get([p.value for p in concrete]), strict=True):
         spec = parameter.spec
+        if np.ndim(value) or np.asarray(value).dtype.kind not in "biuf":
+            got = f"shape {np.shape(value)}" if np.ndim(value) else repr(value)
+            raise UsageError(f"{parameter.name}: got {got}; expected one number; of several robots use jax.vmap")
         wrong = _first_outside(value, *spec.bounds)
         if wrong is not None:
             low, high = spec.bounds

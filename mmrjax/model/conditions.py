@@ -15,14 +15,19 @@ from jaxtyping import Array, Float, Int
 
 from mmrjax.compile.precision import is_double
 from mmrjax.errors import UsageError
+from mmrjax.model.quantities import CONDITIONS
 from mmrjax.model.robot import Robot
 
 Number = float | Sequence[float] | np.ndarray | Array
 
 #: Conditions that can be stated for each side.
 OF_SIDES = ("duty_left", "duty_right", "open_left", "open_right", "motor_speed_left", "motor_speed_right")
+#: Conditions that may be true or false.
+SWITCHES = ("battery", "open", "open_left", "open_right")
 #: Conditions that free a robot to turn if they are stated.
 OF_TURNS = (*OF_SIDES, "heading_deg")
+#: Conditions that every run has.
+NUMBERS = ("voltage", "slope_deg", "payload", "battery", "discharge", "adhesion", "order", "duty", "open")
 
 
 class Named(eqx.Module):
@@ -81,7 +86,6 @@ class Conditions(eqx.Module):
         duty: share of the supply voltage that the driver applies to the motors, negative backward [-]; None: 1.
         open: 1 if the motors' circuit is open, so that they coast; -1 if the driver shorts it, so that they brake at
             any duty.
-            brake whatever it does between pulses.
         motor_speed: speed imposed on the motor shafts [rad/s]; the voltage follows. None: the voltage is imposed.
         motor_acceleration: of an imposed speed [rad/s²]; None: 0.
         motor_current: current imposed on each motor [A]; the voltage follows. None: the current follows.
@@ -158,44 +162,31 @@ class Conditions(eqx.Module):
         if not isinstance(duty, np.ndarray | jax.Array | None) and None not in (duty_left, duty_right):
             raise UsageError(sides_contradiction(("duty", *OF_SIDES[:2])))
         duty = 1.0 if duty is None else duty
+        given: dict[str, Any] = locals()
+        stated = {name: given[name] for name in CONDITIONS if given[name] is not None or name in NUMBERS}
         which: Any = configuration
         if not isinstance(configuration, jax.Array | Named):
             words = np.asarray(configuration)
-            which = Named.of(words) if words.dtype.kind == "U" else words
-        which = which if isinstance(which, Named) else _number(which, int)
-        given = (voltage, slope_deg, payload, battery, discharge, adhesion, order, duty, open)
-        numbers = [_number(v) for v in given]
-        others = {"total_mass": total_mass, "motor_speed": motor_speed, "motor_acceleration": motor_acceleration}
-        others |= {"motor_current": motor_current, "heading_deg": heading_deg, "adhesion_lateral": adhesion_lateral}
-        others |= {"duty_left": duty_left, "duty_right": duty_right, "open_left": open_left, "open_right": open_right}
-        others |= {"motor_speed_left": motor_speed_left, "motor_speed_right": motor_speed_right}
-        others |= {"levers_front_deg": levers_front_deg, "levers_rear_deg": levers_rear_deg}
-        others |= {"load_torque": load_torque}
-        optional = {name: _number(value) for name, value in others.items() if value is not None}
-        shapes = [x.shape for x in (which, *numbers, *optional.values())]
+            which = Named.of(words) if words.dtype.kind == "U" else configuration
+        which = which if isinstance(which, Named) else _number("configuration", which, int)
+        numbers = {name: _number(name, x) for name, x in stated.items()}
+        shapes = {name: x.shape for name, x in {"configuration": which, **numbers}.items()}
         try:
-            shape = np.broadcast_shapes(*shapes)
+            shape = np.broadcast_shapes(*shapes.values())
         except ValueError:
-            names = [f.name for f in dataclasses.fields(type(self)) if f.name not in (*others, "begin")]
-            by_name = dict(zip([*names, *optional], shapes, strict=True))
-            said = ", ".join(f"{name} {s}" for name, s in by_name.items() if s)
-            raise ValueError(f"Conditions: shapes do not broadcast to one another: {said}") from None
+            listed = ", ".join(f"{name} {s}" for name, s in shapes.items() if s)
+            raise ValueError(f"Conditions: shapes do not broadcast to one another: {listed}") from None
         self.configuration = jax.tree.map(lambda x: _broadcast(x, shape), which)
+        self.begin = None if begin is None else _broadcast(_number("begin", begin, int), shape)
         # an equal number for all runs is stored once: most fields of a large batch are 0 or 1
         shared: dict[float, Array] = {}
-        for k, value in enumerate(given):
-            if not isinstance(value, float):
-                numbers[k] = _broadcast(numbers[k], shape)
-                continue
-            if value not in shared:
-                shared[value] = _broadcast(numbers[k], shape)
-            numbers[k] = shared[value]
-        self.voltage, self.slope_deg, self.payload, self.battery, self.discharge, self.adhesion = numbers[:6]
-        self.order, self.duty, self.open = numbers[6:]
-        held = {name: _broadcast(x, shape) for name, x in optional.items()}
-        for name in others:
-            setattr(self, name, held.get(name))
-        self.begin = None if begin is None else _broadcast(_number(begin, int), shape)
+        for name in CONDITIONS:
+            if isinstance(value := stated.get(name), float):
+                if value not in shared:
+                    shared[value] = _broadcast(numbers[name], shape)
+                setattr(self, name, shared[value])
+            else:
+                setattr(self, name, None if value is None else _broadcast(numbers[name], shape))
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -272,9 +263,20 @@ def sides_contradiction(stated: Collection[str]) -> str:
     return f"{known}: got it without {lacking}; state both"
 
 
-def _number(x: Any, kind: type = float) -> Any:
-    """Array of numbers of that kind; NumPy input stays NumPy's, so that no JAX operation is compiled for it."""
-    return jnp.asarray(x, kind) if isinstance(x, jax.Array) else np.asarray(x, kind)
+def _number(name: str, x: Any, kind: type = float) -> Any:
+    """Array of numbers of that kind; NumPy input stays NumPy's, so that no JAX operation is compiled for it.
+
+    Raises:
+        UsageError: words, dates, complex numbers, truth values of a quantity, or parts of a whole number.
+    """
+    if isinstance(x, jax.Array):
+        return jnp.asarray(x, kind)
+    stated = np.asarray(x)
+    whole = kind is float or stated.dtype.kind in "biu" or (stated.dtype.kind == "f" and not (stated % 1).any())
+    if stated.dtype.kind not in ("biuf" if name in SWITCHES else "iuf") or not whole:
+        expected = "numbers" if kind is float else "whole numbers" + ", or names" * (name == "configuration")
+        raise UsageError(f"Conditions: {name}: got {x!r}; expected {expected}")
+    return stated.astype(kind)
 
 
 def _broadcast(x: Any, shape: tuple[int, ...]) -> Any:

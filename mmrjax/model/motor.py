@@ -73,14 +73,18 @@ class Motor(eqx.Module):
     def voltage_winding(self, current: Scalar, temperature: Scalar | None = None) -> Scalar:
         """Voltage across the winding's resistance I R [V], eq. (15).
 
-        If its `temperature` [°C] is given, R follows that of copper: R (1 + α (T - 25 °C)).
+        If its `temperature` [°C] is given, R follows that of copper.
         """
         drop = current * self.resistance
-        return (
-            drop
-            if temperature is None
-            else drop * (1 + self.temperature_coefficient * (temperature - TEMPERATURE_REFERENCE))
-        )
+        return drop if temperature is None else drop * self.resistance_ratio(temperature)
+
+    def resistance_ratio(self, temperature: Scalar) -> Scalar:
+        """Ratio of the winding's resistance at a `temperature` T [°C] to the stated one, 1 + α (T - 25 °C)."""
+        return 1 + self.temperature_coefficient * (temperature - TEMPERATURE_REFERENCE)
+
+    def current_stall(self, voltage: Scalar) -> Scalar:
+        """Current of the motor at rest at a `voltage` [A]."""
+        return voltage / self.resistance
 
     def torque_electromagnetic(self, current: Scalar) -> Scalar:
         """M_de = C_m I [N·m], eq. (17)."""
@@ -107,16 +111,15 @@ class Motor(eqx.Module):
         rise = self.resistance_thermal * self.resistance * current**2
         left = 1 - self.temperature_coefficient * rise
         finite = left > 0
-        settled = self.temperature_ambient + rise * (
-            1 + self.temperature_coefficient * (self.temperature_ambient - TEMPERATURE_REFERENCE)
-        ) / jnp.where(finite, left, 1.0)
+        ratio = self.resistance_ratio(self.temperature_ambient)
+        settled = self.temperature_ambient + rise * ratio / jnp.where(finite, left, 1.0)
         return jnp.where(finite, settled, jnp.inf)
 
     @property
     def current_continuous(self) -> Scalar:
         """Current with a final winding temperature at the permissible limit [A], with the rise of its resistance."""
         allowed = jnp.maximum(self.temperature_limit - self.temperature_ambient, 1.0)
-        hot = self.resistance * (1 + self.temperature_coefficient * (self.temperature_limit - TEMPERATURE_REFERENCE))
+        hot = self.resistance * self.resistance_ratio(self.temperature_limit)
         return jnp.sqrt(allowed / jnp.maximum(self.resistance_thermal * hot, 1e-9))
 
     def heating(self, power: Scalar, winding: Scalar, housing: Scalar) -> tuple[Scalar, Scalar]:

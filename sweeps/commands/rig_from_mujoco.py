@@ -2,17 +2,37 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
 
 import numpy as np
 
 from calibration.data.input_errors import BadConfiguration, allowed_words
+from calibration.data.input_files import VALUE, check_memory, file_bytes, first_bytes
+from calibration.data.named_arrays import cell_number
+from mmrjax.errors import list_some
 from sweeps.commands.rig_joint import Found, JointNumbers, hanging_torque_and_angle, is_round
 from sweeps.commands.rig_template import Stated
 from sweeps.export import mujoco
 
+#: Largest model that is read [bytes].
+LARGEST = 2**26
+#: Elements that name files of the same format, and attributes that name folders.
+NESTED, FOLDERS = ("include",), ("meshdir", "texturedir", "assetdir")
+#: Attributes that are no numbers.
+NAMES = ("name", "class", "childclass", "file")
+#: Elements that copy their content, and attributes with sizes of elements.
+COPIES = ("replicate", "composite", "flexcomp")
+SIZES = {
+    **dict.fromkeys(COPIES, ("count",)), "numeric": ("size",), "hfield": ("nrow", "ncol"),
+    "texture": ("width", "height"), "mesh": ("params",), "user": ("dim",), "general": ("actdim", "nsample"),
+}  # fmt: skip
+#: Most copies of an element, most elements of a model with copies, and largest product of the sizes of one element.
+MOST_COPIES, MOST_ELEMENTS, MOST_CELLS = 2_000, 50_000, 2**24
 #: Largest vertical component of the axis of a wheel, and largest relative difference between radii of equal wheels.
 LEVEL, EQUAL = 0.1, 0.01
 
@@ -28,12 +48,71 @@ def read_mujoco_hinge(source: Path, joint: str | None) -> JointNumbers:
     Raises:
         BadConfiguration: a model that MuJoCo refuses, or a joint that it does not have or that is no hinge.
     """
+    check_mujoco_model(source)
     library = mujoco.mujoco_module()
     try:
         model = library.MjModel.from_xml_path(str(source))
-    except ValueError as error:
+    except (ValueError, RuntimeError) as error:
         raise BadConfiguration(f"{source}: MuJoCo does not read it ({' '.join(str(error).split())})") from error
+    check_memory(source, VALUE * model.nv**2)  # of its matrix of inertia
     return _Model(library, model, source.name).numbers(joint)
+
+
+def check_mujoco_model(source: Path) -> None:
+    """Refuses a model with sizes or files for which MuJoCo's compiler does not end, before that compiler starts.
+
+    Raises:
+        BadConfiguration: numbers that are not finite, too many copies, elements or cells, or a file that is a pipe or
+            a device.
+    """
+    left, roots = [source], dict[Path, Element]()
+    while left:
+        file = left.pop().resolve()
+        text = file_bytes(file, file, BadConfiguration, LARGEST)
+        try:
+            roots[file] = ElementTree.fromstring(text)
+        except (ElementTree.ParseError, ValueError, LookupError) as error:
+            raise BadConfiguration(f"{file}: not a readable XML file ({error}); expected MuJoCo's XML") from error
+        named = [element.get("file", "") for tag in NESTED for element in roots[file].iter(tag)]
+        inner = {(base / name).resolve() for name in named if name for base in (source.parent, file.parent)}
+        left += [each for each in inner if each.exists() and each not in roots]
+    compilers = [element for root in roots.values() for element in root.iter("compiler")]
+    folders = [element.get(key, "") for element in compilers for key in FOLDERS]
+    count = 0
+    for file, root in roots.items():
+        stack = [(root, 1)]
+        while stack:
+            element, copies = stack.pop()
+            copies *= _check_attributes(element, file, source.parent, ("", *folders))
+            count += copies
+            if count > MOST_ELEMENTS:
+                raise BadConfiguration(f"{source}: has more than {MOST_ELEMENTS:,} elements; expected fewer")
+            stack += [(child, copies) for child in element]
+
+
+def _check_attributes(element: Element, file: Path, folder: Path, inside: Sequence[str]) -> int:
+    """Returns the number of copies that an element makes of its content; refuses its numbers and files.
+
+    Args:
+        folder: of the model; inside: folders in it that may hold files.
+    """
+    tag, where, sizes = element.tag, f"{file}, <{element.tag}>", [1.0]
+    for key, text in element.attrib.items():
+        words = [] if key in NAMES else text.casefold().split()
+        numbers = [x for x in map(cell_number, words) if math.isfinite(x)]
+        if "nan" in (word.lstrip("+-") for word in words):
+            raise BadConfiguration(f"{where} {key}: got {text}; expected numbers")
+        if tag == "size" and key.startswith(("nuser", "nkey")) and max(numbers, default=0) > MOST_COPIES:
+            raise BadConfiguration(f"{where} {key}: got {text}; expected at most {MOST_COPIES:,}")
+        if key in SIZES.get(tag, ()):
+            sizes.append(math.prod(max(x, 1.0) for x in numbers))
+        for base in inside if key.startswith("file") else ():
+            if (path := folder / base / text).exists():
+                first_bytes(path, path, BadConfiguration, 1)
+    size = math.prod(sizes)
+    if size > (most := MOST_COPIES if tag in COPIES else MOST_CELLS):
+        raise BadConfiguration(f"{where}: got a size of {size:,.0f}; expected at most {most:,}")
+    return int(size) if tag in COPIES else 1
 
 
 class _Model:
@@ -60,7 +139,7 @@ class _Model:
         driven = [k for k in hinges if k in self.actuators] or hinges
         if joint is None:
             if len(driven) != 1:
-                found = f"has {', '.join(self.joints[k] for k in driven)}" if driven else "has no named hinge"
+                found = f"has {list_some(self.joints[k] for k in driven)}" if driven else "has no named hinge"
                 raise BadConfiguration(f"--joint: missing, and {self.file} {found}; expected the name of one joint")
             return driven[0]
         known = [self.joints[k] for k in hinges]
@@ -79,7 +158,7 @@ class _Model:
         dof = model.jnt_dofadr[joint]
         armature = float(model.dof_armature[dof])
         inertia, weight = self._load(joint, dof, armature)
-        if not inertia > 0:
+        if not 0 < inertia < math.inf:
             raise BadConfiguration(f"{self.file}, {named}: nothing with mass turns with it; expected an inertia")
         actuator = self.actuators.get(joint)
         gear = 1.0 if actuator is None else abs(float(model.actuator_gear[actuator, 0]))

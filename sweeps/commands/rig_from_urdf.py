@@ -9,6 +9,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from calibration.data.input_errors import BadConfiguration, allowed_words
+from mmrjax.errors import list_some
 from mmrjax.model.signals import GRAVITY
 from sweeps.commands.rig_joint import Found, JointNumbers, hanging_torque_and_angle, is_round
 
@@ -87,7 +88,7 @@ class _Urdf:
         candidates = [name for name in turning if self._driven(name)] or turning
         if joint is None:
             if len(candidates) != 1:
-                found = f"has {', '.join(candidates)}" if candidates else "has no joint that turns"
+                found = f"has {list_some(candidates)}" if candidates else "has no joint that turns"
                 raise BadConfiguration(f"--joint: missing, and {self.file} {found}; expected the name of one joint")
             return candidates[0]
         if joint not in self.joints:
@@ -98,7 +99,7 @@ class _Urdf:
             kind = self.joints[joint].get("type") or "without a type"
             slides = "; for a carriage: mmrjax rig new --kind linear" if kind == "prismatic" else ""
             raise BadConfiguration(f"--joint: got {joint}, which is {kind}; expected one that turns: "
-                                   f"{', '.join(candidates) or 'the file has none'}{slides}")  # fmt: skip
+                                   f"{list_some(candidates) or 'the file has none'}{slides}")  # fmt: skip
         return joint
 
     def numbers(self, joint: str) -> JointNumbers:

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from calibration.data.columns import IMPOSED as OF_IMPOSED
 from calibration.data.columns import LEVERS
 from calibration.data.contradictions import without_levers
-from calibration.data.input_errors import BadConfiguration, allowed_words, stated_number
+from calibration.data.input_errors import BadConfiguration, allowed_words, stated_count, stated_number
 from mmrjax.fidelities import variation
 from mmrjax.fidelities.variation import Axis
 from mmrjax.model.conditions import Conditions
@@ -214,7 +214,7 @@ _RANGE = ("start", "stop", "number", "scale")
 def _range(stated: Mapping[str, Any], where: str) -> np.ndarray:
     _keys(stated, _RANGE, ("start", "stop", "number"), where)
     start, stop = (stated_number(stated[k], f"{where}.{k}") for k in ("start", "stop"))
-    number = _count(stated["number"], f"{where}.number", LONGEST)
+    number = stated_count(stated["number"], f"{where}.number", 1, LONGEST)
     scale = stated.get("scale", "linear")
     if scale not in ("linear", "log"):
         raise BadConfiguration(f"{where}.scale: got {scale!r}; allowed: linear, log")
@@ -235,12 +235,6 @@ def _keys(stated: Mapping[str, Any], allowed: tuple[str, ...], needed: tuple[str
     for key in needed:
         if key not in stated:
             raise BadConfiguration(f"{where}: {key} is missing; expected {', '.join(needed)}")
-
-
-def _count(value: Any, where: str, most: int) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= most:
-        raise BadConfiguration(f"{where}: got {value!r}; expected a whole number from 1 to {most}")
-    return value
 
 
 # --- fixed conditions -------------------------------------------------------------------------------------------
@@ -278,7 +272,7 @@ def _samples(stated: Mapping[str, Any], robot: Robot, where: str, data: list[str
     design = stated["design"]
     if not isinstance(design, str) or design not in DESIGNS:
         raise BadConfiguration(f"{where}.design: got {design!r}; {allowed_words(str(design), DESIGNS)}")
-    number = _count(stated["number"], f"{where}.number", 2**52)
+    number = stated_count(stated["number"], f"{where}.number", 1, 2**52)
     seed = stated.get("seed", 0)
     if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**32:
         raise BadConfiguration(f"{where}.seed: got {seed!r}; expected a whole number from 0 to {2**32 - 1}")

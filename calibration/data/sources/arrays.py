@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import zipfile
+import zlib
 from collections.abc import Callable
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
+from calibration.data import input_files
 from calibration.data.input_errors import BadData
 from calibration.data.sources.recorded_signals import Signal, of_arrays, values_in_memory
 
+#: Arrays by path: shape, type, and a function that returns the array.
+Arrays: TypeAlias = dict[str, tuple[tuple[int, ...], np.dtype, Callable[[], np.ndarray]]]
 #: Name of the type of an array of objects.
 _OBJECTS = np.dtype(object)
+#: Kind of a compressed variable in a MATLAB file.
+COMPRESSED = 15
 
 
 def of_npz(path: Path, name: str) -> tuple[Signal, ...]:
@@ -23,18 +30,22 @@ def of_npz(path: Path, name: str) -> tuple[Signal, ...]:
     Raises:
         BadData: a member whose path leads out of the archive.
     """
-    arrays: dict[str, tuple[tuple[int, ...], np.dtype, Callable[[], np.ndarray]]] = {}
-    with zipfile.ZipFile(path) as archive:
-        for member in archive.namelist():
-            where = PurePosixPath(member.replace("\\", "/"))
-            if where.is_absolute() or ".." in where.parts:
-                raise BadData(f"{name}, {member}: is a path that leads out of the archive; expected names of arrays")
-            if where.suffix != ".npy":
-                continue
-            with archive.open(member) as stream:
-                shape, dtype = _header(stream)
-            arrays[member.removesuffix(".npy")] = (shape, dtype, _member(path, member))
-    return of_arrays(arrays)
+    arrays: Arrays = {}
+    archive = zipfile.ZipFile(path)  # stays open with its directory until no signal needs it
+    input_files.check_declared(name, len(archive.namelist()))
+    for member in archive.namelist():
+        where = PurePosixPath(member.replace("\\", "/"))
+        if where.is_absolute() or ".." in where.parts:
+            raise BadData(f"{name}, {member}: is a path that leads out of the archive; expected names of arrays")
+        if where.suffix != ".npy":
+            continue
+        array = member.removesuffix(".npy")
+        if array in arrays:
+            raise BadData(f"{name}, {member}: is in the archive twice; expected different names")
+        with archive.open(member) as stream:
+            shape, dtype = _header(stream)
+        arrays[array] = (shape, dtype, _member(archive, member))
+    return of_arrays(name, arrays)
 
 
 def of_npy(path: Path, name: str) -> tuple[Signal, ...]:
@@ -42,12 +53,9 @@ def of_npy(path: Path, name: str) -> tuple[Signal, ...]:
     with path.open("rb") as stream:
         shape, dtype = _header(stream)
     loaded = functools.cache(lambda: np.load(path, allow_pickle=False))
-    found = of_arrays({path.stem: (shape, dtype, loaded)})
-    return tuple(Signal(s.path.removeprefix(f"{path.stem}."), *_rest(s)) for s in found) if dtype.names else found
-
-
-def _rest(signal: Signal) -> tuple[Any, ...]:
-    return signal.length, signal.load, signal.unit, signal.clock, signal.words, signal.refused
+    found = of_arrays(name, {path.stem: (shape, dtype, loaded)})
+    fields = (dataclasses.replace(s, path=s.path.removeprefix(f"{path.stem}.")) for s in found)
+    return tuple(fields) if dtype.names else found
 
 
 def _header(stream: Any) -> tuple[tuple[int, ...], np.dtype]:
@@ -57,9 +65,9 @@ def _header(stream: Any) -> tuple[tuple[int, ...], np.dtype]:
     return shape, dtype
 
 
-def _member(path: Path, member: str) -> Callable[[], np.ndarray]:
+def _member(archive: zipfile.ZipFile, member: str) -> Callable[[], np.ndarray]:
     def load() -> np.ndarray:
-        with zipfile.ZipFile(path) as archive, archive.open(member) as stream:
+        with archive.open(member) as stream:
             return np.lib.format.read_array(stream, allow_pickle=False)
 
     return functools.cache(load)
@@ -69,8 +77,9 @@ def of_matlab(path: Path, name: str) -> tuple[Signal, ...]:
     """Signals of a MATLAB file up to version 7; fields of structures are named by path, `log.motor.speed`."""
     from scipy import io
 
+    _check_matlab(path, name)
     loaded = functools.cache(lambda: io.loadmat(path, squeeze_me=False, struct_as_record=True, chars_as_strings=True))
-    arrays: dict[str, tuple[tuple[int, ...], np.dtype, Callable[[], np.ndarray]]] = {}
+    arrays: Arrays = {}
     plain = {"double", "single", "logical", "char", *(f"{sign}int{n}" for sign in ("", "u") for n in (8, 16, 32, 64))}
     for variable, shape, kind in io.whosmat(path):
         if kind == "struct":
@@ -79,7 +88,27 @@ def of_matlab(path: Path, name: str) -> tuple[Signal, ...]:
         else:
             dtype = np.dtype(float) if kind in plain - {"char"} else np.dtype(str) if kind == "char" else _OBJECTS
             arrays[variable] = (shape, dtype, _variable(loaded, variable))
-    return of_arrays(arrays)
+    return of_arrays(name, arrays)
+
+
+def _check_matlab(path: Path, name: str) -> None:
+    """Refuses a file whose variables need more memory than is free; reading one of them loads all.
+
+    Raises:
+        BadData: they do.
+    """
+    content = input_files.file_bytes(path, name)
+    order: Literal["little", "big"] = "big" if content[126:128] == b"MI" else "little"
+    at, size = 128, 0
+    while at + 8 <= len(content):
+        kind, length = (int.from_bytes(content[k : k + 4], order) for k in (at, at + 4))
+        at += 8
+        # of a compressed variable, the size after decompression follows its kind
+        begin = zlib.decompressobj().decompress(content[at : at + 256], 8) if kind == COMPRESSED else b""
+        size += int.from_bytes(begin[4:8], order) if begin else length
+        at += length
+    input_files.check_declared(name, 1, size, len(content))
+    input_files.check_memory(name, size)
 
 
 def _variable(loaded: Callable[[], dict[str, np.ndarray]], name: str) -> Callable[[], np.ndarray]:
@@ -106,12 +135,12 @@ def of_hdf5(path: Path, name: str) -> tuple[Signal, ...]:
     """
     import h5py
 
-    arrays: dict[str, tuple[tuple[int, ...], np.dtype, Callable[[], np.ndarray]]] = {}
+    arrays: Arrays = {}
     units: dict[str, str] = {}
     with h5py.File(path, "r") as file:
         matlab = any("MATLAB_class" in file[key].attrs for key in file if _inside(file, key, name))
-        _walk(file, "", name, arrays, units, path, matlab, h5py)
-    return of_arrays(arrays, units)
+        _walk(file, "", name, arrays, units, path, matlab, h5py, set())
+    return of_arrays(name, arrays, units)
 
 
 def _inside(group: Any, key: str, name: str) -> bool:
@@ -127,14 +156,27 @@ def _inside(group: Any, key: str, name: str) -> bool:
 
 
 def _walk(
-    group: Any, at: str, name: str, arrays: dict[str, Any], units: dict[str, str], path: Path, matlab: bool, h5py: Any
+    group: Any,
+    at: str,
+    name: str,
+    arrays: Arrays,
+    units: dict[str, str],
+    path: Path,
+    matlab: bool,
+    h5py: Any,
+    seen: set[int],
 ) -> None:
+    """Adds the arrays and units of a group; a group with several paths is read under its first."""
+    place = h5py.h5o.get_info(group.id).addr
+    if place in seen:
+        return
+    seen.add(place)
     for key in group:
         if not _inside(group, key, name):
             continue
         item, here = group[key], f"{at}/{key}"
         if isinstance(item, h5py.Group):
-            _walk(item, here, name, arrays, units, path, matlab, h5py)
+            _walk(item, here, name, arrays, units, path, matlab, h5py, seen)
             continue
         if not isinstance(item, h5py.Dataset) or item.shape is None:
             continue
@@ -144,11 +186,11 @@ def _walk(
             )
         words = h5py.check_string_dtype(item.dtype) is not None
         char = matlab and item.attrs.get("MATLAB_class") == b"char"
-        dtype = np.dtype(str) if words or char else item.dtype
+        dtype = np.dtype(f"U{item.dtype.itemsize}") if words or char else item.dtype
         shape = item.shape[::-1] if matlab else item.shape
         arrays[here] = (shape, dtype, _dataset(path, here, words, char, matlab))
         stated = next((item.attrs[key] for key in ("unit", "units", "Unit", "Units") if key in item.attrs), "")
-        units[here] = stated.decode() if isinstance(stated, bytes) else str(stated)
+        units[here] = stated.decode("utf-8", "replace") if isinstance(stated, bytes) else str(stated)
 
 
 def _dataset(path: Path, at: str, words: bool, char: bool, matlab: bool) -> Callable[[], np.ndarray]:
@@ -157,7 +199,10 @@ def _dataset(path: Path, at: str, words: bool, char: bool, matlab: bool) -> Call
 
         with h5py.File(path, "r") as file:
             values = np.asarray(file[at].asstr()[()], dtype=str) if words else file[at][()]
+            missing = file[at].attrs.get("_FillValue")  # of netCDF
         values = np.asarray(values)
+        if missing is not None and np.size(missing) == 1 and values.dtype.kind in "iuf":
+            values = np.ma.masked_equal(values, np.ravel(missing)[0])
         if char:
             return np.array(["".join(map(chr, row)) for row in np.atleast_2d(values.T)])
         return values.T if matlab else values

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from calibration.data import input_files
 from calibration.data.sources.recorded_signals import Signal
 
 #: Most elements of a list that become separate signals.
@@ -22,6 +23,8 @@ def of_parquet(path: Path, name: str) -> tuple[Signal, ...]:
 
     file = parquet.ParquetFile(path, memory_map=True)
     rows, schema = file.metadata.num_rows, file.schema_arrow
+    size = input_files.VALUE * rows * file.metadata.num_columns
+    input_files.check_declared(name, file.metadata.num_columns, size, path.stat().st_size)
 
     def column(field: str) -> Callable[[], np.ndarray]:
         return lambda: of_column(file.read([field], use_threads=True).column(0))
@@ -36,8 +39,14 @@ def of_arrow(path: Path, name: str) -> tuple[Signal, ...]:
     with pa.memory_map(str(path)) as probe:
         stream = probe.read(6) != b"ARROW1"
 
-    mapped = pa.memory_map(str(path))
-    return of_table((pa.ipc.open_stream(mapped) if stream else pa.ipc.open_file(mapped)).read_all())
+    mapped, before = pa.memory_map(str(path)), pa.total_allocated_bytes()
+    reader = pa.ipc.open_stream(mapped) if stream else pa.ipc.open_file(mapped)
+    input_files.check_declared(name, len(reader.schema))
+    batches = []
+    for batch in reader if stream else map(reader.get_batch, range(reader.num_record_batches)):
+        batches.append(batch)
+        input_files.check_memory(name, pa.total_allocated_bytes() - before)  # of a compressed file
+    return of_table(pa.Table.from_batches(batches, reader.schema))
 
 
 def of_table(table: Any) -> tuple[Signal, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -9,7 +10,14 @@ import numpy as np
 
 from calibration.data.input_errors import BadData
 from calibration.data.sources import columnar, json_records
-from calibration.data.sources.recorded_signals import Clock, Signal, of_arrays, unit_of_clock, values_in_memory
+from calibration.data.sources.recorded_signals import (
+    Clock,
+    Signal,
+    of_arrays,
+    refused_type,
+    unit_of_clock,
+    values_in_memory,
+)
 
 EXPECTED = (
     "a path, a pandas or polars DataFrame, an Arrow table, an xarray Dataset, a dict of arrays, or a list of records"
@@ -27,7 +35,10 @@ def of_object(source: Any) -> tuple[str, tuple[Signal, ...]]:
     if library == "pandas" and kind == "DataFrame":
         return "the DataFrame", _of_pandas(source)
     if library == "polars" and kind in ("DataFrame", "LazyFrame"):
-        frame = source.collect() if kind == "LazyFrame" else source
+        try:
+            frame = source.collect() if kind == "LazyFrame" else source
+        except Exception as error:  # polars has errors of its own
+            raise BadData(f"the LazyFrame: polars cannot compute it ({' '.join(str(error).split())})") from error
         return "the DataFrame", columnar.of_table(frame.to_arrow())
     if library == "pyarrow" and kind in ("Table", "RecordBatch"):
         import pyarrow as pa
@@ -39,7 +50,7 @@ def of_object(source: Any) -> tuple[str, tuple[Signal, ...]]:
         )
     if isinstance(source, np.ndarray) and source.dtype.names:
         return "the array", of_arrays(
-            {n: (source.shape, source.dtype[n], values_in_memory(source[n])) for n in source.dtype.names}
+            "the array", {n: (source.shape, source.dtype[n], values_in_memory(source[n])) for n in source.dtype.names}
         )
     if isinstance(source, Mapping):
         return "the dict", json_records.of_content(source, "the dict")
@@ -73,13 +84,13 @@ def _column_name(column: Any) -> str:
 def _of_series(name: str, series: Any, rows: int) -> Signal:
     dtype = series.dtype
     kind = getattr(dtype, "kind", "O")
+    if refused := "" if kind == "O" else refused_type(dtype):
+        return Signal(name, rows, lambda: np.empty(0), refused=refused)
     if kind in "mM":  # also with a time zone, which does not change elapsed times
         return Signal(name, rows, lambda: np.asarray(series.to_numpy(dtype=f"{kind}8[ns]")))
     words = str(dtype) in ("str", "string", "category") or str(dtype).startswith("string")
     if kind == "O" and not words:
-        values = list(series)
-        missing = [value is None or value != value for value in values]
-        kinds = {type(value) for value, lost in zip(values, missing, strict=True) if not lost}
+        kinds = {type(value) for value, lost in zip(series, series.isna(), strict=True) if not lost}
         if kinds and kinds <= {str}:
             words = True
         elif kinds and not kinds <= {int, float, bool, np.float64, np.int64}:
@@ -90,7 +101,7 @@ def _of_series(name: str, series: Any, rows: int) -> Signal:
 
 
 def _words(series: Any) -> Callable[[], np.ndarray]:
-    return lambda: np.array(["" if value is None or value != value else str(value) for value in series])
+    return lambda: np.array(["" if lost else str(value) for value, lost in zip(series, series.isna(), strict=True)])
 
 
 def _of_xarray(dataset: Any) -> tuple[Signal, ...]:
@@ -108,9 +119,9 @@ def _of_xarray(dataset: Any) -> tuple[Signal, ...]:
             clock = Clock(str(time), _values(dataset.coords[time]), unit)
         shape, dtype = array.shape, array.dtype
         signals = of_arrays(
-            {str(name): (shape, dtype, _values(array))}, {str(name): str(array.attrs.get("units", ""))}
+            "the Dataset", {str(name): (shape, dtype, _values(array))}, {str(name): str(array.attrs.get("units", ""))}
         )
-        found += [Signal(s.path, s.length, s.load, s.unit, clock, s.words, s.refused) for s in signals]
+        found += [dataclasses.replace(s, clock=clock) for s in signals]
     return tuple(found)
 
 

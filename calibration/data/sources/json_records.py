@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -13,6 +14,7 @@ from calibration.data import input_files
 from calibration.data.input_errors import BadData
 from calibration.data.sources.recorded_signals import (
     Signal,
+    encodable_text,
     of_arrays,
     parent_path,
     path_parts,
@@ -41,16 +43,29 @@ def of_json(path: Path, name: str) -> tuple[Signal, ...]:
     try:
         text = content.decode("utf-8-sig")
         try:
-            found = json.loads(text)
+            found = json.loads(text, object_pairs_hook=_object)
         except json.JSONDecodeError:
             lines = [line for line in text.splitlines() if line.strip()]
             if len(lines) < 2 or not lines[0].rstrip().endswith("}"):
                 raise
-            found = [json.loads(line) for line in lines]
+            found = [json.loads(line, object_pairs_hook=_object) for line in lines]
     except (ValueError, RecursionError) as error:
         why = "nested too deep" if isinstance(error, RecursionError) else error
         raise BadData(f"{name}: cannot be read as JSON ({why}); it may be cut off; export it again") from error
     return of_content(found, name)
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object of JSON.
+
+    Raises:
+        ValueError: a key is there twice.
+    """
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        twice = next(key for key, count in collections.Counter(key for key, _ in pairs).items() if count > 1)
+        raise ValueError(f"an object has the key {encodable_text(twice)} twice")
+    return found
 
 
 def of_content(content: Any, name: str) -> tuple[Signal, ...]:
@@ -61,13 +76,13 @@ def of_content(content: Any, name: str) -> tuple[Signal, ...]:
     """
     arrays: dict[str, Any] = {}
     _collect(content, "", arrays, name, 1)
-    arrays = _stacked({at: values for at, values in arrays.items() if len(values)})
+    arrays = _stacked({at: values for at, values in arrays.items() if values.size})
     if not arrays:
         raise BadData(
             f"{name}: holds no list of records and no arrays; expected "
             '[{"time_s": 0.0, ...}, ...] or {"time_s": [...], ...}'
         )
-    return of_arrays({at: (v.shape, v.dtype, values_in_memory(v)) for at, v in arrays.items()})
+    return of_arrays(name, {at: (v.shape, v.dtype, values_in_memory(v)) for at, v in arrays.items()})
 
 
 def _collect(value: Any, at: str, arrays: dict[str, np.ndarray], name: str, depth: int) -> None:
@@ -87,7 +102,7 @@ def _collect(value: Any, at: str, arrays: dict[str, np.ndarray], name: str, dept
         elif value:
             arrays[at or "values"] = _array(value)
     elif hasattr(value, "__array__"):
-        arrays[at or "values"] = np.asarray(value)
+        arrays[at or "values"] = value if isinstance(value, np.ma.MaskedArray) else np.asarray(value)
 
 
 def _add_time(value: Mapping[str, Any], at: str, arrays: dict[str, np.ndarray]) -> None:
@@ -127,7 +142,11 @@ def _records(records: Sequence[Mapping[str, Any]], at: str, arrays: dict[str, np
     columns: dict[str, list[Any]] = {}
     for k, record in enumerate(records):
         for key, value in _leaves(record, "", name, 1):
-            columns.setdefault(key, [None] * len(records))[k] = value
+            if key not in columns:
+                input_files.check_declared(name, len(columns))
+                input_files.check_memory(name, input_files.VALUE * (len(columns) + 1) * len(records))
+                columns[key] = [None] * len(records)
+            columns[key][k] = value
     for key, values in columns.items():
         arrays[f"{at}.{key}" if at else key] = _array(values)
 

@@ -79,7 +79,9 @@ def _time(path: Path, group: int) -> Callable[[], np.ndarray]:
 def _column(path: Path, group: int, index: int) -> Callable[[], np.ndarray]:
     def load() -> np.ndarray:
         with _opened(path) as file:
-            values = np.asarray(file.get(group=group, index=index).samples)
-        return np.char.decode(values, "utf-8", "replace") if values.dtype.kind == "S" else values
+            found = file.get(group=group, index=index, ignore_invalidation_bits=True)  # else they are left out
+        invalid = found.invalidation_bits
+        values = np.asarray(found.samples)
+        return values if invalid is None else np.ma.masked_array(values, np.asarray(invalid, bool))
 
     return load

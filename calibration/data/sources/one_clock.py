@@ -41,8 +41,13 @@ def clock_seconds(clock: Clock) -> Elapsed:
 
     A clock that does not state its unit is read by its numbers: since 1970 by their size, else by their steps.
     Numbers that are not whole are seconds. A counter that wraps goes on.
+
+    Raises:
+        BadData: a time stamp that is missing or infinite.
     """
     raw = np.asarray(clock.load())
+    if (lost := np.flatnonzero(~np.isfinite(raw))).size:
+        raise BadData(f"{clock.name}: got {raw[lost[0]]} at sample {lost[0] + 1}; expected a time in every sample")
     if raw.dtype.kind in "Mm":
         whole = raw.astype("datetime64[ns]" if raw.dtype.kind == "M" else "timedelta64[ns]").astype(np.int64)
         return Elapsed((whole - whole[:1]) * 1e-9, float(whole[0]) * 1e-9, "")
@@ -96,7 +101,10 @@ def on_one_grid(
         BadData: a clock that goes back, or clocks that have no time in common.
     """
     clocks = {id(s.clock): s.clock for s in chosen.values() if s.clock is not None}
-    read = {key: clock_seconds(clock) for key, clock in clocks.items()}
+    try:
+        read = {key: clock_seconds(clock) for key, clock in clocks.items()}
+    except BadData as error:
+        raise BadData(f"{name}, {str(error).removeprefix(f'{name}, ')}") from error
     begin = min(elapsed.first for elapsed in read.values())
     times = {key: elapsed.time + (elapsed.first - begin) for key, elapsed in read.items()}
     order = {key: _order(time) for key, time in times.items()}

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import collections
 import dataclasses
+import fnmatch
 import hashlib
 import importlib
+import math
 import os
 import stat
 import zipfile
@@ -16,7 +19,8 @@ import numpy as np
 
 from calibration.data import input_files
 from calibration.data.input_errors import BadData, InputError
-from calibration.data.sources.recorded_signals import Signal, Source
+from calibration.data.sources import in_memory
+from calibration.data.sources.recorded_signals import Signal, Source, plain_values, refused_type
 
 #: Separator between the path of a file and the path of signals in it.
 WITHIN = "::"
@@ -81,8 +85,6 @@ BEGINNINGS = {
 }  # fmt: skip
 #: Formats whose files begin with anything, by suffix.
 SUFFIXES = {".mat": MATLAB, ".db3": BAG, ".jsonl": JSON, ".ndjson": JSON}
-#: Bytes of a value, and largest share of the free memory for values; copies and checks use the rest.
-VALUE, SHARE = 8.0, 0.3
 #: File of a ROS 2 bag's folder that lists its contents.
 _METADATA = "metadata.yaml"
 _RECORDINGS = (".db3", ".mcap")
@@ -107,7 +109,8 @@ def files_of_group(source: str) -> list[Path]:
     path = Path(source)
     if not set("*?[") & {*source} or path.exists():
         return []
-    return sorted(file for file in path.parent.glob(path.name) if not file.name.startswith("."))
+    names = fnmatch.filter(os.listdir(path.parent), path.name) if path.parent.is_dir() else []
+    return sorted(path.parent / name for name in names if not name.startswith("."))
 
 
 def format_of(path: Path, name: str) -> Format | None:
@@ -161,28 +164,81 @@ def open_signals(path: Path, within: str, name: str, form: Format) -> Source:
     signals = tuple(form.signals(path, name))
     if not signals:
         raise BadData(f"{name}: is {form.kind} without signals; expected at least one column or array")
-    found = Source(name, form.kind, _guarded(signals, name, form.kind), source_digest(path))
+    held = sum(file.stat().st_size for file in _files(path))
+    found = checked_source(name, form.kind, signals, held, source_digest(path))
     return found.below(within) if within else found
 
 
-def _guarded(signals: Sequence[Signal], name: str, kind: str) -> tuple[Signal, ...]:
-    """Signals that raise `BadData` if their library cannot read their values; shared clocks stay shared."""
+def open_object(source: Any) -> Source:
+    """The signals of a table in memory.
 
-    def guarded(load: Callable[[], np.ndarray], path: str) -> Callable[[], np.ndarray]:
+    Raises:
+        BadData: as `in_memory.of_object`.
+    """
+    kind, signals = in_memory.of_object(source)
+    return checked_source(kind, kind, signals)
+
+
+def checked_source(
+    name: str, kind: str, signals: Sequence[Signal], held: float = math.inf, digest: str = ""
+) -> Source:
+    """A source of signals whose sizes are checked before values are read, and whose values are plain.
+
+    Signals with a path in common are refused.
+
+    Args:
+        held: size of the file [bytes].
+
+    Raises:
+        BadData: sizes that cannot be right (`input_files.check_declared`).
+    """
+    size = input_files.VALUE * sum(signal.length for signal in signals)
+    input_files.check_declared(name, len(signals), size, held)
+    count = collections.Counter(signal.path for signal in signals)
+    why = "has the name of another signal; expected different names"
+    signals = [s if count[s.path] == 1 else dataclasses.replace(s, refused=why) for s in signals]
+    return Source(name, kind, _guarded(signals, name, kind), digest)
+
+
+def _guarded(signals: Sequence[Signal], name: str, kind: str) -> tuple[Signal, ...]:
+    """Signals that raise `BadData` if they are refused, too large for the memory, or if their library cannot read
+    their values; shared clocks stay shared."""
+
+    def guarded(
+        load: Callable[[], np.ndarray], path: str, signal: Signal, refused: str = ""
+    ) -> Callable[[], np.ndarray]:
+        where = f"{name}, {path}"
+
         def read() -> np.ndarray:
+            if refused:
+                raise BadData(f"{where}: {refused}")
+            input_files.check_memory(where, signal.size or input_files.VALUE * signal.length)
             try:
-                return load()
+                values = load()
+                why = refused_type(values.dtype)
+                values = values if why else plain_values(values)
             except InputError:
                 raise
             except Exception as error:  # each library has errors of its own
-                raise unreadable_file(f"{name}, {path}", kind, error) from error
+                raise unreadable_file(where, kind, error) from error
+            if why or len(values) != signal.length:
+                why = why or f"has {len(values)} of the {signal.length} values that it declares; it may be damaged"
+                raise BadData(f"{where}: {why}")
+            return values
 
         return read
 
-    clocks = {id(s.clock): s.clock for s in signals if s.clock is not None}
-    sound = {key: dataclasses.replace(clock, load=guarded(clock.load, clock.name)) for key, clock in clocks.items()}
+    clocks = {id(s.clock): (s.clock, s) for s in signals if s.clock is not None}
+    sound = {
+        key: dataclasses.replace(clock, load=guarded(clock.load, clock.name, signal))
+        for key, (clock, signal) in clocks.items()
+    }
     return tuple(
-        dataclasses.replace(s, load=guarded(s.load, s.path), clock=None if s.clock is None else sound[id(s.clock)])
+        dataclasses.replace(
+            s,
+            load=guarded(s.load, s.path, s, s.refused),
+            clock=None if s.clock is None else sound[id(s.clock)],
+        )
         for s in signals
     )
 
@@ -203,17 +259,13 @@ def check_folder(path: Path, name: str) -> None:
 def source_digest(path: Path) -> str:
     """SHA-256 of a file, or of the files of a folder in the order of their names."""
     found = hashlib.sha256()
-    for file in sorted(path.iterdir()) if path.is_dir() else [path]:
-        if file.is_file():
-            with file.open("rb") as stream:
-                while block := stream.read(2**20):
-                    found.update(block)
+    for file in _files(path):
+        with file.open("rb") as stream:
+            while block := stream.read(2**20):
+                found.update(block)
     return found.hexdigest()
 
 
-def available_memory() -> float:
-    """Free memory of this machine [bytes]; infinite if the system does not report it."""
-    try:
-        return float(os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
-    except (ValueError, OSError, AttributeError):
-        return float("inf")
+def _files(path: Path) -> list[Path]:
+    """Files of a folder in the order of their names, or the file itself."""
+    return [file for file in sorted(path.iterdir()) if file.is_file()] if path.is_dir() else [path]

@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from calibration.data import delimited, presets_file
+from calibration.data import delimited, input_files, presets_file
 from calibration.data.columns import SPEED, TIME, WHEN, WORDS, Layout
 from calibration.data.input_errors import BadData
 from calibration.data.named_arrays import NamedArrays, Raw, column_numbers, column_texts
 from calibration.data.presets_file import Preset
-from calibration.data.sources import in_memory, one_clock, opening
+from calibration.data.sources import one_clock, opening
 from calibration.data.sources.recorded_signals import Signal, Source, find_signal, matching_signals, suggested_paths
 from mmrjax.errors import list_some
 from mmrjax.model import channels, quantities
@@ -56,8 +56,7 @@ def read_columns(source: Any, layout: Layout, columns: Preset | None = None, bet
             or signals of several lengths.
     """
     if not isinstance(source, str | Path):
-        kind, signals = in_memory.of_object(source)
-        return _of_signals(Source(kind, kind, signals), layout, columns, between)
+        return _of_signals(opening.open_object(source), layout, columns, between)
     if group := opening.files_of_group(str(source)):
         return _of_group([read_columns(file, layout, columns, between) for file in group], str(source))
     path, within = opening.split_source(str(source))
@@ -119,7 +118,7 @@ def read_whole_table(path: Path, within: str = "") -> NamedArrays | None:
     for signal in signals.values():
         if signal.refused or signal.clock is not None:
             raise BadData(f"{name}, {signal.path}: {signal.refused or 'has a clock of its own; expected one table'}")
-    _check_memory(name, signals)
+    input_files.check_memory(name, input_files.VALUE * sum(s.length for s in signals.values()))
     values = _in_rows(source, signals)
     units = tuple(quantities.unit_in_column(signal.unit) for signal in signals.values())
     return NamedArrays(
@@ -147,6 +146,7 @@ def _of_table(arrays: NamedArrays, layout: Layout, columns: Preset | None) -> Re
     mapped, notes = columns.mapped(lambda name: name if name in by_name else None, has_readings)
     if arrays.header and not any(theirs in by_name for _, theirs, _ in mapped):
         raise _none_of(arrays.name, columns, arrays.header)
+    columns.check_needed(mapped, layout.imposed_column, arrays.name)
     return Reading(
         dataclasses.replace(arrays, notes=(*arrays.notes, *notes)), presets_file.merge_columns(mapped, layout.mapped)
     )
@@ -174,6 +174,8 @@ def _of_signals(source: Source, layout: Layout, columns: Preset | None, between:
     mapped, notes = ((), ()) if columns is None else columns.mapped(found)
     if columns is not None and not any(found(theirs) for _, theirs, _ in mapped):
         raise _none_of(source.name, columns, [s.path for s in signals])
+    if columns is not None:
+        columns.check_needed(mapped, layout.imposed_column, source.name)
     mapped = presets_file.merge_columns(mapped, layout.mapped)
     chosen, clock, missing = _chosen(source, mapped, layout)
     for column, signal in chosen.items():
@@ -184,7 +186,8 @@ def _of_signals(source: Source, layout: Layout, columns: Preset | None, between:
             )
     own = [s for s in chosen.values() if s.clock is not None]
     extras = _extras(source, chosen, own)
-    _check_memory(source.name, {**chosen, **extras})
+    size = input_files.VALUE * sum(s.length for s in (*chosen.values(), *extras.values()))
+    input_files.check_memory(source.name, size)
     if own:
         values, more = _on_a_grid(source, chosen, layout, between, clock, mapped)
     else:
@@ -241,16 +244,6 @@ def _extras(source: Source, chosen: Mapping[str, Signal], own: Sequence[Signal])
     if own or sum(s.length for s in others) > EXTRA_VALUES:
         return {}
     return {s.path: s for s in others}
-
-
-def _check_memory(name: str, signals: Mapping[str, Signal]) -> None:
-    """Refuse columns that need more memory than is free."""
-    size, free = opening.VALUE * sum(s.length for s in signals.values()), opening.available_memory()
-    if size > opening.SHARE * free:
-        raise BadData(
-            f"{name}: {len(signals)} columns have {size / 1e9:.3g} GB, and {free / 1e9:.3g} GB of memory are free; "
-            f"expected at most {opening.SHARE * free / 1e9:.3g} GB; give a part of the recording, or every n-th row"
-        )
 
 
 def _in_rows(source: Source, signals: Mapping[str, Signal], rows: int = 0) -> dict[str, np.ndarray]:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import fnmatch
+import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 
+from calibration.data import input_files
 from calibration.data.input_errors import BadData
 from mmrjax.errors import similar_words
 
@@ -48,6 +50,7 @@ class Signal:
         unit: as stated by the recording, empty if it states none.
         clock: its own; None: its samples are rows of a table.
         words: True if the values are text; refused: reason why it cannot be read, empty if it can.
+        size: memory that `load` takes [bytes]; 0: that of `length` numbers.
     """
 
     path: str
@@ -57,11 +60,45 @@ class Signal:
     clock: Clock | None = None
     words: bool = False
     refused: str = ""
+    size: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Replaces code points of its path and unit that no text file can hold."""
+        for field in ("path", "unit"):
+            object.__setattr__(self, field, encodable_text(getattr(self, field)))
 
     @property
     def name(self) -> str:
         """Last part of the path."""
         return path_parts(self.path)[-1]
+
+
+def encodable_text(text: str) -> str:
+    """Returns a text with ? in the place of code points that UTF-8 cannot encode (lone surrogates)."""
+    return text.encode("utf-8", "replace").decode()
+
+
+def refused_type(dtype: np.dtype) -> str:
+    """Reason why values of a type cannot be read; empty if they can."""
+    if dtype.kind in "biufUSMm":
+        return ""
+    kinds = {"O": "objects", "c": "complex numbers", "V": "raw bytes"}
+    return f"holds {kinds.get(dtype.kind, f'values of type {dtype}')}; expected numbers or words"
+
+
+def plain_values(values: np.ndarray) -> np.ndarray:
+    """Returns numbers, dates or words without a mask: a masked entry is a missing reading."""
+    kind = values.dtype.kind
+    if isinstance(values, np.ma.MaskedArray):
+        missing = values.dtype.type("NaT") if kind in "mM" else "" if kind == "U" else b"" if kind == "S" else np.nan
+        values = np.ma.filled(values.astype(float) if kind in "biu" else values, missing)
+    if kind == "S":
+        values = np.char.decode(values, "utf-8", "replace")
+    try:
+        "".join(values.tolist() if values.dtype.kind == "U" else ()).encode()
+    except UnicodeEncodeError:
+        values = np.array([encodable_text(word) for word in values.tolist()])
+    return values
 
 
 def values_in_memory(values: np.ndarray) -> Callable[[], np.ndarray]:
@@ -128,6 +165,7 @@ def unit_of_clock(name: str) -> str | None:
 
 
 def of_arrays(
+    source: str,
     arrays: Mapping[str, tuple[tuple[int, ...], np.dtype, Callable[[], np.ndarray]]],
     units: Mapping[str, str] | None = None,
 ) -> tuple[Signal, ...]:
@@ -137,22 +175,28 @@ def of_arrays(
     without one, or a recording in which every array is equally long, is a table.
 
     Args:
+        source: name of it, for messages.
         arrays: by path: shape, kind of numbers, and a function that returns the array.
         units: that the recording states, by path.
+
+    Raises:
+        BadData: too many columns (`input_files.check_declared`).
     """
     units = units or {}
+    input_files.check_declared(source, sum(_column_count(*array[:2]) for array in arrays.values()))
     shapes = {path: (shape, dtype) for path, (shape, dtype, _) in arrays.items()}
     lengths = {sample_count(shape) for shape, _ in shapes.values() if sample_count(shape) > 1}
-    clocks: dict[tuple[str, int], Clock] = {}
+    clocks: dict[int, dict[str, Clock]] = {}
     if len(lengths) > 1:
         for path, (shape, dtype) in shapes.items():
             unit = unit_of_clock(path_parts(path)[-1])
             if unit is not None and dtype.kind in "iufM" and sum(n > 1 for n in shape) == 1:
-                clocks.setdefault((parent_path(path), sample_count(shape)), Clock(path, _flat(arrays[path][2]), unit))
+                of_length = clocks.setdefault(sample_count(shape), {})
+                of_length.setdefault(parent_path(path), Clock(path, _flat(arrays[path][2]), unit))
     found: list[Signal] = []
     for path, (shape, dtype, load) in arrays.items():
         unit = units.get(path, "")
-        own = {name: clock for (name, n), clock in clocks.items() if n == sample_count(shape)}
+        own = clocks.get(sample_count(shape), {})
         clock = own.get(parent_path(path)) or (next(iter(own.values())) if len(own) == 1 else None)
         found += _of_array(path, shape, dtype, load, unit, clock)
     return tuple(found)
@@ -171,6 +215,11 @@ def sample_count(shape: tuple[int, ...]) -> int:
     return shape[1] if len(shape) == 2 and shape[0] == 1 else shape[0]
 
 
+def _column_count(shape: tuple[int, ...], dtype: np.dtype) -> int:
+    columns = shape[1] if len(shape) == 2 and 1 not in shape else 1
+    return columns * sum(_column_count((), dtype[name]) for name in dtype.names) if dtype.names else columns
+
+
 def _flat(load: Callable[[], np.ndarray]) -> Callable[[], np.ndarray]:
     return lambda: np.ravel(load())
 
@@ -179,21 +228,19 @@ def _of_array(
     path: str, shape: tuple[int, ...], dtype: np.dtype, load: Callable[[], np.ndarray], unit: str, clock: Clock | None
 ) -> list[Signal]:
     words, n = dtype.kind in "US", sample_count(shape)
-    refused = ""
     if dtype.names:
         return [
             s
             for name in dtype.names
             for s in _of_array(f"{path}.{name}", shape, dtype[name], _field(load, name), "", clock)
         ]
-    if dtype.kind not in "biufUSMm":
-        kinds = {"O": "objects", "c": "complex numbers", "V": "raw bytes"}
-        refused = f"holds {kinds.get(dtype.kind, f'values of type {dtype}')}; expected numbers or words"
-    elif len(shape) > 2:
+    refused = refused_type(dtype)
+    if not refused and len(shape) > 2:
         refused = f"has {len(shape)} dimensions; expected one, or two for several signals"
+    size = float(math.prod(shape)) * max(dtype.itemsize, input_files.VALUE)
     if refused or len(shape) < 2 or 1 in shape:
-        return [Signal(path, n, _flat(load), unit, clock, words, refused)]
-    return [Signal(f"{path}[{j}]", n, _column(load, j), unit, clock, words) for j in range(shape[1])]
+        return [Signal(path, n, _flat(load), unit, clock, words, refused, size)]
+    return [Signal(f"{path}[{j}]", n, _column(load, j), unit, clock, words, "", size) for j in range(shape[1])]
 
 
 def _column(load: Callable[[], np.ndarray], j: int) -> Callable[[], np.ndarray]:

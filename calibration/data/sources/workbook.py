@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
+import re
+import zipfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from calibration.data import delimited
+from calibration.data import delimited, input_files
 from calibration.data.input_errors import BadData
 from calibration.data.sources.recorded_signals import Signal
+
+#: Memory of the cells, as a multiple of their text in the file.
+OBJECTS = 4
+#: Memory of a cell of a sheet's rectangle [bytes].
+CELL = 100
 
 
 def of_workbook(path: Path, name: str) -> tuple[Signal, ...]:
@@ -22,9 +29,22 @@ def of_workbook(path: Path, name: str) -> tuple[Signal, ...]:
     """
     import pandas as pd
 
+    size = path.stat().st_size
+    if zipfile.is_zipfile(path):
+        with zipfile.ZipFile(path) as archive:
+            inner = sum(item.file_size for item in archive.infolist())
+            input_files.check_declared(name, 1, inner, size)
+            input_files.check_memory(name, OBJECTS * inner)
+            if any(item.startswith("xl/worksheets/") and item.endswith(".bin") for item in archive.namelist()):
+                raise BadData(f"{name}: is a binary workbook (.xlsb); save it as .xlsx")
+            cells = max(map(_cell_count, map(archive.read, archive.namelist())), default=0)
+        input_files.check_memory(name, CELL * cells)
+    else:
+        input_files.check_memory(name, OBJECTS * size)
     sheets = pd.read_excel(path, sheet_name=None, header=None, engine="calamine")
     tables = {sheet: frame.dropna(how="all") for sheet, frame in sheets.items()}
     tables = {sheet: frame for sheet, frame in tables.items() if len(frame) > 1}
+    input_files.check_declared(name, sum(frame.shape[1] for frame in tables.values()))
     found = []
     for sheet, frame in tables.items():
         header = ["" if pd.isna(cell) else str(cell).strip() for cell in frame.iloc[0]]
@@ -37,6 +57,28 @@ def of_workbook(path: Path, name: str) -> tuple[Signal, ...]:
     return tuple(
         dataclasses.replace(s, path=s.path.removeprefix(f"{next(iter(tables))}/")) if alone else s for s in found
     )
+
+
+def _cell_count(content: bytes) -> int:
+    """Number of cells of the rectangle that a sheet's XML declares; calamine allocates it whole."""
+    places = [(_letters(a), int(b)) for a, b in re.findall(rb'\br="([A-Z]{1,3})(\d{1,7})"', content)]  # of .xlsx
+    wide, tall = (max(numbers, default=0) for numbers in zip(*places, strict=True)) if places else (0, 0)
+    if b"number-columns-repeated" in content or b"number-rows-repeated" in content:  # of .ods
+        for row in re.findall(rb"<table:table-row.*?</table:table-row>", content, re.DOTALL):
+            cells = [c for c in re.findall(rb"<table:table-cell[^>]*>", row) if b"value" in c]
+            if cells:
+                rows, columns = (rb'number-%s-repeated="(\d+)"' % word for word in (b"rows", b"columns"))
+                tall += int((re.findall(rows, row) or [1])[0])
+                wide = max(wide, sum(int((re.findall(columns, cell) or [1])[0]) for cell in cells))
+    return wide * tall
+
+
+def _letters(column: bytes) -> int:
+    """Number of a column of a sheet from 1, by its letters."""
+    number = 0
+    for letter in column:
+        number = 26 * number + letter - ord("A") + 1
+    return number
 
 
 def _signal(cells: Any, title: str, sheet: str, unit: str) -> Signal:

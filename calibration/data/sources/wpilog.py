@@ -13,6 +13,8 @@ from calibration.data.sources.recorded_signals import Clock, Signal, values_in_m
 
 #: Bytes before the extra header; control records, of entry 0, that start an entry.
 HEADER, START = 12, 0
+#: Memory of the records, as a multiple of the file.
+OBJECTS = 10
 #: Types of entries with one number in a record; other types are listed and refused.
 NUMBERS = {"double": "<f8", "float": "<f4", "int64": "<i8", "boolean": "?"}
 WORDS = ("string", "json")
@@ -57,6 +59,7 @@ def of_wpilog(path: Path, name: str) -> tuple[Signal, ...]:
         BadData: another version, or a record that does not end within the file.
     """
     content = input_files.file_bytes(path, name)
+    input_files.check_memory(name, OBJECTS * len(content))
     if content[7:8] != b"\x01":
         raise BadData(f"{name}: is a WPILOG file of another version than 1; export it as CSV with DataLogTool")
     place = HEADER + int.from_bytes(content[8:HEADER], "little")

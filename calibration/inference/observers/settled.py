@@ -21,7 +21,7 @@ from calibration.described import describe
 from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
 from calibration.inference.details import EquationDefects
-from calibration.inference.fit_notes import Note, Repeats
+from calibration.inference.fit_notes import Note, Repeats, ThinnedTable
 from calibration.inference.linearization import Linearization, ScoredEffect, balance_probe, finite_or_zero
 from calibration.inference.noise import Noise
 from calibration.inference.observers.base import Diagnosis, Observer, SearchPolicy
@@ -184,7 +184,9 @@ class SettledRuns(Observer):
                 found.append(Repeats(runs.source, (first + 1, second + 1), column, values, known, others, near=near))
         if found and len(alike) == 1:
             raise BadData(f"{describe(found[0])}; no condition varies, so nothing can be fitted")
-        return [dataclasses.replace(found[0], more=len(found) - 1)] if found else []
+        whole = runs.whole
+        thinned = [] if whole is runs else [ThinnedTable(runs.source, len(whole), len(runs))]
+        return [*thinned, *(dataclasses.replace(each, more=len(found) - 1) for each in found[:1])]
 
     @classmethod
     def check_start(cls, runs: Runs, noise: Noise, robot: Robot) -> list[Note | str]:

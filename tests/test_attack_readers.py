@@ -1,0 +1,635 @@
+"""Malformed data at every reader: mutated bytes, declared sizes, names, masks and faults. Each is read, or refused in
+one short sentence, in bounded time and memory.
+
+Mutations are drawn from a seeded generator.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import os
+import resource
+import signal
+import struct
+import time
+import zipfile
+
+import numpy as np
+import pandas as pd
+import polars as pl
+import pyarrow as pa
+import pytest
+import samples
+import xarray as xr
+from pyarrow import feather, parquet
+from test_more_formats import sysid_log, wpilog, write_xlsx
+
+from calibration.data import contents, input_files, robot_file
+from calibration.data import runs as records
+from calibration.data.input_errors import InputError
+from mmrjax.errors import LONGEST
+from sweeps.commands import rig_new
+
+#: Most processor time of one answer [s], wall-clock time after which it hangs [s], and memory that it may take [bytes].
+SECONDS, HANGS, MEMORY = 5.0, 60, 2**31
+#: Mutations of each file.
+EACH = 16
+COLUMNS = {"time_s": "t", "supply_voltage_V": "volts", "total_current_A": "amps", "motor_speed_rpm": "rpm"}
+RIG = """
+base = "none"
+channels = ["total_current", "motor_speed"]
+[motor]
+resistance = "2 ± 20 %"
+torque_constant = "0.05 ± 20 %"
+[gearbox]
+ratio = 1
+efficiency_load = "1 ± 0"
+[bench]
+load = "shaft"
+inertia = 0.001
+loss_coulomb = "0.01 ± 50 %"
+"""
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory):
+    path = tmp_path_factory.mktemp("rig") / "rig.toml"
+    path.write_text(RIG, encoding="utf-8")
+    return robot_file.read_robot(path)
+
+
+class Hangs(BaseException):
+    """A reader has not answered."""
+
+
+@contextlib.contextmanager
+def bounded():
+    """Limits of time and memory around one answer."""
+
+    def hang(*_):
+        raise Hangs
+
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    with open("/proc/self/statm") as stream:
+        used = int(stream.read().split()[0]) * os.sysconf("SC_PAGE_SIZE")
+    handler = signal.signal(signal.SIGALRM, hang)
+    signal.alarm(HANGS)
+    resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, handler)
+
+
+def asked(*questions):
+    """What is wrong with the answers to some questions, empty if nothing is; and the refusals."""
+    wrong, refused = [], []
+    for question in questions:
+        began = time.process_time()
+        try:
+            with bounded():
+                question()
+        except InputError as error:
+            refused.append(message := str(error))
+            wrong += [f"{len(message)} characters"] * (len(message) > LONGEST)
+            try:
+                message.encode()
+            except UnicodeEncodeError:
+                wrong.append("not in UTF-8")
+        except (Exception, Hangs) as error:
+            wrong.append(f"{type(error).__name__}: {str(error)[:200]}")
+        took = time.process_time() - began
+        wrong += [f"{took:.1f} s"] * (took > SECONDS)
+    return wrong, refused
+
+
+def doors(source, robot):
+    """Both ways into the readers: a list of what is in a file, and its columns as runs."""
+
+    def inspect():
+        json.dumps(contents.inspect_source(source).to_json(), ensure_ascii=False).encode()
+
+    def read():
+        table = records.read_runs(source, robot, columns=COLUMNS)
+        "".join(note for note in table.notes).encode()
+
+    return inspect, read
+
+
+# --- mutated bytes ----------------------------------------------------------------------------------------------------
+
+
+def sheet(path, columns):
+    write_xlsx(path, Log=[[*columns], *map(list, zip(*(v.tolist() for v in columns.values()), strict=True))])
+
+
+def csv(path, columns):
+    pd.DataFrame(columns).to_csv(path, index=False)
+
+
+TABLES = {
+    "log.csv": csv, "log.parquet": samples.parquet, "log.feather": samples.feather, "log.arrows": samples.arrow,
+    "log.npz": samples.npz, "log.npy": lambda p, c: np.save(p, np.rec.fromarrays([*c.values()], names=[*c])),
+    "records.json": samples.json_records, "arrays.json": samples.json_arrays, "v5.mat": samples.mat5,
+    "v73.mat": samples.mat73, "log.xlsx": sheet,
+}  # fmt: skip
+LOGS = {
+    "log.h5": samples.hdf5, "log.mf4": samples.mdf, "log.ulg": samples.ulog, "log.bag": samples.ros1,
+    "ros2": samples.ros2, "mcap": samples.mcap,
+}  # fmt: skip
+FORMATS = [*TABLES, *LOGS, "robot.wpilog"]
+
+
+def write(folder, name):
+    """Writes a valid file; returns the path to read, and the path of the bytes to damage."""
+    path = folder / name
+    if name in TABLES:
+        TABLES[name](path, samples.table())
+    elif name in LOGS:
+        LOGS[name](path, samples.fast(0.4), samples.slow(0.4))
+    else:
+        path.write_bytes(wpilog(*sysid_log()))
+    inner = sorted(path.glob("*.db3")) + sorted(path.glob("*.mcap")) if path.is_dir() else [path]
+    return path, inner[0]
+
+
+def mutated(content, rng):
+    """The bytes after one mutation."""
+    content, size = bytearray(content), len(content)
+    at, length = int(rng.integers(size)), int(rng.integers(1, 40))
+    how = rng.integers(8)
+    if how == 0:
+        return bytes(content[:at])
+    if how == 1:
+        for k in rng.integers(size, size=4):
+            content[k] ^= 1 << rng.integers(8)
+    elif how == 2:
+        content[at : at + length] = rng.bytes(length)
+    elif how == 3:  # a size that is far too large
+        content[at : at + 8] = b"\xff\xff\xff\xff\xff\xff\xff\x7f"
+    elif how == 4:
+        content[at : at + 4] = struct.pack("<I", 2**31 - 1)
+    elif how == 5:
+        content[at:at] = content[at : at + length]
+    elif how == 6:
+        del content[at : at + length]
+    else:
+        head = min(512, size)  # headers are where sizes are
+        for k in rng.integers(head, size=3):
+            content[k] = int(rng.integers(256))
+    return bytes(content)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FORMATS)
+def test_mutated_bytes_are_read_or_refused_in_a_sentence(tmp_path, robot, name):
+    path, damaged = write(tmp_path, name)
+    wrong, refused = asked(*doors(path, robot)[:1])
+    assert not wrong and not refused
+    content, rng = damaged.read_bytes(), np.random.default_rng([69, FORMATS.index(name)])
+    failures, refusals = [], 0
+    for k in range(EACH):
+        damaged.write_bytes(mutated(content, rng))
+        wrong, refused = asked(*doors(path, robot))
+        failures += [f"{k}: {each}" for each in wrong]
+        refusals += bool(refused)
+    assert not failures, "\n".join(failures)
+    assert refusals > EACH // 4  # else nothing was attacked
+
+
+# --- declared sizes ---------------------------------------------------------------------------------------------------
+
+
+def npy_header(shape, descr):
+    stream = io.BytesIO()
+    np.lib.format.write_array_header_1_0(stream, {"descr": descr, "fortran_order": False, "shape": shape})
+    return stream.getvalue()
+
+
+def npy(shape, descr="<f8"):
+    return lambda path: path.write_bytes(npy_header(shape, descr) + bytes(16))
+
+
+def npz(*members):
+    def made(path):
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+            for name, content in members:
+                archive.writestr(f"{name}.npy", content)
+
+    return made
+
+
+def many_arrays(path):
+    np.savez(path, **{f"a{k}": np.zeros(3) for k in range(25_000)})
+
+
+def twice(path):
+    with pytest.warns(UserWarning, match="Duplicate name"):
+        npz(("a", b"x"), ("a", b"y"))(path)
+
+
+def hdf5(fill):
+    def made(path):
+        import h5py
+
+        with h5py.File(path, "w") as file:
+            fill(file, h5py)
+
+    return made
+
+
+def paths_without_end(file, _):
+    """Groups of which each holds the next under two names: 2^40 paths."""
+    group = file
+    for _ in range(40):
+        inner = group.create_group("a")
+        group["b"] = inner
+        group = inner
+    group["t"] = np.arange(3.0)
+
+
+def bomb_mat(path):
+    """A compressed variable that declares 16 GB."""
+    import zlib
+
+    inner = zlib.compress(struct.pack("<II", 14, 2**32 - 1) + bytes(1000))
+    path.write_bytes(b"MATLAB 5.0".ljust(124) + struct.pack("<H2sII", 0x0100, b"IM", 15, len(inner)) + inner)
+
+
+def ulog_of(fields):
+    def made(path):
+        body = b"big:uint64_t timestamp;" + fields
+        content = b"ULog\x01\x12\x35\x01" + bytes(8) + struct.pack("<HB", 40, ord("B")) + bytes(40)
+        content += struct.pack("<HB", len(body), ord("F")) + body
+        content += struct.pack("<HB", 6, ord("A")) + bytes(3) + b"big"
+        path.write_bytes(content)
+
+    return made
+
+
+def far_cell(path):
+    """A sheet with one cell in each of two corners."""
+    write_xlsx(path, A=[["t"], [1]])
+    with zipfile.ZipFile(path) as archive:
+        items = {name: archive.read(name) for name in archive.namelist()}
+    items["xl/worksheets/s1.xml"] = items["xl/worksheets/s1.xml"].replace(b"<c><v>", b'<c r="XFD1048576"><v>')
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in items.items():
+            archive.writestr(name, content)
+
+
+def long_mdf(path):
+    """A group that declares 10^12 samples."""
+    samples.mdf(path, samples.fast(0.2), samples.slow(0.2))
+    content = path.read_bytes()
+    at = content.index(b"##CG") + 24 + 6 * 8 + 8
+    path.write_bytes(content[:at] + struct.pack("<Q", 10**12) + content[at + 8 :])
+
+
+def long_bag(path):
+    samples.ros2(path, samples.fast(0.2), samples.slow(0.2))
+    about = path / "metadata.yaml"
+    about.write_text(about.read_text().replace("message_count: 20", f"message_count: {10**15}"))
+
+
+SIZES = {
+    "wide.npy": npy((2, 10**8)), "long.npy": npy((10**11,)), "words.npy": npy((1,), "<U1000000000"),
+    "fields.npy": npy((10**9,), [(f"f{k}", "<f8") for k in range(30)]), "negative.npy": npy((-1, 3)),
+    "wide.npz": npz(("a", npy_header((2, 10**8), "<f8"))), "long.npz": npz(("a", npy_header((10**11,), "<f8"))),
+    "bomb.npz": npz(("t", npy_header((2**29,), "<u1") + bytes(2**29))), "many.npz": many_arrays,
+    "twice.npz": twice,
+    "rows.h5": hdf5(lambda f, _: [f.create_dataset(n, (10**9,), "f8") for n in ("t", "volts", "amps", "rpm")]),
+    "chunks.h5": hdf5(lambda f, _: f.create_dataset("t", (10**9,), "f8", chunks=(10**4,), compression="gzip")),
+    "wide.h5": hdf5(lambda f, _: f.create_dataset("t", (2, 10**8), "f8")),
+    "words.h5": hdf5(lambda f, _: f.create_dataset("t", (3,), "S2000000000")),
+    "paths.h5": hdf5(paths_without_end),
+    "rows.parquet": lambda path: parquet.write_table(pa.table({"t": np.zeros(2**26, np.int8)}), path),
+    "lists.parquet": lambda path: parquet.write_table(pa.table({"t": [[0.0] * 10**6] * 2}), path),
+    "columns.parquet": lambda path: parquet.write_table(pa.table({f"c{k}": [1] for k in range(21_000)}), path),
+    "bomb.mat": bomb_mat,
+    "keys.json": lambda path: path.write_text(json.dumps([{f"k{k}": 1} for k in range(100_000)])),
+    "columns.csv": lambda path: path.write_text(",".join(f"c{k}" for k in range(10**6)) + "\n" + "1," * 10**6 + "\n"),
+    "plain.csv": lambda path: path.write_text("c," * 10**6 + "c\n" + "1," * 10**6 + "1\n"),
+    "array.ulg": ulog_of(b"float[1000000000] x;"),
+    "far.xlsx": far_cell,
+    "long.mf4": long_mdf, "long_bag": long_bag,
+}  # fmt: skip
+
+
+@pytest.mark.quick(
+    "wide.npy", "words.npy", "many.npz", "rows.h5", "paths.h5", "keys.json", "plain.csv", "array.ulg", "far.xlsx"
+)
+@pytest.mark.parametrize("name", SIZES)
+def test_sizes_that_a_file_declares_are_refused_before_they_are_read(tmp_path, robot, name):
+    SIZES[name](tmp_path / name)
+    inspect, read = doors(tmp_path / name, robot)
+    wrong, refused = asked(inspect)
+    assert not wrong, wrong
+    if not refused:  # the signal alone is refused
+        facts = contents.inspect_source(tmp_path / name).signals
+        assert any(fact.refused for fact in facts) or name in ("paths.h5", "lists.parquet", "negative.npy")
+    wrong, refused = asked(read)
+    assert not wrong and refused, (wrong, refused)
+
+
+# --- names ------------------------------------------------------------------------------------------------------------
+
+NAMES = [
+    "\ud800",
+    "a\ud800.b",
+    "",
+    " ",
+    "x" * 100_000,
+    "t\n",
+    "\x1b[31mred",
+    "../../t",
+    "a.b.c",
+    "nan",
+    "💥",
+    "=1+1",
+    "a[0]",
+]
+
+
+def named(name):
+    """Tables of two columns, one with a name, in each container that can hold it; and files of those that can."""
+    columns = {name: np.arange(4.0), "rpm": np.arange(4.0)}
+    yield "a dict", columns
+    yield "records", [{name: 1.0, "rpm": 2.0}] * 3
+    yield "xarray", xr.Dataset({k: ("row", v) for k, v in columns.items()})
+    if all(not "\ud800" <= c < "\ue000" for c in name):
+        yield "pandas", pd.DataFrame(columns)
+        yield "Arrow", pa.table(columns)
+        yield "polars", pl.DataFrame(columns)
+
+
+@pytest.mark.parametrize("name", NAMES, ids=range(len(NAMES)))
+def test_names_of_columns_are_read_or_refused_in_a_sentence(tmp_path, robot, name):
+    failures = []
+    for kind, source in named(name):
+        wrong, _ = asked(*doors(source, robot))
+        failures += [f"{kind}: {each}" for each in wrong]
+    columns = {name: [0.0, 1.0], "rpm": [1.0, 2.0]}
+    (tmp_path / "log.json").write_text(json.dumps(columns))
+    files = [tmp_path / "log.json"]
+    with contextlib.suppress(UnicodeEncodeError):
+        files.append(tmp_path / "log.parquet")
+        parquet.write_table(pa.table(columns), files[-1])
+        files.append(tmp_path / "log.feather")
+        feather.write_feather(pa.table(columns), str(files[-1]))
+        files.append(tmp_path / "log.csv")
+        pd.DataFrame(columns).to_csv(files[-1], index=False)
+    for file in files:
+        if file.exists():
+            wrong, _ = asked(*doors(file, robot))
+            failures += [f"{file.name}: {each}" for each in wrong]
+    assert not failures, "\n".join(failures)
+
+
+def test_a_unit_that_is_not_in_utf8_is_shown_with_question_marks(tmp_path):
+    def fill(file, h5py):
+        file["volts"] = np.arange(3.0)
+        file["volts"].attrs.create("unit", np.array(b"\xff\xfe", dtype=h5py.string_dtype("utf-8", 2)))
+
+    hdf5(fill)(tmp_path / "log.h5")
+    assert contents.inspect_source(tmp_path / "log.h5").signals[0].unit == 2 * "\ufffd"
+
+
+@pytest.mark.parametrize("name", ["rpm", "motor_speed_rpm"])  # by a mapping, and by itself
+@pytest.mark.parametrize("kind", ["pandas", "Arrow", "parquet"])
+def test_two_columns_of_one_name_are_refused(tmp_path, robot, kind, name):
+    table = samples.table()
+    names = ["t", "volts", "amps", name, name]
+    source = pd.DataFrame(np.stack([*table.values(), table["rpm"] + 1], 1), columns=names)
+    if kind != "pandas":
+        source = pa.table([pa.array(source.iloc[:, k]) for k in range(5)], names=names)
+    if kind == "parquet":
+        parquet.write_table(source, tmp_path / "log.parquet")
+        source = tmp_path / "log.parquet"
+    columns = {**COLUMNS, "motor_speed_rpm": name} if name == "rpm" else {**COLUMNS, "motor_speed_rpm": None}
+    with pytest.raises(InputError, match=f"{name}: (has the name of another signal|got a name of 2 signals)"):
+        records.read_runs(source, robot, columns={k: v for k, v in columns.items() if v})
+
+
+@pytest.mark.parametrize("text", ['{"t": [1], "t": [2]}', '[{"t": 1, "t": 2}]', '{"t": 1}\n{"t": 1, "t": 2}'])
+def test_a_key_twice_in_json_is_refused(tmp_path, robot, text):
+    (tmp_path / "log.json").write_text(text)
+    wrong, refused = asked(*doors(tmp_path / "log.json", robot))
+    assert not wrong and len(refused) == 2 and all("has the key t twice" in each for each in refused)
+
+
+# --- masks, complex numbers, times ------------------------------------------------------------------------------------
+
+
+def mdf_with_invalid_bits(path, table, lost):
+    from asammdf import MDF, Signal
+
+    with MDF(version="4.10") as file:
+        time = table["t"]
+        bits = {n: np.where(np.arange(len(time)) == lost, n == "rpm", False) for n in table}
+        file.append([Signal(v, time, name=n, invalidation_bits=bits[n]) for n, v in table.items() if n != "t"])
+        file.save(path)
+
+
+def with_missing(folder, table, lost):
+    """The table in every container that can mark a reading as missing, with one reading marked."""
+    speed = table["rpm"]
+    masked = np.ma.masked_array(speed, np.arange(len(speed)) == lost)
+    listed = [None if k == lost else x for k, x in enumerate(speed.tolist())]
+    rest = {n: v for n, v in table.items() if n != "rpm"}
+    yield "np.ma", rest | {"rpm": masked}
+    yield "np.ma of integers", rest | {"rpm": np.ma.masked_array(speed.astype(int), masked.mask)}
+    yield (
+        "an array of records",
+        np.ma.masked_array(
+            np.rec.fromarrays([*rest.values(), speed], names=[*rest, "rpm"]),
+            [(False,) * len(rest) + (k == lost,) for k in range(len(speed))],
+        ),
+    )
+    yield "a column of a matrix", {"m": np.ma.stack([*map(np.ma.asarray, rest.values()), masked], 1)}
+    for dtype in ("Float64", "object", "float"):
+        yield f"pandas {dtype}", pd.DataFrame(rest).assign(rpm=pd.array(listed, dtype))
+    yield "polars", pl.DataFrame(rest | {"rpm": listed})
+    yield "Arrow", pa.table(rest | {"rpm": pa.array(listed)})
+    yield "xarray", xr.Dataset({n: ("row", v) for n, v in (rest | {"rpm": masked.filled(np.nan)}).items()})
+    (folder / "log.json").write_text(json.dumps({n: v.tolist() for n, v in rest.items()} | {"rpm": listed}))
+    yield "JSON", folder / "log.json"
+    pd.DataFrame(rest | {"rpm": listed}).to_csv(folder / "log.csv", index=False)
+    yield "CSV", folder / "log.csv"
+    mdf_with_invalid_bits(folder / "log.mf4", table, lost)
+    yield "MDF", folder / "log.mf4"
+
+    def fill(file, _):
+        for n, v in (rest | {"rpm": masked.filled(-9999.0)}).items():
+            file[n] = v
+        file["rpm"].attrs["_FillValue"] = -9999.0
+
+    hdf5(fill)(folder / "log.h5")
+    yield "netCDF", folder / "log.h5"
+    rows = [*zip(*(v.tolist() for v in rest.values()), listed, strict=True)]
+    write_xlsx(folder / "log.xlsx", A=[[*rest, "rpm"], *map(list, rows)])
+    yield "a workbook", folder / "log.xlsx"
+
+
+def test_a_masked_reading_is_missing_in_every_container(tmp_path, robot):
+    table, lost, failures = samples.table(), 7, []
+    for kind, source in with_missing(tmp_path, table, lost):
+        matrix = {mine: f"m[{k}]" for k, mine in enumerate(COLUMNS)}
+        columns = COLUMNS if "matrix" not in kind else matrix
+        if kind == "MDF":
+            columns = columns | {"time_s": "time_s"}
+        found = records.read_runs(source, robot, columns=columns)["motor_speed_rpm"]
+        sound = np.flatnonzero(np.isfinite(found))
+        if not np.array_equal(sound, np.delete(np.arange(len(found)), lost)):
+            failures.append(f"{kind}: {np.flatnonzero(np.isnan(found))}")
+        np.testing.assert_allclose(found[sound], table["rpm"][sound], atol=1)  # of integers
+    assert not failures, failures
+
+
+def with_complex(folder, table):
+    from scipy import io as matlab
+
+    wave = table | {"rpm": table["rpm"] * 1j}
+    yield wave
+    yield pd.DataFrame(wave)
+    np.savez(folder / "log.npz", **wave)
+    yield folder / "log.npz"
+    matlab.savemat(folder / "log.mat", wave)
+    yield folder / "log.mat"
+    hdf5(lambda file, _: [file.create_dataset(n, data=v) for n, v in wave.items()])(folder / "log.h5")
+    yield folder / "log.h5"
+
+
+def test_complex_numbers_are_refused_by_every_reader(tmp_path, robot):
+    for source in with_complex(tmp_path, samples.table()):
+        _, read = doors(source, robot)
+        wrong, refused = asked(read)
+        assert not wrong and "rpm: holds complex numbers" in refused[0], source
+        facts = {s.path.strip("/"): s for s in contents.inspect_source(source).signals}
+        assert "complex numbers" in facts["rpm"].refused
+
+
+@pytest.mark.parametrize("stamp", [np.inf, -np.inf, np.nan, 1e308])
+@pytest.mark.parametrize("kind", ["a dict", "CSV", "clocks"])
+def test_times_that_are_not_finite_are_refused_without_a_warning(tmp_path, robot, stamp, kind):
+    table = samples.table()
+    table["t"][5] = stamp
+    source = table
+    if kind == "CSV":
+        pd.DataFrame(table).to_csv(tmp_path / "log.csv", index=False)
+        source = tmp_path / "log.csv"
+    elif kind == "clocks":
+        samples.hdf5(tmp_path / "log.h5", {n: v for n, v in table.items() if n != "rpm"}, samples.slow())
+        source = tmp_path / "log.h5"
+    inspect, read = doors(source, robot)
+    wrong, refused = asked(read)
+    assert not wrong and refused
+    assert not asked(inspect)[0]
+
+
+def test_times_without_a_date_are_listed_and_refused(tmp_path, robot):
+    import datetime
+
+    times = [datetime.time(0, 0, k) for k in range(4)]
+    parquet.write_table(pa.table({"t": times, "rpm": [1.0, 2, 3, 4]}), tmp_path / "log.parquet")
+    found = contents.inspect_source(tmp_path / "log.parquet").signals
+    assert found[0].refused == "holds time64[us]; expected numbers or words" and found[1].greatest == 4
+
+
+# --- faults -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FORMATS)
+@pytest.mark.parametrize("fault", ["gone", "cut", "replaced"])
+def test_a_file_that_changes_after_it_was_listed_is_refused_or_read(tmp_path, robot, name, fault, monkeypatch):
+    path, damaged = write(tmp_path, name)
+    content = damaged.read_bytes()
+
+    def spoil(*_):
+        if fault == "gone":
+            damaged.unlink(missing_ok=True)
+        else:
+            damaged.write_bytes(content[: len(content) // 2] if fault == "cut" else b"\0" * 64)
+
+    honest = input_files.check_memory
+    monkeypatch.setattr(input_files, "check_memory", lambda *a: (spoil(), honest(*a)))
+    wrong, _ = asked(*doors(path, robot))
+    assert not wrong, wrong
+
+
+# --- models of rigs ---------------------------------------------------------------------------------------------------
+
+BODY = '<body name="b"><joint name="j" type="hinge" axis="0 1 0"/><geom type="cylinder" size="0.1 0.02" mass="1"/>%s</body>'
+MODEL = f'<mujoco>%s<worldbody>{BODY}</worldbody><actuator><motor joint="j"/></actuator></mujoco>'
+MODELS = {
+    "nan": MODEL.replace('mass="1"', 'mass="nan"') % ("", ""),
+    "user": MODEL % ('<size nuser_body="2000000000"/>', ""),
+    "keys": MODEL % ('<size nkey="2000000000"/>', ""),
+    "replicate": MODEL % ("", '<replicate count="100000000" offset="0 0 1"><geom size="0.1"/></replicate>'),
+    "nested": MODEL % ("", '<replicate count="1000">' * 3 + '<geom size="0.1"/>' + "</replicate>" * 3),
+    "composite": MODEL % ("", '<composite type="cable" count="100000 1 1" curve="s" size="1"/>'),
+    "numeric": MODEL % ('<custom><numeric name="n" size="2000000000"/></custom>', ""),
+    "texture": MODEL % ('<asset><texture name="t" type="2d" builtin="flat" width="100000" height="100000"/></asset>', ""),
+    "hfield": MODEL % ('<asset><hfield name="h" nrow="100000" ncol="100000" size="1 1 1 1"/></asset>', ""),
+    "include": MODEL % ('<include file="pipe"/>', ""),
+    "mesh": MODEL % ('<asset><mesh name="m" file="pipe.obj"/></asset>', ""),
+    "hfield file": MODEL % ('<asset><hfield name="h" file="pipe.png" size="1 1 1 1"/></asset>', ""),
+    "mesh in a folder": MODEL % ('<compiler meshdir="in"/><asset><mesh name="m" file="pipe.obj"/></asset>', ""),
+    "includes": MODEL % ('<include file="model.xml"/>', ""),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", MODELS)
+def test_models_that_mujoco_does_not_end_with_are_refused(tmp_path, monkeypatch, kind):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "in").mkdir()
+    for pipe in ("pipe", "pipe.obj", "pipe.png", "in/pipe.obj"):
+        os.mkfifo(tmp_path / pipe)
+    (tmp_path / "model.xml").write_text(MODELS[kind])
+    before = set(os.listdir())
+    wrong, refused = asked(lambda: rig_new.joint_of(tmp_path / "model.xml", None))
+    assert not wrong and refused and set(os.listdir()) == before, wrong
+
+
+def test_a_sound_model_is_read_and_leaves_no_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "part.xml").write_text('<mujoco><option timestep="0.001"/></mujoco>')
+    (tmp_path / "model.xml").write_text(MODEL % ('<size njmax="5000" nconmax="2000"/><include file="part.xml"/>', ""))
+    assert rig_new.joint_of(tmp_path / "model.xml", None).joint == "j"
+    assert sorted(os.listdir()) == ["model.xml", "part.xml"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["model.xml", "robot.urdf"])
+def test_mutated_models_are_read_or_refused_in_a_sentence(tmp_path, monkeypatch, kind):
+    monkeypatch.chdir(tmp_path)
+    text = MODEL % ("", "") if kind == "model.xml" else URDF
+    rng, failures = np.random.default_rng([70, len(kind)]), []
+    for k in range(4 * EACH):
+        (tmp_path / kind).write_bytes(mutated(text.encode(), rng))
+        wrong, _ = asked(lambda: rig_new.new_rig_text(None, tmp_path / kind, None, None))
+        failures += [f"{k}: {each}" for each in wrong]
+    assert not failures, "\n".join(failures)
+    assert os.listdir() == [kind]
+
+
+URDF = """<robot name="r"><link name="base"><inertial><mass value="5"/></inertial></link><link name="wheel"><inertial>
+<mass value="0.3"/><inertia ixx="1e-4" iyy="1e-4" izz="2e-4" ixy="0" ixz="0" iyz="0"/></inertial><collision><geometry>
+<cylinder radius="0.05" length="0.02"/></geometry></collision></link><joint name="j" type="continuous">
+<parent link="base"/><child link="wheel"/><axis xyz="0 0 1"/><dynamics damping="0.1" friction="0.02"/></joint></robot>"""
+
+
+def test_many_joints_are_named_in_a_short_sentence(tmp_path):
+    joints = "".join(
+        f'<link name="l{k}"/><joint name="wheel_with_a_long_name_{k}" type="continuous"><parent link="base"/>'
+        f'<child link="l{k}"/></joint>'
+        for k in range(200)
+    )
+    (tmp_path / "robot.urdf").write_text(URDF.replace("</robot>", f"{joints}</robot>"))
+    wrong, refused = asked(lambda: rig_new.joint_of(tmp_path / "robot.urdf", None))
+    assert not wrong and refused[0].endswith("expected the name of one joint")
