@@ -173,7 +173,7 @@ def accepted(*_, **__):
 #: Computations that take long, in the place of which a command ends: what comes before them is attacked here.
 HEAVY = (
     "calibration.sizing.sheet.check_requirements", "sweeps.commands.missions.run_missions", "sweeps.commands.climb.climb_batch",
-    "sweeps.commands.loop.discover", "sweeps.commands.calibrate.run", "sweeps.commands.sensitivity.analyse",
+    "sweeps.commands.loop.discover", "sweeps.commands.calibrate.run", "sweeps.commands.sensitivity.analyse_sensitivity",
     "sweeps.commands.size.search", "sweeps.commands.render._write",
 )  # fmt: skip
 
