@@ -129,7 +129,7 @@ USAGE = {
     "misspelt option": (["sweep", "--slope", "5"], r"No such option: --slope"),
     "unknown command": (["swep"], r"No such command"),
     "slope of 95": (["sweep", "--slopes", "0,95"], r"--slopes: got 95\.0; expected -45 to 45"),
-    "voltage below all": (["sweep", "--voltages=-300"], r"--voltages: got -300\.0; expected -100 to 100"),
+    "voltage below all": (["sweep", "--voltages=-30000"], r"--voltages: got -30000\.0; expected -10000 to 10000"),
     "NaN": (["sweep", "--payloads", "nan"], r"--payloads: got nan"),
     "no numbers": (
         ["sweep", "--slopes", "steep"],

@@ -165,8 +165,8 @@ def test_no_message_of_what_was_stated_by_options_names_a_field(tmp_path):
     (tmp_path / "a.toml").write_text("left_V = 5.0\n")
     with pytest.raises(BadConfiguration, match=r"^a\.toml: left_V acts with right_V only; state both$"):
         config.resolve_configuration(config.Simulate, tmp_path / "a.toml", {})
-    with pytest.raises(BadConfiguration, match=r"^--left: got 500\.0; "):
-        config.resolve_configuration(config.Simulate, None, {"left_V": 500.0, "right_V": 1.0})
+    with pytest.raises(BadConfiguration, match=r"^--left: got 50000\.0; "):
+        config.resolve_configuration(config.Simulate, None, {"left_V": 50000.0, "right_V": 1.0})
 
 
 HARM = "import pathlib\npathlib.Path('harmed').touch()\n"

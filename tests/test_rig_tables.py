@@ -6,9 +6,9 @@ import re
 import numpy as np
 import pytest
 
-from calibration.data import instruments, robot_file, surfaces
+from calibration.data import instruments, rig_facts, robot_file, surfaces
 from calibration.data import runs as records
-from calibration.data.input_errors import BadConfiguration, BadData
+from calibration.data.input_errors import BadConfiguration, BadData, three_digits
 from calibration.inference import bases, blocks, checks, noise, observers, priors
 from calibration.inference.calibration import calibrate
 from calibration.inference.fit_notes import Constant
@@ -711,3 +711,65 @@ quantum = "free"
     assert instrument.signed is False and instrument.quantum == pytest.approx(0.004, rel=1e-6)
     loss = found.parameters["brake.loss_coulomb"]
     assert abs(loss.value - 0.15) < 3 * loss.sd
+
+
+# --- doubts that follow the robot's file ----------------------------------------------------------------------------
+
+MOTOR = """
+schema = "mmrjax.robot/2"
+base = "none"
+sides = 1
+imposed = "voltage"
+channels = ["motor_speed", "motor_current"]
+[motor]
+resistance = {resistance}
+torque_constant = {constant}
+friction_coulomb = {friction}
+[gearbox]
+ratio = 1
+efficiency_load = 1
+[brake]
+load = "shaft"
+inertia = 1e-4
+loss_coulomb = 0.0
+"""
+
+
+def motor_table(resistance, constant, friction, voltages):
+    """A motor without load, by hand: k I = friction, U = R I + k ω."""
+    volts = np.asarray(voltages, float)
+    current = np.sign(volts) * friction / constant
+    return {
+        "supply_voltage_V": volts, "motor_current_A": current,
+        "motor_speed_rpm": (volts - resistance * current) / constant * 30 / np.pi,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(("numbers", "voltages"), [
+    ((4.1, 0.83, 0.05), [150, 220, 310, -310]), ((0.14, 0.0021, 2e-4), [2, 6, 11.6]),
+])  # fmt: skip
+def test_motors_far_from_the_packaged_one_are_read_without_a_doubt(tmp_path, numbers, voltages):
+    (tmp_path / "rig.toml").write_text(MOTOR.format(resistance=numbers[0], constant=numbers[1], friction=numbers[2]))
+    rig = robot_file.read_robot(tmp_path / "rig.toml")
+    runs = records.read_runs(motor_table(*numbers, voltages), rig)
+    assert len(runs) == len(voltages) and rig_facts.doubtful_speed(runs, rig) == ""
+
+
+@pytest.mark.parametrize(("column", "factor"), [("motor_speed_rpm", 60.0), ("supply_voltage_V", 1000.0)])
+def test_a_speed_that_the_constant_cannot_give_is_doubted_with_its_number(tmp_path, column, factor):
+    (tmp_path / "rig.toml").write_text(MOTOR.format(resistance=0.4, constant=0.05, friction=0.01))
+    rig = robot_file.read_robot(tmp_path / "rig.toml")
+    table = motor_table(0.4, 0.05, 0.01, [6, 9])
+    runs = records.read_runs({**table, column: factor * table[column]}, rig)
+    reached = factor * 6 / 0.05 * 30 / np.pi if column == "supply_voltage_V" else 6 / 0.05 * 30 / np.pi
+    assert f"turns the motors at up to {three_digits(reached)} rpm" in rig_facts.doubtful_speed(runs, rig)
+
+
+def test_an_offset_of_an_ammeter_is_no_lost_sign(tmp_path):
+    (tmp_path / "rig.toml").write_text(MOTOR.format(resistance=0.4, constant=0.05, friction=0.01))
+    rig = robot_file.read_robot(tmp_path / "rig.toml")
+    table = motor_table(0.4, 0.05, 0.01, [*range(3, 25, 3), *range(-3, -25, -3)])
+    drag = table["motor_current_A"] + 4e-5 * table["motor_speed_rpm"]  # churning
+    assert len(records.read_runs({**table, "motor_current_A": drag + 0.4}, rig)) == 16
+    with pytest.raises(BadData, match="expected readings with their signs"):
+        records.read_runs({**table, "motor_current_A": np.abs(drag)}, rig)

@@ -15,13 +15,14 @@ from calibration.data.input_errors import three_digits
 from calibration.data.robot_file import RobotFile
 from calibration.data.runs import Runs
 from mmrjax.errors import count_noun
-from mmrjax.model import params
+from mmrjax.model import channels, params
 from mmrjax.model.quantities import RPM, VOLTAGE
 from mmrjax.model.robot import Robot
 from mmrjax.model.shaft import Shaft
 from mmrjax.model.signals import GRAVITY
 
 BATTERY = "battery"
+OUTPUT_SPEED = channels.find_channel("output_speed").column
 #: Least ratio of a gearbox with three stages or more, and the largest efficiency that makers state for these.
 STAGES, EFFICIENCY = 100.0, 0.85
 #: Least duration of a change of speed, in time constants, that the motors and load do not explain; fewest samples.
@@ -354,6 +355,38 @@ def saturation_sentence(runs: Runs) -> str:
     )
 
 
+#: Ratio of speeds to the robot's file beyond which the unit of one of its columns is doubted.
+OTHER_UNIT = 3.0
+
+
+def doubtful_speed(runs: Runs, robot: Robot) -> str:
+    """Reason to doubt the unit of an imposed voltage or of the speed; empty without evidence.
+
+    The speed is far above that at which the motors' back-EMF equals the voltage. A load keeps it below, so only rows
+    without current or without a brake's torque show a speed that is far too small.
+    """
+    column = next((c for c in (SPEED, OUTPUT_SPEED) if runs.has(c)), None)
+    if robot.rig.imposed != "voltage" or not robot.knows(VOLTAGE) or column is None:
+        return ""
+    ratio = float(robot.gearbox.ratio) if column == OUTPUT_SPEED else 1.0
+    reached = np.abs(applied_drive(runs)) / float(robot.motor.torque_constant) / RPM / ratio
+    read, shown = runs[column], np.isfinite(runs[column]) & (reached > 0)
+    shown &= np.abs(np.nan_to_num(read)) > 0
+    if not shown.any():
+        return ""
+    share = float(np.median(np.abs(read[shown]) / reached[shown]))
+    braked = runs.has(LOAD) and bool((runs[LOAD] != 0).all())
+    if share < OTHER_UNIT and (braked or robot.has_ground or share > 1 / OTHER_UNIT / 100):
+        return ""
+    row = int(np.flatnonzero(shown)[0])
+    theirs, supply = (runs.headings.get(c, c) for c in (column, SUPPLY))
+    return (
+        f"{runs.source} row {row + 1}, {theirs}: got {three_digits(abs(read[row]))} rpm, where the file's torque "
+        f"constant turns the motors at up to {three_digits(reached[row])} rpm; check the units of {theirs} and "
+        f"{supply}, and motor.torque_constant"
+    )
+
+
 #: Multiple of the torque at stall beyond which a brake's torque is taken to be in another unit.
 BEYOND = 3.0
 
@@ -390,6 +423,7 @@ def log_doubts(runs: Runs, robot: Robot) -> tuple[str, ...]:
         doubtful_time(runs, robot),
         doubtful_current(runs, robot),
         doubtful_torque(runs, robot),
+        doubtful_speed(runs, robot),
     )
     return tuple(filter(None, every))
 

@@ -28,6 +28,8 @@ from mmrjax.model.rig import Instrument
 
 #: Excess of a reading beyond zero by its noise, in stated sds, and as a share of the channel's rms.
 SIGN_SDS, SIGN_SHARE = 4.0, 0.05
+#: Fewest levels of the drive that show whether readings have signs.
+LEVELS_OF_SIGN = 3
 #: Share of the largest reading of a speed below which an undriven motor counts as at rest.
 STILL = 0.02
 
@@ -235,6 +237,8 @@ def _check_signs(name: str, columns: dict[str, np.ndarray], layout: Layout) -> N
             continue  # the load may drive a motor; a bridge that reverses the voltage reverses the supply's current
         doubt = _doubt(columns, channel)
         wrong = np.flatnonzero(backward & (readings > (doubt if layout.crosses_zero else 0.0)))
+        if _rises_through_zero(imposed, readings, backward):
+            wrong = wrong[:0]
         forward = (imposed > 0) & (columns["slope_deg"] >= 0) & (not channel.zero_at_rest)
         forward &= channel.name != "motor_voltage"  # it is compared with the back-EMF
         against = np.flatnonzero(forward & (readings < -doubt))
@@ -255,6 +259,20 @@ def _check_signs(name: str, columns: dict[str, np.ndarray], layout: Layout) -> N
                 f"{name} row {at + 1}, {channel.column}: got {bound_text(readings[at])} at "
                 f"{bound_text(imposed[at])} {unit}; expected readings with their signs, negative backward{hint}"
             )
+
+
+def _rises_through_zero(imposed: np.ndarray, readings: np.ndarray, backward: np.ndarray) -> bool:
+    """True if readings of backward rows have signs and an offset: they rise with the imposed value to zero.
+
+    A lost sign would mirror the forward readings, which then fall toward zero.
+    """
+    read = backward & np.isfinite(readings)
+    if len(np.unique(imposed[read])) < LEVELS_OF_SIGN:
+        return False
+    levels = imposed[read] - imposed[read].mean()
+    slope = levels @ readings[read] / (levels @ levels)
+    scatter = np.std(readings[read] - readings[read].mean() - slope * levels)
+    return bool(slope * np.ptp(levels) > 2 * scatter)
 
 
 def _doubt(columns: dict[str, np.ndarray], channel: Channel) -> np.ndarray | float:

@@ -322,8 +322,9 @@ SINKS: dict[str, str] = {
     "rolling": "rolling resistance",
     "lift": "lifting robot and payload (comes back downhill)",
 }
-_VOLTS, _SHARE, _ANY_ANGLE = (-100.0, 100.0), (-1.0, 1.0), (-1e6, 1e6)
-_RATIO, _RADIANS_PER_SECOND, _RPMS = (1e-3, 100.0), (-1e4, 1e4), (-30_000.0, 30_000.0)
+# Limits of voltages and speeds exclude what no motor has. What a rig can reach follows from its file (`rig_facts`).
+_VOLTS, _SHARE, _ANY_ANGLE = (-10_000.0, 10_000.0), (-1.0, 1.0), (-1e6, 1e6)
+_RATIO, _RADIANS_PER_SECOND, _RPMS = (1e-3, 100.0), (-1e5, 1e5), (-1e6, 1e6)
 _SPEEDS, _PLACES, _TORQUES = (-10_000.0, 10_000.0), (-1e7, 1e7), (-1e4, 1e4)
 _BY_VOLTAGE = ("voltage",)
 _CURRENT = Channel(
@@ -335,7 +336,7 @@ _SPEED = Channel(
     zero_at_rest=True,
 )  # fmt: skip
 _VOLTAGE = Channel(
-    "motor_voltage", "V", "motor voltage", (-200.0, 200.0), 100.0, signal="voltage", zero_error=0.1, resolution=2,
+    "motor_voltage", "V", "motor voltage", _VOLTS, 100.0, signal="voltage", zero_error=0.1, resolution=2,
     rests_on=VOLTAGE,
 )  # fmt: skip
 _DERIVED = "mmrjax.derived."
