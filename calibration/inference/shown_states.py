@@ -192,7 +192,7 @@ class Course:
 
 @dataclasses.dataclass(frozen=True)
 class Windows:
-    """Windows of one run: indices of their points, and Δt w, Δt w', Δt w'' there, shape (windows, length).
+    """Windows of one run: indices of their points, and Δt w, Δt w', Δt w'' and Δt there, shape (windows, length).
 
     The last point of a shorter window is repeated with zero weights.
     """
@@ -202,6 +202,7 @@ class Windows:
     weight: np.ndarray
     slope: np.ndarray
     bend: np.ndarray
+    steps: np.ndarray
 
 
 def window_function(share: np.ndarray, length: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -440,14 +441,15 @@ def rows_and_windows(
 def _weights(run: int, time: np.ndarray, windows: list[tuple[np.ndarray, np.ndarray]]) -> Windows:
     """Weights of the windows of a run at their points."""
     longest = max((len(rows) for rows, _ in windows), default=0)
-    index, values = np.zeros((len(windows), longest), int), np.zeros((3, len(windows), longest))
+    index, values = np.zeros((len(windows), longest), int), np.zeros((4, len(windows), longest))
+    values[3] = 1.0
     for k, (rows, share) in enumerate(windows):
         index[k], n = rows[-1], len(rows)
         length = (time[rows[-1]] - time[rows[0]]) / max(share[-1] - share[0], 1e-12)
         index[k, :n] = rows
-        values[:, k, :n] = _consistent(
-            np.array(window_function(share, length)) * np.gradient(time[rows]), share, length
-        )
+        values[3, k, :n] = np.gradient(time[rows])
+        plain = np.array(window_function(share, length)) * values[3, k, :n]
+        values[:3, k, :n] = _consistent(plain, share, length)
     return Windows(run, index, *values)
 
 

@@ -40,6 +40,7 @@ from calibration.inference.shown_states import (
 from mmrjax.compile.compiling import SELDOM, compiled
 from mmrjax.effects import Effect
 from mmrjax.model import balances, channels
+from mmrjax.model.chassis import inertia_reduced
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
@@ -62,6 +63,8 @@ STEPS, SMALL, ROUNDS, FAR, SETTLED = 10, 1e-3, 12, 1.0, 0.02
 #: equally well; farthest coordinates at which the profile of a delay is computed [prior sd]; rows by which a jump may
 #: have come between two rows without a delay.
 TENTH, DELAYS, SAME, NEAR, RESOLVED = 0.1, 200, 3.0, 4.0, 1.5
+#: Sds by which the defects must exceed the noise of the readings for a disturbance.
+CHANCE = 3.0
 
 
 class Terms(eqx.Module):
@@ -161,6 +164,13 @@ def _rolling(plan: Plan, robot: Robot, row: Rows, turning: Scalar, current: Scal
     ), current
 
 
+def _inertia(robot: Robot, chassis: Any, signals: Signals) -> Scalar:
+    """Inertia at the driving wheel of all that moves with it, driven forward [kg·m²]."""
+    carried = chassis.radius**2 * signals.mass / robot.sides if robot.has_ground else 0.0
+    gear, turning = robot.gearbox, chassis.inertia + signals.inertia_added + carried
+    return inertia_reduced(robot.motor.inertia, gear.ratio, gear.efficiency_load, turning)
+
+
 def row_terms(
     plan: Plan, robot: Robot, row: Rows, shown: Array, probes: frozenset[str] = frozenset()
 ) -> tuple[Array, Array, Signals]:
@@ -189,9 +199,13 @@ def row_terms(
         # Divided by the inductance, the rate of the current would be mostly noise, and a large inductance fit best.
         f.append(signals.voltage_left)
         y.append(signals.inductance * current)
-    if plan.mechanical:  # in the instrument's unit, because a unit that depends on a parameter would shrink with it
-        f.append(states.unit * signals.acceleration_wheel * robot.gearbox.ratio)
-        y.append(shown[plan.motion] - states.errors[plan.motion] if plan.angle else states.unit * turning)
+    if plan.mechanical:
+        # A torque, not an acceleration: the derivative by an inertia is then the motion, which states without noise
+        # give. That of an acceleration is a torque, whose model error would enter its own instrument.
+        inertia = _inertia(robot, chassis, signals)
+        read = (shown[plan.motion] - states.errors[plan.motion]) / states.unit if plan.angle else turning
+        f.append(inertia * signals.acceleration_wheel)
+        y.append(inertia * read / robot.gearbox.ratio)
     if plan.others:
         if robot.has_ground:
             creep = chassis.ground.speed_creep(signals.traction, signals.normal, signals.adhesion)
@@ -399,12 +413,19 @@ def search_delay(problem: Problem, plan: Plan) -> Delay:
             np.asarray(_by_coordinates(problem, plan, _with_imposed(rows, x), jnp.asarray(z))) for x in moves
         )
         change = {n: (other - fixed) / np.ptp(x) for (n, x), other in zip(prompt.items(), others, strict=True)}
+        # In units of what is imposed, whose factor then is 1: other residuals would shrink with a larger inertia.
+        first = max(change, key=lambda n: float(np.abs(change[n][0, ..., 0]).mean() * np.ptp(prompt[n])))
+        factor = change[first][0].mean(0)  # (equations, 1 + z)
+        acts = np.flatnonzero(np.abs(factor[:, 0]) > 0)
+        unit, growth = factor[acts, None, :1], factor[acts, None, 1:] / factor[acts, None, :1]
         costs, ends = [], []
         for delay in delays:
             means = course.at(float(delay))[0]
             moved = {n: (means[n] - prompt[n])[:, None, None] for n in change}
             f, y = (fixed[k] + sum(moved[n] * change[n][k] for n in change) for k in range(2))
-            whole = np.concatenate([_integrated(plan, w, f, y) for w in cut], 1)  # (equations, windows, 1 + z)
+            whole = np.concatenate([_integrated(plan, w, f, y) for w in cut], 1)[acts]  # (equations, windows, 1 + z)
+            whole[..., 1:] -= whole[..., :1] * growth
+            whole /= unit
             size = np.sqrt(np.mean(whole[..., 0] ** 2, 1))
             for _ in range(3):  # the noise of each equation is what the regression leaves
                 scaled = whole / np.maximum(size, 1e-300)[:, None, None]
@@ -469,6 +490,8 @@ def weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> WeakF
     if equations * sum(len(w.rows) for w in cut) < ENOUGH * len(problem.coordinates):
         return None
 
+    sd = np.asarray(rows.sd)
+
     def terms(rows: Rows, z: np.ndarray, effects: tuple[ScoredEffect, ...] = ()) -> Terms:
         return jax.device_get(_terms(problem, plan, rows, jnp.asarray(z), effects))
 
@@ -480,8 +503,16 @@ def weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> WeakF
         """Residuals and their derivatives, with the covariance and the states without noise at z."""
         smooth = simulated_rows(problem, plan, rows, jnp.asarray(z))
         known = terms(smooth, z)
-        factors = [_factor(plan, w, np.asarray(rows.sd), known) for w in cut]
-        offset = whole(factors, terms(rows, z))[:, 0] - whole(factors, known)[:, 0]
+        read, none = terms(rows, z), np.zeros(equations)
+        plain = [_factor(plan, w, sd, known, none) for w in cut]
+        each = [
+            (integrals(plan, w, read)[:, 0], np.sum(x**2, 1), np.tile(np.sum(w.weight**2 / w.steps, 1), equations))
+            for w, x in zip(cut, plain, strict=True)
+        ]
+        by_equation = (np.concatenate([x.reshape(equations, -1).T for x in part]) for part in zip(*each, strict=True))
+        unknown = disturbances(*by_equation)
+        factors = [_factor(plan, w, sd, known, unknown) for w in cut]
+        offset = whole(factors, read)[:, 0] - whole(factors, known)[:, 0]
 
         last: list[tuple[np.ndarray, np.ndarray]] = []
 
@@ -534,14 +565,31 @@ def _slopes(plan: Plan, w: Windows, equations: int) -> list[np.ndarray]:
     return [-w.bend if plan.angle and k == plan.electrical else w.slope for k in range(equations)]
 
 
-def _factor(plan: Plan, w: Windows, sd: np.ndarray, terms: Terms) -> np.ndarray:
-    """Factor of the covariance of a run's windows."""
+def _factor(plan: Plan, w: Windows, sd: np.ndarray, terms: Terms, unknown: np.ndarray) -> np.ndarray:
+    """Factor of the covariance of a run's windows; `unknown`: torque and voltage without a model (`disturbances`)."""
     equations = terms.f.shape[1]
-    noise = np.zeros((equations, len(w.rows), *sd.shape))
+    noise = np.zeros((equations, len(w.rows), len(sd), sd.shape[1] + equations))
     by, also = terms.by_reading
+    at = np.arange(len(w.rows))[:, None], w.rows
     for k, slope in enumerate(_slopes(plan, w, equations)):
         changed = w.weight[..., None] * by[w.rows, k] + slope[..., None] * also[w.rows, k]
-        np.add.at(noise[k], (np.arange(len(w.rows))[:, None], w.rows), changed * sd[w.rows])
+        np.add.at(noise[k, ..., : sd.shape[1]], at, changed * sd[w.rows])
+        np.add.at(noise[k, ..., sd.shape[1] + k], at, unknown[k] * w.weight / np.sqrt(w.steps))
     flat = noise.reshape(equations * len(w.rows), -1)
     covariance = flat @ flat.T
     return np.linalg.cholesky(covariance + np.diag(FLOOR * np.maximum(np.diag(covariance), 1e-300)))
+
+
+def disturbances(defect: np.ndarray, noise: np.ndarray, unit: np.ndarray) -> np.ndarray:
+    """Intensities of white noise in the terms of each equation, in addition to that of the readings.
+
+    A model error is not white, but windows that the readings of a precise instrument weight would see only
+    its fastest part, and parameters would follow that. 0 if the readings' noise explains the defects.
+
+    Args:
+        defect: of each window, shape (windows, equations); noise: its variance by the readings; unit: by white noise
+            of intensity 1.
+    """
+    more = np.mean(defect**2 - noise, 0)
+    chance = CHANCE * np.sqrt(2 * np.sum(noise**2, 0) / APART) / len(defect)
+    return np.where(more > chance, np.sqrt(np.maximum(more, 0.0) / np.mean(unit, 0)), 0.0)
