@@ -31,13 +31,11 @@ def error_cell(percent: float) -> Cell:
     return Cell(percent, "" if not np.isfinite(size) else "good" if size <= 5 else "fair" if size <= 10 else "bad")
 
 
-def noise_sentence(noise: Mapping[str, Any], shown: Iterable[Channel]) -> str:
-    """Standard deviation of each channel with its source."""
-    shares = {name: n.median_percent for name, n in noise.items()}
+def noise_sentence(noise: Mapping[str, tuple[float | None, str]], shown: Iterable[Channel]) -> str:
+    """Standard deviation of each channel, as its median share of the reading [%], with its source."""
+    of_channels = ((c.label, *noise[c.name]) for c in shown if c.name in noise)
     parts = (
-        f"{c.label} {f'{shares[c.name]:.2f} % ' * (shares[c.name] is not None)}({noise[c.name].source})"
-        for c in shown
-        if c.name in noise
+        f"{label} {'' if share is None else f'{share:.2f} % '}({source})" for label, share, source in of_channels
     )
     return f"Noise (sd): {'; '.join(parts)}."
 
