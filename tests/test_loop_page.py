@@ -321,11 +321,11 @@ def test_a_page_of_nothing_missing_says_what_would_have_been_seen(shown, capsys,
     text = written(tmp_path, none)
     assert "What was looked for" in text and "laws" not in drawn(text) and '<ul id="found">' not in text
     listed = loop_report.would_be_seen(none)
-    assert [one["times"] for one in listed] == sorted(one["times"] for one in listed)
-    strong = next(s for s in none.scores if s.name == listed[0]["name"])
+    assert [one[-1] for one in listed] == sorted(one[-1] for one in listed)
+    strong = next(s for s in none.scores if s.name == listed[0][0].strip("`"))
     level = none.before.kinds["single"].threshold
-    assert listed[0]["times"] * strong.sigmas_per_prior_sd == pytest.approx(level)
-    assert Tables(text).tables["would_be_seen"][1][0] == listed[0]["name"]
+    assert listed[0][-1] * strong.sigmas_per_prior_sd == pytest.approx(level)
+    assert Tables(text).tables["would_be_seen"][1][0] == listed[0][0].strip("`")
 
 
 def test_squares_of_readings_and_of_priors_are_apart(shown, capsys):

@@ -53,14 +53,6 @@ def loop_document(found: DiscoveryResult, robot_name: str, changes: Mapping[str,
     """
     missing = found.verdict not in ("none", "undescribed")
     rise = loop_words.rising_errors_sentence(found.held_out_worse, found.predicted)
-    shaft = [catalogue.note("loop.of-a-shaft")] * (not found.robot.has_ground and bool(found.effects))
-    said = [loop_words.support_sentence(found), loop_words.ruled_out(found)]
-    said += [loop_words.hidden_effects_sentence(found)] if found.hidden else []
-    said += [loop_words.proposed_formula(found.unnamed)] if found.unnamed is not None else []
-    said += [] if found.resolved is None else [found.resolved.statement, *found.resolved.notes]
-    noise = loop_words.at_other_noise(found.sensitivity) if found.sensitivity else ""
-    noises = {name: (n["median_percent"], n["source"]) for name, n in found.noise.items()}
-    notes = [*found.notes, noise, fit_tables.noise_sentence(noises, found.channels)]
     return Document(
         f"Is the {words.words_shown(Path(robot_name).name)} model complete?",
         loop_answer(found),
@@ -71,28 +63,7 @@ def loop_document(found: DiscoveryResult, robot_name: str, changes: Mapping[str,
             _advice(found),
             *run_tables.curve_warning(found.robot),
         ),
-        (
-            Section(
-                "How sure that is",
-                (
-                    Note(f"{found.verdict}: {found.statement}", name="statement", terminal=True),
-                    *([Note(loop_words.cluster_sentence(found.cluster), name="cluster")] if found.cluster else []),
-                    *(
-                        Note(text, name=name, terminal=True)
-                        for name, text in zip(("standing", "ruled_out"), said, strict=False)
-                        if text
-                    ),
-                    *remarks(filter(None, said[2:]), "also"),
-                    *shaft,
-                    *_effects(found),
-                    _certainty(found, missing),
-                ),
-            ),
-            Section("What to know before using it", remarks(filter(None, notes))),
-            *([] if found.resolved is None else [_resolved(found)]),
-            *_rms(found),
-        ),
-        lambda: _sections(found, changes, missing),
+        tuple(_sections(found, changes, missing)),
     )
 
 
@@ -267,13 +238,6 @@ def _certainty(found: DiscoveryResult, missing: bool) -> Table:
     return catalogue.table("loop.certainty", rows)
 
 
-def _rms(found: DiscoveryResult) -> list[Section]:
-    if not Layout.of(found.robot).crosses_zero:
-        return []
-    fits = {when: by for when, by in found.rms.items() if not (found.refit_alone and "after" in when)}
-    return [Section("Errors in units", (fit_tables.rms_table(fits, found.channels),))]
-
-
 def _resolved(found: DiscoveryResult) -> Section:
     assert found.resolved is not None
     d = found.resolved.to_json()
@@ -289,6 +253,30 @@ def _resolved(found: DiscoveryResult) -> Section:
     return Section("What the track model says", (table, catalogue.note("loop.resolved-errors", rms, trade)))
 
 
+def _certain(found: DiscoveryResult, missing: bool) -> Iterable[Section]:
+    """How sure the answer is, and what to know before it is used."""
+    reasons = {"standing": loop_words.support_sentence(found), "ruled_out": loop_words.ruled_out(found)}
+    also = [loop_words.hidden_effects_sentence(found)] if found.hidden else []
+    also += [loop_words.proposed_formula(found.unnamed)] if found.unnamed is not None else []
+    also += [] if found.resolved is None else [found.resolved.statement, *found.resolved.notes]
+    noise = loop_words.at_other_noise(found.sensitivity) if found.sensitivity else ""
+    noises = {name: (n["median_percent"], n["source"]) for name, n in found.noise.items()}
+    notes = [*found.notes, noise, fit_tables.noise_sentence(noises, found.channels)]
+    blocks = [
+        Note(f"{found.verdict}: {found.statement}", name="statement", terminal=True),
+        *([Note(loop_words.cluster_sentence(found.cluster), name="cluster")] if found.cluster else []),
+        *(Note(text, name=name, terminal=True) for name, text in reasons.items() if text),
+        *remarks(also, "also"),
+        *([catalogue.note("loop.of-a-shaft")] if not found.robot.has_ground and found.effects else []),
+        *_effects(found),
+        _certainty(found, missing),
+    ]
+    yield Section("How sure that is", tuple(blocks))
+    yield Section("What to know before using it", remarks(filter(None, notes)))
+    if found.resolved is not None:
+        yield _resolved(found)
+
+
 def _sections(found: DiscoveryResult, changes: Mapping[str, Change], missing: bool) -> Iterable[Section]:
     table, looked_for = rows_of(found), Section("What was looked for", tuple(_looked_for(found)))
     yield Section("Measured and simulated, run by run", tuple(_run_by_run(found, table)))
@@ -297,7 +285,11 @@ def _sections(found: DiscoveryResult, changes: Mapping[str, Change], missing: bo
     yield Section(where, tuple(_where_missing(found, table, changes)))
     yield from fit_tables.clusters_section(found.residual_clusters)
     errors = catalogue.figure("loop.errors-figure", found, words=(OF_SIZE,))
-    yield Section("Errors on runs that the fit has seen, and has not", (errors, held_out_table(found)))
+    fits = {when: by for when, by in found.rms.items() if not (found.refit_alone and "after" in when)}
+    sized = Layout.of(found.robot).crosses_zero
+    in_units = [fit_tables.rms_table(fits, found.channels)] if sized else []
+    yield Section("Errors on runs that the fit has seen, and has not", (errors, held_out_table(found), *in_units))
+    yield from _certain(found, missing)
     yield Section("Candidates", tuple(_candidates(found)))
     hidden = catalogue.figure("loop.null", found.before), catalogue.figure("loop.look_alikes", found)
     yield Section("", hidden, folded="how thresholds were found, and which effects look alike")
