@@ -33,7 +33,7 @@ from sweeps import config as configuration
 from sweeps.console import print_message, print_output, step_reporter
 from sweeps.inputs import load_robot, read_runs
 from sweeps.report import loop_report
-from sweeps.report.loop_report import Change
+from sweeps.report.fit_tables import Change
 from sweeps.skeleton import finish_run_folder, print_report
 from sweeps.store import SOLVER_FAILED, RunFolder, open_folder
 

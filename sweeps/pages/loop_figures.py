@@ -29,7 +29,7 @@ from sweeps.pages.figure_style import (
 )
 from sweeps.pages.words import short_name
 from sweeps.report.condition_columns import UNITS, imposed_column
-from sweeps.report.loop_report import Change
+from sweeps.report.fit_tables import Change
 
 #: Effects on the ladder and on the map of look-alikes.
 RUNGS, ALIKE = 20, 14

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,6 +18,20 @@ FITS = {
     "before": "before", "after": "after", "held_out": "held out", "held_out_before": "before, held out",
     "held_out_after": "after, held out",
 }  # fmt: skip
+
+
+class Change(NamedTuple):
+    """Change of the readings of the runs by an effect of the robot that is written.
+
+    Attributes:
+        channel: with the largest change; rms: of the change [% of the channel's measured rms].
+        without, with_it: simulated without and with the effect, otherwise the same [SI], shape (rows,).
+    """
+
+    channel: Channel
+    rms: float
+    without: np.ndarray
+    with_it: np.ndarray
 
 
 def shift_cell(shift: float) -> Cell:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -20,29 +20,15 @@ from calibration.words import loop_words
 from mmrjax.effects import BY_NAME
 from mmrjax.errors import count_noun
 from mmrjax.model import params
-from mmrjax.model.channels import Channel
 from sweeps.pages import words
 from sweeps.report import catalogue, fit_tables, run_tables
 from sweeps.report.document import Block, Cell, Document, Note, Section, Table, remarks
+from sweeps.report.fit_tables import Change
 
 #: Change of an rms error that is marked [%].
 NOTABLE = 0.05
 #: Verdicts that leave something open.
 OPEN = ("class", "undescribed", *WITHOUT_NAME)
-
-
-class Change(NamedTuple):
-    """Change of the readings of the runs by an effect of the robot that is written.
-
-    Attributes:
-        channel: with the largest change; rms: of the change [% of the channel's measured rms].
-        without, with_it: simulated without and with the effect, otherwise the same [SI], shape (rows,).
-    """
-
-    channel: Channel
-    rms: float
-    without: np.ndarray
-    with_it: np.ndarray
 
 
 def loop_document(found: DiscoveryResult, robot_name: str, changes: Mapping[str, Change]) -> Document:
