@@ -607,12 +607,3 @@ SET: tuple[Condition, ...] = tuple(q for q in TABLE["condition"] if isinstance(q
 CONDITIONS: dict[str, Condition] = {c.field: c for c in SET if c.field}
 #: All of `SET`, by column.
 BY_COLUMN: dict[str, Condition] = {c.column: c for c in SET}
-
-
-def condition_named(name: str) -> Condition:
-    """Returns the condition of a name without its unit: `slope`, `supply_voltage`.
-
-    Raises:
-        KeyError: no such quantity.
-    """
-    return {c.name: c for c in SET}[name]
