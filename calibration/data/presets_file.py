@@ -11,9 +11,12 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from calibration.data import input_files
 from calibration.data.columns import Layout
 from calibration.data.input_errors import BadConfiguration, BadData, allowed_words, parse_number, stated_number
+from calibration.data.named_arrays import Raw, column_numbers
 from mmrjax.model import channels
 
 #: Presets that come with the package, in `calibration/data/presets/`.
@@ -23,7 +26,9 @@ PACKAGED = (
 #: Columns of a packaged preset that a source has at least for it to be recognised.
 OF_A_PRESET = 3
 #: Keys of a preset, and of one of its columns.
-KEYS, KEYS_OF_COLUMN = ("columns", "ask", "header"), ("column", "factor", "per", "times", "note", "needs")
+KEYS, KEYS_OF_COLUMN = ("columns", "ask", "header"), ("column", "factor", "per", "times", "note", "needs", "across")
+#: Ratio of the rms currents along d and q above which the field is weakened [-].
+WEAKENED = 0.3
 #: Keys of a number that a preset asks for.
 KEYS_OF_NUMBER = ("about", "usual")
 #: Between the name of a preset and the numbers that it asks for, `vesc,pole_pairs=7`.
@@ -39,6 +44,7 @@ class PresetColumn:
             file has is read.
         factor: from its unit to the unit of `mine`; note: its meaning, for a note.
         needs: column of this program without which it is not what drives the motor; empty: none.
+        across: column of the file with the current along d, zero where the field is not weakened; empty: none.
     """
 
     mine: str
@@ -46,6 +52,7 @@ class PresetColumn:
     factor: float = 1.0
     note: str = ""
     needs: str = ""
+    across: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,6 +89,24 @@ class Preset:
             elif self.name not in PACKAGED:  # a packaged preset has columns of several loggers
                 mapped.append((column.mine, column.theirs[0], column.factor))
         return tuple(mapped), tuple(notes)
+
+    def notes_on_weakened_field(self, values: Mapping[str, Raw]) -> tuple[str, ...]:
+        """Returns a note on each current whose part along d is large, so that no DC motor is equivalent.
+
+        Args:
+            values: cells of the file's columns, by name.
+        """
+        notes = []
+        for column in self.columns:
+            theirs = next((name for name in column.theirs if name in values), None)
+            if theirs is not None and column.across in values:
+                q, d = (np.sqrt(np.nanmean(column_numbers(values[c]) ** 2)) for c in (theirs, column.across))
+                if d > WEAKENED * q:
+                    notes.append(
+                        f"{self.name}: {column.across} is {d / q:.0%} of {theirs}, so the field is weakened, "
+                        "which no DC motor does; leave those rows out"
+                    )
+        return tuple(notes)
 
     def check_needed(self, mapped: Iterable[tuple[str, str, float]], imposed: str, name: str) -> None:
         """Refuses a source whose imposed column means nothing without another one that the source lacks.
@@ -262,7 +287,10 @@ def _column(mine: str, theirs: Any, where: str, numbers: Mapping[str, float]) ->
     needs = table.get("needs", "")
     if not isinstance(needs, str):
         raise BadConfiguration(f"{where}.needs: got {needs!r}; expected the name of a column")
-    return PresetColumn(mine, tuple(_filled(name, where, numbers) for name in names), factor, note, needs)
+    across = table.get("across", "")
+    if not isinstance(across, str):
+        raise BadConfiguration(f"{where}.across: got {across!r}; expected the name of a column")
+    return PresetColumn(mine, tuple(_filled(name, where, numbers) for name in names), factor, note, needs, across)
 
 
 def _filled(name: str, where: str, numbers: Mapping[str, float]) -> str:

@@ -147,6 +147,7 @@ def _of_table(arrays: NamedArrays, layout: Layout, columns: Preset | None) -> Re
     if arrays.header and not any(theirs in by_name for _, theirs, _ in mapped):
         raise _none_of(arrays.name, columns, arrays.header)
     columns.check_needed(mapped, layout.imposed_column, arrays.name)
+    notes = (*notes, *columns.notes_on_weakened_field(by_name))
     return Reading(
         dataclasses.replace(arrays, notes=(*arrays.notes, *notes)), presets_file.merge_columns(mapped, layout.mapped)
     )
@@ -193,6 +194,8 @@ def _of_signals(source: Source, layout: Layout, columns: Preset | None, between:
     else:
         values, more = _in_rows(source, chosen), ()
         values |= _in_rows(source, extras, len(next(iter(values.values()), [])))
+    if columns is not None:
+        notes = (*notes, *columns.notes_on_weakened_field(values))
     units = tuple(
         quantities.unit_in_column(next((s.unit for c, s in chosen.items() if c == name), "")) for name in values
     )
