@@ -11,12 +11,9 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from calibration.data import input_files
 from calibration.data.columns import Layout
 from calibration.data.input_errors import BadConfiguration, BadData, allowed_words, parse_number, stated_number
-from calibration.data.named_arrays import Raw, column_numbers
 from mmrjax.model import channels
 
 #: Presets that come with the package, in `calibration/data/presets/`.
@@ -27,8 +24,6 @@ PACKAGED = (
 OF_A_PRESET = 3
 #: Keys of a preset, and of one of its columns.
 KEYS, KEYS_OF_COLUMN = ("columns", "ask", "header"), ("column", "factor", "per", "times", "note", "needs", "across")
-#: Ratio of the rms currents along d and q above which the field is weakened [-].
-WEAKENED = 0.3
 #: Keys of a number that a preset asks for.
 KEYS_OF_NUMBER = ("about", "usual")
 #: Between the name of a preset and the numbers that it asks for, `vesc,pole_pairs=7`.
@@ -89,24 +84,6 @@ class Preset:
             elif self.name not in PACKAGED:  # a packaged preset has columns of several loggers
                 mapped.append((column.mine, column.theirs[0], column.factor))
         return tuple(mapped), tuple(notes)
-
-    def notes_on_weakened_field(self, values: Mapping[str, Raw]) -> tuple[str, ...]:
-        """Returns a note on each current whose part along d is large, so that no DC motor is equivalent.
-
-        Args:
-            values: cells of the file's columns, by name.
-        """
-        notes = []
-        for column in self.columns:
-            theirs = next((name for name in column.theirs if name in values), None)
-            if theirs is not None and column.across in values:
-                q, d = (np.sqrt(np.nanmean(column_numbers(values[c]) ** 2)) for c in (theirs, column.across))
-                if d > WEAKENED * q:
-                    notes.append(
-                        f"{self.name}: {column.across} is {d / q:.0%} of {theirs}, so the field is weakened, "
-                        "which no DC motor does; leave those rows out"
-                    )
-        return tuple(notes)
 
     def check_needed(self, mapped: Iterable[tuple[str, str, float]], imposed: str, name: str) -> None:
         """Refuses a source whose imposed column means nothing without another one that the source lacks.

@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from numpy.polynomial import legendre
-from scipy import stats
 
 from calibration.data.columns import CURRENT, LOAD, SPEED, Layout
 from calibration.inference.linearization import Linearization
@@ -381,7 +380,9 @@ def order_collinearity(
     level = cell.ravel() if few else which.ravel()
     spans = [scale_to_unit_range(np.asarray(columns[c], float), weight)[counts] for c in smooth]
     each = [legendre.legvander(span, DEGREE)[:, 1:] for span in spans]
-    each += [stats.rankdata(span)[:, None] / len(x) for span in spans]  # a sorted table's order is the rank
+    for span in spans:  # a sorted table's order is the rank
+        rank = np.searchsorted(np.sort(span), span, "left") + np.searchsorted(np.sort(span), span, "right")
+        each.append(rank[:, None] / (2 * len(x)))
     terms = np.concatenate([np.zeros((len(x), 1)), *each], 1)
     # Without the means of each level: a matrix with a column for each level would be rows times rows.
     count = np.bincount(level)
@@ -389,8 +390,8 @@ def order_collinearity(
     ways, size, _ = np.linalg.svd(inner, full_matrices=False)
     ways = ways[:, size > len(x) * np.finfo(float).eps * np.linalg.norm(terms)]
     left = left - ways @ (ways.T @ left)
-    rank = len(count) + ways.shape[1]
-    freedom = (len(x) - 1) / max(len(x) - rank, 1)
+    terms_used = len(count) + ways.shape[1]
+    freedom = (len(x) - 1) / max(len(x) - terms_used, 1)
     return float(1 - freedom * np.sum(left**2) / np.sum((x - x.mean()) ** 2))
 
 
