@@ -147,7 +147,7 @@ def commands() -> str:
     parts = [
         "# Commands",
         "Each command writes a run folder and prints its path on the last line. `mmrjax COMMAND --help` prints the "
-        "common options, `--help-all` every option. Options marked `*` appear in `--help-all` only.",
+        "common options. Options marked `*` appear with `--help-all` only, which commands with such options have.",
         MADE,
     ]
     for name, command in _commands():
@@ -240,7 +240,8 @@ def _range(quantity: Any) -> str:
 
 
 def parameters() -> str:
-    """Page of the parameters of the paper's robot: value, prior, bounds, source."""
+    """Page of the parameters of the paper's robot (value, prior, bounds, source), and of the keys that no fit frees."""
+    from calibration.data import robot_file
     from mmrjax.model import paper_robots, params
 
     entries = []
@@ -254,7 +255,19 @@ def parameters() -> str:
         "Parameters of the packaged robot: nominal value ± standard deviation of the prior, SI unit, meaning, bounds "
         "of a fit, source. `mmrjax explain NAME` prints the equation too. `--set NAME=VALUE` changes one."
     )
-    return "\n\n".join(["# Parameters", opening, MADE, "\n".join(entries)])
+    fixed = {name: (f"{low:g} to {high:g}", what) for name, (low, high, what) in robot_file.COUNTS.items()}
+    fixed |= {
+        name: (f"{low:g} to {high:g} {unit}", what) for name, (low, high, unit, what) in robot_file.RATINGS.items()
+    }
+    fixed |= {name: ("true or false", what) for name, what in robot_file.SWITCHES.items()}
+    fixed |= {name: (" or ".join(allowed), what) for name, (allowed, what) in robot_file.CHOICES.items()}
+    keys = ["| key | allowed | meaning |", "|---|---|---|"]
+    keys += [f"| `{name}` | {allowed} | {what.strip('()')} |" for name, (allowed, what) in fixed.items()]
+    others = (
+        "## Keys that no fit frees",
+        "Counts, ratings by makers, switches and choices. Robot files and `--set` take them.",
+    )
+    return "\n\n".join(["# Parameters", opening, MADE, "\n".join(entries), *others, "\n".join(keys)]) + "\n"
 
 
 def modules() -> str:

@@ -55,6 +55,8 @@ __all__ = sorted((*_HOME, *_ABOVE, "__version__"))
 #: Value for XLA_FLAGS, to be set before JAX is imported. It turns off LLVM's fast instruction selection, which acts
 #: at optimization level 0 and compiles some derivatives wrongly (NaN or zero; jaxlib 0.10.2).
 SOUND_AT_LEVEL_0 = "--xla_backend_extra_options=-fast-isel=false"
+#: Beginning of the names of threads that compute, which a process must not end around.
+WORKER = "mmrjax-worker"
 
 
 def __getattr__(name: str) -> Any:

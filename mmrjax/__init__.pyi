@@ -31,3 +31,4 @@ if TYPE_CHECKING:
 
 __version__: str
 SOUND_AT_LEVEL_0: str
+WORKER: str

@@ -11,6 +11,18 @@ from collections.abc import Iterable
 WORD, SHOWN, PATH, LONGEST = 80, 40, 240, 400
 
 
+#: Characters that Python does not call printable and a text may contain: line feed, tab, and spaces of typesetting.
+_LAYOUT = "\n\t\u00a0\u2009\u202f"
+
+
+def printable(text: str) -> str:
+    """Returns a text with `�` in place of characters that a terminal or page obeys or cannot show.
+
+    These are escape sequences, other controls, overrides of the writing direction, and halves of surrogate pairs.
+    """
+    return text if text.isprintable() else "".join(c if c.isprintable() or c in _LAYOUT else "�" for c in text)
+
+
 def shorten(message: str, longest: int = LONGEST) -> str:
     """Returns a message with very long words cut and the middle of a very long text left out."""
 
@@ -28,8 +40,8 @@ class UsageError(ValueError):
     """Wrong use of the public API; one sentence: where, what came, what is allowed."""
 
     def __init__(self, message: str) -> None:
-        """Stores the message, `shorten`."""
-        super().__init__(shorten(message))
+        """Stores the message, `shorten` and `printable`."""
+        super().__init__(shorten(printable(message)))
 
 
 def count_noun(count: int, noun: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import inspect
 import os
@@ -16,8 +17,8 @@ from typing import Annotated, Any, NamedTuple
 import typer
 
 from calibration.data.input_errors import BadConfiguration, InputError
-from mmrjax import SOUND_AT_LEVEL_0, __version__, fidelities
-from mmrjax.errors import shorten
+from mmrjax import SOUND_AT_LEVEL_0, WORKER, __version__, fidelities
+from mmrjax.errors import printable, shorten
 from sweeps import config, config_campaign
 from sweeps import options as made
 from sweeps.flags import options_of_fields as flags_of
@@ -722,7 +723,10 @@ def _check_arguments(arguments: Sequence[str]) -> None:
 
 def main() -> None:
     """Run the command line; every failure is one sentence on stderr and a documented exit code."""
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ended or interrupted: both can be taken up again
+    for number in (signal.SIGTERM, signal.SIGALRM):  # ended or interrupted: both can be taken up again
+        signal.signal(number, signal.default_int_handler)
+    unraised, sys.unraisablehook = sys.unraisablehook, _obey_interrupt
+    _replace_closed_streams()
     try:
         _check_arguments(sys.argv[1:])
         code = app(standalone_mode=False)
@@ -730,15 +734,42 @@ def main() -> None:
             raise KeyboardInterrupt
     except BaseException as error:
         code = _answered(error)
-    kept = sys.modules.get("calibration.discovery.kept")  # whose threads nobody waits for
-    beside = kept is not None and any(t.name.startswith(kept.BESIDE) for t in threading.enumerate())
+    signal.setitimer(signal.ITIMER_REAL, 0)
+    sys.unraisablehook = unraised
+    code = code if isinstance(code, int) else 0
+    lost = []
+    for stream in (sys.stderr, sys.stdout):
+        try:
+            stream.flush()
+        except OSError as error:  # Python would try again as it ends
+            lost.append(stream)
+            if code == 0 and stream is sys.stdout:
+                code = 1 if isinstance(error, BrokenPipeError) else _fail(f"{stream.name}: {error.strerror}", 2)
+    working = any(t.name.startswith(WORKER) for t in threading.enumerate())  # for whom nobody waits
     spent = code == 3 and "loop" in sys.argv[1:2]  # perhaps out of time, which interrupts a step too
     # XLA may still be at work, and has crashed when Python was taken down around it
-    if code == INTERRUPTED or spent or (beside and isinstance(code, int)):
-        sys.stdout.flush()
-        sys.stderr.flush()
+    if code == INTERRUPTED or spent or working or lost:
         os._exit(code)
-    sys.exit(code if isinstance(code, int) else 0)
+    sys.exit(code)
+
+
+def _obey_interrupt(ignored: Any) -> None:
+    """Interrupts again, soon: an interrupt is lost in a callback, of collected garbage for instance."""
+    if issubclass(ignored.exc_type, KeyboardInterrupt):
+        signal.setitimer(signal.ITIMER_REAL, 0.01)
+    else:
+        sys.__unraisablehook__(ignored)
+
+
+def _replace_closed_streams() -> None:
+    """Opens closed standard streams, so that no file gets their numbers and with them what libraries print."""
+    for number in range(3):
+        with contextlib.suppress(OSError):
+            os.fstat(number)
+            continue
+        os.open(os.devnull, os.O_RDWR)  # the lowest free number
+    sys.stdout = sys.stdout or open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
+    sys.stderr = sys.stderr or open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
 
 
 def _answered(error: BaseException) -> int:
@@ -759,7 +790,7 @@ def _answered(error: BaseException) -> int:
     if isinstance(error, OSError):
         from sweeps.console import OUTPUT
 
-        place = str(error.filename or "a file")
+        place = str(error.filename or OUTPUT)  # run folders and tables name theirs
         left = "" if place == OUTPUT else "; no run folder was left; what was kept is in its .partial"
         return _fail(f"{place}: {error.strerror}{left}", 2)
     if isinstance(error, SystemExit) and isinstance(error.__context__, BrokenPipeError):
@@ -770,7 +801,8 @@ def _answered(error: BaseException) -> int:
         return _fail(_no_number(error) or error.format_message(), error.exit_code)
     import traceback
 
-    traceback.print_exception(error)
+    with contextlib.suppress(OSError):
+        print(printable("".join(traceback.format_exception(error))), end="", file=sys.stderr)
     return _fail(f"internal error: {error}", 1)
 
 
@@ -794,5 +826,6 @@ def _no_number(error: Any) -> str:
 
 
 def _fail(message: str, code: int) -> int:
-    print(f"mmrjax: {shorten(' '.join(message.splitlines()))}", file=sys.stderr)
+    with contextlib.suppress(OSError):  # of a standard error that takes no more
+        print(f"mmrjax: {shorten(printable(' '.join(message.splitlines())))}", file=sys.stderr)
     return code

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections.abc import Iterable
@@ -933,6 +932,8 @@ def parse_axis(option: str, text: str | None) -> tuple[float, ...] | None:
 
 def as_toml(config: Part) -> str:
     """The resolved configuration; `--config` accepts it."""
+    from calibration.data.writing import toml_value  # with NumPy, which --help does not wait for
+
     lines = []
     values = config.model_dump()
     values["set"] = values.pop("set")  # tables come last
@@ -942,19 +943,7 @@ def as_toml(config: Part) -> str:
     for key, value in values.items():
         if value is None or key in tables:  # None is left to the fidelity or the robot
             continue
-        lines.append(f"{key} = {_toml(value)}")
+        lines.append(f"{key} = {toml_value(value)}")
     for key, table in tables.items():
-        lines += ["", f"[{key}]", *(f'"{name}" = {_toml(value)}' for name, value in table.items())]
+        lines += ["", f"[{key}]", *(f"{toml_value(name)} = {toml_value(value)}" for name, value in table.items())]
     return "\n".join(lines) + "\n"
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False)
-    if isinstance(value, tuple | list):
-        return "[" + ", ".join(_toml(v) for v in value) + "]"
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{json.dumps(name)} = {_toml(v)}" for name, v in value.items()) + "}"
-    return repr(value)

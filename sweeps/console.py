@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import sys
 import textwrap
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any
+from typing import IO, Any, cast
 
 from rich.console import Console
 from rich.progress import (
@@ -21,9 +23,11 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.segment import Segment
 from rich.text import Text
 
-from calibration.data.writing import naming_file
+from calibration.data.writing import json_text, naming_file
+from mmrjax.errors import printable
 
 #: Widest line of text on a terminal.
 COLUMNS = 80
@@ -31,9 +35,42 @@ COLUMNS = 80
 SILENCE, FIRST = 2.0, 1.0
 #: What results are printed to, as an error calls it.
 OUTPUT = "standard output"
-_WIDTH = None if sys.stdout.isatty() else 120  # a file has no width of its own
-_out = Console(highlight=False, soft_wrap=True, markup=False, width=_WIDTH)
-_err = Console(stderr=True, highlight=False, soft_wrap=True, markup=False)
+
+
+class _Outlet(Console):
+    """A console that replaces what a terminal would obey: names, units and cells come from files of others."""
+
+    def render(self, renderable: Any, options: Any = None) -> Iterator[Segment]:
+        """Segments of text, each `printable`."""
+        for segment in super().render(renderable, options):
+            yield segment if segment.control else segment._replace(text=printable(segment.text))
+
+
+_WIDTH = None if sys.stdout is not None and sys.stdout.isatty() else 120  # a file has no width of its own
+_out = _Outlet(highlight=False, soft_wrap=True, markup=False, width=_WIDTH)
+
+
+class _Messages(io.TextIOBase):
+    """Standard error; messages that it does not take, for instance because its disk is full, are lost."""
+
+    def write(self, text: str) -> int:
+        with contextlib.suppress(OSError):
+            sys.stderr.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with contextlib.suppress(OSError):
+            sys.stderr.flush()
+
+    def isatty(self) -> bool:
+        return sys.stderr.isatty()
+
+    def fileno(self) -> int:
+        return sys.stderr.fileno()
+
+
+MESSAGES = _Messages()
+_err = _Outlet(file=cast(IO[str], MESSAGES), highlight=False, soft_wrap=True, markup=False)
 
 
 def print_output(what: Any) -> None:
@@ -42,17 +79,23 @@ def print_output(what: Any) -> None:
         _out.print(wrap_for_terminal(what) if isinstance(what, str) and sys.stdout.isatty() else what)
 
 
+def print_json(content: Mapping[str, Any]) -> None:
+    """Print JSON to stdout."""
+    with naming_file(OUTPUT):
+        print(json_text(content))
+
+
 def print_message(text: str) -> None:
     """Print a line to stderr, in place of a progress line."""
     rewrite_line("")
-    _err.print(wrap_for_terminal(text) if sys.stderr.isatty() else text)
+    _err.print(wrap_for_terminal(text) if MESSAGES.isatty() else text)
 
 
 def rewrite_line(text: str) -> None:
     """Write the last line of a terminal anew; a file, which keeps every line, gets none."""
-    if sys.stderr.isatty():
-        sys.stderr.write(f"\r\x1b[K{text[: COLUMNS - 1]}")
-        sys.stderr.flush()
+    if MESSAGES.isatty():
+        MESSAGES.write(f"\r\x1b[K{printable(text)[: COLUMNS - 1]}")
+        MESSAGES.flush()
 
 
 def wrap_for_terminal(text: str) -> str:
@@ -76,6 +119,7 @@ def report_working(name: str) -> Iterator[None]:
         yield
     finally:
         soon.cancel()
+        soon.join()
 
 
 @contextmanager

@@ -61,6 +61,6 @@ def finish_run_folder(
     """
     folder.write_text("config.resolved.toml", configuration.as_toml(config))
     if page is not None and getattr(config, "report", True):
-        page(folder.partial)
+        page(folder.results())
     print_output(str(folder.finish(manifest, runs)))
     return DONE if solved else SOLVER_FAILED

@@ -23,6 +23,7 @@ import numpy as np
 from calibration.data import writing
 from calibration.data.input_errors import BadConfiguration, InputError
 from calibration.data.runs import Runs
+from calibration.discovery.kept import REFIT_FILE
 from mmrjax import __version__
 from mmrjax.model import params
 from mmrjax.model.robot import Robot
@@ -36,6 +37,14 @@ DONE, SOLVER_FAILED = 0, 3
 #: Schemas of a finished run folder, and of the file that marks an unfinished one and is locked while it is worked on.
 MANIFEST, UNFINISHED = "mmrjax.manifest/1", "mmrjax.unfinished/1"
 LOCK, CHUNKS = "lock", "chunks"
+#: The Zarr group of a sweep, the record of its chunks, and the folder in which its files are written first.
+STORE, JOURNAL, IDENTITY, ASIDE = "results.zarr", "journal", "identity.json", "writing"
+#: Names in an unfinished folder, before the results are written.
+PARTS = frozenset((LOCK, CHUNKS, REFIT_FILE, STORE, JOURNAL, IDENTITY, ASIDE))
+#: Endings of the files in `CHUNKS`.
+KEPT = (".npz", ".stage")
+#: Key of the mark with the names of files that are not ours.
+FOREIGN = "foreign"
 #: First arguments of commands that fit a robot.
 FITS = (["calibrate"], ["loop"])
 #: Largest manifest or mark that is read [bytes].
@@ -60,6 +69,7 @@ class Folder:
             raise BadConfiguration(f"--out: got {str(path)!r}; expected the name of a folder")
         self.path, self.partial = path, path.with_name(path.name + ".partial")
         self.tables = "csv"
+        self._results_begun = False
         self.started = datetime.datetime.now(datetime.UTC)
 
     def refuse_taken(self, force: bool) -> None:
@@ -87,7 +97,7 @@ class Folder:
         raise BadConfiguration(f"--out: {self.path} exists already; choose another path ({hint})")
 
     def refuse_foreign(self, command: str, force: bool) -> None:
-        """Refuse a `.partial` that is not ours, or holds interrupted work of another command.
+        """Refuse a `.partial` that is not ours, or holds a file that is not, or interrupted work of another command.
 
         Args:
             command: that is to go on there; force: begin anew in place of another command.
@@ -100,28 +110,86 @@ class Folder:
         mark = interrupted_run(self.partial)
         if mark is None:
             raise BadConfiguration(f"--out: {self.partial} is in the way and is no run of ours; choose another path")
+        if foreign := sorted(self._foreign()):
+            raise BadConfiguration(
+                f"--out: {self.partial} holds {foreign[0]}, which its command did not write; move it, or choose "
+                "another path"
+            )
         if mark["command"] not in ("", command) and not force and holds_work(self.partial):
             raise BadConfiguration(
                 f"--out: {self.partial} holds an interrupted {mark['command']}, which the same command takes up "
                 "again; choose another path, or --force to begin anew"
             )
 
+    def refuse_appeared(self, force: bool) -> None:
+        """Refuse to move the finished folder to a path where something has appeared meanwhile.
+
+        Raises:
+            OSError: it has; the partial folder is left.
+        """
+        try:
+            self.refuse_taken(force)
+        except BadConfiguration:
+            raise OSError(errno.EEXIST, os.strerror(errno.EEXIST), str(self.path)) from None
+
+    def _foreign(self) -> set[str]:
+        """Names in the partial folder that no command of ours wrote.
+
+        Before the results are written these are all but `PARTS`; later the lock's file lists them.
+        """
+        found = {p.name for p in self.partial.iterdir()} - PARTS
+        listed = _json(self.partial / LOCK).get(FOREIGN)
+        kept = (self.partial / CHUNKS).glob("*")
+        return (found & set(map(str, listed)) if isinstance(listed, list) else found) | {
+            f"{CHUNKS}/{p.name}" for p in kept if p.suffix not in KEPT
+        }
+
+    def _begin_results(self) -> None:
+        """Lists foreign files in the lock's file before the first result is written: all other files are ours."""
+        mark = _json(self.partial / LOCK)
+        if FOREIGN not in mark:
+            text = json.dumps({**mark, FOREIGN: sorted(self._foreign())})
+            with writing.naming_file(self.partial / LOCK), (self.partial / LOCK).open("r+b", buffering=0) as lock:
+                lock.write(text.encode())  # at once and longer than before, so that others never read a part of it
+
+    def _clear(self) -> None:
+        """Delete everything of ours in the partial folder but its lock."""
+        foreign = self._foreign()
+        for entry in self.partial.iterdir():
+            if entry.name != LOCK and entry.name not in foreign:
+                shutil.rmtree(entry) if entry.is_dir() and not entry.is_symlink() else entry.unlink()
+
+    def _remove_partial(self) -> None:
+        """Delete the partial folder, the lock last; foreign files stay."""
+        with contextlib.suppress(OSError):
+            self._clear()
+            if {p.name for p in self.partial.iterdir()} <= {LOCK}:
+                (self.partial / LOCK).unlink(missing_ok=True)
+                self.partial.rmdir()
+
+    def results(self) -> Path:
+        """Folder for the results, which are moved into place when all are written."""
+        if not self._results_begun:
+            self._begin_results()
+            self._results_begun = True
+        return self.partial
+
     def write_text(self, name: str, text: str) -> None:
         """Write a text file."""
-        writing.write_text(self.partial / name, text)
+        writing.write_text(self.results() / name, text)
 
     def write_bytes(self, name: str, content: bytes) -> None:
         """Write a file of bytes."""
         with writing.naming_file(self.partial / name):
-            (self.partial / name).write_bytes(content)
+            (self.results() / name).write_bytes(content)
 
     def write_json(self, name: str, content: dict[str, Any]) -> None:
         """Write a JSON file; what is not finite becomes null."""
-        writing.write_json(self.partial / name, content)
+        writing.write_json(self.results() / name, content)
 
     def write_table(self, name: str, columns: dict[str, np.ndarray]) -> None:
         """Write a table as CSV, and as Parquet too where asked; what is not finite is an empty cell."""
-        writing.write_table(self.partial / name, columns, self.tables)
+        writing.write_table(self.results() / name, columns, self.tables)
 
     def finish(self, manifest: dict[str, Any], runs: Runs | None = None) -> Path:
         """Write the manifest and move the folder into place; returns its path.
@@ -137,7 +205,7 @@ class Folder:
             "started": self.started.isoformat(timespec="seconds"),
             "seconds": round((now - self.started).total_seconds(), 3),
         }
-        names = {"manifest.json", *(p.name for p in self.partial.iterdir())} - {LOCK, CHUNKS}
+        names = {"manifest.json", *(p.name for p in self.partial.iterdir())} - {LOCK, CHUNKS} - self._foreign()
         whole = {**result_provenance(), **times, **manifest, "hashes": hashes, "contents": sorted(names)}
         self.write_json("manifest.json", whole)
         return self.move_into_place()
@@ -180,7 +248,7 @@ def lock_text(command: str, identity: str = "") -> str:
 
 def holds_work(partial: Path) -> bool:
     """True if a run that ended early has kept anything: chunks, stages, lines of a sweep's journal, or a result."""
-    patterns = (f"{CHUNKS}/*.npz", f"{CHUNKS}/*.stage", "journal/*.jsonl", "manifest.json")
+    patterns = (*(f"{CHUNKS}/[!.]*{ending}" for ending in KEPT), f"{JOURNAL}/*.jsonl", "manifest.json")
     return any(file.stat().st_size for pattern in patterns for file in partial.glob(pattern))
 
 
@@ -190,7 +258,7 @@ def share_at_work(partial: Path, own: Path | None = None) -> str | None:
     Args:
         own: journal of this process.
     """
-    for file in sorted((partial / "journal").glob("*.jsonl")):
+    for file in sorted((partial / JOURNAL).glob("*.jsonl")):
         if file != own:
             with file.open("a") as journal:
                 if not try_to_lock(journal):
@@ -223,7 +291,7 @@ class RunFolder(Folder):
     """A folder that appears at `path` only when `finish` is called.
 
     If the command is stopped, the same command with the same configuration finds its finished chunks in `partial`
-    and goes on; with another configuration the partial folder is begun anew. One process at a time works on it.
+    and goes on; another configuration begins the partial folder anew with `force`. One process at a time works on it.
     """
 
     def __init__(self, path: Path, identity: dict[str, Any], *, force: bool = False) -> None:
@@ -243,12 +311,16 @@ class RunFolder(Folder):
         self._force, self._command = force, str(identity.get("command", ""))
         self._digest = sha256_hex(json.dumps(identity, sort_keys=True, default=str).encode())
         self._lock: TextIO | None = None
+        self._taken_up = False
         self.refuse_taken(force)
         try:
             while self._lock is None:
                 self.refuse_foreign(self._command, force)
                 self._lock = self._entered()
             self._begin_or_take_up()
+        except BadConfiguration:
+            self.close()
+            raise
         except OSError as error:
             self.close()
             raise BadConfiguration(
@@ -275,15 +347,20 @@ class RunFolder(Folder):
         try:
             self.refuse_taken(self._force)  # by a process that has finished meanwhile
         except BadConfiguration:
-            self._remove()
+            if not holds_work(self.partial):
+                self._remove()
             raise
         mark = interrupted_run(self.partial)
-        if mark is None or mark["identity"] != self._digest:
-            if mark is not None and holds_work(self.partial):
+        self._taken_up = mark is not None and mark["identity"] == self._digest
+        if not self._taken_up:
+            if holds_work(self.partial) or FOREIGN in _json(self.partial / LOCK):
+                if not self._force:
+                    raise BadConfiguration(
+                        f"--out: {self.partial} holds interrupted work of another configuration, table or version; "
+                        "choose another path, or --force to begin anew"
+                    )
                 print_message(f"{self.partial}: of another configuration; begun anew")
-            for entry in self.partial.iterdir():
-                if entry.name != LOCK:
-                    shutil.rmtree(entry) if entry.is_dir() and not entry.is_symlink() else entry.unlink()
+            self._clear()
             self._lock.truncate(0)
             self._lock.write(lock_text(self._command, self._digest))
             self._lock.flush()
@@ -293,19 +370,20 @@ class RunFolder(Folder):
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, *_: Any) -> None:
-        """Leave nothing behind if the command was refused, or ended before a chunk was done.
+        """Leave nothing behind if the command ended before a chunk was done, or was refused after it began anew.
 
         Chunks and stages of any other end are taken up again.
         """
         if isinstance(error, OSError) and error.filename is None:
             error.filename = str(self.partial)
-        if kind is not None and (issubclass(kind, InputError) or not holds_work(self.partial)):
+        refused = kind is not None and issubclass(kind, InputError) and not self._taken_up
+        if kind is not None and (refused or not holds_work(self.partial)):
             self._remove()
         self.close()
 
     def _remove(self) -> None:
         """Remove the partial folder of this process."""
-        shutil.rmtree(self.partial, ignore_errors=True)
+        self._remove_partial()
         self.close()
 
     def close(self) -> None:
@@ -330,10 +408,8 @@ class RunFolder(Folder):
     def keep_chunk(self, name: str, columns: dict[str, np.ndarray]) -> None:
         """Keep a finished chunk for a run that is taken up again."""
         file = self.partial / CHUNKS / f"{name}.npz"
-        aside = file.with_suffix(".writing")
-        with writing.naming_file(file), aside.open("wb") as stream:
+        with writing.replacing(file) as aside, aside.open("wb") as stream:
             np.savez(stream, allow_pickle=False, **columns)
-        aside.replace(file)
 
     def stage(self, name: str, make: Callable[[], T]) -> T:
         """Result of a stage: read if an interrupted run of the same identity kept it, else made and kept.
@@ -350,10 +426,8 @@ class RunFolder(Folder):
             except stage_files.Unreadable:
                 print_message(f"{file}: damaged; computed again")
         made = make()
-        aside = file.with_suffix(".writing")
-        with contextlib.suppress(OSError, stage_files.Unwritable):
+        with contextlib.suppress(OSError, stage_files.Unwritable), writing.replacing(file) as aside:
             stage_files.write_stage(aside, made)
-            aside.replace(file)
         return made
 
     def keeps(self, name: str) -> bool:
@@ -369,10 +443,7 @@ class RunFolder(Folder):
         Raises:
             OSError: something has appeared there meanwhile; the partial folder is left.
         """
-        try:
-            self.refuse_taken(self._force)
-        except BadConfiguration:
-            raise OSError(errno.EEXIST, os.strerror(errno.EEXIST), str(self.path)) from None
+        self.refuse_appeared(self._force)
         shutil.rmtree(self.partial / CHUNKS)
         if self.path.is_dir():
             os.replace(self.path, self.partial / CHUNKS)

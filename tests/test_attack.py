@@ -5,13 +5,17 @@ Mutations of valid files are drawn from a seeded generator. One that is still a 
 
 from __future__ import annotations
 
+import ast
 import contextlib
+import json
 import os
 import re
 import shutil
 import signal
 import time
+import tomllib
 from importlib import resources
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -24,6 +28,7 @@ from calibration.data import robot_file
 from calibration.data.input_errors import BadConfiguration
 from calibration.inference import priors
 from calibration.inference.fit_posterior import posterior_of_coordinates
+from mmrjax.errors import printable
 from mmrjax.model import paper_robots
 from sweeps import cli
 from sweeps.points import scale
@@ -173,7 +178,7 @@ def accepted(*_, **__):
 #: Computations that take long, in the place of which a command ends: what comes before them is attacked here.
 HEAVY = (
     "calibration.sizing.sheet.check_requirements", "sweeps.commands.missions.run_missions", "sweeps.commands.climb.climb_batch",
-    "sweeps.commands.loop.discover", "sweeps.commands.calibrate.run", "sweeps.commands.sensitivity.analyse",
+    "sweeps.commands.loop.discover", "sweeps.commands.calibrate.run", "sweeps.commands.sensitivity.analyse_sensitivity",
     "sweeps.commands.size.search", "sweeps.commands.render._write",
 )  # fmt: skip
 
@@ -290,6 +295,39 @@ def test_senseless_values_of_options_are_answered_in_a_sentence(asked, command):
             wrong, _ = asked(*command, option, text, "--out", "out")
             failures += [wrong] * bool(wrong)
     assert not failures, "\n".join(failures)
+
+
+# --- names ------------------------------------------------------------------------------------------------------------
+
+LETTERS = ("\"", "'", "\\", "\\N{x}", '"""+str(__import__("os").system("touch executed"))+"""', "\n", "\t", "\r", "{", "}",
+           "{{7*7}}", "%s", "-->", "--", "]]>", "<script>", "=1+1", "+", "@", "-", "*", ";", "$(touch executed)", "`", "|",
+           "\x1b[31m", "\x07", "\x7f", "\x9b", "\u202e", "\u2028", "\ufeff", "é", "𝟙", " ", "#", "?", "::", ",")  # fmt: skip
+EXPORTS = ("jax", "mjlab", "table", "mujoco", "onnx", "randomization")
+
+
+@pytest.mark.parametrize("to", EXPORTS)
+def test_names_of_files_are_never_obeyed_by_an_export(ended, tmp_path, to):
+    rng = np.random.default_rng([60, EXPORTS.index(to)])
+    for k in range(4):
+        words = ["".join(rng.choice(LETTERS, 4)) for _ in range(2)]
+        robot, table = tmp_path / f"r{words[0]}.toml", tmp_path / f"t{words[1]}.csv"
+        shutil.copy(tmp_path / "rig.toml", robot)
+        shutil.copy(tmp_path / "table.csv", table)
+        _, out, err, wrong = ended(
+            "export", f"./{robot.name}", "--to", to, "--data", f"./{table.name}", "--out", f"out{k}"
+        )
+        assert not wrong and not (tmp_path / "executed").exists(), (words, wrong, err)
+        assert set(out + err) == set(printable(out + err)), words
+        for path in (tmp_path / f"out{k}").rglob("*"):
+            if path.suffix in (".csv", ".html", ".md", ".xml", ".h", ".py"):
+                text = path.read_text("utf-8")
+                assert set(text) == set(printable(text)), (words, path)
+            if path.suffix in (".toml", ".json", ".xml", ".py"):
+                READ[path.suffix](path.read_text("utf-8"))
+
+
+#: Readers of languages in which an export has names.
+READ = {".toml": tomllib.loads, ".json": json.loads, ".xml": ElementTree.fromstring, ".py": ast.parse}
 
 
 # --- files of another kind ------------------------------------------------------------------------------------------

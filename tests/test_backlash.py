@@ -52,26 +52,27 @@ def test_a_little_backlash_is_a_rigid_gear_once_things_have_settled():
 
 
 def test_effects_of_the_gearbox_go_by_the_load_within_the_backlash_too():
-    """By its dry and viscous loss and what it pulls with: 0.1 + 0.01 · 4 + 0.5 N·m and, where it drives, - 0.5."""
+    """By the torque that the flanks carry: on the flank that drives, on the other one, and none between them."""
     those = [e for e in ALL if e.balance == "gearbox"]
-    state = State(0.5, 64.0, 4.0, 0.0, {e.name: jnp.asarray(0.6) for e in those}, gap=jnp.asarray(0.015))
+    memory = {e.name: jnp.asarray(0.6) for e in those}
 
     @jax.jit
-    def net(amplitudes, constant):
-        robot = params.replace(bench(0.02), {"bench.torque_constant": constant})
+    def moving(amplitudes, gap):
         there = tuple(e(amplitude=a) for e, a in zip(those, amplitudes, strict=True))
-        return balances.moving_signals(
-            dataclasses.replace(robot, effects=there), Conditions(0, voltage=6.0), state
-        ).torque_net
+        robot = dataclasses.replace(bench(0.02), effects=there)
+        found = balances.moving_signals(
+            robot, Conditions(0, voltage=6.0), State(0.5, 64.0, 4.0, 0.0, memory, gap=gap)
+        )
+        return found.torque_net, found.torque_output
 
-    for constant, load in ((0.5, 0.64), (-0.5, -0.36)):
-        without = net(jnp.zeros(len(those)), constant)
-        at = Signals(torque_track_loss=jnp.asarray(load), traction=jnp.asarray(0.0), direction=jnp.asarray(1.0),
-                     speed_motor=jnp.asarray(64.0), memory=state.memory)  # fmt: skip
+    for gap in jnp.asarray([0.015, 0.0, -0.015]):
+        without, carried = moving(jnp.zeros(len(those)), gap)
+        assert np.sign(carried) == np.sign(gap)
+        at = Signals(torque_carried=carried, direction=jnp.asarray(1.0), speed_motor=jnp.asarray(64.0), memory=memory)
         for k, effect in enumerate(those):
-            lost = float(without - net(jnp.zeros(len(those)).at[k].set(0.1), constant))
+            lost = float(without - moving(jnp.zeros(len(those)).at[k].set(0.1), gap)[0])
             assert lost == pytest.approx(float(effect(amplitude=0.1).term(bench(0.02), at)), rel=1e-6), effect.name
-            assert lost != 0 or (effect.name == "backdriving_loss" and constant > 0)
+            assert lost != 0 or gap == 0 or (effect.name == "backdriving_loss" and gap > 0)
 
 
 @pytest.mark.slow

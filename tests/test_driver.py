@@ -50,11 +50,30 @@ def test_limit_and_diode_act_alike_on_a_supply_of_either_sign(robot, volts):
 
 
 def test_a_diode_blocks_current_against_the_duty_alone():
+    """At no current, what the driver's voltage would drive."""
     diode = Driver(returns_current=False)
-    assert [bool(diode.blocks(d, i, 0.0)) for d, i in ((1.0, 2.0), (1.0, -2.0), (-1.0, -2.0), (-1.0, 2.0))] == [
-        False, True, False, True,
-    ]  # fmt: skip
-    assert not bool(Driver().blocks(1.0, -2.0, 0.0)) and bool(Driver().blocks(1.0, 2.0, 1.0))
+    cases = {
+        (1.0, 2.0, 5.0): 1, (1.0, 2.0, -5.0): 1, (1.0, -2.0, 5.0): 0, (1.0, 0.0, 5.0): 1, (1.0, 0.0, -5.0): 0,
+        (-1.0, -2.0, -5.0): 1, (-1.0, 2.0, -5.0): 0, (-1.0, 0.0, 5.0): 0, (0.0, -2.0, 5.0): 1, (1.0, -2.0, -5.0): -1,
+    }  # fmt: skip
+    for (duty, current, excess), conducts in cases.items():
+        assert float(diode.conducts(duty, duty, current, excess, 0.0)) == conducts
+    assert float(diode.conducts(1.0, -0.1, 6.0, 5.0, 0.0)) == 0  # the limit would reverse the duty
+    assert float(Driver().conducts(1.0, 1.0, -2.0, -5.0, 0.0)) == 1
+    assert float(Driver().conducts(1.0, 1.0, 2.0, 5.0, 1.0)) == 0
+
+
+@pytest.mark.parametrize("returns", [True, False])
+@pytest.mark.parametrize("duty", [1.0, -0.4, 0.0])
+def test_admitted_current_is_what_the_balance_of_a_winding_admits(duty, returns):
+    """Along the curve, U = D U_s at the current's own duty, less what a diode holds back, falls evenly by R."""
+    driver = Driver(current_limit=2.0, returns_current=returns)
+    resistance, source, wanted = 0.5, 12.0, np.linspace(-80.0, 80.0, 4001)
+    current, held = driver.admitted(wanted, duty, source / resistance)
+    left = driver.duty_limited(duty, current) * source - resistance * (current + held)
+    np.testing.assert_allclose(left, duty * source - resistance * wanted, atol=1e-9)
+    assert (np.diff(current) >= 0).all() and (returns or (np.asarray(current) * duty >= 0).all())
+    assert returns or np.abs(current).max() < 2.0 * (1 + 1.01 * max(abs(duty), 1e-9) / STEEPNESS)
 
 
 def test_controller_is_proportional_and_integral_with_the_back_emf_fed_forward():

@@ -67,7 +67,7 @@ SIGNAL_UNITS = {
     "1/s": "speed_motor speed_wheel speed_output yaw_rate",
     "1/s^2": "acceleration_wheel",
     "N·m": "torque_electromagnetic torque_motor_loss torque_motor torque_track_loss torque_load torque_idle "
-    "torque_input torque_gear torque_output torque_net moment_lateral",
+    "torque_input torque_gear torque_output torque_carried torque_net moment_lateral",
     "H": "inductance",
     "kg·m^2": "inertia_added",
     "rad": "angle heading",
@@ -254,7 +254,7 @@ DRIVERS = {
     "speed": ("speed_motor", "speed_wheel", "speed_theoretical", "speed", "yaw_rate"),
     "load": (
         "current", "payload", "mass", "normal", "demand", "traction", "torque_load", "torque_track_loss",
-        "torque_electromagnetic",
+        "torque_carried", "torque_electromagnetic",
     ),
     "demand": ("demand", "traction", "resistance"),
     "weight": ("normal", "mass"),
@@ -1031,9 +1031,7 @@ def test_directional_friction_fades_at_rest_and_does_not_turn_round():
 @pytest.mark.slow
 def test_backdriving_loss_is_a_share_of_a_load_that_drives():
     """Against the load of each state, and steady travel: (C_m I - losses) i = η_b (1 - a) M_load down, M_load / η up."""
-    load = np.asarray(STATES.torque_track_loss) + np.where(STATES.configuration == 0, 0.24 / (2 * np.pi), 0.05) * (
-        np.asarray(STATES.traction)
-    )
+    load = np.asarray(STATES.torque_carried)
     turning = np.asarray(STATES.direction)
     driven = load * turning < 0
     assert 40 < driven.sum() < 360
@@ -1161,7 +1159,7 @@ def test_load_lost_through_a_bristle_is_its_mean_and_its_difference(bend, way):
     average, difference = 0.12, -0.05
     amplitudes = {"bristle_load_loss": average + difference, "bristle_backdriving_loss": -2 * difference}
     for load in (1.5, -1.5):
-        at = dict(torque_track_loss=jnp.asarray(load), traction=jnp.asarray(0.0), direction=jnp.asarray(way))
+        at = dict(torque_carried=jnp.asarray(load), direction=jnp.asarray(way))
         signals = [Signals(memory={n: jnp.asarray(bend)}, **at) for n in amplitudes]
         found = [
             fitted(BY_NAME[n], a).term(NOMINAL, s) for (n, a), s in zip(amplitudes.items(), signals, strict=True)

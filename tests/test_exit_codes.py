@@ -1,11 +1,23 @@
 """One rule for exit codes: whatever the answer 0, and 3 where a solver failed; documented for each command."""
 
+import dataclasses
+import shlex
+import signal
+import subprocess
+import sys
+import threading
+import time
+import weakref
 from pathlib import Path
 
 import numpy as np
 import pytest
 from typer.main import get_command
 
+from calibration.data.input_errors import InputError
+from calibration.discovery import scales
+from mmrjax import WORKER
+from mmrjax.model import paper_robots
 from sweeps import cli
 from sweeps.pages import words
 from sweeps.points import run
@@ -40,6 +52,68 @@ def test_a_reader_that_has_had_enough_is_no_fault_of_a_file_of_effects(monkeypat
     with pytest.raises(SystemExit) as end:
         cli.main()
     assert end.value.code == 1 and capsys.readouterr().err == ""
+
+
+PROGRAM = [sys.executable, "-c", "from sweeps.cli import main; main()"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "streams", "code"),
+    [
+        ("--version", ">&-", 0),
+        ("--version", "<&- >&- 2>&-", 0),
+        ("--version", "> /dev/full", 2),
+        ("--help", "> /dev/full", 2),
+        ("--version", "2> /dev/full", 0),
+        ("rig new no/folder.toml", "2> /dev/full", 2),
+        ("rig new no/folder.toml", "> /dev/full", 2),
+    ],
+)
+def test_closed_and_full_outputs_change_no_exit_code_but_of_what_is_lost(tmp_path, arguments, streams, code):
+    shell = f"{shlex.join(PROGRAM)} {arguments} {streams}"
+    ended = subprocess.run(["sh", "-c", shell], capture_output=True, text=True, cwd=tmp_path)
+    assert ended.returncode == code and ended.stderr.count("\n") == (code and "2>" not in streams), ended.stderr
+
+
+def test_files_do_not_get_the_number_of_a_closed_stream(tmp_path):
+    code = "from sweeps import cli; cli._replace_closed_streams(); print(open('file', 'w').fileno() > 2, file=open('n', 'w'))"
+    subprocess.run(["sh", "-c", f"{shlex.join([sys.executable, '-c', code])} <&- >&- 2>&-"], check=True, cwd=tmp_path)
+    assert (tmp_path / "n").read_text() == "True\n"
+
+
+def test_an_interrupt_within_a_callback_is_obeyed(monkeypatch, capsys):
+    """As in the collection of garbage, where Python would print it and go on."""
+
+    class Garbage:
+        pass
+
+    def app(**_):
+        thing = Garbage()
+        held = weakref.ref(thing, lambda _: signal.raise_signal(signal.SIGINT))
+        del thing
+        for _ in range(500):
+            time.sleep(0.01)
+        return held
+
+    monkeypatch.setattr(cli, "app", app)
+    monkeypatch.setattr("sys.argv", ["mmrjax"])
+    monkeypatch.setattr("os._exit", sys.exit)
+    hook, begun = sys.unraisablehook, time.monotonic()
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    assert end.value.code == 130 and time.monotonic() - begun < 4 and sys.unraisablehook is hook
+    assert capsys.readouterr().err == "mmrjax: interrupted; no run folder was left\n"
+
+
+def test_no_thread_outlives_a_refusal(monkeypatch):
+    monkeypatch.setattr(scales, "_nominal", lambda: time.sleep(0.3))
+    robot = dataclasses.replace(
+        paper_robots.nominal(), rig=dataclasses.replace(paper_robots.nominal().rig, inherits=False)
+    )
+    with pytest.raises(InputError, match="refused"), scales.nominal_ahead(robot):
+        assert any(t.name.startswith(WORKER) for t in threading.enumerate())
+        raise InputError("refused")
+    assert not any(t.name.startswith(WORKER) for t in threading.enumerate())
 
 
 def test_every_command_says_what_3_means_and_the_docs_have_its_words():

@@ -8,17 +8,20 @@ import dataclasses
 import importlib
 import io
 import json
+import os
 import re
 import shutil
 import subprocess
 import sys
 import types
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import mmrjax as mm
 from calibration.data import posterior_file, robot_file
 from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.inference import priors
@@ -163,6 +166,7 @@ def term(drive, part, given, rate=False):
         **around, configuration=0, on_tracks=load.on_tracks, direction_travel=given["way"], battery=0.0,
         speed=load.radius * given["wheel_speed"], total_current=robot.sides * given["current"],
         traction=given["pull"] / load.radius if at_wheel else 0.0, torque_track_loss=given["load"],
+        torque_carried=given["load"],
         memory={part.name: given["memory"]}, current=given["current"], speed_motor=given["motor_speed"],
         speed_wheel=given["wheel_speed"], direction=given["way"], voltage=given["voltage"],
     )  # fmt: skip
@@ -239,9 +243,34 @@ def test_energy_of_the_actuator_is_what_is_given_and_lost(with_effects):
     np.testing.assert_allclose(info["power"], torque * speed + lost, rtol=1e-9)
 
 
+@pytest.mark.slow
+def test_serialised_actuator_has_the_same_bytes_in_every_process_and_folder(rig, tmp_path):
+    code = (
+        "import sys; from calibration.data import robot_file; "
+        "from sweeps.export import constants, jax_actuator, joint, law_source; "
+        "drive = joint.joint_of_robot(robot_file.find_robot_file('rig.toml')); "
+        "module = law_source.module_from_source(law_source.jax_source(drive, constants.constants_of(drive, None, None))); "
+        "sys.stdout.buffer.write(jax_actuator.serialise_actuator(module))"
+    )
+    found = []
+    for seed in "12":
+        (folder := tmp_path / seed).mkdir()
+        shutil.copy(rig, folder)
+        shutil.copytree(Path(law_source.__file__).parents[1], folder / "sweeps")
+        path = os.pathsep.join([str(folder), str(Path(law_source.__file__).parents[2])])
+        given = {**os.environ, "PYTHONHASHSEED": seed, "PYTHONPATH": path}
+        found.append(
+            subprocess.run(
+                [sys.executable, "-c", code], cwd=folder, env=given, check=True, stdout=subprocess.PIPE
+            ).stdout
+        )
+    assert found[0] == found[1] and len(found[0]) > 1000
+
+
 def test_serialised_actuator_computes_what_its_source_does(with_effects):
     drive, _, known = with_effects
     files = jax_actuator.jax_files(drive, known, [])
+    assert b".py" not in files["actuator.jaxexport"]  # no path of this machine
     module = law_source.module_from_source(files["actuator.py"])
     with jax.enable_x64(False):
         kept = jax.export.deserialize(bytearray(files["actuator.jaxexport"]))
@@ -438,6 +467,52 @@ def xml_of(file):
     }
 
 
+LOSSES = """
+[effects.gear_quadratic_loss]
+amplitude = 0.05
+[effects.bristle_load_loss]
+amplitude = 0.1
+[effects.backdriving_loss]
+amplitude = 0.3
+[effects.tension_friction]
+amplitude = 0.1
+[effects.rotating_inertia]
+amplitude = 0.004
+"""
+
+
+@pytest.mark.parametrize(("voltage", "torque"), [(12.0, 0.2), (2.0, -2.0)])
+def test_start_of_the_actuator_is_that_of_the_model_with_losses_by_load(rig, voltage, torque):
+    """A start, and a load that drives the motor, in a simulator with Euler's steps.
+
+    The losses saw other inertias than in the model: the actuator started 19 % later with `gear_quadratic_loss`.
+    """
+    arm = RIG.split("[effects")[0].replace("torque_gravity = 0.6", f"torque_constant = {torque}")
+    rig.write_text(arm + LOSSES)
+    file = robot_file.find_robot_file(str(rig))
+    drive = joints.joint_of_robot(file)
+    module = law_source.module_from_source(law_source.jax_source(drive, constants.constants_of(drive, None, None)))
+    step, inertia = 2e-5, float(drive.load.inertia + module.armature(module.PARAMS))
+
+    def advance(at, _):
+        state, speed = at
+        made, state, info = module.actuator(module.PARAMS, state, voltage, 0.0, speed, step)
+        speed = speed + step * (made - torque) / inertia
+        return (state, speed), (speed, info["current"])
+
+    found = jax.lax.scan(advance, (module.initial_state(), 0.0), None, length=5000)[1]
+    history = mm.simulate(
+        file.robot, mm.Conditions(voltage=voltage), model="drive", duration=0.1, history=True
+    ).history
+    times = step * np.arange(1, 5001)
+    expected = np.asarray(history.reading["motor_speed"]) / 19.7, np.asarray(history.reading["total_current"])
+    for mine, native, begins in zip(
+        found, expected, (0.0, 2e-3), strict=True
+    ):  # a step is a tenth of the winding's L/R
+        error = np.interp(history.time, times, np.asarray(mine)) - native
+        assert np.max(np.abs(error[history.time > begins])) < 1e-3 * np.max(np.abs(native))
+
+
 def test_rig_that_was_exported_comes_back_to_the_last_digit(rig, tmp_path):
     first = xml_of(rig)
     for name, text in first.items():
@@ -534,12 +609,44 @@ def test_a_rig_whose_angle_alone_is_read_is_compared_by_its_motor(rig):
     assert {c.name for c in joints.channels_of(drive)} == {"motor_speed", "motor_current"}
 
 
+def test_error_without_data_is_that_of_mujoco_under_load_and_backward(rig):
+    """The grid was three runs forward without load: the stated 0.01 % of current was 28 % backward."""
+    losses = "[effects.gear_quadratic_loss]\namplitude = 0.05\n[effects.directional_viscous]\namplitude = 0.0012\n"
+    rig.write_text(RIG.split("torque_gravity")[0].replace("efficiency_load = 1.0", "efficiency_load = 0.81") + losses)
+    found = formats.export_format(robot_file.find_robot_file(str(rig)), "mujoco")
+    seen = found.comparison.situation
+    for way in (-1, 1):
+        assert {(v, m > 0) for v, m in zip(way * seen.command, way * seen.load, strict=True) if v > 0} >= {
+            (v, loaded) for v in (4.0, 8.0, 12.0) for loaded in (False, True)
+        }
+    kept = {f.name: f.kept for f in found.comparison.fates}
+    assert kept["directional_viscous"] < 0.01 and kept["gear_quadratic_loss"] < 0.95
+    rng = np.random.default_rng(4)
+    volts = rng.choice((-1.0, 1.0), 8) * rng.uniform(4, 12, 8)
+    grid = situation.export_grid(found.joint)
+    loads = rng.uniform(0, 0.5, 8) * np.sign(volts) * situation.stall_torque(found.joint, np.abs(volts))
+    columns = {"configuration": np.repeat("arm", 8), grid.layout.imposed_column: volts, "load_torque_Nm": loads}
+    other = situation.situation_of_joint(found.joint, dataclasses.replace(grid, columns=columns))
+    law = mujoco.translate_law(found.joint, 0.0)
+    theta = jnp.asarray([found.comparison.refitted[n] for n in law.names])
+    near = comparison.evaluate_law(law, theta, other.command, other.load, other.way)
+    motor = mujoco.mjcf_motor(found.joint, found.comparison.refitted)
+    got = mujoco.settle_in_mujoco(
+        found.files, motor, other, situation.AtJoint(*map(np.asarray, near)), range(len(other.load))
+    )
+    stated = found.comparison.of(comparison.EXPORTED)
+    assert len(other.load) >= 6
+    assert stated["total_current"] > 1
+    assert 100 * apart(got.current, other.inside.current) < 1.3 * stated["total_current"]
+    assert 100 * apart(got.speed, other.inside.speed) < 1.3 * stated["motor_speed"]
+
+
 def test_command_leaves_the_files_the_law_and_a_page(mmrjax, rig):
     code, out, _ = mmrjax("export", rig, "--to", "mujoco", "--out", "out", "--joint", "wheel")
     assert code == 0 and "series_resistance" not in out
     folder = rig.parent / "out"
     result = json.loads((folder / "result.json").read_text())
-    assert result["errors_percent"]["exported"]["motor_speed"] < 0.01
+    assert result["errors_percent"]["exported"]["motor_speed"] < 0.1  # heat at half of the stall torque
     assert {e["name"]: e["verdict"] for e in result["effects"]}["thermal_drift"] == "held"
     law = (folder / "LAW.md").read_text()
     for heading in (

@@ -40,7 +40,7 @@ def test_a_stage_is_made_once_and_read_after_an_interrupt(tmp_path):
         assert folder.stage("noise 0.5", refuse)[1].tolist() == [0, 1, 2]
         assert folder.stage("cannot be written", lambda: lambda: 1)() == 1
         raise KeyboardInterrupt
-    with RunFolder(tmp_path / "x", {"seed": 2}) as folder:  # another command's are not taken
+    with RunFolder(tmp_path / "x", {"seed": 2}, force=True) as folder:  # another command's are not taken
         assert folder.stage("noise 0.5", lambda: 7) == 7
 
 
@@ -48,10 +48,10 @@ def test_a_stage_of_another_version_is_made_again(tmp_path, monkeypatch):
     """What is named by a hash of the source: the release's number does not change with a mended line."""
     told = SimpleNamespace(model_dump=lambda **_: {}, effects=())
 
-    def stage(make):
+    def stage(make, force=False):
         with (
             pytest.raises(KeyboardInterrupt),
-            open_folder("loop", told, paper_robots.nominal(), tmp_path / "x", False) as folder,
+            open_folder("loop", told, paper_robots.nominal(), tmp_path / "x", force) as folder,
         ):
             found.append(folder.stage("base", make))
             raise KeyboardInterrupt
@@ -60,7 +60,9 @@ def test_a_stage_of_another_version_is_made_again(tmp_path, monkeypatch):
     stage(lambda: 1)
     stage(refuse)
     monkeypatch.setattr(programs, "source_hash", lambda: "mended")
-    stage(lambda: 2)
+    with pytest.raises(BadConfiguration, match="another configuration, table or version"):
+        open_folder("loop", told, paper_robots.nominal(), tmp_path / "x", False)
+    stage(lambda: 2, force=True)
     assert found == [1, 1, 2]
 
 

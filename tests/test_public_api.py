@@ -20,7 +20,7 @@ import mmrjax as mm
 from calibration.data.input_errors import BadConfiguration
 from mmrjax import fidelities
 from mmrjax.effects import ALL
-from mmrjax.fidelities import outputs, results
+from mmrjax.fidelities import outputs
 from mmrjax.fidelities.drive import drive_batch
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import channels, paper_robots, params
@@ -184,9 +184,8 @@ def test_every_result_field_and_channel_is_an_attribute(robot):
         _ = one.torque
 
 
-def test_every_name_of_a_result_is_typed_and_listed(robot):
+def test_every_name_of_a_result_is_listed(robot):
     fields = {field.name for field in dataclasses.fields(Result)}
-    assert results._Numbers.__annotations__.keys() == fields | {c.name for c in channels.EVERY}
     one = mm.simulate(robot, mm.Conditions())
     assert {*fields, *channels.USUAL, "statuses", "table", "model"} <= set(dir(one))
     numbers = one.rows_table()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import re
@@ -11,7 +12,7 @@ import equinox as eqx
 import numpy as np
 import pytest
 
-from calibration.data import rig_facts, robot_file
+from calibration.data import configuration_tables, rig_facts, rig_file, robot_file
 from calibration.data.input_errors import BadConfiguration
 from calibration.inference import priors
 from calibration.sensitivity import uncertain_inputs
@@ -20,6 +21,7 @@ from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import paper_robots, params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.rig import Instrument
+from mmrjax.model.shaft import Shaft
 from mmrjax.model.signals import FLAGS, GRAVITY
 from sweeps.commands import rig_check, rig_new
 
@@ -596,7 +598,8 @@ def test_surfaces_of_a_calibrated_rig_are_written_and_read(tmp_path):
         read(tmp_path, ROVER + '[grass]\nlike = "rover"\n[surfaces]\ngras = "rover"\n')
 
 
-PAGE = (Path(__file__).parents[1] / "docs" / "reference" / "robot-files.md").read_text(encoding="utf-8")
+ROBOT_FILES = Path(__file__).parents[1] / "docs" / "reference" / "robot-files.md"
+PAGE = ROBOT_FILES.read_text(encoding="utf-8")
 EXAMPLES = PAGE.split("```toml\n")[1:]
 
 
@@ -605,6 +608,19 @@ def test_example_of_the_page_reads(tmp_path, text):
     robot = read(tmp_path, text)
     assert not robot.rig.inherits and not [f for f in rig_facts.derived_facts(robot) if f.odd]
     assert same(again(tmp_path, robot), robot)
+
+
+def test_every_key_of_robot_files_is_in_the_reference():
+    parameters = (ROBOT_FILES.parent / "parameters.md").read_text(encoding="utf-8")
+    own = {p.name for p in params.walk_parameters(paper_robots.nominal())}
+    fixed = {*robot_file.COUNTS, *robot_file.RATINGS, *robot_file.SWITCHES, *robot_file.CHOICES}
+    lacking = {name for name in own | fixed if f"`{name}`" not in parameters}
+    shaft = {field.name for field in dataclasses.fields(Shaft) if "spec" in field.metadata}
+    keys = {*rig_file.KEYS, *rig_file.LINEAR, *shaft, *configuration_tables._KINDS}
+    keys |= {"base", "sides", "configurations", "schema"}
+    keys |= {name.split(".")[1] for name in fixed if name.startswith(("driver.", "gearbox.mesh"))}
+    lacking |= {key for key in keys if not re.search(rf"[`\[]{key}\b", PAGE)}
+    assert not lacking
 
 
 def test_a_linear_unit_of_exact_numbers_makes_an_exact_shaft(tmp_path):

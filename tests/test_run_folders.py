@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import threading
+from pathlib import Path
 
+import numpy as np
 import pytest
 
+from calibration.data import writing
 from calibration.data.input_errors import BadConfiguration
-from sweeps.store import RunFolder
+from sweeps.commands.rig_new import write_new_rig
+from sweeps.store import RunFolder, lock_text
 
 LOOP, SWEEP = {"command": "loop", "seed": 1}, {"command": "sweep", "seed": 1}
 
@@ -90,14 +95,100 @@ def test_interrupted_work_of_another_command_is_left_alone(tmp_path, capsys):
         BadConfiguration, match=r"x\.partial holds an interrupted loop, which the same command takes up"
     ):
         RunFolder(tmp_path / "x", SWEEP)
+    other = LOOP | {"seed": 2}
+    with pytest.raises(
+        BadConfiguration, match=r"x\.partial holds interrupted work of another configuration.*--force"
+    ):
+        RunFolder(tmp_path / "x", other)
     assert (partial / "chunks" / "base.stage").is_file()
-    RunFolder(tmp_path / "x", LOOP | {"seed": 2}).close()  # another configuration begins anew, and says so
+    RunFolder(tmp_path / "x", other, force=True).close()
     assert not (partial / "chunks" / "base.stage").exists()
     assert "x.partial: of another configuration; begun anew" in capsys.readouterr().err
     RunFolder(tmp_path / "x", SWEEP).close()  # nothing of the loop's is left
     interrupted(tmp_path / "x", SWEEP)
     with RunFolder(tmp_path / "x", LOOP, force=True) as folder:
         assert not folder.keeps("base")
+
+
+@pytest.mark.parametrize("place", ["notes.txt", "chunks/notes.txt"])
+@pytest.mark.parametrize("identity", [LOOP, LOOP | {"seed": 2}, SWEEP])
+def test_a_foreign_file_in_our_partial_folder_is_left_alone(tmp_path, place, identity):
+    partial = interrupted(tmp_path / "x")
+    (partial / place).write_text("years of work")
+    before = names(tmp_path)
+    with pytest.raises(BadConfiguration, match=rf"x\.partial holds {place}, which its command did not write"):
+        RunFolder(tmp_path / "x", identity, force=True)
+    assert names(tmp_path) == before
+
+
+def test_a_forged_mark_costs_no_file(tmp_path):
+    partial = tmp_path / "x.partial"
+    partial.mkdir()
+    (partial / "thesis.txt").write_text("years of work")
+    (partial / "lock").write_text(lock_text("loop"))
+    with pytest.raises(BadConfiguration, match=r"thesis\.txt, which its command did not write"):
+        finished(tmp_path / "x")
+    (partial / "lock").write_text(json.dumps(json.loads(lock_text("loop")) | {"foreign": []}))
+    with pytest.raises(BadConfiguration, match="or --force to begin anew"):
+        finished(tmp_path / "x")
+    assert (partial / "thesis.txt").is_file()
+
+
+def test_a_foreign_file_that_comes_during_the_run_is_not_listed_as_ours(tmp_path):
+    with RunFolder(tmp_path / "x", LOOP) as folder:
+        (folder.partial / "notes.txt").write_text("years of work")
+        folder.write_text("robot.toml", "")
+        folder.finish({})
+    assert json.loads((tmp_path / "x" / "manifest.json").read_text())["contents"] == ["manifest.json", "robot.toml"]
+    with pytest.raises(BadConfiguration, match=r"--force would delete notes\.txt"):
+        finished(tmp_path / "x", force=True)
+    with pytest.raises(KeyboardInterrupt), RunFolder(tmp_path / "y", LOOP) as folder:
+        (folder.partial / "notes.txt").write_text("years of work")
+        raise KeyboardInterrupt
+    assert (tmp_path / "y.partial" / "notes.txt").is_file()
+
+
+def test_a_folder_killed_while_its_results_were_written_is_taken_up(tmp_path):
+    folder = RunFolder(tmp_path / "x", LOOP)
+    folder.write_text("rows.csv", "")
+    folder.close()
+    finished(tmp_path / "x")
+    assert names(tmp_path / "x") == ["manifest.json", "robot.toml", "rows.csv"]
+
+
+def test_a_refusal_keeps_the_work_that_was_taken_up(tmp_path):
+    partial = interrupted(tmp_path / "x")
+    with pytest.raises(BadConfiguration, match="refused"), RunFolder(tmp_path / "x", LOOP):
+        raise BadConfiguration("refused")
+    assert (partial / "chunks" / "base.stage").is_file()
+
+
+@pytest.mark.parametrize("there", ["my own rig", None])
+def test_a_full_disk_leaves_a_file_as_it_was(tmp_path, there):
+    file = tmp_path / "rig.toml"
+    if there is not None:
+        file.write_text(there)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, limits[1]))
+    try:
+        with pytest.raises(BadConfiguration, match=r"rig\.toml: cannot be written"):
+            write_new_rig(file, "tracked", force=True)
+        with pytest.raises(OSError, match=r"rig\.toml"):
+            writing.write_table(file, {"x": np.arange(1000)})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert [p.read_text() for p in tmp_path.iterdir()] == [there] * (there is not None)
+
+
+def test_writing_follows_links_keeps_modes_and_writes_to_pipes(tmp_path):
+    file, link = tmp_path / "rig.toml", tmp_path / "link.toml"
+    file.write_text("old")
+    file.chmod(0o640)
+    link.symlink_to(file)
+    writing.write_text(link, "new")
+    assert link.is_symlink() and file.read_text() == "new" and file.stat().st_mode & 0o777 == 0o640
+    writing.write_text(Path("/dev/null"), "new")
+    assert not Path("/dev/null").is_file()
 
 
 def test_a_folder_killed_before_its_mark_was_written_is_taken_up(tmp_path):

@@ -75,6 +75,23 @@ def test_means_are_those_of_the_levels_within_their_sds(tmp_path, case):
         assert np.ptp(log.settled[log.level[s.rows]], 0) == pytest.approx(np.zeros(z.shape[1]), abs=1e-9)
 
 
+@pytest.mark.parametrize("noise", [0.01, 0.1])
+def test_noise_does_not_cut_levels_short(tmp_path, noise):
+    """Five levels of 2.9 s at 50 Hz without any start: each sample is settled."""
+    shares = []
+    for seed in range(6):
+        rng, volts = np.random.default_rng(seed), np.repeat([6.0, 12.0, 18.0, 9.0, 15.0], 145)
+        columns = {
+            "time_s": np.arange(len(volts)) / 50,
+            "supply_voltage_V": volts,
+            "total_current_A": (0.5 + 0.05 * volts) * (1 + noise * rng.standard_normal(len(volts))),
+            "motor_speed_rpm": 180 * volts * (1 + 0.25 * noise * rng.standard_normal(len(volts))),
+        }
+        found = settled(tmp_path, bench(tmp_path, columns))
+        shares += [len(s.rows) / 145 for s in found.kept]
+    assert len(shares) == 30 and min(shares) > 0.5 and np.mean(shares) > 0.9
+
+
 @pytest.mark.nightly
 @pytest.mark.slow
 def test_sds_hold_over_random_logs(tmp_path):

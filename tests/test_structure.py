@@ -296,7 +296,11 @@ KEPT = {
     ("calibration/data/parts.py", "packaged_cells"): "a packaged table",
     ("calibration/discovery/scales.py", "_nominal"): "pure: signals of the nominal robot",
     ("sweeps/cli.py", "os.environ"): "set for jax, before it is imported",
+    ("sweeps/cli.py", "sys.unraisablehook"): "repeats an interrupt that a callback lost, while a command works",
+    ("sweeps/cli.py", "sys.stdout"): "where it is closed, once a process",
+    ("sweeps/cli.py", "sys.stderr"): "where it is closed, once a process",
     ("sweeps/cli.py", "jax.config"): "a switch of jax, once a process",
+    ("sweeps/export/jax_actuator.py", "jax.config"): "set back after a program is lowered",
     (
         "sweeps/points/cluster.py",
         "_compiled",

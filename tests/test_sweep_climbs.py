@@ -1,6 +1,7 @@
 """Sweeps of climbs: the search of many points side by side, points as single climbs, the store, what is refused."""
 
 import json
+import time
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +19,7 @@ from mmrjax.model.conditions import Conditions
 from mmrjax.model.paper_robots import nominal
 from sweeps.config_campaign import Campaign, Obstacle
 from sweeps.pages.campaign_figures import Varied, draw_grid_statuses
-from sweeps.points import axes, climbs
+from sweeps.points import axes, climbs, scale
 
 ROBOT = nominal()
 
@@ -152,7 +153,17 @@ obstacle_mm = [60, 500]
 
 
 def test_interrupted_map_goes_on_after_its_last_chunk(mmrjax, tmp_path, monkeypatch):
-    """Climbs in closed form: what a chunk has is kept, what was under way is climbed again."""
+    """Climbs in closed form: what a chunk has is kept, what was under way is climbed again.
+
+    The interrupt comes while the first chunk waits to be written, as on a machine with idle cores.
+    """
+    fetch = scale.fetch_values
+
+    def later(arrays, count):
+        time.sleep(0.3)
+        return fetch(arrays, count)
+
+    monkeypatch.setattr(scale, "fetch_values", later)
     climbed, ends = [], iter([False, True, False, False])
 
     def closed(of, variation, conditions, values, sizes, told):

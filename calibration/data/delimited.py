@@ -16,6 +16,7 @@ from calibration.data import input_files
 from calibration.data.columns import WORDS
 from calibration.data.input_errors import BadData
 from calibration.data.named_arrays import NamedArrays, Raw, cell_number
+from calibration.data.writing import cell_word
 from mmrjax.errors import count_noun
 from mmrjax.model import channels, quantities
 
@@ -87,7 +88,7 @@ def _plain(name: str, content: bytes) -> NamedArrays | None:
     except UnicodeDecodeError:
         return None
     input_files.check_declared(name, first[0].count(",") + 1)
-    header, row = ([cell.strip() for cell in line.split(",")] for line in (*first, "", "")[:2])
+    header, row = ([cell_word(cell.strip()) for cell in line.split(",")] for line in (*first, "", "")[:2])
     if len(header) < 2 or not all(header) or len(header) != len(row) or row_of_units(header, row):
         return None
     import pyarrow as pa
@@ -114,7 +115,7 @@ def _plain(name: str, content: bytes) -> NamedArrays | None:
             found = column.cast(pa.float64()).to_numpy()
         except pa.ArrowInvalid:  # some cell states no number
             found = np.full(1, np.nan)
-        values.append([cell.strip() for cell in column.to_pylist()] if np.isnan(found).any() else found)
+        values.append([cell_word(cell.strip()) for cell in column.to_pylist()] if np.isnan(found).any() else found)
     if empty is None or compute.any(empty).as_py():  # rows of separators alone
         return None
     return NamedArrays(name, tuple(header), tuple(values), digest=hashlib.sha256(content).hexdigest())
@@ -188,7 +189,7 @@ def split_cells(name: str, lines: Sequence[str]) -> tuple[list[list[str]], tuple
     header = lines[0] if lines else ""
     mark = next((m for m in SEPARATORS if m in header and "," not in header), ",")
     try:
-        rows = [[cell.strip() for cell in row] for row in csv.reader(lines, delimiter=mark)]
+        rows = [[cell_word(cell.strip()) for cell in row] for row in csv.reader(lines, delimiter=mark)]
     except csv.Error as error:
         raise BadData(
             f"{name}: cannot be read as CSV ({error}); look for a quotation mark that is not closed, or a cell of "

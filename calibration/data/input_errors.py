@@ -7,7 +7,7 @@ import numbers
 from typing import Any
 
 from mmrjax.errors import allowed_words as allowed_words
-from mmrjax.errors import shorten
+from mmrjax.errors import printable, shorten
 
 #: Largest random seed.
 SEEDS = 2**32 - 1
@@ -17,8 +17,8 @@ class InputError(Exception):
     """Error of input from outside; the message is one sentence for a person."""
 
     def __init__(self, message: str) -> None:
-        """Keeps the message `shortened`."""
-        super().__init__(shorten(message))
+        """Keeps the message, `shorten` and `printable`."""
+        super().__init__(shorten(printable(message)))
 
     exit_code = 2
 

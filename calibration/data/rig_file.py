@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from calibration.data.columns import Layout
 from calibration.data.input_errors import BadConfiguration, allowed_words, is_number
+from calibration.data.writing import toml_value
 from mmrjax.model import channels, params
 from mmrjax.model.paper_robots import DYNAMIC_SHARE
 from mmrjax.model.rig import BETWEEN, IMPOSED, STARTS, Instrument, Rig
@@ -361,27 +361,27 @@ def rig_lines(rig: Rig) -> tuple[list[str], dict[str, list[str]]]:
     """Lines of a robot file that state a rig: of its head, and by table."""
     head = [
         f'imposed = "{rig.imposed}"  # on the drives: voltage, motor_speed or motor_current',
-        f"channels = {json.dumps(list(rig.channels))}  # what its instruments show",
+        f"channels = {toml_value(list(rig.channels))}  # what its instruments show",
         f'start = "{rig.start}"  # of histories: rest, measured or free',
         f'between_rows = "{rig.between_rows}"  # what is imposed, in histories: held or linear',
     ]
     tables: dict[str, list[str]] = {}
     if rig.columns:
         tables["columns"] = [
-            f"{mine} = {json.dumps(theirs)}"
+            f"{mine} = {toml_value(theirs)}"
             if factor == 1
-            else f"{mine} = {{column = {json.dumps(theirs)}, factor = {factor!r}}}"
+            else f"{mine} = {{column = {toml_value(theirs)}, factor = {factor!r}}}"
             for mine, theirs, factor in rig.columns
         ]
     if rig.surfaces:
         tables["surfaces"] = ["# each differs from the other by its ground alone"]
-        tables["surfaces"] += [f'{name} = "{other}"' for name, other in rig.surfaces]
+        tables["surfaces"] += [f"{toml_value(name)} = {toml_value(other)}" for name, other in rig.surfaces]
     for instrument in rig.instruments:
         channel = channels.find_channel(instrument.channel)
         size = f'"{FREE}"' if instrument.quantum is None else repr(instrument.quantum / channel.factor)
         step = [f"quantum = {size}  # [{channel.unit}] step of its readings"]
         tables[f"instruments.{channel.name}"] = [
-            f"signed = {json.dumps(FREE if instrument.signed is None else instrument.signed)}",
+            f"signed = {toml_value(FREE if instrument.signed is None else instrument.signed)}",
             *([] if instrument.quantum == 0 else step),
         ]
     return head, tables

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-import json
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -17,12 +16,12 @@ from calibration.data.configuration_tables import loads_from_tables, resolved_li
 from calibration.data.effect_file import Library
 from calibration.data.input_errors import BadConfiguration, allowed_words, bound_text, is_number
 from calibration.data.input_files import toml_content, toml_text
-from calibration.data.writing import write_text
+from calibration.data.writing import toml_value, write_text
 from mmrjax import effects
 from mmrjax.compile.precision import in_double
 from mmrjax.effects import Effect
 from mmrjax.effects.scaled import scaled_effect
-from mmrjax.errors import list_some
+from mmrjax.errors import list_some, printable
 from mmrjax.model import paper_robots, params, power
 from mmrjax.model.driver import DECAYS
 from mmrjax.model.robot import Configurations, Robot
@@ -439,10 +438,10 @@ def write_robot(robot: Robot, path: Path, *, note: str = "") -> None:
         tables.setdefault(title, []).append(line)
     for title, line in _lines_of_ratings(robot, nothing, {name for name, lines in tables.items() if lines}):
         tables.setdefault(title, []).append(line)
-    lines = [f"# {line}" for line in note.splitlines()]
+    lines = [f"# {printable(line)}" for line in note.splitlines()]
     lines += [f'schema = "{SCHEMA}"', f'base = "{"nominal" if whole else rig_file.NONE}"']
     lines += [f"sides = {int(robot.sides)}  # motors driven alike", *head]
-    lines.append(f"configurations = {json.dumps(list(robot.configurations))}")
+    lines.append(f"configurations = {toml_value(list(robot.configurations))}")
     for title, table in {**tables, **more}.items():
         if not (whole or table or title in robot.configurations):
             continue
@@ -453,7 +452,7 @@ def write_robot(robot: Robot, path: Path, *, note: str = "") -> None:
 def _lines_of_effect(effect: Effect) -> list[str]:
     """Keys of an effect's table other than its parameters."""
     named = effect.configurations or type(effect)().configurations
-    lines = [f"configurations = {json.dumps(effect.configurations)}  # on which it acts"] if named else []
+    lines = [f"configurations = {toml_value(effect.configurations)}  # on which it acts"] if named else []
     if type(effect).plain is not None:
         lines.append(f"{FACTORS} = {list(type(effect).factors)}  # sd, shape, limits: times the library's")
     return lines
@@ -508,7 +507,7 @@ def _lines_of_ratings(robot: Robot, nothing: Robot, stated: set[str]) -> Iterato
     for name, (_, what) in CHOICES.items():
         part, _, key = name.partition(".")
         if value(robot, name) != value(nothing, name):
-            yield part, f"{key} = {json.dumps(value(robot, name))}  # {what}"
+            yield part, f"{key} = {toml_value(value(robot, name))}  # {what}"
 
 
 def _start(robot: Robot) -> Robot:

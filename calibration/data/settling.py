@@ -36,7 +36,7 @@ SDS = 3.0
 #: Sd of the change along a stretch by a straight line, over that of its mean: √12.
 OF_CHANGE = 12**0.5
 #: Beginnings of a stretch that are tried, and share of the largest change from which on a change is slight.
-TRIES, SLIGHT = 5, 0.05
+TRIES, SLIGHT = 20, 0.05
 #: Largest number of different readings, as a share of all, of an instrument with coarse steps.
 COARSE = 0.2
 #: Equal readings one after the other that an instrument with noise does not show, and up to what share of all steps
@@ -199,8 +199,8 @@ def settle_log(
     """Returns the settled runs of a log.
 
     The log is divided into levels where the imposed quantity changes. Of each level the end is taken, extended
-    backward while every channel's mean stays the same. The means over this stretch are the settled run. Means leave
-    out glitches; see `find_glitches`. The sd of a mean has four parts:
+    backward while every channel's mean stays the same within its noise. The means over this stretch are the settled
+    run. Means leave out glitches; see `find_glitches`. The sd of a mean has four parts:
 
     * noise with its autocorrelation (Geyer's initial positive sequence, 1992),
     * the error from the steps of the instrument (Widrow and Kollár, Quantization noise, 2008, first term for normal
@@ -550,17 +550,23 @@ def _settled(
 
 
 def _end(signals: tuple[Signal, ...], time: np.ndarray, rows: np.ndarray, shortest: float, drift: float) -> _End:
-    """The part of a level after its last significant change, if there is one, else its last parts."""
+    """The end of a level whose means are most certain: a longer one has less noise, a shorter one changes less."""
     parts = _parts(time[rows], shortest)
     first = _first_steady(signals, rows, parts, drift)
     last = max(len(parts) - 3, first)
+    ends: list[tuple[float, _End]] = []
     for k in sorted({first, *np.linspace(first, last, TRIES).astype(int).tolist()}):
         taken = rows[parts[k][0] :]
         seen = {s.channel.name: _mean(s, time[taken], taken) for s in signals}
         left_over = max(_certain(s, *seen[s.channel.name]) for s in signals)
+        sds = [
+            sd / _scale(s, mean) for s in signals for mean, sd, _ in (seen[s.channel.name],) if math.isfinite(mean)
+        ]
+        glitches = {s.channel.name: int(s.glitches[taken].sum()) for s in signals}
+        ends.append((math.hypot(max(sds, default=0.0), left_over), _End(taken, seen, left_over, glitches)))
         if left_over <= SLIGHT * drift:
             break
-    return _End(taken, seen, left_over, {s.channel.name: int(s.glitches[taken].sum()) for s in signals})
+    return min(ends, key=lambda end: end[0])[1]
 
 
 def _unsettled(signals: tuple[Signal, ...], rows: np.ndarray, end: _End, drift: float) -> tuple[_Why | None, float]:
@@ -674,7 +680,8 @@ def _first_steady(signals: tuple[Signal, ...], rows: np.ndarray, parts: list[tup
     for k in range(first - 1, -1, -1):
         apart = np.abs(means[:, k] - tail)
         count = parts[k][1] - parts[k][0]
-        if np.any(apart > tolerance + SDS * noise / math.sqrt(max(count, 1))):
+        scatter = noise * math.sqrt(1 / max(count, 1) + 1 / (len(rows) - ends[0][0]))
+        if np.any(apart > tolerance + SDS * scatter):
             break
         first = k
     return first

@@ -7,6 +7,8 @@ import csv
 import io
 import json
 import math
+import re
+import shutil
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, TextIO
@@ -14,6 +16,7 @@ from typing import Any, TextIO
 import numpy as np
 
 from calibration.data import frames
+from mmrjax.errors import printable
 
 
 @contextlib.contextmanager
@@ -27,15 +30,63 @@ def naming_file(path: Path | str) -> Iterator[None]:
         raise
 
 
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Path next to a file, which replaces the file when the block ends.
+
+    After an error the file is as it was. A full disk is an example: writing into the file would have emptied it.
+    """
+    path = path.resolve()  # the file that a link names
+    if path.exists() and not path.is_file():  # a device or a pipe
+        with naming_file(path):
+            yield path
+        return
+    aside = path.with_name(f".{path.stem[:100]}.writing{path.suffix}")
+    try:
+        with naming_file(path):
+            yield aside
+            if path.exists():
+                shutil.copymode(path, aside)
+            aside.replace(path)
+    except OSError as error:
+        if error.filename == str(aside):
+            error.filename = str(path)
+        raise
+    finally:
+        aside.unlink(missing_ok=True)
+
+
 def write_text(path: Path, text: str) -> None:
     """Write a text file."""
-    with naming_file(path):
-        path.write_text(text, encoding="utf-8")
+    with replacing(path) as aside:
+        aside.write_text(text, encoding="utf-8")
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Write a JSON file; numbers that are not finite become null."""
-    write_text(path, json.dumps(finite_or_null(content), indent=2, ensure_ascii=False) + "\n")
+    """Write a JSON file, `json_text`."""
+    write_text(path, json_text(content) + "\n")
+
+
+def json_text(content: Mapping[str, Any]) -> str:
+    """Data as JSON: numbers that are not finite become null, characters that are not `printable` their escapes."""
+    text = json.dumps(finite_or_null(content), indent=2, ensure_ascii=False)
+    shown = printable(text)
+    pairs = zip(text, shown, strict=True)
+    return text if shown == text else "".join(a if a == b else json.dumps(a)[1:-1] for a, b in pairs)
+
+
+def toml_value(value: Any) -> str:
+    """A value as TOML, a text with escapes for characters that are not `printable`."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        text = json.dumps(value.encode("utf-8", "replace").decode(), ensure_ascii=False)
+        return "".join(c if c.isprintable() else f"\\U{ord(c):08x}" for c in text)
+    if isinstance(value, tuple | list):
+        return "[" + ", ".join(map(toml_value, value)) + "]"
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{toml_value(name)} = {toml_value(v)}" for name, v in value.items()) + "}"
+    return repr(value)
 
 
 def write_table(path: Path, columns: Mapping[str, np.ndarray], tables: str = "csv") -> None:
@@ -47,9 +98,9 @@ def write_table(path: Path, columns: Mapping[str, np.ndarray], tables: str = "cs
     if tables == "parquet":
         from pyarrow import parquet
 
-        with naming_file(path):
-            parquet.write_table(frames.to_arrow(columns), path.with_suffix(".parquet"))
-    with naming_file(path), path.open("w", newline="", encoding="utf-8") as stream:
+        with replacing(path.with_suffix(".parquet")) as aside:
+            parquet.write_table(frames.to_arrow(columns), aside)
+    with replacing(path) as aside, aside.open("w", newline="", encoding="utf-8") as stream:
         _write_rows(stream, columns)
 
 
@@ -62,15 +113,32 @@ def table_text(columns: Mapping[str, np.ndarray]) -> str:
 
 def _write_rows(stream: TextIO, columns: Mapping[str, np.ndarray]) -> None:
     writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(columns)
+    writer.writerow(map(cell_text, columns))
     writer.writerows(zip(*(map(cell_text, column) for column in columns.values()), strict=True))
 
 
+#: Words that a spreadsheet would run as formulas, and those that already have our mark.
+_FORMULA = re.compile(r"'*[=+\-@\t\r]")
+
+
 def cell_text(value: Any) -> str:
-    """A cell of a table."""
+    """A cell of a table; a word that a spreadsheet would run as a formula gets an apostrophe (`cell_word`)."""
     if isinstance(value, float | np.floating):
         return f"{value:.9g}" if math.isfinite(value) else ""
-    return str(value)
+    text = printable(str(value)).replace("\n", " ")
+    return f"'{text}" if isinstance(value, str) and _FORMULA.match(text) and not _is_number(text) else text
+
+
+def cell_word(text: str) -> str:
+    """A cell as it was before `cell_text` marked it."""
+    return text[1:] if text.startswith("'") and _FORMULA.match(text) else text
+
+
+def _is_number(text: str) -> bool:
+    with contextlib.suppress(ValueError):
+        float(text)
+        return True
+    return False
 
 
 def finite_or_null(value: Any) -> Any:

@@ -191,7 +191,7 @@ def discover(
     silent = channels.channel_names(known.silent)
     factors = FACTORS.get(known.word, ())
     # Verdicts at other noises use the programs of the first one, so they run in parallel on other cores.
-    others = Threads(2, kept.BESIDE)
+    others = Threads(2)
     sensitivity, outstanding = list[Sensitivity](), list[float]()
     try:
         if factors:
@@ -279,8 +279,6 @@ def prepare_loop(
     A campaign that needs only verdicts continues with `LoopInput.trace`, and so follows the same path as users.
     """
     menu.check_forbidden(forbidden, robot)
-    if not robot.rig.inherits:
-        scales.precompute_nominal()
     runs = used_rows(runs, robot, rows)
     distinct, numbers, notes = without_copies(runs)
     kind = observers.observer_kind(distinct)
@@ -289,7 +287,8 @@ def prepare_loop(
             f"{runs.source}: {count_noun(len(distinct), kind.word)} cannot show what a model lacks; at least "
             f"{kind.fewest} are needed"
         )
-    ready = preparation.prepare(distinct, robot, noise, stated)
+    with scales.nominal_ahead(robot):
+        ready = preparation.prepare(distinct, robot, noise, stated)
     for note in ready.checked:
         if isinstance(note, NothingVaries) or (isinstance(note, Copied) and not note.tied):
             raise BadData(describe(note))

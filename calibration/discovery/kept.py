@@ -6,8 +6,8 @@ from collections.abc import Callable
 from typing import Protocol, TypeVar
 
 T = TypeVar("T")
-#: Name of the threads for other noises, whose results are optional.
-BESIDE = "loop-beside"
+#: File of the robot as fitted, without effects that were found; it is written as soon as it is known.
+REFIT_FILE = "fitted.toml"
 
 
 class Keep(Protocol):

@@ -18,6 +18,7 @@ from calibration.described import describe, sentences
 from calibration.discovery.clusters import Cluster
 from calibration.discovery.headline import headline
 from calibration.discovery.instructions import Instruction
+from calibration.discovery.kept import REFIT_FILE
 from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.loop_notes import Asked, Headline, Mechanism, NameSupport, RuledOut, Summary
 from calibration.discovery.prediction import Gain
@@ -34,7 +35,6 @@ SCHEMA = "mmrjax.loop/3"
 #: The robot with the running gear fitted by the track model.
 TRACK_FILE = "robot_track.toml"
 #: The robot fitted with nothing added.
-REFIT_FILE = "fitted.toml"
 #: Significance at which a running gear explains the discrepancy.
 RESOLVED_ERROR = 0.01
 #: Prior sds above which a constant of the running gear is implausible.

@@ -10,11 +10,11 @@ one.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import math
-import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +24,7 @@ from calibration.data.effect_file import Library
 from calibration.data.runs import Runs
 from calibration.discovery.reach import LOADED, RUNNING
 from mmrjax.compile.compiling import OVER_TIME, compiled
-from mmrjax.compile.precision import in_double
+from mmrjax.compile.precision import Threads, in_double
 from mmrjax.effects import Effect
 from mmrjax.effects.scaled import amplitude_of, scaled_effect, shape_of
 from mmrjax.fidelities.steady import operating_signals, results_of_rows
@@ -104,9 +104,16 @@ def library_of_size(robot: Robot, conditions: Conditions, library: Library, turn
     return sized
 
 
-def precompute_nominal() -> None:
-    """Compute the nominal robot's signals for `library_of_size` on another core."""
-    threading.Thread(target=in_double(_nominal), daemon=True).start()
+@contextlib.contextmanager
+def nominal_ahead(robot: Robot) -> Iterator[None]:
+    """Context that computes the nominal robot's signals for `library_of_size` on another core.
+
+    It waits for them also after an error: a thread at work in XLA aborts a process that ends.
+    """
+    with Threads(1) as core:
+        if not robot.rig.inherits:
+            core.submit(in_double(_nominal))
+        yield
 
 
 def output_rotation(runs: Runs, robot: Robot) -> float:

@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from calibration.data.input_errors import BadConfiguration
+from calibration.data.writing import replacing
 from calibration.described import describe
 from calibration.inference import noise as noise_room
 from calibration.inference import series_noise
@@ -184,15 +185,12 @@ class Members:
         kept: dict[str, Any] = dict(
             zip(KEPT, (z, *map(np.array, zip(*self._kept.values(), strict=True))), strict=True)
         )
-        aside = self._file.with_name(self._file.name + ".partial")
         try:
-            with aside.open("wb") as out:
+            with replacing(self._file) as aside, aside.open("wb") as out:
                 np.savez(out, **kept, identity=np.array(self._own))
                 out.flush()
                 os.fsync(out.fileno())
-            aside.replace(self._file)
         except OSError as error:
-            aside.unlink(missing_ok=True)
             raise BadConfiguration(f"--members {self._file}: cannot be written: {error.strerror}") from None
 
     def lost(self, seen: Rows) -> Bool[np.ndarray, "members rows"]:

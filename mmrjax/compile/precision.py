@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mmrjax import WORKER
 from mmrjax.compile.programs import has_tracer
 
 #: Reason for refusing a fit inside a trace in single precision, with the remedy.
@@ -126,6 +127,10 @@ def as_array(value: Any, kind: type = float) -> Any:
 
 class Threads(concurrent.futures.ThreadPoolExecutor):
     """Pool of threads; each call is computed in the precision of the thread that submits it."""
+
+    def __init__(self, workers: int) -> None:
+        """Makes a pool of this number of threads."""
+        super().__init__(workers, WORKER)
 
     def submit(self, fn: Callable[..., T], /, *args: Any, **named: Any) -> concurrent.futures.Future[T]:
         """Submits a call, to be computed in the precision of this thread."""

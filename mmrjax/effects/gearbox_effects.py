@@ -1,4 +1,8 @@
-"""Effects on the gearbox [N·m] at its output shaft, eqs. (19)-(23)."""
+"""Effects on the gearbox [N·m] at its output shaft, eqs. (19)-(23).
+
+M_load is the torque that the gearbox transmits to its output (`signals.torque_carried`): the load, and what
+accelerates the parts behind the gearbox, but not the rotor.
+"""
 
 from __future__ import annotations
 
@@ -16,11 +20,6 @@ class GearboxEffect(Effect):
     """Torque lost in the gearbox, at its output shaft [N·m]."""
 
     balance = "gearbox"
-
-
-def torque_output(robot: Robot, signals: Signals) -> Scalar:
-    """Torque of traction and track losses at the output shaft [N·m]."""
-    return signals.torque_track_loss + robot.chassis(signals.configuration).radius * signals.traction
 
 
 class GearLoadLoss(GearboxEffect):
@@ -41,7 +40,7 @@ class GearLoadLoss(GearboxEffect):
     )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
-        load = torque_output(robot, signals)
+        load = signals.torque_carried
         return self.amplitude * magnitude(load, signals.direction) * signals.direction
 
 
@@ -63,8 +62,7 @@ class GearQuadraticLoss(GearboxEffect):
     )
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
-        load = torque_output(robot, signals)
-        return self.amplitude * load**2 * signals.direction
+        return self.amplitude * signals.torque_carried**2 * signals.direction
 
 
 class StribeckGear(GearboxEffect):
@@ -113,7 +111,7 @@ class BackdrivingLoss(GearboxEffect):
     )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
-        driving = at_least(0.0, -torque_output(robot, signals) * signals.direction)
+        driving = at_least(0.0, -signals.torque_carried * signals.direction)
         return self.amplitude * driving * signals.direction
 
 
@@ -138,7 +136,7 @@ class BristleLoadLoss(Bristle, GearboxEffect):
     angle_breakaway: Scalar = breakaway_parameter()
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
-        load = magnitude(torque_output(robot, signals), signals.direction)
+        load = magnitude(signals.torque_carried, signals.direction)
         return self.amplitude * load * self.recall(robot, signals)
 
 
@@ -164,6 +162,6 @@ class BristleBackdrivingLoss(Bristle, GearboxEffect):
     angle_breakaway: Scalar = breakaway_parameter()
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
-        load, bend = torque_output(robot, signals), self.recall(robot, signals)
+        load, bend = signals.torque_carried, self.recall(robot, signals)
         driving = magnitude(load, signals.direction) * bend - load * bend**2
         return 0.5 * self.amplitude * driving

@@ -11,6 +11,7 @@ from jaxtyping import Array
 from mmrjax.fidelities.result import movers_slip, travel_status
 from mmrjax.model import balances
 from mmrjax.model.conditions import Conditions
+from mmrjax.model.driver import STEEPNESS
 from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import NOT_SETTLED, SLIDES, STALLED, Signals, State
@@ -44,14 +45,18 @@ def smallest(*values: Scalar) -> Array:
 def travel_direction(robot: Robot, conditions: Conditions) -> Array:
     """Direction in which a robot can travel, 1 forward or -1 backward, from the torque on its shafts at rest.
 
-    The torque is that of the motors at stall current less gravity's. Friction can hold the robot but not reverse it.
-    With an imposed motor speed, the direction of that speed.
+    The torque is that of the motors at stall current, within the driver's limit, less gravity's. Friction can hold
+    the robot but not reverse it. With an imposed motor speed, the direction of that speed.
     """
     if conditions.motor_speed is not None:
         return jax.lax.stop_gradient(jnp.where(conditions.motor_speed >= 0, 1.0, -1.0))
     chassis = robot.chassis(conditions.configuration)
     mass = chassis.mass + conditions.payload if conditions.total_mass is None else conditions.total_mass
-    stall = robot.motor.torque_electromagnetic(robot.motor.current_stall(voltage_at_rest(robot, conditions)))
+    stall = robot.motor.current_stall(voltage_at_rest(robot, conditions))
+    if not conditions.voltage_follows:
+        most = robot.driver.current_limit * (1 + jnp.abs(conditions.duty) * (1 / STEEPNESS))
+        stall = one_sided.clip(stall, -most, most)
+    stall = robot.motor.torque_electromagnetic(stall)
     weight = chassis.torque_weight(mass * (1 / robot.sides), conditions.slope)
     weight = weight if conditions.load_torque is None else weight + conditions.load_torque
     return jax.lax.stop_gradient(jnp.where(robot.gearbox.ratio * stall >= weight, 1.0, -1.0))
@@ -63,9 +68,33 @@ def voltage_at_rest(robot: Robot, conditions: Conditions) -> Array:
         return jnp.asarray(robot.motor.voltage_back(conditions.motor_speed))
     if conditions.motor_current is not None:  # an amplifier's, see `balances.electrical`
         return jnp.asarray(robot.motor.resistance * conditions.motor_current)
+    return conditions.duty * jnp.where(conditions.open > 0.5, 0.0, _source_at_rest(robot, conditions))
+
+
+def _source_at_rest(robot: Robot, conditions: Conditions) -> Array:
     battery = robot.battery.voltage(0.0, conditions.discharge)
-    source = jnp.where(conditions.battery > 0.5, battery, conditions.voltage)
-    return conditions.duty * jnp.where(conditions.open > 0.5, 0.0, source)
+    return jnp.where(conditions.battery > 0.5, battery, conditions.voltage)
+
+
+def admitted_current(robot: Robot, conditions: Conditions, wanted: Scalar) -> tuple[Scalar, Scalar]:
+    """Current that limit and diode of the driver admit [A], and the voltage that holds back the rest [V].
+
+    See `Driver.admitted`, with the resistance of a motor and its share of the battery's. An amplifier that imposes
+    speed or current has neither limit nor diode.
+    """
+    if conditions.voltage_follows:
+        return wanted, jnp.zeros_like(wanted)
+    battery, duty = robot.battery, conditions.duty
+    behind = robot.sides * battery.cells * battery.resistance * duty * robot.driver.share_drawn(duty)
+    resistance = robot.motor.resistance + jnp.where(conditions.battery > 0.5, behind, 0.0)
+    resistance, source = jax.lax.stop_gradient((resistance, _source_at_rest(robot, conditions)))
+    current, held = robot.driver.admitted(wanted, conditions.polarity * duty, jnp.abs(source) / resistance)
+    return current, resistance * held
+
+
+def without_diode(robot: Robot) -> Robot:
+    """Same robot on a supply that takes current back, for balances at an `admitted_current`."""
+    return dataclasses.replace(robot, driver=dataclasses.replace(robot.driver, returns_current=True))
 
 
 def _carried(robot: Robot, conditions: Conditions, state: State, direction: Scalar) -> Signals:
@@ -76,7 +105,7 @@ def _carried(robot: Robot, conditions: Conditions, state: State, direction: Scal
     signals = balances.settled_signals(robot, conditions, state, direction)[0]
     limit = signals.adhesion_limit
     carried = dataclasses.replace(signals, traction=jnp.clip(signals.demand, -limit, limit))
-    return balances.gearbox(robot, robot.chassis(conditions.configuration), carried)
+    return balances.gearbox(robot, robot.chassis(conditions.configuration), carried, settled=True)
 
 
 def standing_signals(robot: Robot, conditions: Conditions, state: State) -> Signals:
@@ -119,6 +148,7 @@ def standing_signals(robot: Robot, conditions: Conditions, state: State) -> Sign
         torque_load=torque,
         torque_gear=torque,
         torque_output=torque,
+        torque_carried=torque,
         torque_input=torque / gear.ratio,
         torque_net=none,
         speed_sliding=none,
@@ -215,14 +245,17 @@ def slides_in_place(robot: Robot, conditions: Conditions) -> Array:
 def current_settled(robot: Robot, conditions: Conditions, state: State) -> Scalar:
     """Current [A] that settles at the motor speed of `state`, by the secant of its voltage balance."""
 
-    def left(current: Scalar) -> Scalar:
+    def left(wanted: Scalar) -> Scalar:
+        current, held = admitted_current(robot, conditions, wanted)
         here = dataclasses.replace(state, current=current)
-        return balances.driven_signals(robot, conditions, here, jnp.zeros_like(state.speed)).voltage_left
+        none = jnp.zeros_like(state.speed)
+        return balances.driven_signals(without_diode(robot), conditions, here, none).voltage_left - held
 
     guess = robot.motor.current_stall(left(jnp.zeros_like(state.current)))
     first, second = left(0.5 * guess), left(guess)
     slope = (second - first) / jnp.where(guess == 0, 1.0, 0.5 * guess)
-    return guess - jnp.where(guess == 0, 0.0, second / jnp.where(guess == 0, 1.0, slope))
+    wanted = guess - jnp.where(guess == 0, 0.0, second / jnp.where(guess == 0, 1.0, slope))
+    return admitted_current(robot, conditions, wanted)[0]
 
 
 def current_at_rest(robot: Robot, conditions: Conditions, state: State) -> Scalar:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Array
 
 from mmrjax.compile.precision import on_host
 from mmrjax.compile.programs import has_tracer
@@ -18,8 +17,7 @@ from mmrjax.fidelities.base import History
 from mmrjax.fidelities.run_batches import Pending
 from mmrjax.missions import mission_batch
 from mmrjax.missions.mission import Mission
-from mmrjax.model.channels import Channel, usual_channels
-from mmrjax.model.channels import channel_names as channel_names
+from mmrjax.model.channels import Channel, channel_names, usual_channels
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar
 from mmrjax.model.signals import CODES, STATUSES, Result
@@ -68,54 +66,8 @@ def _codes(words: Any) -> Any:
     return np.array([STATUSES.index(word) for word in asked.ravel().tolist()], int).reshape(asked.shape)
 
 
-class _Numbers:
-    """Fields of `Result` and channels that `Results` offers under their names, for type checkers and `dir`."""
-
-    theoretical_speed: Array
-    slip: Array
-    voltage: Array
-    mass: Array
-    traction: Array
-    adhesion_used: Array
-    power_supply: Array
-    power_motor: Array
-    power_gear: Array
-    power_ground: Array
-    power_lift: Array
-    efficiency_motor: Array
-    efficiency_gear: Array
-    efficiency_chassis: Array
-    winding_settled: Array
-    voltage_cell: Array
-    status: Array
-    flags: Array
-    reading: Mapping[str, Array]
-    # channels
-    total_current: Array
-    motor_speed: Array
-    speed: Array
-    motor_current: Array
-    output_speed: Array
-    output_angle: Array
-    position: Array
-    motor_voltage: Array
-    output_torque: Array
-    winding_temperature: Array
-    motor_current_left: Array
-    motor_current_right: Array
-    motor_speed_left: Array
-    motor_speed_right: Array
-    motor_voltage_left: Array
-    motor_voltage_right: Array
-    yaw_rate: Array
-    lateral_speed: Array
-    yaw: Array
-    place_x: Array
-    place_y: Array
-
-
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
-class Results(_Numbers):
+class Results:
     """Results of one run or a batch, of one fidelity; a pytree.
 
     For `steady`, numbers are computed at first use and kept. One program computes the readings and statuses, another
@@ -191,24 +143,22 @@ class Results(_Numbers):
             status = shown.get(STATUS, _compared(whole.status))
             own["result"] = dataclasses.replace(whole, reading=reading, status=status)
 
-    if not TYPE_CHECKING:  # type checkers know the names from `_Numbers`
-
-        def __getattr__(self, name: str) -> Any:
-            self._compute(name)
-            if name in self.__dict__:
-                return self.__dict__[name]
-            result, further = self.__dict__.get("result"), self.__dict__.get("further")
-            if further is not None and name in further:
-                return further[name]
-            if result is not None and not name.startswith("__"):
-                try:
-                    return getattr(result, name)
-                except AttributeError:
-                    pass
-            raise AttributeError(f"{type(self).__name__} has no {name}")
+    def __getattr__(self, name: str) -> Any:
+        self._compute(name)
+        if name in self.__dict__:
+            return self.__dict__[name]
+        result, further = self.__dict__.get("result"), self.__dict__.get("further")
+        if further is not None and name in further:
+            return further[name]
+        if result is not None and not name.startswith("__"):
+            try:
+                return getattr(result, name)
+            except AttributeError:
+                pass
+        raise AttributeError(f"{type(self).__name__} has no {name}")
 
     def __dir__(self) -> list[str]:
-        return sorted({*object.__dir__(self), *_Numbers.__annotations__, *self.further})
+        return sorted({*object.__dir__(self), *Result.__annotations__, *channel_names(self.channels), *self.further})
 
     @property
     def shape(self) -> tuple[int, ...]:

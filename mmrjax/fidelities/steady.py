@@ -15,11 +15,18 @@ from jaxtyping import Array, Bool, Float
 from mmrjax.compile.compiling import SELDOM, compiled
 from mmrjax.fidelities import outputs
 from mmrjax.fidelities.base import Fidelity, Implicit, Progress, Run
-from mmrjax.fidelities.rest import is_at_rest, slides_in_place, standing_signals, travel_direction, voltage_at_rest
+from mmrjax.fidelities.rest import (
+    admitted_current,
+    is_at_rest,
+    slides_in_place,
+    standing_signals,
+    travel_direction,
+    voltage_at_rest,
+    without_diode,
+)
 from mmrjax.fidelities.result import is_not_forward, result_of_signals, travel_status, withhold_numbers
 from mmrjax.model import balances, channels, ground, params
 from mmrjax.model.conditions import Conditions
-from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import (
     BATTERY_EMPTY,
@@ -34,6 +41,7 @@ from mmrjax.model.signals import (
 )
 from mmrjax.numerics.linear_equations import Vector
 from mmrjax.numerics.newton import root
+from mmrjax.numerics.one_sided import clip
 from mmrjax.numerics.rarely import compute_rarely
 from mmrjax.turning import circling
 
@@ -41,38 +49,46 @@ from mmrjax.turning import circling
 _SPEED, _CURRENT, _SPEED_MOTOR, _VOLTAGE, _TORQUE = 1.0, 10.0, 1000.0, 10.0, 100.0
 
 
-def _state(unknowns: Vector, discharge: Float[Array, ""]) -> State:
-    """State from speed, current and motor speed, in the order of elimination of the balances.
-
-    For any robot the slip determines the speed and the voltage the current; the torque then gives the motor speed.
-    """
-    speed, current, speed_motor = unknowns
-    return State(_CURRENT * current, _SPEED_MOTOR * speed_motor, _SPEED * speed, discharge)
-
-
 _balanced = compiled(balances.settled_signals)
+
+
+def _settled_at(
+    robot: Robot, conditions: Conditions, unknowns: Vector, sense: Array
+) -> tuple[State, Signals, Vector]:
+    """State and signals at given unknowns, and the residuals of the balances, all 0 at the operating point.
+
+    The unknowns are speed, current and motor speed, in the order of elimination of the balances. For any robot the
+    slip determines the speed and the voltage the current; the torque then gives the motor speed. The current is the
+    one that the duty alone would drive, see `Driver.admitted`.
+    """
+    speed, wanted, speed_motor = unknowns
+    current, held = admitted_current(robot, conditions, _CURRENT * wanted)
+    state = State(current, _SPEED_MOTOR * speed_motor, _SPEED * speed, conditions.discharge)
+    signals, creep = _balanced(without_diode(robot), conditions, state, sense)
+    # Moving with balanced torques, or at rest with too little torque: speed >= 0 and torque <= 0 in the direction of
+    # travel, and one of them is 0.
+    lacking, moving = -sense * signals.torque_net / _TORQUE, sense * speed_motor
+    torque = sense * jnp.where(moving < lacking, moving, lacking)
+    slip, voltage = signals.speed_sliding - creep, (signals.voltage_left - held) / _VOLTAGE
+    if conditions.motor_speed is not None:  # the torque determines the current; the motor speed is given
+        known = speed_motor - conditions.motor_speed / _SPEED_MOTOR
+        return state, signals, (jnp.asarray(slip), jnp.asarray(signals.torque_net / _TORQUE), jnp.asarray(known))
+    if not robot.driver.returns_current:  # a diode takes the rest of the voltage
+        settled = signals.voltage_back + signals.voltage_drop
+        signals = dataclasses.replace(signals, voltage=settled, voltage_left=jnp.zeros_like(settled))
+    return state, signals, (jnp.asarray(slip), jnp.asarray(voltage), torque)
 
 
 @compiled
 def _residual(unknowns: Vector, robot: Robot, own: tuple[Conditions, Array]) -> Vector:
     conditions, sense = own
     robot = robot.within(conditions.configuration)
-    _, conditions = _sound(robot, conditions)
-    signals, creep = _balanced(robot, conditions, _state(unknowns, conditions.discharge), sense)
-    return _left(unknowns, conditions, sense, signals, creep)
+    return _settled_at(robot, _sound(robot, conditions)[1], unknowns, sense)[2]
 
 
-def _left(unknowns: Vector, conditions: Conditions, sense: Array, signals: Signals, creep: Scalar) -> Vector:
-    """Residuals of the balances, all 0 at the operating point."""
-    # Moving with balanced torques, or at rest with too little torque: speed >= 0 and torque <= 0 in the direction of
-    # travel, and one of them is 0.
-    lacking, moving = -sense * signals.torque_net / _TORQUE, sense * unknowns[2]
-    torque = sense * jnp.where(moving < lacking, moving, lacking)
-    slip, voltage = signals.speed_sliding - creep, signals.voltage_left / _VOLTAGE
-    if conditions.motor_speed is not None:  # the torque determines the current; the motor speed is given
-        known = unknowns[2] - conditions.motor_speed / _SPEED_MOTOR
-        return jnp.asarray(slip), jnp.asarray(signals.torque_net / _TORQUE), jnp.asarray(known)
-    return jnp.asarray(slip), jnp.asarray(voltage), torque
+def _residual_unlimited(unknowns: Vector, robot: Robot, own: tuple[Conditions, Array]) -> Vector:
+    """`_residual` in most runs: linear, without the driver's limit and diode."""
+    return _residual(unknowns, dataclasses.replace(robot, driver=robot.driver.unlimited()), own)
 
 
 def _sound(robot: Robot, conditions: Conditions) -> tuple[Array, Conditions]:
@@ -95,9 +111,12 @@ def _start(robot: Robot, conditions: Conditions) -> Vector:
     speed = nominal * (0.9 / robot.motor.torque_constant)
     if conditions.motor_speed is not None:
         speed = conditions.motor_speed
+    current = nominal * (0.05 / robot.motor.resistance)
+    if not conditions.voltage_follows:  # below the limit, from which Newton's method reaches each part of the curve
+        current = clip(current, -0.5 * robot.driver.current_limit, 0.5 * robot.driver.current_limit)
     return (
         robot.chassis(conditions.configuration).radius * speed * (1 / robot.gearbox.ratio / _SPEED),
-        nominal * (0.05 / robot.motor.resistance / _CURRENT),
+        current / _CURRENT,
         speed / _SPEED_MOTOR,
     )
 
@@ -111,7 +130,8 @@ def _root(robot: Robot, conditions: Conditions, large: bool = True) -> tuple[Vec
     sound = _sound(robot, conditions)[1]
     start = jax.lax.stop_gradient(_start(robot, sound))
     own = conditions, travel_direction(robot, sound)
-    return root(_residual, start, robot, own, tolerance, large and not robot.effects, large)
+    linear = _residual_unlimited if large and not robot.effects else None
+    return root(_residual, start, robot, own, tolerance, linear, large)
 
 
 @compiled
@@ -128,7 +148,7 @@ def operating_signals(robot: Robot, conditions: Conditions) -> Signals:
         return _circled(robot, conditions)
     unknowns, _ = _root(robot, conditions)
     _, sound = _sound(robot, conditions)
-    return _balanced(robot, sound, _state(unknowns, sound.discharge), travel_direction(robot, sound))[0]
+    return _settled_at(robot, sound, unknowns, travel_direction(robot, sound))[1]
 
 
 def steady(robot: Robot, conditions: Conditions) -> Result:
@@ -213,8 +233,7 @@ def _operating_at(
     robot = robot.within(conditions.configuration)
     sound, conditions = _sound(robot, conditions)
     sense = travel_direction(robot, conditions)
-    signals, creep = _balanced(robot, conditions, _state(unknowns, conditions.discharge), sense)
-    left = _left(unknowns, conditions, sense, signals, creep)
+    state, signals, left = _settled_at(robot, conditions, unknowns, sense)
     rest = robot.chassis(conditions.configuration).speed_still
     voltage = voltage_at_rest(robot, conditions)
     still = is_at_rest(sense, voltage, signals.speed_theoretical, signals.speed, rest)
@@ -227,7 +246,7 @@ def _operating_at(
         status = jnp.where(beyond, jnp.where(slides, SLIDES, STALLED), status)
     if conditions.motor_speed is None:
         stands_still = (status == STALLED) & (jnp.abs(signals.speed_theoretical) < 1e-9)
-        static = standing_signals(robot, conditions, _state(unknowns, conditions.discharge))
+        static = standing_signals(robot, conditions, state)
         signals = jax.tree.map(lambda rest, travel: jnp.where(stands_still, rest, travel), static, signals)
     status = jnp.where(solved, status, FAILED)
     empty = (conditions.battery > 0.5) & robot.battery.empty(conditions.discharge)

@@ -136,8 +136,10 @@ def supply(robot: Robot, conditions: Conditions, signals: Signals) -> Signals:
     )
     back = robot.motor.voltage_back(signals.speed_motor)
     voltage = robot.driver.voltage(source - effects_sum(robot, signals, "supply"), signals.duty, signals.pause, back)
-    blocked = robot.driver.blocks(signals.duty * conditions.polarity, signals.current, conditions.open)
-    return _fill(signals, voltage_source=source, voltage=jnp.where(blocked, back, voltage))
+    demanded, limited = (conditions.polarity * duty for duty in (conditions.duty, signals.duty))
+    conducts = robot.driver.conducts(demanded, limited, signals.current, voltage - back, conditions.open)
+    voltage = jnp.where(conducts == 1, voltage, back + conducts * (voltage - back))
+    return _fill(signals, voltage_source=source, voltage=voltage)
 
 
 def power_drawn(robot: Robot, signals: Signals) -> Scalar:
@@ -233,21 +235,51 @@ def track(robot: Robot, chassis: Load, signals: Signals, guide: Scalar | None = 
 
 #: Least inertia of the parts that turn with a wheel [kg·m²]: a rig's file may state none.
 LEAST_INERTIA = 1e-12
+#: Newton steps of the torque at the output, on which effects of the gearbox depend.
+TORQUE_STEPS = 4
 
 
-def gearbox(robot: Robot, chassis: Load, signals: Signals, mover: Scalar | None = None) -> Signals:
+def gearbox(
+    robot: Robot, chassis: Load, signals: Signals, mover: Scalar | None = None, *, settled: bool = False
+) -> Signals:
     """Torques at both shafts and the acceleration of the driving wheel, the armature taking its share.
 
-    `mover` is the mover's torque on the shaft in addition to the track losses [N·m]; None: the traction.
+    Effects of the gearbox depend on the torque B + J_w ω̇_k that it transmits to its output, J_w being what turns with
+    the output and B the load without their own loss. That torque depends on their loss, so Newton's method finds it.
+
+    Args:
+        mover: the mover's torque on the shaft in addition to the track losses [N·m]; None: the traction.
+        settled: True in steady travel: the torque at the output is B.
+    """
+    mover = chassis.radius * signals.traction if mover is None else mover
+    load = signals.torque_track_loss + mover
+
+    def at_output(torque: Scalar) -> Signals:
+        carrying = _fill(signals, torque_carried=torque)
+        return _accelerated(robot, chassis, carrying, load, effects_sum(robot, carrying, "gearbox"))
+
+    def surplus(torque: Scalar) -> Scalar:
+        signals = at_output(torque)
+        return torque - load - (chassis.inertia + signals.inertia_added) * signals.acceleration_wheel
+
+    torque, found = load, at_output(load)
+    if settled or not any(e.balance == "gearbox" for e in robot.effects):
+        return found
+    for _ in range(TORQUE_STEPS):
+        left, rise = jax.jvp(surplus, (torque,), (jnp.ones_like(torque),))
+        torque = torque - left / rise
+    return at_output(torque)
+
+
+def _accelerated(robot: Robot, chassis: Load, signals: Signals, load: Scalar, own: Scalar) -> Signals:
+    """Signals of a gearbox whose effects lose `own` under a load [N·m].
 
     Let A be the motor torque less the idle loss, and B the load at the output. The transmitted torque has the sign of
     A J_w + i J_d B at any efficiency. That sign decides the direction in which the load loss acts.
     """
     gear, inertia_motor = robot.gearbox, robot.motor.inertia
     idle = gear.torque_idle(signals.speed_motor, signals.direction)
-    mover = chassis.radius * signals.traction if mover is None else mover
-    own = effects_sum(robot, signals, "gearbox")
-    load = signals.torque_track_loss + mover + own
+    load = load + own
     drive = signals.torque_motor - idle
     inertia_added = effects_sum(robot, signals, "inertia")
     # Shafts without inertia get a very small one, which decides the direction of power and the torque transmitted.
@@ -397,11 +429,11 @@ def _within_backlash(robot: Robot, chassis: Shaft, signals: Signals, gap: Scalar
     gear = robot.gearbox
     idle = gear.torque_idle(signals.speed_motor, signals.direction)
     loss = chassis.torque_loss(signals.speed_output, signals.direction_travel) + effects_sum(robot, signals, "track")
-    signals = _fill(signals, torque_track_loss=loss)  # effects of the gearbox depend on it
-    own = effects_sum(robot, signals, "gearbox")
     inertia_added = effects_sum(robot, signals, "inertia")
     inertia_motor = robot.motor.inertia * gear.ratio**2
     mesh = chassis.torque_mesh(gap, signals.speed_wheel - signals.speed_output, inertia_motor)
+    signals = _fill(signals, torque_track_loss=loss, torque_carried=mesh)
+    own = effects_sum(robot, signals, "gearbox")
     efficiency = gear.efficiency_flow(mesh, signals.direction)
     drive = signals.torque_motor - idle
     net = gear.ratio * drive - mesh / efficiency - own
@@ -517,7 +549,7 @@ def settled_signals(
         creep = still
     else:
         creep = chassis.ground.speed_creep(signals.demand, signals.normal, signals.adhesion)
-    return gearbox(robot, chassis, track(robot, chassis, signals)), creep
+    return gearbox(robot, chassis, track(robot, chassis, signals), settled=True), creep
 
 
 class Travel(eqx.Module):

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, Int
 
 from mmrjax.compile.precision import is_double
 from mmrjax.errors import UsageError
+from mmrjax.model.quantities import CONDITIONS
 from mmrjax.model.robot import Robot
 
 Number = float | Sequence[float] | np.ndarray | Array
@@ -25,6 +26,8 @@ OF_SIDES = ("duty_left", "duty_right", "open_left", "open_right", "motor_speed_l
 SWITCHES = ("battery", "open", "open_left", "open_right")
 #: Conditions that free a robot to turn if they are stated.
 OF_TURNS = (*OF_SIDES, "heading_deg")
+#: Conditions that every run has.
+NUMBERS = ("voltage", "slope_deg", "payload", "battery", "discharge", "adhesion", "order", "duty", "open")
 
 
 class Named(eqx.Module):
@@ -83,7 +86,6 @@ class Conditions(eqx.Module):
         duty: share of the supply voltage that the driver applies to the motors, negative backward [-]; None: 1.
         open: 1 if the motors' circuit is open, so that they coast; -1 if the driver shorts it, so that they brake at
             any duty.
-            brake whatever it does between pulses.
         motor_speed: speed imposed on the motor shafts [rad/s]; the voltage follows. None: the voltage is imposed.
         motor_acceleration: of an imposed speed [rad/s²]; None: 0.
         motor_current: current imposed on each motor [A]; the voltage follows. None: the current follows.
@@ -160,47 +162,31 @@ class Conditions(eqx.Module):
         if not isinstance(duty, np.ndarray | jax.Array | None) and None not in (duty_left, duty_right):
             raise UsageError(sides_contradiction(("duty", *OF_SIDES[:2])))
         duty = 1.0 if duty is None else duty
+        given: dict[str, Any] = locals()
+        stated = {name: given[name] for name in CONDITIONS if given[name] is not None or name in NUMBERS}
         which: Any = configuration
         if not isinstance(configuration, jax.Array | Named):
             words = np.asarray(configuration)
             which = Named.of(words) if words.dtype.kind == "U" else configuration
         which = which if isinstance(which, Named) else _number("configuration", which, int)
-        given = {
-            "voltage": voltage, "slope_deg": slope_deg, "payload": payload, "battery": battery,
-            "discharge": discharge, "adhesion": adhesion, "order": order, "duty": duty, "open": open,
-        }  # fmt: skip
-        numbers = [_number(name, v) for name, v in given.items()]
-        others = {"total_mass": total_mass, "motor_speed": motor_speed, "motor_acceleration": motor_acceleration}
-        others |= {"motor_current": motor_current, "heading_deg": heading_deg, "adhesion_lateral": adhesion_lateral}
-        others |= {"duty_left": duty_left, "duty_right": duty_right, "open_left": open_left, "open_right": open_right}
-        others |= {"motor_speed_left": motor_speed_left, "motor_speed_right": motor_speed_right}
-        others |= {"levers_front_deg": levers_front_deg, "levers_rear_deg": levers_rear_deg}
-        others |= {"load_torque": load_torque}
-        optional = {name: _number(name, value) for name, value in others.items() if value is not None}
-        shapes = [x.shape for x in (which, *numbers, *optional.values())]
+        numbers = {name: _number(name, x) for name, x in stated.items()}
+        shapes = {name: x.shape for name, x in {"configuration": which, **numbers}.items()}
         try:
-            shape = np.broadcast_shapes(*shapes)
+            shape = np.broadcast_shapes(*shapes.values())
         except ValueError:
-            names = [f.name for f in dataclasses.fields(type(self)) if f.name not in (*others, "begin")]
-            by_name = dict(zip([*names, *optional], shapes, strict=True))
-            said = ", ".join(f"{name} {s}" for name, s in by_name.items() if s)
-            raise ValueError(f"Conditions: shapes do not broadcast to one another: {said}") from None
+            listed = ", ".join(f"{name} {s}" for name, s in shapes.items() if s)
+            raise ValueError(f"Conditions: shapes do not broadcast to one another: {listed}") from None
         self.configuration = jax.tree.map(lambda x: _broadcast(x, shape), which)
+        self.begin = None if begin is None else _broadcast(_number("begin", begin, int), shape)
         # an equal number for all runs is stored once: most fields of a large batch are 0 or 1
         shared: dict[float, Array] = {}
-        for k, value in enumerate(given.values()):
-            if not isinstance(value, float):
-                numbers[k] = _broadcast(numbers[k], shape)
-                continue
-            if value not in shared:
-                shared[value] = _broadcast(numbers[k], shape)
-            numbers[k] = shared[value]
-        self.voltage, self.slope_deg, self.payload, self.battery, self.discharge, self.adhesion = numbers[:6]
-        self.order, self.duty, self.open = numbers[6:]
-        held = {name: _broadcast(x, shape) for name, x in optional.items()}
-        for name in others:
-            setattr(self, name, held.get(name))
-        self.begin = None if begin is None else _broadcast(_number("begin", begin, int), shape)
+        for name in CONDITIONS:
+            if isinstance(value := stated.get(name), float):
+                if value not in shared:
+                    shared[value] = _broadcast(numbers[name], shape)
+                setattr(self, name, shared[value])
+            else:
+                setattr(self, name, None if value is None else _broadcast(numbers[name], shape))
 
     @property
     def shape(self) -> tuple[int, ...]:

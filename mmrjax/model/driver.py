@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 
 from mmrjax.model.params import Scalar, parameter
-from mmrjax.numerics.one_sided import at_least, clip
+from mmrjax.numerics.one_sided import at_least, at_most, clip
 
 #: Slope of the duty beyond the current limit, per relative excess [-]: an excess of 0.1 % lowers the duty by 0.5.
 STEEPNESS = 500.0
 #: Duty below which a driver gives no pulses [-].
 LEAST_DUTY = 1e-9
+#: Current [A] and duty [-] within which a diode begins to block.
+CURRENT_DIODE, DUTY_DIODE = 1e-3, 5e-3
 
 
 #: State of the bridge between the pulses of a duty: motors shorted (`slow`), or coasting (`fast`).
@@ -52,6 +57,11 @@ class Driver(eqx.Module):
     returns_current: bool = eqx.field(default=True, static=True)
     decay: str = eqx.field(default=SLOW, static=True)
 
+    def unlimited(self) -> Driver:
+        """Same driver without limit and diode."""
+        without: dict[str, Any] = {"current_limit": None, "returns_current": True}
+        return dataclasses.replace(self, **without)
+
     def voltage(self, source: Scalar, duty: Scalar, pause: Scalar, back: Scalar) -> Scalar:
         """Mean voltage at the motors [V]; `pause`: share of a period without pulses [-]; `back`: back-EMF E [V]."""
         pulses = duty * source
@@ -73,20 +83,59 @@ class Driver(eqx.Module):
 
         `polarity` is the sign of the supply voltage.
         """
-        over = at_least(0.0, jnp.abs(current) / self.current_limit - 1)
+        if self.current_limit is None:
+            return duty
+        over = at_least(0.0, jnp.abs(current) * (1 / self.current_limit) - 1)
         return clip(duty - polarity * jnp.sign(current) * STEEPNESS * over, -1.0, 1.0)
 
     def limits(self, current: Scalar) -> Scalar:
         """True if the limit acts at a motor `current` [A]."""
         return jnp.abs(current) > self.current_limit
 
-    def blocks(self, duty: Scalar, current: Scalar, open_circuit: Scalar) -> Scalar:
-        """True if the motor terminals are free, and therefore at the back-EMF.
+    def conducts(
+        self, duty: Scalar, limited: Scalar, current: Scalar, excess: Scalar, open_circuit: Scalar
+    ) -> Scalar:
+        """Share of time in which the driver's voltage is at the motors [-]; else they are free, at the back-EMF E.
 
-        The circuit is open, or the diode of a supply that takes no current back blocks it.
+        An open circuit never conducts. A diode conducts current in the direction of the duty. It begins and ends
+        smoothly within `CURRENT_DIODE` of 0, where a negative share drives a current through the diode back to 0. A
+        limit that would reverse the duty opens the circuit instead, smoothly within `DUTY_DIODE` of 0.
+
+        Args:
+            duty: demanded [-], with the sign of the voltage that it gives; limited: after the current limit [-].
+            current: of a motor [A]; excess: the driver's voltage less E [V].
         """
-        blocked = jnp.asarray(open_circuit) > 0.5
-        return blocked if self.returns_current else blocked | (duty * current < 0)
+        closed = jnp.where(jnp.asarray(open_circuit) > 0.5, 0.0, 1.0)
+        if self.returns_current:
+            return closed
+        drawn = jnp.sign(duty) * current / CURRENT_DIODE
+        diode = jnp.where(jnp.sign(duty) * excess < 0, clip(drawn, -1.0, 1.0), clip(1 + drawn, 0.0, 1.0))
+        backward = (limited * current < 0) & (duty * current >= 0)
+        return closed * jnp.where(backward, clip(1 - jnp.abs(limited) / DUTY_DIODE, 0.0, 1.0), diode)
+
+    def admitted(self, wanted: Scalar, duty: Scalar, most: Scalar) -> tuple[Scalar, Scalar]:
+        """Current that flows [A], and the part of `wanted` that a diode holds back [A].
+
+        Limit and diode as a curve over the current that the demanded duty alone would drive. Along it the voltage
+        available to change the current falls evenly, so that Newton's method crosses them. With over = |wanted| less
+        the limit, the limiter takes D = over / (|U_s|/R + I_max/`STEEPNESS`) of the duty, up to full reverse duty.
+        Beyond, the current increases again. With a diode, the duty is not reversed and the current does not increase.
+
+        Args:
+            wanted: any number; duty: as for `conducts`; most: |U_s|/R, or any number above 0 if it has no source [A].
+        """
+        if self.current_limit is None:
+            return wanted, jnp.zeros_like(wanted)
+        way, limit = jnp.where(wanted < 0, -1.0, 1.0), self.current_limit
+        along = way * duty
+        over, step = at_least(jnp.abs(wanted) - limit, 0.0), limit / STEEPNESS
+        taken = at_most(over / (most + step), 1 + along if self.returns_current else at_least(along, 0.0))
+        beyond = over - taken * (most + step)
+        current = at_most(jnp.abs(wanted), limit) + taken * step
+        if self.returns_current:
+            return way * (current + beyond), jnp.zeros_like(beyond)
+        current = jnp.where(along < 0, 0.0, way * current)
+        return current, jnp.where(along < 0, wanted, way * beyond)
 
     def demand(self, error: Scalar, integral: Scalar, speed: Scalar, constant: Scalar) -> Scalar:
         """Voltage [V] of the speed controller: PI with the back-EMF fed forward.

@@ -154,6 +154,7 @@ class Signals(eqx.Module):
     adhesion_limit: Scalar = UNSET  # largest traction of the friction law [N]
     # track and gearbox
     torque_track_loss: Scalar = UNSET  # eq. (24), (26) at the pulley [N·m]
+    torque_carried: Scalar = UNSET  # at the gearbox output, with what accelerates the load [N·m]
     inertia_added: Scalar = UNSET  # by effects, of one side at the driving wheel [kg·m²]
     torque_load: Scalar = UNSET  # all load of the gearbox output except inertia [N·m]
     efficiency_load: Scalar = UNSET  # η_rm, or 1/η_rm if power flows back [-]

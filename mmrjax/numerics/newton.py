@@ -22,6 +22,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float
 
 from mmrjax.numerics.linear_equations import Entry, Matrix, Vector, factorise, regularise, substitute
+from mmrjax.numerics.rarely import compute_rarely
 
 #: f(y, shared, own): as many scalars as unknowns, so that in a batch each is an array.
 Residual = Callable[[Vector, Any, Any], Vector]
@@ -30,7 +31,9 @@ Residual = Callable[[Vector, Any, Any], Vector]
 Function = Callable[[Vector, tuple[Any, Any]], tuple[Vector, Any]]
 
 #: Linearisations after which a search has failed.
-MAX_STEPS = 40
+MAX_STEPS = 60
+#: Turns of full steps before a search is bounded.
+PATIENCE = 8
 
 
 def _linearised(fn: Function, y: Vector, args: Any, apart: bool) -> tuple[Matrix, Vector]:
@@ -78,34 +81,59 @@ def _watched(value: Array, index: int, moved: set[int]) -> Array:
 
 
 def _small(value: Vector, tolerance: float) -> Bool[Array, ""]:
-    return functools.reduce(jnp.logical_and, [jnp.abs(x) < tolerance for x in value])
+    return functools.reduce(jnp.logical_and, [jnp.abs(x) < tolerance for x in value], jnp.asarray(True))
 
 
-def _step(fn: Function, y: Vector, args: Any, apart: bool) -> tuple[Vector, Vector]:
-    """y - J⁻¹ f, with unknowns unchanged that would not be finite; and J⁻¹ f."""
-    jacobian, value = _linearised(fn, y, args, apart)
-    step = tuple(jnp.zeros(()) if x is None else x for x in substitute(factorise(jacobian), value))
-    return tuple(jnp.where(jnp.isfinite(b), a - b, a) for a, b in zip(y, step, strict=True)), step
+def _solution(factors: list, value: Vector) -> Vector:
+    return tuple(jnp.zeros(()) if x is None else x for x in substitute(factors, value))
+
+
+def _less(y: Vector, step: Vector) -> Vector:
+    """y - step, with unknowns unchanged that would not be finite."""
+    return tuple(jnp.where(jnp.isfinite(b), a - b, a) for a, b in zip(y, step, strict=True))
 
 
 class Turning(eqx.Module):
-    """State of a search: the unknowns, and True once f is 0 at them."""
+    """State of a search.
+
+    Full steps between branches of f can alternate without end. After `PATIENCE` turns, the last unknown therefore
+    stays between the places where its equation was last below and above 0, with the other equations solved.
+
+    Attributes:
+        y: the unknowns; solved: True once f is 0 at them; turns: number of linearisations.
+        low, high: ends of the interval of the last unknown.
+    """
 
     y: Vector
     solved: Bool[Array, ""]
+    turns: Array
+    low: Array
+    high: Array
+
+    def after(self, jacobian: Matrix, value: Vector, atol: float) -> Turning:
+        """The search after one turn, from ∂f/∂y and f at its unknowns."""
+        factors = factorise(jacobian)
+        step, here, left = _solution(factors, value), self.y[-1], value[-1]
+        # Such a small step leaves an error of the order of its square.
+        solved, others, late = _small(step, atol**0.7), _small(value[:-1], atol**0.5), self.turns >= PATIENCE
+        low = jnp.where(others & (left < 0), here, self.low)
+        high = jnp.where(others & (left > 0), here, self.high)
+        then = here - step[-1]
+        leaves = late & others & ~solved & jnp.isfinite(high - low) & ((then <= low) | (then >= high))
+        share = jnp.where(leaves, (here - 0.5 * (low + high)) / jnp.where(leaves, step[-1], 1.0), 1.0)
+        aside = (*_solution([row[:-1] for row in factors[:-1]], value[:-1]), jnp.zeros_like(here))
+        alone = late & ~others & ~solved
+        taken = tuple(jnp.where(alone, b, jnp.where(leaves, share * a, a)) for a, b in zip(step, aside, strict=True))
+        return Turning(_less(self.y, taken), solved, self.turns + 1, low, high)
 
 
 class FewUnknowns(optx.AbstractRootFinder[Vector, Vector, Any, Turning]):
     """Newton's method for a few scalars, each determined by the equation of the same index (see `factorise`).
 
-    A member is solved once |f| < `atol`, or after a step whose square is below `atol`. A linear f needs one
-    pass. `init` makes it, outside the loop, so that XLA fuses it over a batch with the code before and after. The
-    loop then runs only for members that crossed into another branch of f.
+    A member is solved after a step whose square is below `atol`.
 
     Attributes:
         atol: of f; rtol, norm: not read.
-        linear: True if f is linear in y except for branches; correct for any f, fast for such. Arguments of f are
-            then the data shared by a batch and the data of each member, in this order.
         apart: True to compute ∂f/∂y one unknown after another, which is faster over large batches; False: all
             together, a program of a third of the size.
     """
@@ -113,7 +141,6 @@ class FewUnknowns(optx.AbstractRootFinder[Vector, Vector, Any, Turning]):
     rtol: float = 0.0
     atol: float = 1e-12
     norm: Callable[[Any], Array] = optx.max_norm
-    linear: bool = False
     apart: bool = False
 
     def init(
@@ -127,23 +154,15 @@ class FewUnknowns(optx.AbstractRootFinder[Vector, Vector, Any, Turning]):
         tags: frozenset,
     ) -> Turning:
         """Returns the state of a search before its first turn."""
-        if not self.linear:
-            return Turning(y, jnp.asarray(False))
-        y, _ = _step(fn, y, args, self.apart)
-        return Turning(y, _small(fn(y, args)[0], self.atol))
+        least = jnp.full_like(y[-1], -jnp.inf)
+        return Turning(y, jnp.asarray(False), jnp.asarray(0), least, -least)
 
     def step(
         self, fn: Function, y: Vector, args: tuple[Any, Any], options: dict[str, Any], state: Turning, tags: frozenset
     ) -> tuple[Vector, Turning, Any]:
         """One turn: y - J⁻¹ f."""
-        if self.linear:
-            # Solved members are masked. Without the mask the compiler would compute and store the common part of the
-            # turns before the first of them, even if there is none.
-            shared, own = args
-            args = shared, jax.tree.map(lambda x: jnp.where(state.solved, jnp.ones_like(x), x), own)
-        # Such a small step leaves an error of the order of its square.
-        y, step = _step(fn, state.y, args, self.apart)
-        return y, Turning(y, _small(step, self.atol**0.7)), None
+        state = state.after(*_linearised(fn, state.y, args, self.apart), self.atol)
+        return state.y, state, None
 
     def terminate(
         self, fn: Function, y: Vector, args: Any, options: dict[str, Any], state: Turning, tags: frozenset
@@ -162,13 +181,19 @@ class FewUnknowns(optx.AbstractRootFinder[Vector, Vector, Any, Turning]):
         tags: frozenset,
         result: optx.RESULTS,
     ) -> tuple[Vector, Any, dict[str, Any]]:
-        """Returns the unknowns, also if no turn was needed."""
+        """Returns the unknowns."""
         return state.y, aux, {}
 
 
 @eqx.filter_custom_jvp
 def root(
-    residual: Residual, start: Vector, shared: Any, own: Any, tolerance: float, linear: bool, apart: bool
+    residual: Residual,
+    start: Vector,
+    shared: Any,
+    own: Any,
+    tolerance: float,
+    linear: Residual | None,
+    apart: bool,
 ) -> tuple[Vector, Bool[Array, ""]]:
     """Solves f(y) = 0 by `FewUnknowns`, until every member of a batch has converged.
 
@@ -179,23 +204,30 @@ def root(
         shared, own: arguments of f other than y: data of all members of a batch and of each. Derivatives with respect
             to both are implicit, dy = -(∂f/∂y)⁻¹ (∂f/∂shared dshared + ∂f/∂own down), forward and reverse, zero if
             ∂f/∂y is singular. The program holds no host callback.
-        tolerance, linear, apart: as for `FewUnknowns`.
+        tolerance, apart: as for `FewUnknowns`.
+        linear: f in its usual branches, where it is linear in y; None if it has none. Its root is computed first, so
+            that XLA fuses it over a batch with the code before and after. The search runs only for members in which
+            that leaves |f| above the tolerance.
 
     Returns:
         y, and whether it converged within `MAX_STEPS` turns; False for a residual that is not finite.
     """
-
     function: Any = _function(residual)
-    found: optx.Solution = optx.root_find(
-        function,
-        FewUnknowns(atol=tolerance, linear=linear, apart=apart),
-        start,
-        (shared, jax.tree.map(jnp.asarray, own)),
-        has_aux=True,
-        max_steps=MAX_STEPS,
-        throw=False,
-    )
-    return found.value, found.state.solved
+    own = jax.tree.map(jnp.asarray, own)
+
+    def search(start: Vector, shared: Any, own: Any) -> tuple[Vector, Array]:
+        method: Any = FewUnknowns(atol=tolerance, apart=apart)
+        found: optx.Solution = optx.root_find(
+            function, method, start, (shared, own), has_aux=True, max_steps=MAX_STEPS, throw=False
+        )
+        return found.value, found.state.solved
+
+    if linear is None:
+        return search(start, shared, own)
+    jacobian, value = _linearised(_function(linear), start, (shared, own), apart)
+    y = _less(start, _solution(factorise(jacobian), value))
+    solved = _small(residual(y, shared, own), tolerance)
+    return compute_rarely(~solved, search, (y, shared, own), (y, solved))
 
 
 def _function(residual: Residual) -> Function:

@@ -312,15 +312,24 @@ def render(
     file = File(file)
     times = frame_times(file, begin, end, slow, float(view.time[-1]), rate)
     frames = [int(np.argmin(np.abs(view.time - t))) for t in times]
+    import matplotlib
+
+    with matplotlib.rc_context():
+        matplotlib.rcdefaults()  # a file matplotlibrc of the working folder could run LaTeX
+        _write_frames(view, file, frames, rate)
+    return file
+
+
+def _write_frames(view: View, file: File, frames: list[int], rate: int) -> None:
     if file.suffix == ".png":
         view.sheet(frames[0]).savefig(file)
-        return file
+        return
     if file.suffix == ".gif":
         from PIL import Image
 
         images = [Image.fromarray(_pixels(view.sheet(k))).quantize(256) for k in frames]
         images[0].save(file, save_all=True, append_images=images[1:], duration=round(1000 / rate), loop=0)
-        return file
+        return
     pictures = (_pixels(view.sheet(k)) for k in frames)
     first = next(pictures)
     import imageio_ffmpeg
@@ -333,4 +342,3 @@ def render(
     for picture in itertools.chain([first], pictures):
         writer.send(picture.tobytes())
     writer.close()
-    return file

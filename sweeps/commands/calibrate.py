@@ -41,7 +41,7 @@ def calibrate_robot(
             generations=config.generations, members=members, seed=config.seed,
             profiles=config.profiles, blocks=config.hold_out, solver=config.solver, tell=heard,
         )  # fmt: skip
-        found.save(folder.partial, config.robot, folder.tables)
+        found.save(folder.results(), config.robot, folder.tables)
         print_calibration(found)
         settled = found.converged and all(b.converged for h in found.held_out.values() for b in h.blocks.values())
         manifest = {"seed": found.seed, "statuses": found.counts}

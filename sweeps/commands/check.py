@@ -75,7 +75,7 @@ def _check_heat(robot: Robot, asked: requirements_file.Requirements) -> None:
 def _write(folder: RunFolder, config: configuration.Check, found: CheckResult) -> None:
     folder.write_text("requirements.toml", found.asked.text)
     robot_file.write_robot(
-        found.robot, folder.partial / "robot.toml", note=f"the robot of this check, from {config.robot}"
+        found.robot, folder.results() / "robot.toml", note=f"the robot of this check, from {config.robot}"
     )
     folder.write_table("requirements.csv", outcomes_table(found))
     folder.write_json("result.json", found.to_json())

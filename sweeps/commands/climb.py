@@ -73,12 +73,12 @@ def climb_obstacle(config: configuration.Climb, out: Path | None, force: bool) -
             folder.write_table("derivatives.csv", {name: np.array([row[name] for row in rows]) for name in rows[0]})
         folder.write_json("result.json", found.to_json())
         robot_file.write_robot(
-            robot, folder.partial / "robot.toml", note=f"the robot of this climb, from {config.robot}"
+            robot, folder.results() / "robot.toml", note=f"the robot of this climb, from {config.robot}"
         )
         if config.film:
             from sweeps.pages import climb_figures
 
-            climb_figures.render_climb(found, folder.partial / "climb.gif")
+            climb_figures.render_climb(found, folder.results() / "climb.gif")
         shown = print_report(climb_report.climb_document(found, file), file)
         manifest = {"seed": None, "verdict": found.verdict}
         return finish_run_folder(folder, config, manifest, solved=found.verdict != "failed", page=shown)

@@ -63,7 +63,7 @@ def explain_name(name: str | None, files: tuple[str, ...] = ()) -> int:
 
 
 def _wrapped(heading: str, text: str) -> str:
-    head = f"  {heading}".ljust(INDENT)
+    head = f"  {heading} ".ljust(INDENT)  # a parameter's name may be longer
     return textwrap.fill(
         text, WIDTH, initial_indent=head, subsequent_indent=" " * INDENT, break_long_words=False,
         break_on_hyphens=False,

@@ -24,7 +24,7 @@ def export_to_folder(config: configuration.Export, out: Path | None, force: bool
             draws=config.draws, seed=config.seed,
         )  # fmt: skip
         robot_file.write_robot(
-            file.robot, folder.partial / "robot.toml", note=f"what was exported, from {config.robot}"
+            file.robot, folder.results() / "robot.toml", note=f"what was exported, from {config.robot}"
         )
         for name, content in found.files.items():
             folder.write_bytes(name, content if isinstance(content, bytes) else content.encode())

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import math
 
 from rich.table import Table
 
 from calibration.data import contents, presets_file
 from calibration.data.contents import SignalFacts
-from calibration.data.writing import finite_or_null
 from mmrjax.errors import count_noun
-from sweeps.console import print_output
+from sweeps.console import print_json, print_output
 
 
 def inspect_file(file: str, as_json: bool) -> int:
@@ -22,7 +20,7 @@ def inspect_file(file: str, as_json: bool) -> int:
     """
     found = contents.inspect_source(file)
     if as_json:
-        print(json.dumps(finite_or_null(found.to_json()), indent=2, ensure_ascii=False))
+        print_json(found.to_json())
         return 0
     print_output(f"{found.name}: {found.kind}, {count_noun(len(found.signals), 'signal')}")
     table = Table(box=None, pad_edge=False)

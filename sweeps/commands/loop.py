@@ -18,9 +18,9 @@ from calibration.data.columns import Layout
 from calibration.described import in_words
 from calibration.discovery import findings
 from calibration.discovery.discover import discover
-from calibration.discovery.kept import OutOfTime
+from calibration.discovery.kept import REFIT_FILE, OutOfTime
 from calibration.discovery.resolve import check_resolvable, resolve
-from calibration.discovery.result import REFIT_FILE, DiscoveryResult, Ranking
+from calibration.discovery.result import DiscoveryResult, Ranking
 from calibration.discovery.settings import fewest_replicates
 from calibration.inference import blocks, observers, priors
 from calibration.inference.simulation_errors import OF_SIZE
@@ -118,7 +118,7 @@ def _loop(
             print_output(
                 "The track model was not asked: nothing remains in slip, track or ground that it has a say in."
             )
-        found.save(folder.partial, config.robot, folder.tables)
+        found.save(folder.results(), config.robot, folder.tables)
         if config.report:
             progress("writing the report")
         manifest = {"seed": config.seed, "verdict": found.verdict}

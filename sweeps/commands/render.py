@@ -9,6 +9,7 @@ from typing import Any
 import jax
 
 from calibration.data.input_errors import BadConfiguration
+from calibration.data.writing import replacing
 from mmrjax.fidelities.track import track_batch
 from mmrjax.model.signals import STATUSES
 from mmrjax.undercarriage import rendering, rendering_from_above
@@ -84,13 +85,9 @@ def _check_free(file: Path, force: bool) -> None:
 
 def _write(file: Path, draw: Callable[[Path], Any]) -> None:
     """Draw into a file that is whole or not there."""
-    aside = file.with_name(f".{file.stem}.writing{file.suffix}")
-    try:
-        with progress_bar(1, quiet=False, doing="drawing") as advance:
+    with replacing(file) as aside, progress_bar(1, quiet=False, doing="drawing") as advance:
+        try:
             draw(aside)
-            advance(1)
-        aside.replace(file)
-    except ValueError as error:
-        raise BadConfiguration(f"render: {error}".replace(aside.name, file.name)) from error
-    finally:
-        aside.unlink(missing_ok=True)
+        except ValueError as error:
+            raise BadConfiguration(f"render: {error}".replace(aside.name, file.name)) from error
+        advance(1)

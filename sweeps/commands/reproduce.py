@@ -25,7 +25,7 @@ def reproduce_paper(config: configuration.Reproduce, out: Path | None, force: bo
     runs = records.read_runs("measured")
     gear = "track.guide_share" in fidelities.fidelity_facts(config.model).computes
     with open_folder("reproduce", config, robot, out, force) as folder:
-        _, rows = report.write_paper_page(folder.partial, file, model=config.model, gear=gear)
+        _, rows = report.write_paper_page(folder.results(), file, model=config.model, gear=gear)
         result = {"schema": "mmrjax.reproduce/1", "model": config.model, "rows": 0}
         if rows is None:
             print_message(f"the paper's runs are of {', '.join(CONFIGURATIONS)}; none of them is this robot's")
@@ -37,7 +37,7 @@ def reproduce_paper(config: configuration.Reproduce, out: Path | None, force: bo
                 "adhesion_raised": rows.ratio,
             }
         robot_file.write_robot(
-            robot, folder.partial / "robot.toml", note=f"the robot of these figures, from {config.robot}"
+            robot, folder.results() / "robot.toml", note=f"the robot of these figures, from {config.robot}"
         )
         folder.write_json("result.json", result)
         return finish_run_folder(

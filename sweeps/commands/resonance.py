@@ -200,7 +200,7 @@ def _write(folder: RunFolder, config: configuration.Resonance, found: ResonanceR
     )
     folder.write_table("peaks.csv", _rows([p._asdict() for p in found.peaks], Peak))
     robot_file.write_robot(
-        found.robot, folder.partial / "robot.toml", note=f"the robot of this map, from {config.robot}"
+        found.robot, folder.results() / "robot.toml", note=f"the robot of this map, from {config.robot}"
     )
     folder.write_json("result.json", found.to_json())
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,6 @@ from calibration.data.input_errors import BadConfiguration
 from calibration.data.rig_facts import Fact, Origin
 from calibration.data.rig_file import FREE
 from calibration.data.runs import Runs
-from calibration.data.writing import finite_or_null
 from calibration.described import describe, sentences
 from calibration.inference import foresight, identifiability, priors
 from calibration.inference.fit_notes import Determination
@@ -33,7 +31,7 @@ from mmrjax.model.robot import Robot
 from mmrjax.model.shaft import Shaft
 from sweeps.commands.rig_template import EXAMPLE
 from sweeps.config import RobotPart
-from sweeps.console import print_output
+from sweeps.console import print_json, print_output
 from sweeps.inputs import load_robot, read_runs
 from sweeps.pages import words
 
@@ -288,7 +286,7 @@ def check_rig_file(
         raise BadConfiguration(f"{file}: no such file; mmrjax rig new {file} writes one to fill in")
     found = examine_rig_file(file, data, effects, columns)
     if as_json:
-        print(json.dumps(finite_or_null(found.to_json()), indent=2, ensure_ascii=False))
+        print_json(found.to_json())
     else:
         print_check(found)
     return 0

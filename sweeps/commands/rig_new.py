@@ -9,6 +9,7 @@ from xml.etree import ElementTree
 
 from calibration.data.input_errors import BadConfiguration, allowed_words
 from calibration.data.input_files import file_bytes
+from calibration.data.writing import write_text
 from sweeps.commands.rig_joint import JointNumbers
 from sweeps.commands.rig_template import KINDS, Stated, example_numbers, fill_rig_template, rig_template
 from sweeps.console import print_output
@@ -109,7 +110,7 @@ def write_new_rig(
         what = written.removeprefix("# ").partition("; a comment")[0]
         what += f"; not found, so fill in: {lacking}. Then" if lacking else ". Next"
     try:
-        file.write_text(written, encoding="utf-8")
+        write_text(file, written)
     except OSError as error:
         raise BadConfiguration(f"{file}: cannot be written ({error.strerror}); state a file elsewhere") from error
     print_output(f"{file}: {what}: mmrjax rig check {file} [DATA.csv]")

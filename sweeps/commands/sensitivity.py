@@ -87,7 +87,7 @@ def study_sensitivity(config: configuration.Sensitivity, out: Path | None, force
         for name, table in found.tables().items():
             folder.write_table(name, table)
         robot_file.write_robot(
-            file.robot, folder.partial / "robot.toml", note=f"the robot of this study, from {config.robot}"
+            file.robot, folder.results() / "robot.toml", note=f"the robot of this study, from {config.robot}"
         )
         print_sensitivity(found)
         manifest = {"seed": found.seed, "statuses": found.statuses}

@@ -43,7 +43,9 @@ def settle_to_folder(config: configuration.Settle, source: str, out: Path | None
     )
     few = settle_words.too_few(found, SettledRuns.fewest, loop)
     with open_folder("settle", config, robot, out, force, runs) as folder:
-        robot_file.write_robot(robot, folder.partial / "robot.toml", note=f"the rig of this log, from {config.robot}")
+        robot_file.write_robot(
+            robot, folder.results() / "robot.toml", note=f"the rig of this log, from {config.robot}"
+        )
         folder.write_table("settled.csv", found.table())
         folder.write_table("stretches.csv", stretches_table(found))
         folder.write_json("result.json", to_json(found, few))

@@ -80,5 +80,5 @@ def _write(folder: RunFolder, config: configuration.Size, found: SizeResult) -> 
     note = f"the robot that was changed, {config.robot}: no design meets the requirements"
     if best is not None:
         note = f"sized for {found.asked.source} from {config.robot}: {describe_design(best)}"
-    robot_file.write_robot(found.robot if best is None else best.robot, folder.partial / "robot.toml", note=note)
+    robot_file.write_robot(found.robot if best is None else best.robot, folder.results() / "robot.toml", note=note)
     folder.write_json("result.json", found.to_json())

@@ -33,7 +33,7 @@ from sweeps.report import campaign_report, sweep_report
 from sweeps.report.document import Column, Table
 from sweeps.report.run_tables import endings_table
 from sweeps.report.terminal_renderer import print_table
-from sweeps.store import DONE, SOLVER_FAILED, default_path, open_folder
+from sweeps.store import DONE, IDENTITY, SOLVER_FAILED, default_path, open_folder
 
 #: Most runs of which a grid leaves a table, runs.csv; of more it leaves a store, in a tenth of the time and bytes.
 TABLE = 100_000
@@ -111,6 +111,8 @@ def _into_store(config: Campaign, file: RobotFile, where: str, out: Path | None,
         files = [*([config.robot] if Path(config.robot).is_file() else []), *config.effects, *plan.data]
         files += [config.profile] if config.profile is not None and config.profile not in profiles.PACKAGED else []
         same = job_identity(config, robot, files, device)
+        if not any((folder / IDENTITY).is_file() for folder in (path, path.with_name(f"{path.name}.partial"))):
+            _refuse_without_space(layout.size, 1.0, path)  # a sweep that goes on needs less
         store = SweepStore(path, same, layout, force=force)
         try:
             if not store.finished:
@@ -283,7 +285,7 @@ def finish_sweep(
 def write_sweep_folder(store: SweepStore, config: Campaign, file: RobotFile, job: scale.Job, same: Identity) -> None:
     """Write all files of a run folder except the store, then move the store into place."""
     robot_file.write_robot(
-        job.robot, store.partial / "robot.toml", note=f"the robot of this sweep, from {config.robot}"
+        job.robot, store.results() / "robot.toml", note=f"the robot of this sweep, from {config.robot}"
     )
     found = sweep_summary(store.layout, job, store.done().values())
     store.write_json("result.json", found)

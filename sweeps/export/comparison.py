@@ -122,8 +122,8 @@ def compare_format(
         kept = share_kept(law, law_of(joint, {effect.name: 0.0}), situation, inside, own)
         verdict = HELD if effect.name in held else DROPPED if kept < LITTLE else APPROXIMATED
         how = held.get(effect.name) or approximated(effect.balance)
-        if not np.isfinite(kept) and effect.name not in held:  # nothing of it shows in steady travel
-            verdict, how = DROPPED, "it shows only while the motion changes, and the format has no term for it"
+        if not np.isfinite(kept) and effect.name not in held:
+            verdict, how = DROPPED, "these runs do not show it, and the format has no term for it"
         found.append(Fate(effect.name, verdict, how, kept))
     exported = _at(law, theta, situation)
     models = {NATIVE: situation.native, EXPORTED: situation.readings(exported)}

@@ -13,6 +13,7 @@ import numpy as np
 
 from calibration.data.writing import table_text
 from mmrjax import __version__
+from mmrjax.errors import printable
 from sweeps.export import jax_actuator
 from sweeps.export.comparison import APPROXIMATED, HELD, Fate
 from sweeps.export.joint import Joint
@@ -189,9 +190,11 @@ def c_header(joint: Joint, found: Map, notes: Sequence[str]) -> str:
         f"  return {name}_read({name}_{key}, speed, torque);\n}}\n"
         for key, what in units.items()
     )
-    about = "\n".join(f" * {line}" for line in notes)
-    return f"""/* Feed-forward of {joint.file.name}, {joint.configuration}. Written by mmrjax {__version__}.
-{about}
+    origin = f"Feed-forward of {joint.file.name}, {joint.configuration}. Written by mmrjax {__version__}."
+    # Names come from users, so nothing in them can end the comment.
+    words = (" ".join(printable(text).split()) for text in (origin, *notes))
+    about = "\n * ".join(text.replace("*/", "* /").replace("/*", "/ *") for text in words)
+    return f"""/* {about}
  * duty = {name}_get_voltage(speed, torque) / supply voltage; torque is that of the joint without its inertia.
  */
 #ifndef {guard}

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import contextlib
+from collections.abc import Iterator, Mapping, Sequence
 from types import ModuleType
 from typing import Any
 
@@ -23,6 +24,8 @@ SETTLING, LONG = 10, 1e9
 STEPS = 25
 #: Platforms for which the serialised program is lowered.
 PLATFORMS = ("cpu", "cuda")
+#: Setting of JAX: frames of the call stack that a lowered program keeps for each operation.
+PLACES = "jax_traceback_in_locations_limit"
 
 
 class ActuatorLaw(eqx.Module):
@@ -128,10 +131,21 @@ def serialise_actuator(module: ModuleType) -> bytes:
     """
     from jax import export
 
-    with jax.enable_x64(False):
+    with jax.enable_x64(False), _without_places():
         (many,) = export.symbolic_shape("n")
         single, each = jax.ShapeDtypeStruct((), jnp.float32), jax.ShapeDtypeStruct((many,), jnp.float32)
         params = dict.fromkeys(module.PARAMS, single)
         state = dict.fromkeys(module.initial_state(), each)
         made = export.export(jax.jit(module.actuator), platforms=PLATFORMS)(params, state, each, each, each, single)
         return bytes(made.serialize(vjp_order=1))
+
+
+@contextlib.contextmanager
+def _without_places() -> Iterator[None]:
+    """Context in which lowered programs have no paths of source files: equal programs have equal bytes."""
+    kept = getattr(jax.config, PLACES)
+    jax.config.update(PLACES, 0)
+    try:
+        yield
+    finally:
+        jax.config.update(PLACES, kept)

@@ -89,9 +89,10 @@ class Joint:
 
     @property
     def name(self) -> str:
-        """Name of the robot, as a word of letters, digits and underscores."""
+        """Name of the robot, as a name that Python, C and XML allow."""
         stem = self.file.name.rpartition("/")[2].removesuffix(".toml")
-        return "".join(c if c.isalnum() and c.isascii() else "_" for c in stem) or "robot"
+        word = "".join(c if c.isalnum() and c.isascii() else "_" for c in stem)
+        return word if word.isidentifier() else f"robot_{word}"
 
     @property
     def limit(self) -> float | None:
@@ -103,6 +104,16 @@ class Joint:
     def remembering(self) -> tuple[Part, ...]:
         """Parts that have a memory, in order."""
         return tuple(p for p in self.parts if p.rate is not None)
+
+    @property
+    def accelerates(self) -> bool:
+        """True if a loss depends on the torque at gearbox or wheel, which what turns before them takes a share of."""
+        return any(p.by for p in (*self.of("gearbox"), *self.of("track")))
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Names of the actuator's state: the current, memories of effects, and the speed one step before."""
+        return ("current", *(p.name for p in self.remembering), *(("speed",) * self.accelerates))
 
     def of(self, balance: str) -> tuple[Part, ...]:
         """Parts of a balance, in order."""
@@ -118,6 +129,7 @@ class Joint:
         used = [n for part in self.parts for n in names_of(*_symbols(part))]
         further = ["gearbox.ratio", "motor.inertia", "gearbox.efficiency_load"]
         further += ["driver.current_limit"] * (self.limit is not None)
+        further += [f"{self.configuration}.inertia"] * self.accelerates
         return {n: known[n] for n in dict.fromkeys((*further, *used)) if n in known}
 
     def surroundings(self) -> tuple[str, ...]:
@@ -230,6 +242,7 @@ class _Tracer:
             traction=known["pull"] / load.radius if self.at_wheel else jnp.zeros(()),
             torque_track_loss=known["load"],
             torque_load=known["load"],
+            torque_carried=known["load"],
             memory={n: known[f"memory.{n}"] for n in self.memories},
         )
         return robot, Signals(**around)

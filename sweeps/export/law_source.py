@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import ast
+import contextlib
 import dataclasses
+import re
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from types import ModuleType
 from typing import Any
 
+from calibration.data.input_errors import BadConfiguration
 from mmrjax import __version__
+from mmrjax.errors import printable
+from mmrjax.model.balances import TORQUE_STEPS
 from sweeps.export.expressions import JAX, TORCH, Dialect, Symbol, lines_of, names_of
 from sweeps.export.joint import VARIABLES, Joint, Part
 
-#: Newton steps by which torques of the gearbox and of the wheel follow from those that depend on them.
-STEPS = 3
 _ARGUMENTS = (*VARIABLES, "load", "pull")
 
 
@@ -66,11 +70,21 @@ def function_arguments(symbol: Symbol) -> list[str]:
     return [*found, "memory"] if any(n.startswith("memory.") for n in used) else found
 
 
+def quoted(word: str) -> str:
+    """A word as a literal of Python."""
+    return f'"{word}"' if re.fullmatch(r"[\w.-]+", word) else repr(word)
+
+
+def _docstring(text: str) -> str:
+    """A text as a docstring: names in it come from users, so nothing in it can end the literal."""
+    return '"""' + printable(text).replace("\\", "\\\\").replace('"', '\\"') + '"""'
+
+
 def _function(name: str, symbol: Symbol, document: str, dialect: Dialect) -> str:
     def spelled(word: str) -> str:
         if word in _ARGUMENTS:
             return word
-        return "memory" if word.startswith("memory.") else f'p["{word}"]'
+        return "memory" if word.startswith("memory.") else f"p[{quoted(word)}]"
 
     head = f"def {name}({', '.join(['p', *function_arguments(symbol)])}):"
     body = textwrap.indent(_wrapped(document), "    ")
@@ -79,9 +93,8 @@ def _function(name: str, symbol: Symbol, document: str, dialect: Dialect) -> str
 
 def _wrapped(document: str) -> str:
     lines = textwrap.wrap(document, 108)
-    if len(lines) == 1 and len(document) < 104:
-        return f'"""{document}"""'
-    return '"""' + "\n".join(lines) + '\n"""'
+    short = len(lines) == 1 and len(document) < 104
+    return _docstring(document if short else "\n".join(lines) + "\n")
 
 
 def call_text(part: Part, suffix: str = "", memory: str | None = None) -> str:
@@ -105,7 +118,7 @@ def functions_text(joint: Joint, dialect: Dialect) -> str:
     for part in joint.parts:
         unit = "" if part.unit == "-" else f" [{part.unit}]"
         meaning = part.meaning if part.meaning.endswith(".") else f"{part.meaning}." if part.meaning else ""
-        document = f"{part.equation.rstrip('.')}{unit}. {meaning}".strip().replace("\\", "")
+        document = f"{part.equation.rstrip('.')}{unit}. {meaning}".strip()
         found.append(_function(part.name, part.value, document, dialect))
         if part.by:
             what = f"Derivative of `{part.name}` by `{part.by}`."
@@ -122,6 +135,7 @@ def step_lines(joint: Joint, library: _Library) -> list[str]:
     circuit = joint.of("supply") + joint.of("electrical")
     gear, track = joint.of("gearbox"), joint.of("track")
     later = {p.name: f'memory["{p.name}"]' for p in joint.remembering}
+    through = "(load + rotor)" if joint.accelerates else "load"
     lines = [
         "p, voltage, angle, wheel_speed = params, command, joint_position, joint_velocity",
         'motor_speed = p["gearbox.ratio"] * wheel_speed',
@@ -152,25 +166,42 @@ def step_lines(joint: Joint, library: _Library) -> list[str]:
         f"at_shaft = made - ({_sum(joint.of('motor'), '', later)})",
         f"load = at_shaft - {call_text(joint.of('idle')[0])}",
         f'through = p["gearbox.ratio"] * {call_text(joint.of("efficiency")[0])} * load',
-        *_solved("load", "through", gear, later),
-        *_solved("pull", "load", track, later),
+        *(_inertia_lines(joint) if joint.accelerates else ()),
+        *_solved("load", "through - rotor" if joint.accelerates else "through", gear, later),
+        *_solved("pull", "load - wheel" if joint.accelerates else "load", track, later),
         'info = {"current": current, "voltage": voltage, "motor_speed": motor_speed, "power": voltage * current,',
         '        "lost_winding": lost * current, "lost_motor": (made - at_shaft) * motor_speed,',
-        '        "lost_gearbox": at_shaft * motor_speed - load * wheel_speed,',
-        '        "lost_output": (load - pull) * wheel_speed}',
-        "return pull, memory, info",
+        f'        "lost_gearbox": at_shaft * motor_speed - {through} * wheel_speed,',
+        f'        "lost_output": (load{" - wheel" * joint.accelerates} - pull) * wheel_speed}}',
+        f"return pull{' + wheel + rotor' * joint.accelerates}, memory, info",
     ]
     return lines
+
+
+def _inertia_lines(joint: Joint) -> list[str]:
+    """Lines for the torques that accelerate rotor and wheel: the joint has their inertia, losses by torque do not."""
+    wheel = [f"p[{quoted(f'{joint.configuration}.inertia')}]", *map(call_text, joint.of("inertia"))]
+    return [
+        "# Torques that accelerate rotor and wheel, by the acceleration of the last step.",
+        'acceleration = (wheel_speed - state["speed"]) / dt',
+        'memory["speed"] = wheel_speed',
+        f"rotor = {_ROTOR} * acceleration",
+        f"wheel = ({' + '.join(wheel)}) * acceleration",
+    ]
+
+
+#: Inertia of the rotor at the joint.
+_ROTOR = 'p["motor.inertia"] * p["gearbox.ratio"] ** 2 * p["gearbox.efficiency_load"]'
 
 
 def _solved(name: str, given: str, parts: Sequence[Part], later: Mapping[str, str]) -> list[str]:
     """Lines that find x with x + losses(x) = given."""
     if not any(p.by for p in parts):
         return [f"{name} = {given} - ({_sum(parts, '', later)})" if parts else f"{name} = {given}"]
-    left = f"({name} + {_sum(parts, '', later)} - {given})"
+    left = f"({name} + {_sum(parts, '', later)} - ({given}))"
     return [
         f"{name} = {given}",
-        f"for _ in range({STEPS}):  # a loss that depends on the torque itself",
+        f"for _ in range({TORQUE_STEPS}):  # a loss that depends on the torque itself",
         f"    {name} = {name} - {left} / (1.0 + {_sum(parts, '_slope', later)})",
     ]
 
@@ -179,8 +210,8 @@ def constants_text(constants: Sequence[Constant], name: str = "PARAMS") -> str:
     """Text of the table of the law's numbers, each with its unit, meaning, interval and source."""
     lines = [f"{name} = {{"]
     for c in constants:
-        lines += [f"    # {text}" for text in textwrap.wrap(_about(c), 106)]
-        lines.append(f'    "{c.name}": {c.value!r},')
+        lines += [f"    # {text}" for text in textwrap.wrap(printable(_about(c)), 106)]
+        lines.append(f"    {quoted(c.name)}: {c.value!r},")
     return "\n".join([*lines, "}"])
 
 
@@ -192,7 +223,7 @@ def _about(c: Constant) -> str:
 def _header(joint: Joint, what: str, notes: Sequence[str]) -> str:
     head = f"{what} of {joint.file.name}, {joint.configuration}. Written by mmrjax {__version__}."
     body = "\n\n".join("\n".join(textwrap.wrap(n, 108)) for n in notes)
-    return f'"""{head}\n\n{body}\n"""\n'
+    return _docstring(f"{head}\n\n{body}\n") + "\n"
 
 
 _DOCUMENT = '''"""One step of the drive: torque at the joint, state after the step, and what happens inside.
@@ -224,7 +255,10 @@ def torch_source(
 
 
 def _source(joint: Joint, constants: Sequence[Constant], library: _Library, what: str, notes: Sequence[str]) -> str:
-    states = ", ".join(f'"{n}": zero' for n in ("current", *(p.name for p in joint.remembering)))
+    states = ", ".join(f'"{n}": zero' for n in joint.states)
+    moving = (
+        "" if not joint.accelerates else ", and the joint's speed one step before [rad/s]: set it if the joint moves"
+    )
     added = "".join(f" + {call_text(p)}" for p in joint.of("inertia"))
     body = textwrap.indent("\n".join(step_lines(joint, library)), "    ")
     zero = "jnp.zeros(shape)" if library.dialect is JAX else "torch.zeros(shape, device=device)"
@@ -235,9 +269,9 @@ def _source(joint: Joint, constants: Sequence[Constant], library: _Library, what
         f"def armature(params):\n"
         f'    """Inertia of the rotor at the joint, J i² η, for the joint\'s own armature [kg·m²]."""\n'
         f"    p = params\n"
-        f'    return p["motor.inertia"] * p["gearbox.ratio"] ** 2 * p["gearbox.efficiency_load"]{added}\n\n\n'
+        f"    return {_ROTOR}{added}\n\n\n"
         f"def initial_state({given}):\n"
-        f'    """State at rest: current [A], and memories of effects."""\n'
+        f'    """State at rest: current [A], memories of effects{moving}."""\n'
         f"    zero = {zero}\n"
         f"    return {{{states}}}\n\n\n"
         f"def actuator(params, state, command, joint_position, joint_velocity, dt):\n"
@@ -246,10 +280,39 @@ def _source(joint: Joint, constants: Sequence[Constant], library: _Library, what
 
 
 def module_from_source(source: str, name: str = "exported_law") -> ModuleType:
-    """Module of a source text."""
+    """Module of the source of a law.
+
+    Raises:
+        BadConfiguration: it has more than an import, literals, and functions that call each other and the library.
+    """
+    tree = ast.parse(source)
+    if not _states_a_law(tree):
+        raise BadConfiguration("export: the generated source would do more than state a law, so it is not executed")
     module = ModuleType(name)
-    exec(compile(source, f"<{name}>", "exec"), module.__dict__)
+    exec(compile(tree, f"<{name}>", "exec"), module.__dict__)
     return module
+
+
+def _states_a_law(tree: ast.Module) -> bool:
+    """True if a source imports one library, assigns literals, and defines functions that call only these."""
+    defined = {node.name for node in tree.body if isinstance(node, ast.FunctionDef)} | {"range"}
+    for node in tree.body:
+        if isinstance(node, ast.Assign):
+            with contextlib.suppress(ValueError):
+                ast.literal_eval(node.value)
+                continue
+            return False
+        literal = isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
+        if not literal and not isinstance(node, ast.Import | ast.FunctionDef):
+            return False
+    called = [node.func for node in ast.walk(tree) if isinstance(node, ast.Call)]
+    imported = [name.name for node in ast.walk(tree) if isinstance(node, ast.Import) for name in node.names]
+    return imported in (["jax.numpy"], ["numpy"], ["torch"]) and all(
+        f.id in defined
+        if isinstance(f, ast.Name)
+        else isinstance(f, ast.Attribute) and isinstance(f.value, ast.Name) and f.value.id in ("jnp", "torch")
+        for f in called
+    )
 
 
 def constant_values(constants: Sequence[Constant]) -> dict[str, Any]:

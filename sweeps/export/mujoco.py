@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 import textwrap
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -15,6 +16,7 @@ import numpy as np
 
 from calibration.data.input_errors import BadConfiguration
 from mmrjax import __version__
+from mmrjax.errors import printable
 from mmrjax.model.chassis import inertia_reduced
 from sweeps.export.comparison import APPROXIMATED, DROPPED, HELD, Fate
 from sweeps.export.joint import Joint
@@ -257,7 +259,8 @@ def _digits(*numbers: float) -> str:
 
 
 def _comment(lines: Sequence[str], indent: str) -> str:
-    text = [t.replace("--", "- -") for line in lines for t in textwrap.wrap(line, 104 - len(indent))]
+    """Lines as XML comments; names in them come from users, so nothing in them can end the comment."""
+    text = [re.sub("-(?=-)", "- ", t) for line in lines for t in textwrap.wrap(printable(line), 104 - len(indent))]
     return "".join(f"{indent}<!-- {t} -->\n" for t in text)
 
 

@@ -44,7 +44,7 @@ def step_of(joint: Joint, constants: Sequence[Constant]) -> tuple[Any, list[str]
     length, of shape (1,); outputs are torque, state, voltage taken and power.
     """
     module = module_from_source(jax_source(joint, constants))
-    states = list(module.initial_state())
+    states = joint.states
 
     def step(*given: Any) -> tuple[Any, ...]:
         state, rest = dict(zip(states, given, strict=False)), given[len(states) :]
@@ -93,7 +93,7 @@ def random_states(joint: Joint, inputs: int) -> list[np.ndarray]:
     motor, ratio = joint.robot.motor, float(joint.robot.gearbox.ratio)
     volts = float(motor.voltage_limit or 24.0)
     fastest = volts / float(motor.torque_constant) / ratio
-    scales = [2.0, *(1.0 for _ in joint.remembering), volts, 3.0, fastest]
+    scales = [2.0, *(1.0 for _ in joint.states[1:]), volts, 3.0, fastest]
     assert len(scales) == inputs - 1
     given = [(s * rng.uniform(-1, 1, STATES)).astype(np.float32) for s in scales]
     return [*given, np.full(1, 1e-3, np.float32)]

@@ -9,12 +9,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data.columns import Layout
+from calibration.data.columns import LOAD, Layout
 from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.data.runs import Runs
 from mmrjax.fidelities.steady import results_of_rows
 from mmrjax.model import balances, params
 from mmrjax.model.conditions import Conditions
+from mmrjax.model.paper_tables import SLOPES_DEG
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Signals, is_done
 from sweeps.config import GridPart
@@ -22,6 +23,9 @@ from sweeps.export.joint import Joint, channels_of
 from sweeps.inputs import read_runs
 from sweeps.points import imposed
 from sweeps.points.grid import grid_conditions
+
+#: Loads of a shaft in a grid, as shares of its stall torque.
+LOADS = (0.0, 1 / 6, 1 / 3, 1 / 2)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -133,8 +137,8 @@ def situation_of_joint(joint: Joint, data: Runs | str | None) -> Situation:
                 f"--data: not stated, and {joint.file.name} has no motor.voltage_limit for a grid of operating "
                 "points; give a table of runs, or state the limit"
             )
-        runs = grid_conditions(GridPart.model_construct(configurations=(joint.configuration,)), robot)
-        source = "a grid of operating points, without readings"
+        runs = export_grid(joint)
+        source = "a grid of operating points in both directions, without readings"
     else:
         runs = _table(data, joint)
         source = runs.source
@@ -157,6 +161,36 @@ def situation_of_joint(joint: Joint, data: Runs | str | None) -> Situation:
         joint, source, chosen, conditions, kept, signals, native[kept], measured, np.asarray(command),
         radius * np.asarray(signals.demand),
     )  # fmt: skip
+
+
+def export_grid(joint: Joint) -> Runs:
+    """Operating points in both directions, with loads that oppose the motion.
+
+    Voltages are Table 8's or thirds of the motor's limit. A vehicle climbs the slopes of Table 8. A shaft carries
+    shares of its stall torque at each voltage, up to half of it, where a motor gives its greatest power.
+    """
+    robot = joint.file.robot
+    slopes = SLOPES_DEG if robot.has_ground else None
+    config = GridPart.model_construct(configurations=(joint.configuration,), slopes_deg=slopes)
+    runs = grid_conditions(config, robot)
+    columns = dict(runs.columns)
+    volts = runs.layout.imposed_column
+    if not robot.has_ground:
+        shares = np.tile(LOADS, len(runs))
+        columns = {name: np.repeat(values, len(LOADS)) for name, values in columns.items()}
+        columns[LOAD] = shares * stall_torque(joint, columns[volts])
+    turned = {name: -values for name, values in columns.items() if name in (volts, LOAD, "slope_deg")}
+    both = {name: np.concatenate([values, turned.get(name, values)]) for name, values in columns.items()}
+    return dataclasses.replace(runs, columns=both)
+
+
+def stall_torque(joint: Joint, voltage: np.ndarray) -> np.ndarray:
+    """Load at which a shaft's motor stalls [N·m], without effects, within the limits of driver and gearbox."""
+    motor, gear, load = joint.robot.motor, joint.robot.gearbox, joint.load
+    current = np.minimum(voltage / float(motor.resistance), float(joint.robot.driver.current_limit))
+    made = float(motor.torque_constant) * current - float(motor.friction_coulomb + gear.friction_coulomb)
+    given = float(gear.ratio * gear.efficiency_load) * made - float(load.loss_coulomb)
+    return np.clip(given, 0.0, np.inf if gear.torque_limit is None else gear.torque_limit)
 
 
 def _measured(runs: Runs, channels: tuple[Any, ...]) -> np.ndarray:

@@ -77,9 +77,14 @@ LETTERS, NAMES = 42, 20
 
 @contextmanager
 def figure_settings(width: float = WIDTH) -> Iterator[None]:
-    """The settings of every figure, for as long as the block lasts; at the width `NARROW` panels are stacked."""
-    with matplotlib.rc_context(_RC | {"figure.figsize": (width, width)}):
-        yield
+    """The settings of every figure, for as long as the block lasts; at the width `NARROW` panels are stacked.
+
+    Matplotlib reads a file `matplotlibrc` of the working folder, which could change figures or run LaTeX.
+    """
+    with matplotlib.rc_context():
+        matplotlib.rcdefaults()
+        with matplotlib.rc_context(_RC | {"figure.figsize": (width, width)}):
+            yield
 
 
 def is_narrow() -> bool:

@@ -16,6 +16,7 @@ from markupsafe import Markup, escape
 from calibration.data.robot_file import RobotFile
 from calibration.data.writing import write_text
 from mmrjax import __version__, effects
+from mmrjax.errors import printable
 from mmrjax.model import channels
 from mmrjax.model.channels import Channel
 from mmrjax.model.robot import Robot
@@ -60,7 +61,7 @@ class Album:
             with figure_settings(NARROW):
                 drawn = draw()
                 narrow = figure_as_svg(fit_for_phones(drawn[0] if isinstance(drawn, tuple) else drawn))
-        write_text(self.folder / f"{name}.svg", text)
+        write_text(self.folder / f"{name}.svg", printable(text))
         looks = "scale " * has_colour_scale(figure)
         picture = _inline(text, name, looks + ("wide" if narrow else "only"))
         self.pictures[name] = Markup(
@@ -245,7 +246,7 @@ def render_page(
     warnings = {"curve-warning": words.of_curves(curves), "robot-warning": escape(". ".join(remarks))}
     page = _with_contents(page, warnings)
     path = Path(folder) / "report.html"
-    write_text(path, page)
+    write_text(path, printable(page))
     return path
 
 

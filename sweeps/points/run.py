@@ -229,7 +229,7 @@ def write_run_folder(
     """
     folder.write_table("runs.csv", capabilities.without_idle(result.robot, result.table))
     robot_file.write_robot(
-        result.robot, folder.partial / "robot.toml", note=f"the robot of this run, from {config.robot}"
+        result.robot, folder.results() / "robot.toml", note=f"the robot of this run, from {config.robot}"
     )
     folder.write_json("result.json", result.to_json())
     manifest = {"seed": None, "statuses": result.statuses}

@@ -23,7 +23,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float
 
-from mmrjax import fidelities
+from mmrjax import WORKER, fidelities
 from mmrjax.compile.compiling import compiled
 from mmrjax.compile.precision import Threads
 from mmrjax.fidelities import outputs
@@ -41,6 +41,8 @@ POINTS = "points"
 SHARED = 16_384
 #: Chunks that may wait for the writer, besides the one that it writes and the one that is computed.
 WAITING = 1
+#: Time after an interrupt to write chunks that have been computed, for each of two steps [s].
+LAST = 2.5
 #: Types in which outputs that are no numbers are stored.
 KINDS = {STATUS: "uint8", FLAGS: "uint16", VERDICT: "uint8"}
 
@@ -263,7 +265,7 @@ def produce_chunks(
     Args:
         advance: called with how many more points are done, of chunks that are computed in parts.
     """
-    with Threads(1, thread_name_prefix="points") as maker:
+    with Threads(1) as maker:
         ahead = deque[tuple[int, concurrent.futures.Future[Any]]]()
         for chunk in chunks:
             ahead.append((chunk, maker.submit(compiled.points, chunk)))
@@ -333,13 +335,16 @@ def write_chunks(keep: Keep, job: Job, chunks: Produced, advance: Advance, times
     begun = time.perf_counter()
 
     def write(piece: Piece) -> None:
+        whole = all(x.is_ready() for x in piece.arrays.values() if isinstance(x, jax.Array))  # type: ignore[attr-defined]
+        if stop.is_set() and not whole:
+            return
         start = time.perf_counter()
         jax.block_until_ready(list(piece.arrays.values()))
         computed = time.perf_counter()
         count = job.blocks.count(piece.chunk)
         here = fetch_values(piece.arrays, count)
         transferred = time.perf_counter()
-        if stop.is_set():  # interrupted while it was computed
+        if stop.is_set() and not whole:  # interrupted while it was computed
             return
         keep(piece.chunk, here, drawn_samples(job, piece))
         times.compute += computed - start
@@ -350,13 +355,13 @@ def write_chunks(keep: Keep, job: Job, chunks: Produced, advance: Advance, times
     def keep_writing() -> None:
         while (piece := waiting.get()) is not None:
             try:
-                if not stop.is_set():
+                if not failures:
                     write(piece)
             except BaseException as error:
                 failures.append(error)
                 stop.set()
 
-    writer = threading.Thread(target=keep_writing, name="writer", daemon=True)
+    writer = threading.Thread(target=keep_writing, name=WORKER, daemon=True)
     writer.start()
     try:
         for piece in chunks:
@@ -367,11 +372,9 @@ def write_chunks(keep: Keep, job: Job, chunks: Produced, advance: Advance, times
         writer.join()
     except BaseException:
         stop.set()
-        with contextlib.suppress(queue.Empty):  # the writer takes from it too
-            while True:
-                waiting.get_nowait()
-        waiting.put(None)
-        writer.join(5.0)  # what is written now is finished, what is still computed is not waited for
+        with contextlib.suppress(queue.Full):
+            waiting.put(None, timeout=LAST)
+        writer.join(LAST)  # what is computed is written, what is still being computed is not waited for
         raise
     finally:
         times.total += time.perf_counter() - begun

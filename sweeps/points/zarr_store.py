@@ -24,20 +24,32 @@ from typing import Any, TextIO
 import numpy as np
 
 from calibration.data.input_errors import BadConfiguration, BadData
+from calibration.data.writing import naming_file
 from mmrjax.fidelities.variation import STATUS
 from mmrjax.model.signals import STATUSES
 from sweeps.console import print_message
 from sweeps.points.identity import Identity, identity_differences
 from sweeps.points.sampled_design import SAMPLE, Blocks, Design
-from sweeps.store import LOCK, Folder, interrupted_run, listed_names, lock_text, share_at_work, try_to_lock
+from sweeps.store import (
+    ASIDE,
+    IDENTITY,
+    JOURNAL,
+    LOCK,
+    STORE,
+    Folder,
+    interrupted_run,
+    listed_names,
+    lock_text,
+    share_at_work,
+    try_to_lock,
+)
 
-STORE = "results.zarr"
 #: The command that a store's folder is marked with: a sweep into a table leaves other files.
 COMMAND = "sweep into a store"
-#: Folder in which files are written before they are moved into place.
-ASIDE = "writing"
 #: Status of a point that has not been simulated.
 ABSENT = 255
+#: Unit in which file systems give space to files and folders, and typical metadata of an array in its group [bytes].
+BLOCK, METADATA = 4096, 1024
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,11 +85,19 @@ class Layout:
 
     @property
     def size(self) -> int:
-        """Bytes of all arrays, uncompressed."""
-        outputs = sum(np.dtype(v.dtype).itemsize for v in self.variables) * len(self.blocks) * self.blocks.points
-        samples = self.design.samples
-        drawn = 0 if samples is None else 8 * len(samples.names) * samples.number
-        return outputs + drawn + 8 * sum(len(v) for v in self.design.axes.values())
+        """Bytes of the store on a disk, uncompressed: blocks of its files and folders, metadata and journal."""
+        counts, points = self.blocks.counts, self.blocks.points
+        folders = sum(math.prod(counts[:k]) for k in range(len(counts)))
+        each = sum(_on_disk(np.dtype(v.dtype).itemsize * points) for v in self.variables) * len(self.blocks)
+        outputs = each + BLOCK * folders * len(self.variables)
+        names = () if self.design.samples is None else self.design.samples.names
+        drawn = len(names) * counts[-1] * _on_disk(8 * self.blocks.size[-1])
+        axes = sum(_on_disk(8 * len(values)) for values in self.design.axes.values())
+        arrays = len(self.variables) + len(names) + len(self.design.axes)
+        widest = {v.name: (-1.2345678901234567e-300,) * 2 for v in self.variables}
+        checks = dict.fromkeys([*widest, *names], 2**32 - 1)
+        line = _line(Done(len(self.blocks), (points,) * len(STATUSES), widest, checks))
+        return outputs + drawn + axes + arrays * (3 * BLOCK + METADATA) + _on_disk(len(line) * len(self.blocks))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,6 +132,7 @@ class SweepStore(Folder):
         super().__init__(path)
         self.layout = layout
         self.finished = False
+        self._force = force
         self._journal: TextIO | None = None
         self._share: Path | None = None
         self._lock: TextIO | None = None
@@ -153,7 +174,7 @@ class SweepStore(Folder):
         return True
 
     def _is_finished(self) -> bool:
-        return listed_names(self.path) is not None and (self.path / "identity.json").is_file()
+        return listed_names(self.path) is not None and (self.path / IDENTITY).is_file()
 
     def _present(self) -> bool:
         """True if the folder is still the one that this process opened, neither removed nor moved."""
@@ -176,12 +197,12 @@ class SweepStore(Folder):
         self._refuse_damaged()
 
     def _begin_or_take_up(self, force: bool) -> None:
-        if (self.partial / "identity.json").is_file() and not (force and self._differs(self.partial)):
+        if (self.partial / IDENTITY).is_file() and not (force and self._differs(self.partial)):
             self._same(self.partial)
             self._mend_layout()
         elif not force and self._is_finished():  # finished between our looking and our coming
             self._take_finished()
-            shutil.rmtree(self.partial)
+            self._remove_partial()
         else:
             self._create()
 
@@ -189,14 +210,14 @@ class SweepStore(Folder):
 
     def _differs(self, folder: Path) -> str:
         try:
-            stored = json.loads((folder / "identity.json").read_text(encoding="utf-8"))
+            stored = json.loads((folder / IDENTITY).read_text(encoding="utf-8"))
             return identity_differences(stored, self._identity)
         except (ValueError, AttributeError, TypeError, RecursionError):
-            return "identity.json"
+            return IDENTITY
 
     def _same(self, folder: Path) -> None:
         differ = self._differs(folder)
-        if differ == "identity.json":
+        if differ == IDENTITY:
             raise BadData(
                 f"--out: {folder / 'identity.json'} is damaged; choose another path, or --force to begin anew"
             )
@@ -217,11 +238,6 @@ class SweepStore(Folder):
 
     # --- layout -----------------------------------------------------------------------------------
 
-    def _clear(self) -> None:
-        for entry in self.partial.iterdir():
-            if entry.name != LOCK:
-                shutil.rmtree(entry) if entry.is_dir() and not entry.is_symlink() else entry.unlink()
-
     def _create(self) -> None:
         """Metadata and axes, and the identity last: what has one is whole.
 
@@ -233,10 +249,11 @@ class SweepStore(Folder):
             raise self._busy(share)
         self._clear()
         (self.partial / LOCK).write_text(lock_text(COMMAND), encoding="utf-8")
-        (self.partial / "journal").mkdir()
+        (self.partial / JOURNAL).mkdir()
         (self.partial / ASIDE).mkdir()
-        create_store(self.partial / STORE, self.layout)
-        write_file(self.partial / "identity.json", json.dumps(self._identity, indent=1).encode(), self._aside)
+        with naming_file(self.partial / STORE):
+            create_store(self.partial / STORE, self.layout)
+        write_file(self.partial / IDENTITY, json.dumps(self._identity, indent=1).encode(), self._aside)
 
     def _altered(self, folder: Path) -> dict[Path, bytes]:
         """Files of metadata and axes that are not as `create_store` writes them, with what they should hold."""
@@ -263,7 +280,7 @@ class SweepStore(Folder):
         if damaged is None and len(self.done()) < len(self.layout.blocks):
             lost = min(set(range(len(self.layout.blocks))) - set(self._sound))
             records = self._records().get(lost, [])
-            damaged = self._wrong_file(records[-1]) if records else self.path / "journal"
+            damaged = self._wrong_file(records[-1]) if records else self.path / JOURNAL
         if damaged is not None:
             raise BadData(f"--out: {damaged} is damaged; choose another path, or --force to make the sweep anew")
 
@@ -276,7 +293,7 @@ class SweepStore(Folder):
             BadConfiguration: another process does, or has removed the store or begun another one in its place.
         """
         name = f"{shard[0]}-of-{shard[1]}"
-        file, self._aside = self.partial / "journal" / f"{name}.jsonl", self.partial / ASIDE / f"{name}-{os.getpid()}"
+        file, self._aside = self.partial / JOURNAL / f"{name}.jsonl", self.partial / ASIDE / f"{name}-{os.getpid()}"
         with self._locked():
             if not self._present():
                 if self._finished_by_another():
@@ -321,7 +338,7 @@ class SweepStore(Folder):
         """Lines of all journals that are whole, by chunk."""
         found: dict[int, list[Done]] = {}
         folder = self.path if self.finished else self.partial
-        for file in sorted((folder / "journal").glob("*.jsonl")):
+        for file in sorted((folder / JOURNAL).glob("*.jsonl")):
             for line in file.read_text(encoding="utf-8", errors="replace").splitlines():
                 record = _record(line)
                 if record is not None and 0 <= record.chunk < len(self.layout.blocks):
@@ -405,6 +422,7 @@ class SweepStore(Folder):
         The folder that it replaces goes into the new one first, and is deleted there: after a kill between any two
         steps the same command does the rest.
         """
+        self.refuse_appeared(self._force)
         if self.path.is_dir():
             replaced = self.partial / ASIDE / "replaced"
             shutil.rmtree(replaced, ignore_errors=True)
@@ -434,8 +452,7 @@ class SweepStore(Folder):
             return
         with self._locked(), contextlib.suppress(OSError):
             if self._present() and not self.done() and self._at_work() is None:
-                self._clear()  # the lock last: a folder without one would be somebody else's
-                shutil.rmtree(self.partial)
+                self._remove_partial()
 
 
 def write_file(path: Path, content: Any, aside: Path) -> None:
@@ -450,9 +467,10 @@ def write_file(path: Path, content: Any, aside: Path) -> None:
             stream.flush()
             os.fsync(stream.fileno())
         os.replace(aside, path)
-    except OSError:
+    except OSError as error:
         with contextlib.suppress(OSError):
             aside.unlink()
+        error.filename = str(path)
         raise
 
 
@@ -496,6 +514,10 @@ def create_store(path: Path, layout: Layout) -> None:
         # xarray opens a store with it at once, and one without it with a warning
         warnings.filterwarnings("ignore", message="Consolidated metadata is currently not part")
         zarr.consolidate_metadata(path)
+
+
+def _on_disk(size: int) -> int:
+    return -(-size // BLOCK) * BLOCK
 
 
 def fill_value(variable: Variable) -> Any:

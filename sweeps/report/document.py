@@ -16,6 +16,8 @@ from typing import Any
 
 import numpy as np
 
+from calibration.data.writing import cell_text
+
 #: Most rows of a table on a page, and on a terminal.
 PAGE_ROWS, TERMINAL_ROWS = 200, 60
 #: Entry of a table for a missing number.
@@ -154,10 +156,11 @@ class Table:
         """The table as CSV with numbers in full; missing ones are empty cells."""
         stream = io.StringIO()
         writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(plain_text(column.full_title) for column in self.columns)
+        writer.writerow(cell_text(plain_text(column.full_title)) for column in self.columns)
         for row in self.rows:
             bare = (cell.value if isinstance(cell, Cell) else cell for cell in row)
-            writer.writerow("" if is_missing(v) else plain_text(v) if isinstance(v, str) else v for v in bare)
+            texts = (plain_text(v) if isinstance(v, str) else v for v in bare)
+            writer.writerow("" if is_missing(v) else cell_text(v) if isinstance(v, str) else v for v in texts)
         return stream.getvalue()
 
 

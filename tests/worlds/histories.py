@@ -99,6 +99,10 @@ def runge_kutta(rates: Callable[[float, np.ndarray], np.ndarray], y: np.ndarray,
     return y + h / 6 * (a + 2 * b + 2 * d + e)
 
 
+#: Rounds of the torque at the output, of which a loss that depends on it is a small share.
+ROUNDS = 12
+
+
 def rates(
     time: float, y: np.ndarray, c: Conditions, battery: Any, p: Mapping[str, Any], terms: Sequence[Term]
 ) -> np.ndarray:
@@ -129,12 +133,15 @@ def rates(
     D = p["ground.rolling_resistance"] * N * sign_V + extra("ground") + m * G * np.sin(c.slope)
     guide = p["track.guide_friction"] * p["track.guide_share"] * N * s.d
     B = p["track.loss_coulomb"] * s.d + p["track.loss_viscous"] * s.w_k + extra("track")
-    s.B = B = B + s.r * (guide + P)
-    B = B + extra("gearbox")
+    load = B + s.r * (guide + P)
     A = M_d - p["gearbox.friction_coulomb"] * s.d - p["gearbox.friction_viscous"] * s.w
     J_w = p["inertia"] + extra("inertia")
-    eta = teeth(A * J_w + s.i * J_d * B, s.d, eta_0)
-    wheel = (s.i * eta * A - B) / (J_w + J_d * s.i**2 * eta)
+    s.B = load
+    for _ in range(1 + ROUNDS * any(t.law.balance == "gearbox" for t in terms)):
+        B = load + extra("gearbox")
+        eta = teeth(A * J_w + s.i * J_d * B, s.d, eta_0)
+        wheel = (s.i * eta * A - B) / (J_w + J_d * s.i**2 * eta)
+        s.B = load + J_w * wheel  # transmitted to the output, which effects of the gearbox see
     return np.stack([
         dI,
         s.i * wheel,

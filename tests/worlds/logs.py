@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 from worlds import laws
-from worlds.histories import runge_kutta, soft_sign, teeth
+from worlds.histories import ROUNDS, runge_kutta, soft_sign, teeth
 from worlds.laws import Term, shaped
 from worlds.rigs import RPM
 from worlds.settled import Sealed, between, remainder, robot_toml, typed
@@ -167,19 +167,23 @@ def histories(r: Rig, members: Sequence[Mapping[str, float]], terms: Sequence[Se
 
         load = p["dry"] * s.d + p["damping"] * s.w_k + brake + extra("track")
         s.B = load
-        s.B = load + extra("gearbox")
         idle = p["friction"] * s.d + p["viscous"] * s.w
         if r.imposed == "motor_speed":
             turn = slope / i
+            s.B = load + J_w * turn
+            B = load + extra("gearbox")
             for _ in range(6):  # the current by which the motors accelerate so
                 A = C * s.I - idle - extra("motor")
-                eta = teeth(A * J_w + i * J_d * s.B, s.d, p["efficiency"])
-                s.I = ((turn * (J_w + J_d * i**2 * eta) + s.B) / (i * eta) + idle + extra("motor")) / C
+                eta = teeth(A * J_w + i * J_d * B, s.d, p["efficiency"])
+                s.I = ((turn * (J_w + J_d * i**2 * eta) + B) / (i * eta) + idle + extra("motor")) / C
             s.rate = turn
         else:
             A = C * s.I - idle - extra("motor")
-            eta = teeth(A * J_w + i * J_d * s.B, s.d, p["efficiency"])
-            s.rate = (i * eta * A - s.B) / (J_w + J_d * i**2 * eta)
+            for _ in range(1 + ROUNDS * any(t.law.balance == "gearbox" for t in every)):
+                B = load + extra("gearbox")
+                eta = teeth(A * J_w + i * J_d * B, s.d, p["efficiency"])
+                s.rate = (i * eta * A - B) / (J_w + J_d * i**2 * eta)
+                s.B = load + J_w * s.rate  # transmitted to the output, which effects of the gearbox see
         if r.imposed == "voltage":
             s.dI = (given - C * s.w - R * s.I - extra("electrical")) / (2e-4 * R)
         else:

@@ -8,7 +8,7 @@ import numpy as np
 
 from calibration.data.input_errors import three_digits
 from mmrjax import __version__
-from mmrjax.errors import count_noun
+from mmrjax.errors import count_noun, printable
 from mmrjax.model import channels
 from sweeps.export.comparison import APPROXIMATED, DROPPED, EXPORTED, HELD, NATIVE, Fate
 from sweeps.export.formats import FORMATS, Export
@@ -174,13 +174,20 @@ def law_equations(found: Export) -> list[str]:
     return lines
 
 
+def markdown(text: str) -> str:
+    """A name of a user's in Markdown: it ends no line, cell or code, and begins no HTML."""
+    words = " ".join(printable(text).split())
+    return words.replace("`", "'").replace("|", "\\|").replace("<", "&lt;")
+
+
 def law_text(found: Export) -> str:
     """Text of LAW.md."""
     drive, compared = found.joint, found.comparison
     about = {"name": drive.name, "at": "drive", "armature": rotor_inertia(found)}
     verdicts = {HELD: "held by", APPROXIMATED: "approximated by", DROPPED: "dropped:"}
     constants = "\n".join(
-        f"| `{c.name}` | {c.value:.6g} | {c.unit} | {c.interval or '–'} | {c.meaning} | {c.source} |"
+        f"| `{markdown(c.name)}` | {c.value:.6g} | {c.unit} | {c.interval or '–'} | {c.meaning} | "
+        f"{markdown(c.source)} |"
         for c in found.constants
     )
     refitted = "\n".join(f"| {n} | {compared.translated[n]:.6g} | {v:.6g} |" for n, v in compared.refitted.items())
@@ -197,8 +204,9 @@ def law_text(found: Export) -> str:
     cited = any(re.search(r"\beqs?\.|\bTables? [A\d]", f"{c.meaning} {c.source}") for c in found.constants)
     paper = "\nNumbers of equations and tables are those of the paper that describes this robot.\n" if cited else ""
     bullets = lambda lines: "\n".join(f"* {line}" for line in lines)  # noqa: E731
+    origin = markdown(f"{drive.file.name}, {drive.configuration}")
     return f"""# The law of this drive
-A motor with its gearbox on one joint: {drive.file.name}, {drive.configuration}. A program, mmrjax {__version__},
+A motor with its gearbox on one joint: {origin}. A program, mmrjax {__version__},
 found its numbers from measurements or data sheets, and wrote it as {FORMATS[found.format]}. You need no other file of
 that program. All units are SI; the joint is the driven wheel or output shaft.
 
@@ -226,7 +234,7 @@ Percentages compare currents and speeds of settled runs with and without the eff
 {errors}
 
 ## Conditions seen
-{bullets(conditions_seen(found))}
+{bullets(map(markdown, conditions_seen(found)))}
 
 ## Not tested
 {bullets(not_tested(found))}

@@ -1,0 +1,133 @@
+"""Settled runs behind a current limit or a diode, compared with a bisection in NumPy, and their derivatives."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from worlds import bridges, paper
+
+import mmrjax as mm
+from mmrjax.fidelities.steady import steady_outputs
+from mmrjax.model import paper_robots, params
+from mmrjax.model.robot import Configurations
+from mmrjax.model.shaft import Shaft
+from mmrjax.model.signals import STATUSES
+
+P = paper.NOMINAL
+VEHICLE = {
+    "R": P["motor.resistance"],
+    "C": P["motor.torque_constant"],
+    "M_f": P["motor.friction_coulomb"] + P["gearbox.friction_coulomb"],
+    "K_f": P["motor.friction_viscous"] + P["gearbox.friction_viscous"],
+    "i": P["gearbox.ratio"],
+    "eta": P["gearbox.efficiency_load"],
+}
+DYNO = {"R": 2.37, "C": 0.0302, "M_f": 2e-3, "K_f": 3e-6, "i": 14.0, "eta": 0.8}
+
+
+def bench():
+    """A dyno of one motor, on whose shaft a brake acts."""
+    shaft = Shaft(inertia=1e-2, loss_coulomb=0.05, loss_viscous=0.002)
+    names = {
+        "motor.resistance": "R", "motor.torque_constant": "C", "motor.friction_coulomb": "M_f",
+        "motor.friction_viscous": "K_f", "gearbox.ratio": "i", "gearbox.efficiency_load": "eta",
+    }  # fmt: skip
+    values = {name: DYNO[symbol] for name, symbol in names.items()}
+    values |= {"motor.inertia": 1e-5, "motor.inductance": 1e-3}
+    return params.replace(paper_robots.blank_robot(Configurations({"dyno": shaft}), sides=1.0), values)
+
+
+def drawn(kind, one_way, number, seed=0):
+    """Random runs: a robot, its conditions, a limit for each, and their bisection by volts and limits."""
+    rng = np.random.default_rng(seed)
+    volts = rng.uniform(5, 40, number) * rng.choice([-1, 1, 1, 1], number)
+    duty = np.where(rng.random(number) < 0.5, 1.0, rng.uniform(-1, 1, number))
+    for values in (volts, duty):
+        values[rng.random(number) < 0.03] = 0.0
+    limits, battery = np.exp(rng.uniform(np.log(0.3), np.log(5), number)), rng.random(number) < 0.3
+    payload, slope, torque = (rng.uniform(a, b, number) for a, b in ((0, 8), (-20, 20), (-1.5, 1.5)))
+    if kind == "dyno":
+        robot, motor, battery = bench(), DYNO, np.zeros(number, bool)
+        load = {"dry": 0.05, "viscous": 0.002, "constant": torque, "demand": 0.0 * torque}
+        conditions = mm.Conditions(voltage=volts, duty=duty, load_torque=torque)
+    else:
+        robot, motor = paper_robots.nominal(), VEHICLE
+        of = [bridges.vehicle(c, payload, np.radians(slope)) for c in ("6T2A", "4W2T")]
+        wheeled = rng.random(number) < 0.5
+        load = {key: np.where(wheeled, of[1][key], of[0][key]) for key in of[0]}
+        conditions = mm.Conditions(
+            np.where(wheeled, "4W2T", "6T2A").tolist(), voltage=volts, duty=duty, battery=battery, payload=payload,
+            slope_deg=slope,
+        )  # fmt: skip
+    robot = dataclasses.replace(robot, driver=dataclasses.replace(robot.driver, returns_current=not one_way))
+
+    def bisected(volts, limits):
+        way = np.full(number, one_way)
+        return bridges.settled(motor, load, volts, duty, limits, way, battery, float(robot.sides))
+
+    return robot, conditions.resolved(robot), limits, bisected, load["demand"]
+
+
+def solved(robot, conditions, limits):
+    limited = params.replace(robot, {"driver.current_limit": limits})
+    return steady_outputs(limited, conditions, ("motor_current", "motor_speed", "status"))
+
+
+def checked(kind, one_way, number):
+    robot, conditions, limits, bisected, demand = drawn(kind, one_way, number)
+    current, speed = bisected(np.asarray(conditions.voltage), limits)
+    found = solved(robot, conditions, jnp.asarray(limits))
+    status = np.asarray(found["status"])
+    assert not (status == STATUSES.index("failed")).any()
+    numbers = np.isfinite(found["motor_speed"])
+    assert (numbers | (demand > 1)).all() and numbers.mean() > 0.9
+    for got, exact in ((found["motor_current"], current), (found["motor_speed"], speed)):
+        np.testing.assert_allclose(np.asarray(got)[numbers], exact[numbers], rtol=1e-9, atol=1e-9)
+    # Runs of each kind are among them.
+    assert {STATUSES.index(s) for s in ("converged", "stalled", "reverses", "rolls_back")} <= set(status.tolist())
+    limited, blocked = np.abs(current) > limits, one_way & (np.abs(current) < 1e-9) & (speed != 0)
+    assert limited.mean() > 0.1 and blocked.any() == one_way
+    return numbers
+
+
+@pytest.mark.parametrize("one_way", [False, True])
+@pytest.mark.parametrize("kind", ["robot", "dyno"])
+def test_every_run_with_a_limit_or_a_diode_is_solved(kind, one_way):
+    checked(kind, one_way, 400)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("one_way", [False, True])
+@pytest.mark.parametrize("kind", ["robot", "dyno"])
+def test_ten_thousand_runs_with_a_limit_or_a_diode_are_solved(kind, one_way):
+    checked(kind, one_way, 10_000)
+
+
+@pytest.mark.parametrize("one_way", [False, True])
+def test_derivatives_in_each_mode_are_differences_of_the_bisection(one_way):
+    """Along a change of limit and voltage together."""
+    robot, conditions, limits, bisected, _ = drawn("dyno", one_way, 400)
+    volts = np.asarray(conditions.voltage)
+
+    def answer(share):
+        moved = dataclasses.replace(conditions, voltage=volts * (1 + share))
+        return [solved(robot, moved, limits * (1 - share))[name] for name in ("motor_current", "motor_speed")]
+
+    slope = [np.asarray(x) for x in jax.jvp(answer, (0.0,), (1.0,))[1]]
+    far = 1e-5
+    before, here, after = (bisected(volts * (1 + x), limits * (1 - x)) for x in (-far, 0.0, far))
+    rises = [(b - a) / (2 * far) for a, b in zip(before, after, strict=True)]
+    # The rest changes its mode within the difference.
+    smooth = np.ones(len(limits), bool)
+    for a, middle, b in zip(before, here, after, strict=True):
+        smooth &= np.abs(a - 2 * middle + b) < 1e-3 * np.abs(b - a) + 1e-9
+    assert smooth.mean() > 0.95
+    for got, wanted in zip(slope, rises, strict=True):
+        np.testing.assert_allclose(got[smooth], wanted[smooth], rtol=1e-4, atol=1e-4)
+        assert np.isfinite(got).all()
+    limited = np.abs(here[0]) > limits
+    assert (np.abs(slope[1][limited]) > 1).sum() > 20 and (slope[1][~limited] != 0).sum() > 20
