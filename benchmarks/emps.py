@@ -105,19 +105,21 @@ def page(folder: Path, listing: str, seconds: float, record: Path) -> str:
     rows = [f"| {name} of this run | {error:.2f} | `benchmarks/emps.py` |" for name, error in scores]
     rows += [f"| {name} | {error} | {source} |" for name, error, source in PUBLISHED]
     fitted = [f"## `{p.name}`\n\n```toml\n" + "\n".join(parameters(p)) + "\n```\n" for p in files]
-    return "\n".join([
-        "# EMPS: a public benchmark\n",
-        "`python benchmarks/emps.py --data DIR` made this page. The loop saw `train.csv` alone, 24 841 rows at 1 kHz.\n",
-        f"**{found['headline']['statement']}** The loop took {seconds:.0f} s.\n",
-        *effects,
-        "",
-        "| model | free-run rms on `test.csv` [mm] | source |",
-        "|---|---|---|",
-        *rows,
-        "",
-        *fitted,
-        "## `mmrjax inspect train.csv`\n\n```\n" + listing.strip() + "\n```\n",
-    ])
+    return "\n".join(
+        [
+            "# EMPS: a public benchmark\n",
+            "`python benchmarks/emps.py --data DIR` made this page. The loop saw `train.csv` alone (24 841 rows, 1 kHz).\n",
+            f"**{found['headline']['statement']}** The loop took {seconds:.0f} s.\n",
+            *effects,
+            "",
+            "| model | free-run rms on `test.csv` [mm] | source |",
+            "|---|---|---|",
+            *rows,
+            "",
+            *fitted,
+            "## `mmrjax inspect train.csv`\n\n```\n" + listing.strip() + "\n```\n",
+        ]
+    )
 
 
 def main() -> int:
