@@ -108,7 +108,7 @@ def page(folder: Path, listing: str, seconds: float, record: Path) -> str:
     return "\n".join(
         [
             "# EMPS: a public benchmark\n",
-            "`python benchmarks/emps.py --data DIR` made this page. The loop saw `train.csv` alone (24 841 rows, 1 kHz).\n",
+            "`python benchmarks/emps.py --data DIR` made this page. The loop saw `train.csv` alone.\n",
             f"**{found['headline']['statement']}** The loop took {seconds:.0f} s.\n",
             *effects,
             "",

@@ -135,9 +135,8 @@ def search_agreement(note: fit_notes.Agreement) -> str:
 
 def unsettled_search(note: fit_notes.Unsettled) -> str:
     """A search that ended before it converged."""
-    open_ones = (
-        f"these data do not determine {', '.join(note.names)}" if note.names else "the data determine them all"
-    )
+    names = ", ".join(note.names)
+    determined = f"these data do not determine {names}" if names else "the data determine them all"
     return (
         f"the search ended before it converged: parameters are the best that it found, their intervals are not to be "
         f"trusted, and {determined}"
