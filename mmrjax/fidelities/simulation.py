@@ -93,7 +93,9 @@ def simulate(
     conditions = check_conditions(robot, conditions)
     _check_battery(robot, conditions)
     _check_turning(robot, conditions, profile)
-    _check_brake(robot, conditions, profile)
+    braked = conditions.load_torque is not None or (profile is not None and profile.load_torque is not None)
+    if braked and robot.has_ground:
+        raise UsageError(f"load_torque: {NO_BRAKE}; state slope_deg or payload")
     turns = conditions.turns or (profile is not None and profile.turns)
     if not (turns or has_tracer(robot.effects)) and (unlike := robot.unlike):
         warnings.warn(f"{', '.join(unlike)}: {STRAIGHT}; {OF_TURNS[0]}=1, {OF_TURNS[1]}=1 let it turn", stacklevel=2)
@@ -151,13 +153,6 @@ def _check_turning(robot: Robot, conditions: Conditions, profile: Profile | None
         return
     if why := turn_error(robot, [robot.configurations.names[k] for k in np.unique(conditions.configuration)]):
         raise UsageError(f"{freed[0]}: {why}")
-
-
-def _check_brake(robot: Robot, conditions: Conditions, profile: Profile | None) -> None:
-    """Raises if a brake torque is stated for a vehicle."""
-    braked = conditions.load_torque is not None or (profile is not None and profile.load_torque is not None)
-    if braked and robot.has_ground:
-        raise UsageError(f"load_torque: {NO_BRAKE}; state slope_deg or payload")
 
 
 def _check_profile(model: str, profile: Any, options: Mapping[str, float | None]) -> None:
