@@ -456,8 +456,8 @@ def held_sentence(runs: Runs) -> str:
 def swapped_sentence(runs: Runs) -> str:
     """Sentence on a speed whose sign swaps within a log, by the power of the drive; empty for others."""
     imposed = runs.layout.imposed_column
-    if not (runs.sampled and runs.has(imposed)):
-        return ""
+    if not (runs.sampled and runs.has(imposed) and np.nanmin(runs[imposed]) < 0 < np.nanmax(runs[imposed])):
+        return ""  # what never changes its sign may lack one, which other checks report
     for name in np.unique(runs.run_names):
         rows = runs.in_order(name)
         for channel, shown in zip(runs.channels, runs.measured()[rows].T, strict=True):
