@@ -7,7 +7,7 @@ import pytest
 from test_shaft import DRIVE, bench
 
 import mmrjax as mm
-from calibration.data import robot_file
+from calibration.data import rig_facts, robot_file
 from calibration.data import runs as records
 from calibration.data.input_errors import BadData
 from mmrjax.errors import UsageError
@@ -94,6 +94,9 @@ loss_coulomb = 0.0
 """
 
 
+FREED = ("motor.resistance", "motor.torque_constant", "motor.friction_coulomb")
+
+
 def rig(tmp_path, imposed, channels):
     path = tmp_path / "rig.toml"
     path.write_text(RIG_HELD.format(imposed=imposed, channels=channels), encoding="utf-8")
@@ -112,7 +115,9 @@ def table(held=True, **more):
 
 def test_a_test_with_the_shaft_held_gives_constant_friction_and_resistance(tmp_path):
     robot = rig(tmp_path, "motor_current", '"motor_voltage", "output_torque"')
-    found = mm.calibrate(records.read_runs(table(), robot=robot), robot, free=("motor.resistance", "motor.torque_constant", "motor.friction_coulomb"))
+    found = mm.calibrate(
+        records.read_runs(table(), robot=robot), robot, free=FREED, noise="motor_voltage=0.01V,output_torque=0.01Nm"
+    )
     for name, right in (("resistance", 0.25), ("torque_constant", 0.12), ("friction_coulomb", 0.03)):
         p = found.parameters[f"motor.{name}"]
         assert abs(p.value - right) < 4 * p.sd and p.sd < 0.1 * right, (name, p.value, p.sd)
@@ -129,12 +134,19 @@ def test_a_locked_rotor_with_voltage_alone_gives_the_resistance(tmp_path):
 
 def test_rows_of_a_clamp_in_tables(tmp_path):
     held = rig(tmp_path, "motor_current", '"motor_voltage", "output_torque"')
-    with pytest.raises(BadData, match="row 1, load_torque_Nm: got 1 where held is 1; expected 0, .* output_torque"):
+    with pytest.raises(BadData, match=r"row 1, load_torque_Nm: got 1 where held is 1; expected 0, .* output_torque"):
         records.read_runs(table(load_torque_Nm=np.ones(16)), robot=held)
     with pytest.raises(BadData, match="column held is for settled rows"):
         records.read_runs(table(time_s=np.arange(16.0)), robot=held)
     speed = rig(tmp_path, "motor_speed", '"motor_current", "output_torque"')
-    with pytest.raises(BadData, match='nothing drives the motors; .* a held shaft: state imposed = "motor_current"'):
+    with pytest.raises(BadData, match=r'nothing drives the motors; .* a held shaft: state imposed = "motor_current"'):
         records.read_runs(table(held=False, motor_speed_rpm=np.zeros(16)), robot=speed)
     rows = table(held=False, motor_speed_rpm=np.zeros(16), load_torque_Nm=np.r_[np.ones(15), 0.0])
     assert len(records.read_runs(rows, robot=speed)) == 15
+    rows = table()
+    strong = {**rows, "motor_current_A": 5 * rows["motor_current_A"]}
+    assert rig_facts.doubtful_current(records.read_runs(strong, robot=held), held) == ""
+    strong["held"] = np.r_[np.zeros(15), 1.0]
+    assert "80 A, where the file's numbers turn the load" in rig_facts.doubtful_current(
+        records.read_runs(strong, robot=held), held
+    )

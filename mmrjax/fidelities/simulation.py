@@ -155,9 +155,7 @@ def _check_turning(robot: Robot, conditions: Conditions, profile: Profile | None
 
 def _check_brake(model: str, robot: Robot, conditions: Conditions, profile: Profile | None) -> None:
     """Raises if a brake torque is stated for a vehicle, or a clamp for anything but a settled shaft."""
-    if conditions.held is not None and (
-        model != "steady" or robot.has_ground or conditions.motor_speed is not None
-    ):
+    if conditions.held is not None and (model != "steady" or robot.has_ground or conditions.motor_speed is not None):
         raise UsageError(
             "held: a clamp holds the output of a shaft in settled runs at an imposed voltage or current; expected "
             "such runs, or leave held out"

@@ -100,7 +100,7 @@ class Conditions(eqx.Module):
             None: those of the running gear, folded as it states.
         load_torque: torque of a brake or load motor on the output of each drive [N·m]: positive against forward
             rotation, in both directions of rotation. Only for a load on a shaft; None: 0.
-        held: 1 where a clamp holds the output of each drive at rest, so that `output_torque` is what the clamp carries.
+        held: 1 where a clamp holds the output of each drive at rest; `output_torque` is then what the clamp carries.
             Only for a load on a shaft at an imposed voltage or current, in settled runs; None: 0.
     """
 
