@@ -9,7 +9,8 @@ from test_shaft import DRIVE, bench
 import mmrjax as mm
 from calibration.data import rig_facts, robot_file
 from calibration.data import runs as records
-from calibration.data.input_errors import BadData
+from calibration.data.input_errors import BadConfiguration, BadData
+from calibration.inference.observers import SettledRuns
 from mmrjax.errors import UsageError
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import params
@@ -130,6 +131,12 @@ def test_a_locked_rotor_with_voltage_alone_gives_the_resistance(tmp_path):
     runs = records.read_runs({**rows, "held": columns["held"]}, robot=robot)
     found = mm.calibrate(runs, robot, free=("motor.resistance",))
     assert found.parameters["motor.resistance"].value == pytest.approx(0.25, rel=0.01)
+
+
+def test_a_clamp_with_another_model_is_refused(tmp_path):
+    robot = rig(tmp_path, "motor_current", '"motor_voltage", "output_torque"')
+    with pytest.raises(BadConfiguration, match="held: got model drive; expected steady"):
+        SettledRuns.of(records.read_runs(table(), robot=robot), robot, "drive")
 
 
 def test_rows_of_a_clamp_in_tables(tmp_path):
