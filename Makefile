@@ -80,8 +80,8 @@ gallery: $(TOOLS)
 	$(BIN)/mmrjax check --out runs/gallery/check --force
 	$(BIN)/mmrjax size --out runs/gallery/size --force
 	$(BIN)/mmrjax sensitivity --outputs total_current,slip --out runs/gallery/sensitivity --force
-	$(BIN)/python docs/gallery/make.py $(foreach page,loop run sweep mission check size sensitivity,$(page)=runs/gallery/$(page))
 	$(BIN)/python docs/site.py runs/gallery/loop
+	$(BIN)/python docs/gallery/make.py $(foreach page,loop run sweep mission check size sensitivity,$(page)=runs/gallery/$(page))
 
 clean:
 	rm -rf $(VENV) runs site

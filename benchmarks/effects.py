@@ -32,7 +32,7 @@ ADHESION = {
     f"{c}.ground.friction.{k}": v for c in (TRACKED, WHEELED) for k, v in (("static", 0.6), ("dynamic", 0.48))
 }
 #: In the units of the channels' columns; only the ratios of display resolutions matter for look-alikes.
-SHOWN = 1 / np.array(channels.channel_factors(channels.usual_channels()))
+SHOWN = 1 / np.array([c.factor for c in channels.usual_channels()])
 NOISE = np.array([0.02, 5.0, 3.0])
 #: Base parameters that every fit frees; they are projected out.
 FREED = (

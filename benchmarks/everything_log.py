@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from everything import note
 
-LOG = Path(os.environ["EVERYTHING_LOG"])
+LOG = Path(os.environ.get("EVERYTHING_LOG", os.devnull))
 DISTRIBUTES = "PYTEST_XDIST_WORKER" not in os.environ
 #: Outcome, seconds and text of tests in progress.
 RUNNING: dict[str, dict[str, Any]] = {}

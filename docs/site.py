@@ -7,6 +7,7 @@ python docs/site.py found      # docs/start/table.md too, from the folder of `mm
 from __future__ import annotations
 
 import ast
+import hashlib
 import inspect
 import json
 import re
@@ -19,6 +20,9 @@ from typing import Any
 DOCS = Path(__file__).parent
 FIGURES = ("before_after", "laws", "errors")
 PACKAGES = ("mmrjax", "calibration", "sweeps")
+#: What the tutorial about the loop was written from, and the parts of `result.json` in it.
+RECORD = DOCS / "start" / "loop.json"
+RECORDED = ("statement", "rows", "errors", "held_out_by", "effects", "next_experiment")
 #: Second paragraph of every page that this program writes.
 MADE = "*`python docs/site.py` writes this page from the code.*"
 
@@ -305,9 +309,16 @@ def _table(heads: tuple[str, ...], rows: Any) -> str:
     )
 
 
-def example(folder: Path) -> str:
-    """Tutorial about the loop on the packaged runs, from the `result.json` of a run folder."""
-    d = json.loads((folder / "result.json").read_text("utf-8"))
+def picture_source(name: str) -> str:
+    """Hash of what a picture of the gallery is made from: templates, renderer, and of the loop its record."""
+    pages = DOCS.parent / "sweeps"
+    files = [*sorted((pages / "pages" / "templates").iterdir()), pages / "report" / "page_renderer.py"]
+    return hashlib.sha256(b"".join(f.read_bytes() for f in [*files, *[RECORD] * (name == "loop")])).hexdigest()[:16]
+
+
+def example(result: Path) -> str:
+    """Tutorial about the loop on the packaged runs, from its `result.json` or the record of it."""
+    d = json.loads(result.read_text("utf-8"))
     labels = {"total_current": "current", "motor_speed": "motor speed", "speed": "speed"}
     cells = lambda errors: " | ".join(f"{errors[c]['rms_percent']:.1f}" for c in labels)  # noqa: E731
     reached = lambda errors: f"{max(e['rows'] for e in errors.values())}/{d['rows']}"  # noqa: E731
@@ -400,7 +411,10 @@ def main() -> None:
     for name, page in PAGES.items():
         (DOCS / "reference" / f"{name}.md").write_text(page(), encoding="utf-8")
     for folder in map(Path, sys.argv[1:]):
-        (DOCS / "start" / "table.md").write_text(example(folder), encoding="utf-8")
+        (DOCS / "start" / "table.md").write_text(example(folder / "result.json"), encoding="utf-8")
+        result = json.loads((folder / "result.json").read_text("utf-8"))
+        kept = {name: result[name] for name in RECORDED}
+        RECORD.write_text(json.dumps(kept, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
         for name in FIGURES:
             shutil.copy(folder / "figures" / f"{name}.svg", DOCS / "start" / "figures")
 

@@ -44,6 +44,27 @@ def test_every_script_is_imported_or_prints_its_help(unchanged, monkeypatch):
         assert not end.value.code and shown.getvalue().startswith("usage:"), script.name
 
 
+def test_a_killed_tier_counts_what_has_finished(tmp_path):
+    everything, log = importlib.import_module("everything"), tmp_path / "quick.jsonl"
+    assert everything.summary("quick", log)["state"] == "not run"
+    everything.note(log, command="pytest")
+    everything.note(log, selected=3)
+    for test, outcome in {"a.py::one": "passed", "a.py::two": "failed"}.items():
+        everything.note(log, test=test, outcome=outcome)
+    with log.open("a") as file:
+        file.write('{"test": "a.py::thr')  # killed here
+    row = everything.summary("quick", log)
+    assert [row[n] for n in ("passed", "failed", "skipped", "left", "state")] == [1, 1, 0, 1, "not finished"]
+    with log.open("a") as file:
+        file.write("\n")
+    everything.note(log, command="pytest --go-on")
+    everything.note(log, selected=1)
+    everything.note(log, test="a.py::three", outcome="skipped")
+    everything.note(log, code=1)
+    row = everything.summary("quick", log)
+    assert [row[n] for n in ("passed", "failed", "skipped", "left", "state")] == [1, 1, 1, 0, "finished"]
+
+
 #: Options that make a cited command small, after its own; None: why it is not run here.
 _ONE = "--clean 1 --library 0 --outside 0 --replicates 20 --jobs 1 --out cases.jsonl"
 SMALL = {
@@ -54,6 +75,8 @@ SMALL = {
     "draw_mutants.py": "--number 1",
     "drive.py": "--batches 2 --repeats 1",
     "effects.py": "--check",
+    "weight.py": None,  # tests/test_weight.py
+    "everything.py": None,  # test_a_killed_tier_counts_what_has_finished
     "fastsim_comparison.py": None,  # tests/test_fastsim_comparison.py
     "free_chain.py": None,  # a chain of 168 masses takes half a minute
     "head_to_head.py": "--quick --out lines.jsonl",

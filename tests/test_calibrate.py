@@ -33,8 +33,8 @@ from calibration.inference.simulation_errors import relative_error, root_mean_sq
 from mmrjax.fidelities.results import Results
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import channels, paper_robots
-from sweeps.commands.calibrate import print_calibration
-from sweeps.pages import calibration_page as calibration_page
+from sweeps.report import calibration_report, page_renderer
+from sweeps.report.terminal_renderer import print_document
 from tests.commands import rows as rows_of
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -159,9 +159,9 @@ def test_blocks_that_tell_nothing_of_their_own_are_said_and_not_shown(found, cap
     found = dataclasses.replace(found, held_out=dict(zip(kinds, held, strict=True)))
     assert found.held_out_alike == {"voltage_configuration": ("voltage", "payload"), "slope": ()}
     assert SamePredictions("voltage_configuration", ("voltage", "payload")) in calibration_remarks(found)
-    print_calibration(found)
+    print_document(calibration_report.calibration_document(found, "nominal"))
     shown = capsys.readouterr().out
-    table = [line for line in shown.splitlines() if line.startswith("│ after, held out")]
+    table = [line for line in shown.splitlines() if line.startswith("after, held out")]
     assert [" by slope " in line or " by voltage and configuration " in line for line in table] == [True, True]
 
 
@@ -583,9 +583,13 @@ def test_clusters_are_in_the_document_and_on_the_page_of_a_calibration(tmp_path)
     document = json.loads(json.dumps(made.to_json()))
     jsonschema.validate(document, SCHEMA)
     assert document["residual_clusters"][0]["statement"] == found.statement
-    page = calibration_page.write_calibration_page(tmp_path / "with", made, robot_name="nominal").read_text("utf-8")
+    page = page_of(tmp_path / "with", made)
     assert "cluster by idle_wheel" in page and (tmp_path / "with" / "figures" / "clusters.svg").exists()
     bare = dataclasses.replace(plain, residual_clusters=())
-    assert 'id="clusters"' not in calibration_page.write_calibration_page(
-        tmp_path / "bare", bare, robot_name="nominal"
-    ).read_text("utf-8")
+    assert 'id="clusters"' not in page_of(tmp_path / "bare", bare)
+
+
+def page_of(folder, found):
+    """The page of a calibration."""
+    document = calibration_report.calibration_document(found, "nominal")
+    return page_renderer.write_report_page(folder, document).read_text("utf-8")

@@ -124,13 +124,24 @@ def test_extras_of_the_project_are_those_that_the_docs_name():
     assert {"test", "cluster", "bench", "docs"} <= set(extras)
 
 
+def test_sentences_of_the_example_follow_from_the_recorded_result():
+    """Else: make gallery."""
+    assert SITE.example(SITE.RECORD) == (DOCS / "start" / "table.md").read_text("utf-8")
+
+
+def test_pictures_are_of_todays_pages():
+    """Else: make gallery."""
+    made = json.loads((DOCS / "gallery" / "sources.json").read_text("utf-8"))
+    assert made == {p.stem: SITE.picture_source(p.stem) for p in (DOCS / "gallery").glob("*.png")}
+
+
 @pytest.mark.nightly
 @pytest.mark.slow
 def test_the_example_is_what_the_loop_says_today(tmp_path, mmrjax):
     """Else: mmrjax loop measured --out found; python docs/site.py found."""
     assert mmrjax("loop", "measured", "--out", "found", "--no-report")[0] == 0
     numbers = r"[-+−]?\d+(?:\.\d+)?"
-    said, made = (DOCS / "start" / "table.md").read_text("utf-8"), SITE.example(tmp_path / "found")
+    said, made = (DOCS / "start" / "table.md").read_text("utf-8"), SITE.example(tmp_path / "found" / "result.json")
     assert re.sub(numbers, "N", said) == re.sub(numbers, "N", made)
     for a, b in zip(re.findall(numbers, said), re.findall(numbers, made), strict=True):
         assert float(a) == pytest.approx(float(b), rel=0.02, abs=0.11), (a, b)

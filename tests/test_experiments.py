@@ -388,6 +388,25 @@ def test_higher_voltage_needs_a_rating_and_is_watched(rover):
     assert Overvoltage(18.0, 12.0) in shown.watch
 
 
+@pytest.mark.parametrize(
+    ("imposed", "limits", "highest"),
+    [
+        ("voltage", {"voltage": 24.0}, 24.0),
+        ("voltage", {"voltage": 28.6}, 28.0),
+        ("voltage", {"voltage": 48.0}, 31.0),
+        ("motor_speed", {"geared": 27.5}, 27.0),
+        ("motor_current", {}, 31.0),
+    ],
+)
+def test_levels_of_a_shaft_stay_within_those_of_the_table_or_the_makers_limit(imposed, limits, highest):
+    levels = (6.0, 12.0, 24.0)
+    used = dataclasses.replace(REACH.used[0], voltages=levels)
+    reach = dataclasses.replace(REACH, used=(used,), imposed=imposed, levels=levels, has_ground=False, **limits)
+    other, *rest = menu._shaft_runs(reach, used)
+    assert max(other.voltage) == highest and len(set(other.voltage) - set(levels)) >= 2
+    assert all(abs(v) <= 24.0 for r in rest for v in r.voltage)
+
+
 def plain(run, temperature=40.0, speed=100.0):
     """All of a run kept, with one temperature and speed."""
     rows = len(run.voltage)

@@ -140,7 +140,10 @@ def expressions_text(drive):
     """Function from part, suffix and signals to the number that its text computes."""
     known = [
         law_source.Constant(n, x, "", "", "")
-        for n, x in {**joints.parameter_values(drive), **dict.fromkeys(drive.surroundings(), 0.7)}.items()
+        for n, x in {
+            **{n: float(p.value) for n, p in drive.parameters().items()},
+            **dict.fromkeys(drive.surroundings(), 0.7),
+        }.items()
     ]
     source = law_source.jax_source(drive, known)
     module = law_source.module_from_source(

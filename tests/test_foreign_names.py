@@ -53,7 +53,10 @@ def drive():
     joint = joints.joint_of_robot(dataclasses.replace(file, robot=named, source=f"{ALL.replace('/', '')}.toml"), ALL)
     known = [
         law_source.Constant(n, x, ALL, ALL, ALL)
-        for n, x in {**joints.parameter_values(joint), **dict.fromkeys(joint.surroundings(), 0.7)}.items()
+        for n, x in {
+            **{n: float(p.value) for n, p in joint.parameters().items()},
+            **dict.fromkeys(joint.surroundings(), 0.7),
+        }.items()
     ]
     return joint, known
 

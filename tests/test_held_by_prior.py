@@ -18,8 +18,8 @@ from calibration.inference import identifiability
 from calibration.inference.calibration import calibrate
 from calibration.inference.identifiability import HELD, held_by_prior
 from mmrjax.model import paper_robots
-from sweeps.commands import calibrate as command
-from sweeps.pages import calibration_page as calibration_page
+from sweeps.report import calibration_report, page_renderer
+from sweeps.report.terminal_renderer import print_document
 
 
 def linear(jacobian):
@@ -117,13 +117,14 @@ def test_calibration_says_it_of_every_parameter_everywhere(case, found, capsys, 
     listed = set(notes[0].split("): ")[1].split(", ")) if notes else set()
     far = {note.split()[0] for note in made.notes if note.endswith("the prior or the model is wrong")}
     assert listed == held - far and len(notes) <= 1
-    command.print_calibration(made)
+    shown = calibration_report.calibration_document(made, "nominal")
+    print_document(shown)
     printed = capsys.readouterr().out
     lines = {line.split()[0]: line.rstrip() for line in printed.splitlines() if line.split()[:1] and line.split()[0] in made.parameters}  # fmt: skip
     assert {name for name, line in lines.items() if line.endswith("no")} == held and set(lines) == set(
         made.parameters
     )
-    page = Tables(calibration_page.write_calibration_page(tmp_path, made, robot_name="nominal").read_text("utf-8"))
+    page = Tables(page_renderer.write_report_page(tmp_path, shown).read_text("utf-8"))
     head, *rows = page.tables["parametertable"]
     at = head.index("determined")
     assert {row[0] for row in rows if row[at].startswith("no")} == held

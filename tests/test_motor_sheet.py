@@ -10,6 +10,7 @@ import pytest
 from calibration.data import robot_file
 from calibration.data.input_errors import BadConfiguration
 from sweeps.commands import rig_from_sheet
+from sweeps.commands.rig_new import write_new_rig
 
 #: maxon RE30 310007, as printed.
 RE30 = {
@@ -33,6 +34,17 @@ def test_each_sheet_that_determines_the_motor_gives_its_constants(names):
         "resistance": pytest.approx(2), "torque_constant": pytest.approx(0.05),
         "friction_coulomb": pytest.approx(0.03), "friction_viscous": 0,
     }  # fmt: skip
+
+
+def test_viscous_friction_that_a_sheet_leaves_open_is_free(tmp_path):
+    """Half of the no-load torque may be viscous: 0.5 k I0 / ω0."""
+    sheet = rig_from_sheet.read_data_sheet(EXACT)["motor.friction_viscous"]
+    assert float(sheet.width) == pytest.approx(0.5 * 0.03 / 216, rel=0.01)
+    write_new_rig(tmp_path / "rig.toml", None, False, sheet=EXACT)
+    robot = robot_file.read_robot(tmp_path / "rig.toml")
+    priors = {name: sd for name, _, sd in robot.rig.priors}
+    assert priors["motor.friction_viscous"] == pytest.approx(0.5 * 0.03 / 216, rel=0.01)
+    assert "motor.friction_viscous" not in robot.rig.exact
 
 
 def test_printed_sheet_gives_the_makers_torque_constant():

@@ -20,7 +20,7 @@ from calibration.inference.observers import Histories
 from calibration.inference.residual_clusters import LEVEL, residual_clusters
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import paper_robots
-from sweeps.pages import calibration_page as calibration_page
+from sweeps.report import calibration_report, page_renderer
 
 SCHEMAS = Path(__file__).parents[1] / "docs" / "schemas"
 ROWS = 90
@@ -263,7 +263,8 @@ def test_calibration_says_what_its_residuals_cluster_by(shifted, tmp_path):
     document = json.loads(json.dumps(shifted.to_json()))
     jsonschema.validate(document, json.loads((SCHEMAS / "calibrate.schema.json").read_text("utf-8")))
     assert document["residual_clusters"][0]["statement"] == found.statement and found.statement in document["notes"]
-    page = calibration_page.write_calibration_page(tmp_path, shifted, robot_name="nominal").read_text("utf-8")
+    document = calibration_report.calibration_document(shifted, "nominal")
+    page = page_renderer.write_report_page(tmp_path, document).read_text("utf-8")
     assert "residuals of speed cluster by idle_wheel" in page and (tmp_path / "figures" / "clusters.svg").exists()
     assert Tables(page).tables
 
@@ -272,7 +273,8 @@ def test_calibration_says_what_its_residuals_cluster_by(shifted, tmp_path):
 def test_clean_table_says_nothing_of_columns_without_a_role(tmp_path):
     clean = calibrate(measured_table(1, 0.0), paper_robots.nominal(), starts=2, profiles=False, blocks=())
     assert clean.residual_clusters == () and "without a role" not in " ".join(clean.notes)
-    page = calibration_page.write_calibration_page(tmp_path, clean, robot_name="nominal").read_text("utf-8")
+    document = calibration_report.calibration_document(clean, "nominal")
+    page = page_renderer.write_report_page(tmp_path, document).read_text("utf-8")
     assert 'id="clusters"' not in page
 
 

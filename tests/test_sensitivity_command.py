@@ -27,7 +27,8 @@ from calibration.sensitivity.result import Points
 from calibration.sensitivity.study import Study
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import params
-from sweeps.pages import sensitivity_page as page
+from sweeps.report import sensitivity_report
+from sweeps.report.document import Figure
 from tests.commands import rows as table
 from tests.pages import Tables
 
@@ -213,19 +214,16 @@ def test_a_share_of_a_reading_of_zero_tells_nothing():
     np.testing.assert_array_equal(told, [[[0.25]]])
 
 
-def test_an_output_that_nothing_changes_has_no_figures(tmp_path, monkeypatch):
+def test_an_output_that_nothing_changes_has_no_figures(monkeypatch):
     """A yaw rate beside straight travel: one without bars leaves no room for its axes."""
-    drawn, shares = [], {"speed": np.array([0.4, 0.6]), "yaw_rate": np.zeros(2)}
-    monkeypatch.setattr(page.Album, "add", lambda self, name, make: drawn.append(name))
-    monkeypatch.setattr(page, "render_page", lambda *_, **told: told["sections"])
-    for name in ("_sentence", "_pairs", "_inputs", "_ranges", "_bounds", "_next_runs", "robot_section"):
-        monkeypatch.setattr(page, name, lambda *_: {})
+    shares = {"speed": np.array([0.4, 0.6]), "yaw_rate": np.zeros(2)}
+    monkeypatch.setattr(sensitivity_report, "_sentence", lambda *_: "a sentence")
+    monkeypatch.setattr(sensitivity_report, "_inputs", lambda *_: "a table")
     one = {"studied": np.array([True]), "value": np.zeros(1), "row": SimpleNamespace(label=""), "second": None}
     outputs = {k: SimpleNamespace(overall_share=v, convergence=None, **one) for k, v in shares.items()}
-    sections = page.write_sensitivity_page(
-        tmp_path, SimpleNamespace(outputs=outputs, next_runs=None, method="local"), None
-    )
-    assert drawn == ["overview", "tornado_speed", "indices_speed"] and [s["drawn"] for s in sections] == [True, False]
+    found = SimpleNamespace(outputs=outputs, next_runs=None, comparison={}, names=("a", "b"))
+    blocks = [block for section in sensitivity_report._sections(found) for block in section.blocks]
+    assert [b.name for b in blocks if isinstance(b, Figure)] == ["tornado_speed", "indices_speed"]
 
 
 def test_schema_can_fail():
@@ -276,7 +274,7 @@ def test_posterior_of_a_robot_is_its_inputs_and_gives_runs_their_uncertainty(mmr
     (["--outputs", "current"], 2, "--outputs current: no such output; did you mean total_current? allowed: total_"),
     (["--outputs", "sped"], 2, "--outputs sped: no such output; did you mean speed? allowed: total_current"),
     (["--evaluations", "10"], 2, "--evaluations: got 10; expected 1000 or more"),
-    (["--vary", "voltage=28:20"], 2, "--vary voltage: got 28 to 20; expected a range within -100 to 100 V"),
+    (["--vary", "voltage=28:20"], 2, "--vary voltage: got 28 to 20; expected a range within -10000 to 10000 V"),
     (["--vary", "voltage"], 2, "--vary: got voltage; expected name=low:high with numbers, such as voltage=22:26"),
     (["--vary", "tension=1:2"], 2, "--vary tension: no such condition; "),
     (["--vary", "voltage=20:28", "--voltages", "24"], 2, "--vary voltage: --voltages states it too; give one of them"),

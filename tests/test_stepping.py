@@ -74,6 +74,31 @@ def test_steps_are_runs_of_drive(robot):
     assert np.ptp(coarse.distance[100:]) == 0 and abs(coarse.current[-1]) < 1e-6
 
 
+@pytest.mark.parametrize("dt", [0.05, 0.02])
+def test_starts_are_as_accurate_as_stated(dt, robot, in_steps):
+    """Largest error of the speed at any step, compared with steps of 1 ms."""
+    for conditions in (RUNS["tracked"], mm.Conditions("4W2T", voltage=33.0)):
+        found, exact = (in_steps(conditions, length) for length in (dt, 1e-3))
+        exact = exact[round(dt / 1e-3) - 1 :: round(dt / 1e-3)]
+        np.testing.assert_allclose(found, exact, rtol=3e-3)
+
+
+@pytest.fixture(scope="module")
+def in_steps(robot):
+    """Speeds of a start in steps of one length, over half a second; one program for all."""
+    step = jax.jit(lambda state, dt, conditions: mm.step(robot, state, None, dt, conditions))
+
+    def speeds(conditions, dt):
+        conditions, found = conditions.resolved(robot), []
+        state = mm.initial_state(robot, conditions)
+        for _ in range(round(0.5 / dt)):
+            state = step(state, dt, conditions)
+            found.append(float(state.speed))
+        return np.array(found)
+
+    return speeds
+
+
 @pytest.mark.slow
 def test_steps_converge(robot):
     """Against a hundred times as many, over a command that changes: the figures that the docstring states."""

@@ -52,7 +52,7 @@ LONGEST = 1_000_000
 #: Quantities of columns, by field of `mmrjax.missions.profile.Profile`; demands become `demand`.
 QUANTITIES: dict[str, Quantity] = {
     quantity.key: quantity
-    for quantity in (quantities.condition_named("time"), *quantities.SET, *channels.EVERY)
+    for quantity in (quantities.BY_COLUMN["time_s"], *quantities.SET, *channels.EVERY)
     if quantity.in_profiles
 }
 #: Columns of demands, at most one in a row, and the mode of each.

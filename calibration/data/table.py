@@ -195,7 +195,7 @@ class Runs:
     def _stacked(self, columns: tuple[str, ...]) -> np.ndarray:
         nothing = np.full(len(self), np.nan)
         found = [self.columns.get(column, nothing) for column in columns]
-        return np.stack(found, 1) * np.asarray(channels.channel_factors(self.channels))
+        return np.stack(found, 1) * np.asarray([c.factor for c in self.channels])
 
     def missing(self) -> list[str]:
         """Returns a note on each channel with missing readings."""

@@ -346,15 +346,11 @@ def _shaft_runs(reach: Reach, used: Used) -> tuple[Run, ...]:
     others_of = {"voltage": "other voltages", "motor_speed": "other speeds", "motor_current": "other currents"}
     levels = used.voltages if reach.imposed == "voltage" else reach.levels
     sizes = tuple(sorted({round_significant(abs(x)) for x in levels if x})) or (1.0,)
-    others = tuple(
-        sorted(
-            {
-                round_significant(0.4 * sizes[0]),
-                round_significant(0.5 * (sizes[0] + sizes[-1])),
-                round_significant(1.3 * sizes[-1]),
-            }
-        )
-    )
+    low, high = 0.4 * sizes[0], sizes[-1]
+    allowed = {"voltage": reach.voltage, "motor_speed": reach.geared}.get(reach.imposed, math.inf)
+    top = round_significant(1.3 * high) if 1.3 * high < allowed else floor_significant(max(allowed, high))
+    between = 0.5 * (sizes[0] + high) if top > high else 0.5 * (low + high)
+    others = tuple(sorted({round_significant(low), round_significant(between), top}))
     both = any(x < 0 for x in levels) and any(x > 0 for x in levels)
     torques = other_torques(reach.torques)
     way = -1.0 if levels[-1] > 0 else 1.0  # also of a brake, which acts against the rotation

@@ -105,22 +105,14 @@ def _at(robot: Robot, point: EnvelopePoint, rated: Ratings) -> tuple[Robot, Cond
     warm = robot.motor.resistance * robot.motor.resistance_ratio(point.ambient)
     motor = dataclasses.replace(robot.motor, resistance=warm)
     robot = with_cells(dataclasses.replace(robot, motor=motor), rated.cells)
+    # slightly less charge is taken at a state of charge of 0, because a battery counts as empty there
+    discharge = robot.battery.capacity * (1 - jnp.maximum(point.charge, 1e-9))
     return robot, Conditions(
         configuration=jnp.asarray(point.configuration),
         voltage=jnp.where(point.battery > 0.5, 1.0, point.charge),
         slope_deg=point.slope_deg, payload=point.payload, battery=point.battery,
-        discharge=jnp.where(point.battery > 0.5, _discharge(robot, point.charge), 0.0), adhesion=point.adhesion,
+        discharge=jnp.where(point.battery > 0.5, discharge, 0.0), adhesion=point.adhesion,
     )  # fmt: skip
-
-
-def _discharge(robot: Robot, charge: Scalar) -> Scalar:
-    """Charge taken at a state of charge [C]; slightly less at 0, because a battery counts as empty there."""
-    return robot.battery.capacity * (1 - jnp.maximum(charge, 1e-9))
-
-
-def _temperature(robot: Robot, point: EnvelopePoint, current: Scalar) -> Scalar:
-    """Winding temperature after long running [°C]; `robot` as stated, not as returned by `_at`."""
-    return dataclasses.replace(robot.motor, temperature_ambient=point.ambient).temperature_settled(current)
 
 
 def heat_left(robot: Robot, point: EnvelopePoint, current: Scalar, limit: Scalar) -> Scalar:
@@ -147,12 +139,13 @@ def travel_quantities(robot: Robot, point: EnvelopePoint, rated: Ratings) -> tup
     here, conditions = _at(robot, point, rated)
     signals, status, _ = operating_state(here, conditions)
     outcome = jnp.where((status == CONVERGED) & (_cell(rated, signals, point) < 0), CUT_OFF, status)
+    warm = dataclasses.replace(robot.motor, temperature_ambient=point.ambient)  # its resistance as stated
     moving = jnp.where(jnp.abs(signals.speed) > 1e-6, signals.speed, 1e-6)
     turns = jnp.abs(signals.speed_motor)
     found = {
         "speed_m_s": signals.speed,
         "speed_end_of_charge_m_s": signals.speed,
-        "winding_C": _temperature(robot, point, signals.current),
+        "winding_C": warm.temperature_settled(signals.current),
         "gearbox_Nm": jnp.abs(signals.torque_gear),
         "gearbox_speed_rpm": turns,
         "motor_speed_rpm": turns,

@@ -140,14 +140,6 @@ class Simulate(Protocol):
         ...
 
 
-def _nothing_to_refuse(robot: Robot, conditions: Conditions, options: Mapping[str, float]) -> None:
-    pass
-
-
-def _nothing_to_say(robot: Robot, conditions: Conditions) -> list[str]:
-    return []
-
-
 @dataclasses.dataclass(frozen=True)
 class Implicit:
     """Steady travel of one run, straight or turning, in two halves; a fit takes all derivatives from one evaluation.
@@ -187,8 +179,8 @@ class Fidelity:
     outputs: Callable[[Robot, Conditions, tuple[str, ...]], dict[str, Array]] | None = None
     implicit: Implicit | None = None
     histories: Simulate | None = None
-    check: Callable[[Robot, Conditions, Mapping[str, float]], None] = _nothing_to_refuse
-    cautions: Callable[[Robot, Conditions], list[str]] = _nothing_to_say
+    check: Callable[[Robot, Conditions, Mapping[str, float]], None] = lambda *_: None
+    cautions: Callable[[Robot, Conditions], list[str]] = lambda *_: []
     columns: tuple[str, ...] = ()
 
     @property

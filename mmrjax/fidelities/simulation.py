@@ -93,7 +93,14 @@ def simulate(
     conditions = check_conditions(robot, conditions)
     _check_battery(robot, conditions)
     _check_turning(robot, conditions, profile)
-    _check_brake(model, robot, conditions, profile)
+    if conditions.held is not None and (model != "steady" or robot.has_ground or conditions.motor_speed is not None):
+        raise UsageError(
+            "held: a clamp holds the output of a shaft in settled runs at an imposed voltage or current; expected "
+            "such runs, or leave held out"
+        )
+    braked = conditions.load_torque is not None or (profile is not None and profile.load_torque is not None)
+    if braked and robot.has_ground:
+        raise UsageError(f"load_torque: {NO_BRAKE}; state slope_deg or payload")
     turns = conditions.turns or (profile is not None and profile.turns)
     if not (turns or has_tracer(robot.effects)) and (unlike := robot.unlike):
         warnings.warn(f"{', '.join(unlike)}: {STRAIGHT}; {OF_TURNS[0]}=1, {OF_TURNS[1]}=1 let it turn", stacklevel=2)
@@ -151,18 +158,6 @@ def _check_turning(robot: Robot, conditions: Conditions, profile: Profile | None
         return
     if why := turn_error(robot, [robot.configurations.names[k] for k in np.unique(conditions.configuration)]):
         raise UsageError(f"{freed[0]}: {why}")
-
-
-def _check_brake(model: str, robot: Robot, conditions: Conditions, profile: Profile | None) -> None:
-    """Raises if a brake torque is stated for a vehicle, or a clamp for anything but a settled shaft."""
-    if conditions.held is not None and (model != "steady" or robot.has_ground or conditions.motor_speed is not None):
-        raise UsageError(
-            "held: a clamp holds the output of a shaft in settled runs at an imposed voltage or current; expected "
-            "such runs, or leave held out"
-        )
-    braked = conditions.load_torque is not None or (profile is not None and profile.load_torque is not None)
-    if braked and robot.has_ground:
-        raise UsageError(f"load_torque: {NO_BRAKE}; state slope_deg or payload")
 
 
 def _check_profile(model: str, profile: Any, options: Mapping[str, float | None]) -> None:

@@ -173,7 +173,8 @@ def simulate_in_parts(
         size = max(1, min(runs, MOST_KEPT // keep))
         rows = np.minimum(np.arange(first, first + size), runs - 1)  # padding repeats the last run
         some = jax.tree.map(lambda x, rows=rows: jnp.asarray(np.asarray(x)[rows]), conditions)
-        found = jax.device_get(simulate_batch(robot, some, _rows_of(profile, rows), start, keep))
+        followed = jax.tree.map(lambda x, rows=rows: x[rows] if x.ndim == 2 else x, profile)
+        found = jax.device_get(simulate_batch(robot, some, followed, start, keep))
         steps = int(np.max(found.steps - found.rejected))
         if steps > keep and keep < MOST_KEPT:
             keep = min(MOST_KEPT, _power(steps))
@@ -188,10 +189,6 @@ def _room(profile: Profile) -> int:
 
 def _power(count: int) -> int:
     return 1 << (count - 1).bit_length()
-
-
-def _rows_of(profile: Profile, rows: np.ndarray) -> Profile:
-    return jax.tree.map(lambda x: x[rows] if x.ndim == 2 else x, profile)
 
 
 @compiled

@@ -60,8 +60,3 @@ def channel_index(name: str, shown: Iterable[Channel]) -> int:
     if name not in known:
         raise KeyError(f"no channel {name}; there are {', '.join(known)}")
     return known.index(name)
-
-
-def channel_factors(shown: Iterable[Channel]) -> tuple[float, ...]:
-    """SI value of one unit of each channel's column."""
-    return tuple(c.factor for c in shown)

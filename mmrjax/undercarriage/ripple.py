@@ -106,31 +106,3 @@ def touchdowns(
     length = np.asarray(place).max()
     front = (np.asarray(place)[1:] > length / 2) | (np.asarray(place)[1:] < 0.02 * length)
     return np.sort(np.asarray(time)[1:][np.nonzero(lands & front)[0]])
-
-
-class Stages(NamedTuple):
-    """Stages of Fig. 23: I starting, II acceleration with slipping, III uniform travel.
-
-    Attributes:
-        slipping: first time of sliding beyond V_s [s]; NaN: the movers never do.
-        uniform: start of the time with the speed within 1 % of its last mean and without sliding [s].
-        slip: mean of 1 - V / V_theoretical in stage II, eq. (33) [-].
-    """
-
-    slipping: float
-    uniform: float
-    slip: float
-
-
-def slipping_stages(time: Series, speed: Series, theoretical: Series, speed_static: float) -> Stages:
-    """Stages of a run from standstill, from its speed V, r_k ω_k and V_s [m/s]."""
-    time, speed, theoretical = (np.asarray(x, float) for x in (time, speed, theoretical))
-    slides = theoretical - speed > speed_static
-    last = speed[-max(len(speed) // 10, 1) :].mean()
-    apart = np.nonzero(slides | (np.abs(speed - last) > 0.01 * abs(last)))[0]
-    uniform = time[min(apart[-1] + 1, len(time) - 1)] if len(apart) else time[0]
-    if not slides.any():
-        return Stages(float("nan"), float(uniform), 0.0)
-    begin = time[np.argmax(slides)]
-    second = (time >= begin) & (time < uniform)
-    return Stages(float(begin), float(uniform), float(np.mean(1 - speed[second] / theoretical[second])))

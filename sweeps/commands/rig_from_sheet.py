@@ -107,7 +107,12 @@ def read_data_sheet(stated: Mapping[str, str]) -> dict[str, Stated]:
         "motor.resistance": line(resistance, "ohm", given[0][1], max(WIDTH_RESISTANCE, spread[0])),
         "motor.torque_constant": line(constant, "N·m/A", known[0][1], max(WIDTH_CONSTANT, spread[1])),
         "motor.friction_coulomb": line(constant * idle, "N·m", "torque constant × no-load current", 30.0),
-        "motor.friction_viscous": Stated(0.0, "N·m·s", "one no-load current cannot split it from friction_coulomb"),
+        "motor.friction_viscous": Stated(
+            0.0,
+            "N·m·s",
+            "the no-load current does not split friction; ± if half of it were viscous",
+            f"{0.5 * constant**2 * idle / back:.2g}",
+        ),
     }
 
 

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.table import Table
 
 from calibration.data import robot_file
 from calibration.data.columns import Layout
@@ -20,10 +19,9 @@ from calibration.sensitivity import uncertain_inputs
 from calibration.sensitivity.analyse import analyse_sensitivity
 from calibration.sensitivity.model import chosen_outputs
 from calibration.sensitivity.next_runs import Candidates
-from calibration.sensitivity.result import METHODS, NEGLIGIBLE, Points, SensitivityResult
+from calibration.sensitivity.result import METHODS, Points
 from calibration.sensitivity.study import Study, Supply
 from calibration.sensitivity.uncertain_inputs import Inputs
-from calibration.words import sensitivity_words
 from mmrjax.model.conditions import OF_TURNS
 from mmrjax.model.paper_tables import PAYLOADS_KG, SLOPES_DEG, VOLTAGES_V
 from mmrjax.model.power import COULOMB_PER_MAH
@@ -31,16 +29,16 @@ from mmrjax.model.quantities import RPM
 from mmrjax.model.robot import Robot
 from sweeps import config as configuration
 from sweeps.config import GridPart
-from sweeps.console import print_message, print_output
+from sweeps.console import print_message
 from sweeps.inputs import beside_robot, load_robot, read_runs
-from sweeps.pages.words import short_name
 from sweeps.points import axes as axes_room
 from sweeps.points import grid as grid_room
 from sweeps.points import imposed
 from sweeps.points.grid import grid_conditions, grid_configurations
 from sweeps.points.job import showing_turns
 from sweeps.points.run import check_runs_bearable
-from sweeps.skeleton import finish_run_folder, page_writer
+from sweeps.report import sensitivity_report
+from sweeps.skeleton import finish_run_folder, print_report
 from sweeps.store import open_folder
 
 #: Operating points where a sample is drawn at each: corners and middle of Table 8.
@@ -89,9 +87,8 @@ def study_sensitivity(config: configuration.Sensitivity, out: Path | None, force
         robot_file.write_robot(
             file.robot, folder.results() / "robot.toml", note=f"the robot of this study, from {config.robot}"
         )
-        print_sensitivity(found)
+        shown = print_report(sensitivity_report.sensitivity_document(found, file), file)
         manifest = {"seed": found.seed, "statuses": found.statuses}
-        shown = page_writer("sensitivity", found, file)
         return finish_run_folder(folder, config, manifest, solved=found.solved, page=shown, runs=runs)
 
 
@@ -193,28 +190,3 @@ def _candidates(config: configuration.Sensitivity, robot: Robot, points: Runs, t
     return Candidates(
         Points.of(runs), runs.conditions(robot), source, stated, config.noise or usual, runs.deviations(), config.runs
     )
-
-
-def print_sensitivity(found: SensitivityResult) -> None:
-    """Print decisive inputs of each output, inputs without effect, and the next measurements."""
-    print_output(found.statement())
-    title = sensitivity_words.METHODS[found.method]
-    if found.evaluations:
-        title += f", {found.evaluations:,} model evaluations"
-    shown = Table(title=title, title_justify="left", box=None, pad_edge=False)
-    for heading in ("", "first", "second", "third"):
-        shown.add_column(heading)
-    for study in found.outputs.values():
-        share = study.overall_share
-        top = [k for k in np.argsort(-share)[:3] if share[k] >= NEGLIGIBLE]
-        shown.add_row(study.row.label, *(f"{short_name(found.names[k])} {100 * share[k]:.0f} %" for k in top))
-    print_output(shown)
-    idle = found.negligible
-    if idle:
-        print_output(f"less than {100 * NEGLIGIBLE:g} % everywhere: {', '.join(idle)}")
-    if found.next_runs is not None:
-        n = found.next_runs
-        labels = "; ".join(n.points.label(k) for k in range(len(n.points)))
-        print_output(f"next runs, of {n.candidates} ({n.source}), read to {n.noise}: {labels}")
-    for note in found.notes:
-        print_output(f"- {note}")

@@ -13,7 +13,6 @@ import numpy as np
 
 from calibration.data.input_errors import BadConfiguration, allowed_words
 from calibration.data.robot_file import RobotFile
-from mmrjax import effects as library
 from mmrjax.effects import Effect
 from mmrjax.model import balances, contact, params
 from mmrjax.model.channels import EVERY
@@ -323,19 +322,9 @@ def effect_docstring(effect: Effect | type[Effect]) -> tuple[str, str]:
     return head, "" if second.startswith("Source") else second
 
 
-def known_as(effect: Effect) -> bool:
-    """True if an effect is one of the library or of its curves, and not the user's own."""
-    return effect.name in library.BY_NAME or effect.name in library.BESIDE
-
-
 def memory_grows(part: Part) -> bool:
     """True if a part's memory grows without end, as a phase does: it has no settled value but its mean, 0."""
     return part.rate is not None and part.rate_slope.is_const and part.rate_slope.value == 0
-
-
-def parameter_values(joint: Joint) -> dict[str, float]:
-    """Numbers of the law's parameters [SI], by dotted name."""
-    return {n: float(p.value) for n, p in joint.parameters().items()}
 
 
 def mean_surroundings(signals: Signals, names: Sequence[str]) -> dict[str, float]:

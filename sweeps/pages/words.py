@@ -243,4 +243,4 @@ def words_shown(name: str) -> str:
 
 def short_name(name: str) -> str:
     """A parameter's name without the words that every such name has."""
-    return name.replace("ground.friction.", "").replace("ground.", "").replace("track.", "").replace("effects.", "")
+    return name.replace("ground.", "").replace("track.", "").replace("effects.", "")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -16,19 +17,12 @@ from mmrjax.model import signals
 from sweeps.pages import words
 from sweeps.points.climbs import LARGEST, SIZE, VERDICT
 from sweeps.points.zarr_store import STORE, Layout
-from sweeps.report import run_tables
-from sweeps.report.document import Block, Column, Document, Figure, Note, Section, Table, columns, deferred_figure
+from sweeps.report import catalogue, run_tables
+from sweeps.report.document import Block, Column, Document, Figure, Note, Section, Table
 from sweeps.results.climb_results import VERDICTS
 
 #: Points, and chunks that they come from, that figures and quantiles are made of; outputs that are drawn.
 THINNED, CHUNKS, DRAWN = 200_000, 100, 6
-_SPREAD = (
-    "**{}**: how often; median and 5-95 % over the two names that explain most of its variance; median over both."
-)
-_VERDICTS = (
-    "**Verdicts** over the first name that varies and the size of the obstacle; whatever else varies is at its first "
-    "value."
-)
 
 
 def campaign_document(file: RobotFile, layout: Layout, result: dict[str, Any], store: Path) -> Document:
@@ -73,20 +67,14 @@ def _outputs(
         quantiles = np.quantile(numbers, (0.05, 0.5, 0.95)) if len(numbers) else [None] * 3
         rows.append((label, unit, extremes[name]["least"], *quantiles, extremes[name]["greatest"]))
         if len(numbers) and len(figures) < DRAWN:
-            figures.append(
-                deferred_figure(
-                    f"spread_{name}", f"{label} over what varies", _SPREAD.format(label.capitalize()),
-                    "campaign_figures.draw_output", numbers, Column(label, unit).title, values[usable], layout,
-                )
+            spread = catalogue.figure(
+                "campaign.spread", numbers, Column(label, unit).title, values[usable], layout,
+                finding=f"{label} over what varies", words=(label.capitalize(),),
             )  # fmt: skip
+            figures.append(dataclasses.replace(spread, name=f"spread_{name}"))
     drawn = "" if len(values) == layout.design.points else " drawn at random"
-    text = (
-        f"Least and greatest of all points; quantiles and figures of {len(values):,} points{drawn}, of those that "
-        "settled."
-    )
-    heads = columns("output", "unit", "least | .4g", "5 % | .4g", "median | .4g", "95 % | .4g", "greatest | .4g")
-    yield Note(text)
-    yield Table("ranges", heads, rows)
+    yield catalogue.note("campaign.thinned", len(values), drawn)
+    yield catalogue.table("campaign.ranges", rows)
     yield from figures
 
 
@@ -95,14 +83,14 @@ def _verdicts(values: np.ndarray, found: dict[str, np.ndarray], layout: Layout) 
     codes, design = found[VERDICT].astype(int), layout.design
     meanings = next(v.attributes for v in layout.variables if v.name == VERDICT)["flag_meanings"].split()
     rows = [(f"`{meanings[k]}`", int((codes == k).sum()), *VERDICTS[meanings[k]]) for k in np.unique(codes)]
-    heads = columns("verdict", "points | ,", "the robot", "meaning")
     others = [n for n in design.axes if n != SIZE and len(design.axes[n]) > 1][:1]
-    figure = deferred_figure(
-        "endings", "Verdicts over what varies and the size of the obstacle", _VERDICTS,
-        "campaign_figures.draw_verdicts", codes, meanings, values, layout, *others,
-    )  # fmt: skip
+    figure = catalogue.figure("campaign.endings", codes, meanings, values, layout, *others)  # fmt: skip
     drawn = (figure,) * bool(others and SIZE in design.axes)
-    return Note(_largest(values, found, layout), "answer", "largest"), Table("endings", heads, rows), *drawn
+    return (
+        Note(_largest(values, found, layout), "answer", "largest"),
+        catalogue.table("campaign.endings", rows),
+        *drawn,
+    )
 
 
 def _largest(values: np.ndarray, found: dict[str, np.ndarray], layout: Layout) -> str:
@@ -159,4 +147,4 @@ def _varied(layout: Layout, values: np.ndarray) -> Table:
         else:
             text = f"{axis.min():.4g} to {axis.max():.4g}, {len(axis):,} values"
         rows.append((f"`{name}`", about["long_name"], about.get("units", "").removeprefix("1"), text))
-    return Table("names", columns("name", "meaning", "unit", "values"), rows)
+    return catalogue.table("campaign.names", rows)

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from calibration.data.input_errors import three_digits
 from calibration.sizing.sheet import Change, Outcome
 from mmrjax.model.paper_tables import COULOMB_PER_MAH
-from sweeps.report.document import Block, Cell, Document, Figure, Note, Section, Table, columns, deferred_figure
+from sweeps.report import catalogue
+from sweeps.report.document import Block, Cell, Document, Figure, Note, Section, Table
 from sweeps.results.check_results import (
     CheckResult,
     reached_value_text,
@@ -20,31 +21,13 @@ from sweeps.results.check_results import (
 SHOWN = 3
 
 
-_CORNERS = (
-    "Each quantity at the worst corner of its envelope of payload, slope, charge (or supply voltage) and ambient "
-    "temperature: the ends of each range and values between them. Fidelity: steady. Windings are at ambient "
-    "temperature; **winding after long running** is their final temperature, with the resistance that it causes."
-)
-_MARGINS = (
-    "Margin of each requirement at the worst corner of its envelope, in percent of the required value: **right** of "
-    "the line it is met, **left** it is missed."
-)
-_POSTURES = (
-    "The robot in the posture of each geometric requirement. Highest step: centre of mass (dot) above its edge. Gap: "
-    "levers flush with the belt. Size: folded."
-)
-_CHANGES = (
-    "Each line changes one parameter, with everything else (masses too) as it is, and meets the requirement at "
-    "every corner: direction from the derivative at the worst corner, value found by search and verified. Changes "
-    "that miss no other requirement come first, the smallest first."
-)
-
-
 def check_document(found: CheckResult, robot_name: str, changes: bool = True) -> Document:
     """The report; `changes`: True where changes were searched for."""
     lead = f"Robot: **{robot_name}**. Requirements: **{found.asked.source}**."
-    margins = deferred_figure("margins", found.statement(), _MARGINS, "check_figures.draw_margins", found)
-    sections = [Section("Requirements", (Note(_CORNERS), requirements_sheet(found.outcomes)), "sheet")]
+    margins = catalogue.figure("check.margins", found, finding=found.statement())
+    sections = [
+        Section("Requirements", (catalogue.note("check.corners"), requirements_sheet(found.outcomes)), "sheet")
+    ]
     if changes and found.missed:
         sections.append(Section("Changes that would meet them", _changes(found), "changes"))
     blocks: tuple[Block, ...] = (Note(lead, "lead"), margins, *_postures(found))
@@ -53,7 +36,6 @@ def check_document(found: CheckResult, robot_name: str, changes: bool = True) ->
 
 def requirements_sheet(outcomes: Sequence[Outcome], terminal: bool = True) -> Table:
     """Requirements with required and reached values, margins and worst corners."""
-    heads = columns("", "requirement", "required |", "value |", "margin |", "worst corner", "~on", "~source")
     rows = [
         (
             Cell(*(("met", "good") if o.met else ("missed", "bad"))), requirement_label(o),
@@ -62,7 +44,7 @@ def requirements_sheet(outcomes: Sequence[Outcome], terminal: bool = True) -> Ta
         )
         for o in outcomes
     ]  # fmt: skip
-    return Table("requirements", heads, rows, terminal=terminal)
+    return catalogue.table("check.requirements", rows, terminal=terminal)
 
 
 def _postures(found: CheckResult) -> tuple[Figure, ...]:
@@ -72,13 +54,10 @@ def _postures(found: CheckResult) -> tuple[Figure, ...]:
         f"{requirement_label(o)} {reached_value_text(o)}" for o in found.outcomes if o.requirement.name in found.drawn
     )
     title = f"The robot from the side: {names}"
-    return (deferred_figure("postures", title, _POSTURES, "posture_figures.asked_about", found.drawn),)
+    return (catalogue.figure("check.postures", found.drawn, finding=title),)
 
 
 def _changes(found: CheckResult) -> tuple[Note | Table, ...]:
-    heads = columns(
-        "requirement", "parameter", "now | .4g", "needed | .6g", "unit", "change [%] | +.1f", "would then be missed"
-    )
     rows: list[tuple[object, ...]] = []
     brief: list[int] = []
     for o in found.missed:
@@ -89,8 +68,8 @@ def _changes(found: CheckResult) -> tuple[Note | Table, ...]:
     title = f"changes of one parameter that would meet them{more}"
     none = f"No change of one parameter within its bounds meets {', '.join(hopeless)}."
     return (
-        Note(_CHANGES),
-        Table("change", heads, rows, title, brief=brief),
+        catalogue.note("check.changes"),
+        catalogue.table("check.change", rows, title=title, brief=brief),
         *([Note(none, terminal=True)] if hopeless else []),
     )  # fmt: skip
 

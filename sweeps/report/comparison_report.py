@@ -9,19 +9,9 @@ import numpy as np
 
 from mmrjax.errors import count_noun
 from sweeps.pages import words
+from sweeps.report import catalogue
 from sweeps.report.condition_columns import condition_formats
-from sweeps.report.document import (
-    Cell,
-    Column,
-    Document,
-    Note,
-    Section,
-    Table,
-    columns,
-    deferred_figure,
-    is_missing,
-    remarks,
-)  # fmt: skip
+from sweeps.report.document import Cell, Column, Document, Note, Section, Table, is_missing, remarks
 from sweeps.results.comparison_results import Comparison
 
 _FITS = {
@@ -29,14 +19,6 @@ _FITS = {
     "others": "This robot was fitted to other rows: the errors are a prediction.",
     "": "",
 }
-_ERRORS = (
-    "Errors are simulated − measured; percent are of the channel's measured root mean square; "
-    "R² = 1 − Σ(error)² / Σ(measured − mean)² in each group."
-)
-_PARITY = (
-    "**Simulated against measured.** On the line both agree; above it the simulation is too high. Rows without a "
-    "simulated number are not drawn; the table gives the reason."
-)
 
 
 def comparison_document(found: Comparison) -> Document:
@@ -46,17 +28,8 @@ def comparison_document(found: Comparison) -> Document:
         f"Robot: **{found.robot_name}**. Fidelity: **{found.model}**. Measured: **{found.source}**, "
         f"{count_noun(len(found.table['status']), 'row')}."
     )
-    parity = deferred_figure("parity", _bias(found), _PARITY, "comparison_figures.draw_parity", *known, band=False)
-    errors = deferred_figure(
-        "errors",
-        _trend(found),
-        "**Errors.** A trend along a condition points at what the model lacks. Band: ±2 standard deviations of the "
-        "readings, where they are known.",
-        "comparison_figures.errors_over",
-        *known,
-        in_units=True,
-        beside=found.over,
-    )
+    parity = catalogue.figure("comparison.parity", *known, False, finding=_bias(found))
+    errors = catalogue.figure("comparison.errors", *known, True, found.over, finding=_trend(found))
     return Document(
         f"{found.robot_name} against {found.source}",
         comparison_answer(found),
@@ -65,7 +38,7 @@ def comparison_document(found: Comparison) -> Document:
             *(Note(text, "warn", terminal=True) for text in _unsolved(found)),
             _summary(found),
             *([_both_robots(found)] if found.against else []),
-            Note(_ERRORS, "key", terminal=True),
+            catalogue.note("comparison.errors-note"),
             *remarks(found.notes),
         ),
         (
@@ -81,16 +54,11 @@ def _over_time(found: Comparison) -> tuple[Section, ...]:
     """The section with readings over time of a log; none for a table of settled runs."""
     if found.over is None:
         return ()
-    caption = (
-        "**Measured and simulated readings over time, each with its residual below.** "
-        "The run with the largest residuals comes first."
-    )
     lines = {"simulated_": found.robot_name, "against_": found.against}
     if not found.against:
         lines = {"simulated_": "simulated"}
-    overlay = deferred_figure(
-        "overlay", comparison_answer(found), caption, "time_overlay.time_overlay", found.table, found.channels, lines
-    )
+    answer = comparison_answer(found)
+    overlay = catalogue.figure("fit.overlay", found.table, found.channels, lines, finding=answer)
     return (Section("Over time", (overlay,)),)
 
 
@@ -123,8 +91,8 @@ def _second_robot(found: Comparison) -> str:
 
 def _both_robots(found: Comparison) -> Table:
     both = (f"rms error, {name} [%] | .1f" for name in (found.robot_name, found.against))
-    heads = columns("channel", "rows of both |", *both)
-    return Table("robots", heads, [(c.label, *found.rms_of_both[c.name]) for c in found.channels])
+    rows = [(c.label, *found.rms_of_both[c.name]) for c in found.channels]
+    return catalogue.table("comparison.robots", rows, *both)
 
 
 def _seconds(found: Comparison) -> float:
@@ -145,16 +113,13 @@ def _unsolved(found: Comparison) -> list[str]:
 
 
 def _summary(found: Comparison) -> Table:
-    heads = columns(
-        "rows of", "channel", "rows |", "rms error |", "rms error [%] | .1f", "worst [%] | .1f", "R² | .3f"
-    )
     rows = []
     for group, by_channel in found.summary.items():
         for c in found.channels:
             e = by_channel[c.name]
             rms = None if is_missing(e["rms"]) else f"{e['rms']:.{c.resolution}f} {c.unit}"
             rows.append((group, c.label, e["rows"], rms, e["rms_percent"], e["max_percent"], e["r2"]))
-    return Table("errors", heads, rows)
+    return catalogue.table("comparison.errors", rows)
 
 
 def _rows(found: Comparison) -> Table:

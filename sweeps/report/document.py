@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import csv
 import dataclasses
-import importlib
 import io
 import math
 import re
@@ -231,19 +230,6 @@ def remarks(texts: Iterable[str], name: str = "notes") -> tuple[Note, ...]:
     """A list of remarks for page and terminal, if there are any."""
     items = tuple(texts)
     return (Note(items, name=name, terminal=True),) if items else ()
-
-
-def deferred_figure(name: str, alternative: str, caption: str, drawing: str, *known: Any, **options: Any) -> Figure:
-    """A figure that `module.function` of `sweeps/pages` draws, imported when it is drawn.
-
-    matplotlib costs half a second, which a command without a page saves.
-    """
-    module, _, function = drawing.partition(".")
-
-    def draw() -> Any:
-        return getattr(importlib.import_module(f"sweeps.pages.{module}"), function)(*known, **options)
-
-    return Figure(name, alternative, caption, draw)
 
 
 def plain_text(text: str) -> str:

@@ -19,8 +19,8 @@ from mmrjax.model.robot import Robot
 from mmrjax.model.signals import FLAGS
 from sweeps import capabilities
 from sweeps.pages import words
-from sweeps.report import run_tables
-from sweeps.report.document import Block, Column, Document, Note, Section, Table, columns, deferred_figure, remarks
+from sweeps.report import catalogue, run_tables
+from sweeps.report.document import Block, Column, Document, Note, Section, Table, columns, remarks
 from sweeps.report.run_tables import quantity_column
 from sweeps.report.runs_report import run_headings
 from sweeps.results.mission_results import Missions
@@ -35,28 +35,7 @@ _RUNS = (
 )  # fmt: skip
 #: Those of each segment.
 _OF_SEGMENTS = ("energy_Wh", "distance_m", "rms_current_A", "peak_current_A", "winding_peak_C")
-_COURSE = (
-    "**The mission over time.** Speed follows what is demanded (dashed) as far as the driver's voltage and limits "
-    "let it. The current is that of all motors together; its highest peak is marked. {} instants are drawn, each "
-    "segment's peak of current among them; the same are in `history.csv`."
-)
-_CUT = " The mission took more steps than are kept: the course ends before it does, its numbers do not."
-_PATH = (
-    "**The path** of the centre of mass: the robot at the start, half way through the rows of `history.csv` and at "
-    "the end. It turned by {:.0f}°, positive to the left."
-)
-_SIDES = "**Either side.** Rms currents {:.2f} A left and {:.2f} A right."
-_HEAT = " Hottest windings {:.1f} and {:.1f} °C."
-_ENERGY = (
-    "**Energy taken from the {}, and where it went.** Shares are of what was drawn; everything below the first bar "
-    "adds up to it. {} Energy unaccounted for by the integration: {:.0e} of what was turned over."
-)
 _NO_RETURN = "Nothing came back to the source"
-_SETTLES = (
-    "A segment **settles** where the robot travels steadily, or stands as it should, at its end; it is **not "
-    "settled** where a ramp ends while the speed still changes, as it was asked to. Energy is the source's, on "
-    "balance: what came back is taken off."
-)
 
 
 def missions_document(file: RobotFile, found: Missions) -> Document:
@@ -98,28 +77,23 @@ def _sections(robot: Robot, found: Missions, first: Mapping[str, Any]) -> Iterab
     mine = found.course["run_id"] == name
     rows = {key: value[mine] for key, value in capabilities.without_idle(robot, found.course).items()}
     cycle = float(source.time[-1] - source.time[0]) if source.cycles > 1 else None
-    course = deferred_figure(
-        "course", "speed, current, temperatures and charge over time",
-        _COURSE.format(len(rows["time_s"])) + ("" if found.whole else _CUT),
-        "mission_figures.draw_mission_course", rows, cycle, limit, source.linear, float(robot.sides),
+    course = catalogue.figure(
+        "mission.course", rows, cycle, limit, source.linear, float(robot.sides), words=(len(rows["time_s"]),),
+        more="" if found.whole else catalogue.text("mission.cut"),
     )  # fmt: skip
     limits = run_tables.limits_table(mission_limits(robot, first), "this mission")
-    yield Section("Over time", (course, limits, Note(run_tables.WARMING_SHARE, "key")), "course-section")
+    yield Section("Over time", (course, limits, catalogue.note("run.warming")), "course-section")
     if source.turns:
         yield Section("From above", _from_above(robot, first, rows), "path-section")
     back, on_battery = float(first["energy_returned_Wh"]), bool(np.isfinite(first["state_of_charge"]))
     returned = f"{back:.3g} Wh came back to the source." if back > 1e-6 * first["energy_drawn_Wh"] else (
         f"{_NO_RETURN}; what driven motors give feeds the other consumers first." if on_battery else f"{_NO_RETURN}."
     )  # fmt: skip
-    caption = _ENERGY.format(
-        "battery's charge" if on_battery else "supply", returned, abs(first["unaccounted_share"])
-    )
-    energy = deferred_figure(
-        "energy", mission_answer(first), caption, "mission_figures.draw_mission_energy", first, on_battery
-    )
+    asked = "battery's charge" if on_battery else "supply", returned, abs(first["unaccounted_share"])
+    energy = catalogue.figure("mission.energy", first, on_battery, finding=mission_answer(first), words=asked)
     yield Section("Where the energy goes", (energy,), "energy-section")
     yield Section(
-        "Segments", (_segments(found, name, capabilities.idle_columns(robot)), Note(_SETTLES, "key")),
+        "Segments", (_segments(found, name, capabilities.idle_columns(robot)), catalogue.note("mission.settles")),
         "segments-section",
     )  # fmt: skip
 
@@ -128,17 +102,11 @@ def _from_above(robot: Robot, first: Mapping[str, Any], rows: Mapping[str, np.nd
     place = rows["x_mm"] / 1e3, rows["y_mm"] / 1e3, np.radians(rows["yaw_deg"])
     sides = [[first[f"{name}_{side}_{unit}"] for side in channels.SIDES]
              for name, unit in (("rms_current", "A"), ("winding_peak", "C"))]  # fmt: skip
-    caption = _SIDES.format(*sides[0]) + (_HEAT.format(*sides[1]) if robot.knows(WARMING) else "")
+    heat = catalogue.text("mission.heat", *sides[1]) if robot.knows(WARMING) else ""
     return (
-        deferred_figure(
-            "path", "the path of the robot from above", _PATH.format(first["turned_deg"]), "turn_figures.draw_path",
-            robot, first, *place,
-        ),
-        deferred_figure(
-            "sides", "current and duty of either side and the yaw rate over time", caption,
-            "mission_figures.of_sides", rows,
-        ),
-    )  # fmt: skip
+        catalogue.figure("mission.path", robot, first, *place, words=(first["turned_deg"],)),
+        catalogue.figure("mission.sides", rows, words=sides[0], more=heat),
+    )
 
 
 def _names(runs: dict[str, np.ndarray]) -> list[str]:
@@ -229,12 +197,11 @@ def _segments(found: Missions, name: str, idle: set[str]) -> Table:
             )
         )  # fmt: skip
     first = "first cycle" if many else "this segment"
-    heads = (
-        *columns("segment", "mode", "asked"), *(quantity_column(c, group=first) for c in shown),
-        *(quantity_column(c, group="all cycles") for c in totals),
-        *columns(*["all cycles > share of energy [%] | .1f"] * many, "ends", "limits exceeded"),
-    )  # fmt: skip
-    return Table("segments", heads, answer, file="segments.csv", wide=True)
+    heads = [quantity_column(c, group=first) for c in shown] + [
+        quantity_column(c, group="all cycles") for c in totals
+    ]
+    heads += columns(*["all cycles > share of energy [%] | .1f"] * many)
+    return catalogue.table("mission.segments", answer, *heads)
 
 
 def _demand(found: Missions, k: int) -> str:

@@ -9,31 +9,10 @@ from mmrjax.errors import count_noun
 from mmrjax.model.quantities import MM
 from mmrjax.undercarriage.ripple_peaks import MATTERS, PERIODS, SIGNALS, TAIL, strongest_resonances
 from sweeps.pages import words
-from sweeps.report import run_tables
-from sweeps.report.document import Cell, Document, Note, Section, Table, columns, deferred_figure, remarks
+from sweeps.report import catalogue, run_tables
+from sweeps.report.document import Cell, Document, Section, Table, remarks
 from sweeps.results.resonance_results import SLOW, ResonanceResult
 
-_MAP = (
-    "**Above**: grey lines, frequency at which {} pass ({:.2f} mm of travel apart) and its harmonics; bands, natural "
-    "frequencies of the robot on its contacts over payloads and positions of the belt (line: mean at the least "
-    "payload; dashed: at the greatest). Every run is marked at its strongest frequency; a **star** is where ripple "
-    "peaks over speed while its strongest line is in a band: a crossing that shows. **Below**: ripple of every run, "
-    "standard deviation over mean; **boxes** are the speeds to avoid at that payload (dotted: a peak with no natural "
-    "frequency to name), white circles the operating points of Table 8, dotted lines its voltages."
-)
-_MODES = (
-    "Of half a robot rolling on its contacts, linearised about its balance at the middle voltage; over positions of "
-    "the belt within a pitch. A mode has the name of the coordinate with most of its kinetic energy. Grey: too "
-    "damped to amplify (ζ of 0.5 or more), there at few positions only, or different by an octave over positions, "
-    "so that it has no one frequency."
-)
-_PEAKS = (
-    "Every peak of settled runs. Order: which harmonic of the passing {} is strongest there. Marked: to be avoided "
-    "(at least {:g} % of ripple, and at least half the rise of the signal's largest). A peak whose strongest line "
-    "is in no mode's band names none: it may be the running gear's own, or a robot that rocks and jumps rather than "
-    "swings. Crossings that no peak confirms are in `result.json`."
-)
-_ENDED = "Ripple is read in the last {:g} % of a run that begins rolling."
 _FEW = "travels, but fewer than {} {} passed while ripple was read; take a longer --duration"
 #: Most peaks that are shown unfolded.
 UNFOLDED = 30
@@ -44,10 +23,10 @@ def resonance_document(found: ResonanceResult, file: RobotFile) -> Document:
     first, *others = found.sentences
     passing = found.passing
     lead = f"**{found.configuration}**, slope {found.slope_deg:g}°, {found.surface}; {found.read.size} runs."
-    caption = _MAP.format(passing.name, 1000 * passing.travel)
-    figure = deferred_figure("map", found.statement(), caption, "resonance_figures.resonance_map", found)
+    values = passing.name, 1000 * passing.travel
+    figure = catalogue.figure("resonance.map", found, finding=found.statement(), words=values)
     endings = run_tables.endings_table(found.statuses, meanings={SLOW: _FEW.format(PERIODS, passing.name)})
-    peaks, ended = _peaks(found), Note(_ENDED.format(100 * TAIL))
+    peaks, ended = _peaks(found), catalogue.note("resonance.ended", 100 * TAIL)
     folded = count_noun(len(peaks.rows), "peak") if len(peaks.rows) > UNFOLDED else ""
     return Document(
         "Which speeds to avoid",
@@ -55,11 +34,15 @@ def resonance_document(found: ResonanceResult, file: RobotFile) -> Document:
         (
             run_tables.lead_note(file, "track", lead),
             *remarks(others),
-            figure if found.read.any() else Note("No run travels, so there is nothing to draw."),
+            figure if found.read.any() else catalogue.note("resonance.still"),
         ),
         (
-            Section("Natural frequencies", (Note(_MODES), _modes(found)), "modes"),
-            Section("Peaks of ripple over speed", (Note(_PEAKS.format(passing.name, 100 * MATTERS)),), "peaks"),
+            Section("Natural frequencies", (catalogue.note("resonance.modes"), _modes(found)), "modes"),
+            Section(
+                "Peaks of ripple over speed",
+                (catalogue.note("resonance.peaks", passing.name, 100 * MATTERS),),
+                "peaks",
+            ),
             Section("", (peaks,), folded=folded),
             Section("Operating points of Table 8", (_points(found),), "table8"),
             Section("How the runs ended", (ended, endings), "ended"),
@@ -68,25 +51,17 @@ def resonance_document(found: ResonanceResult, file: RobotFile) -> Document:
 
 
 def _modes(found: ResonanceResult) -> Table:
-    heads = columns(
-        "payload [kg] | g", "mode", "damped [Hz] | .1f", "range [Hz] |", "~undamped [Hz] | .1f", "damping ζ | .2f",
-        "~energy in its coordinate [%] | .0f", "~positions [%] | .0f",
-    )  # fmt: skip
     rows = []
     for payload, modes in found.modes.items():
         for m in modes:
             low_high = f"{m.low:.1f} to {m.high:.1f}"
             numbers = (m.frequency, low_high, m.natural, m.damping, 100 * m.share, 100 * m.positions)
             rows.append((payload, m.name, *(Cell(x, "" if m.resonant else "none") for x in numbers)))
-    return Table("frequencies", heads, rows, "natural frequencies")
+    return catalogue.table("resonance.frequencies", rows)
 
 
 def _peaks(found: ResonanceResult) -> Table:
     strong = {(r.mode, r.order, r.signal) for r in strongest_resonances(found.resonances)}
-    heads = columns(
-        "ripple of", "payload [kg] | g", "speed [mm/s] | .0f", "above 70 % of its rise |", "ripple [%] | .3g",
-        "rise [%] | .2g", "order |", "strongest line [Hz] | .1f", "mode",
-    )  # fmt: skip
     rows = [
         (
             Cell(SIGNALS[p.signal].label, "bad" if (p.mode, p.order, p.signal) in strong else ""), p.payload,
@@ -95,7 +70,7 @@ def _peaks(found: ResonanceResult) -> Table:
         )
         for p in found.peaks
     ]  # fmt: skip
-    return Table("peaks_found", heads, rows, terminal=False)
+    return catalogue.table("resonance.peaks_found", rows)
 
 
 def _points(found: ResonanceResult) -> Table:
@@ -110,5 +85,4 @@ def _points(found: ResonanceResult) -> Table:
         for k in np.flatnonzero(table["table8"])
     ]  # fmt: skip
     ripples = (f"ripple > {signal.label} [%] | .3g" for signal in SIGNALS.values())
-    heads = columns("voltage [V] | g", "payload [kg] | g", "speed [mm/s] | .0f", *ripples, "status", "to avoid")
-    return Table("points", heads, rows, terminal=False)
+    return catalogue.table("resonance.points", rows, *ripples)

@@ -10,12 +10,15 @@ from typing import Any
 import numpy as np
 
 from calibration.data.robot_file import RobotFile
+from mmrjax import effects
 from mmrjax.model.channels import Channel
 from mmrjax.model.quantities import TABLE
+from mmrjax.model.robot import Robot
 from sweeps import capabilities
 from sweeps.pages import words
 from sweeps.points import uncertainty
 from sweeps.points.imposed import UNLIMITED
+from sweeps.report import catalogue
 from sweeps.report.condition_columns import CONDITIONS
 from sweeps.report.document import Cell, Column, Note, Table, columns
 
@@ -33,7 +36,6 @@ _OTHERS = {
     "time_end_s": ("time at the end", "s", "{:.6g}"),
     "permissible_time_s": ("permissible at this current for", "s", "{:.3g}"),
 }
-WARMING_SHARE = "Winding: share of the temperature rise that it may have above its surroundings."
 #: What a number that is infinite, or missing, means in some columns.
 _ENDLESS = {"permissible_time_s": words.FOR_EVER}
 _MISSING = {"supply_voltage_V": "battery", "flags": "none"}
@@ -109,6 +111,12 @@ def lead_note(file: RobotFile, model: str = "", more: str = "") -> Note:
     return Note(" ".join(filter(None, parts)), "lead")
 
 
+def curve_warning(robot: Robot) -> tuple[Note, ...]:
+    """A warning of curves of a robot that nobody has named, if it has any."""
+    names = " and ".join(f"`{e.name}`" for e in robot.effects if e.name in effects.UNNAMED)
+    return (catalogue.note("run.curves", names),) if names else ()
+
+
 def endings_table(
     counts: Mapping[str, int],
     things: str = "runs",
@@ -137,9 +145,8 @@ def endings_table(
 
 def limits_table(limits: Sequence[Mapping[str, Any]], what: str) -> Table:
     """Use of each limit: its value, the limit and the share of it that is used."""
-    heads = columns("limit of", f"{what} |", "limit |", "used | {:.0f} %")
     rows = [(limit["words"], limit["value"], limit["limit"], _used(limit)) for limit in limits]
-    return Table("limits", heads, rows, terminal=False)
+    return catalogue.table("run.limits", rows, f"{what} |")
 
 
 def use_of_limits(asked: Iterable[tuple[str, Any, Any, str]], ambient: float) -> list[dict[str, Any]]:

@@ -16,20 +16,9 @@ from mmrjax.model.quantities import MM, RPM, VOLTAGE
 from mmrjax.model.robot import Robot
 from sweeps import capabilities
 from sweeps.pages import words
-from sweeps.report import run_tables
+from sweeps.report import catalogue, run_tables
 from sweeps.report.condition_columns import imposed_column
-from sweeps.report.document import (
-    SIDE_BY_SIDE,
-    Block,
-    Column,
-    Document,
-    Note,
-    Section,
-    Table,
-    columns,
-    deferred_figure,
-    remarks,
-)  # fmt: skip
+from sweeps.report.document import SIDE_BY_SIDE, Block, Column, Document, Note, Section, Table, remarks
 from sweeps.report.words import posture_words
 from sweeps.results.posture_results import Postures
 
@@ -42,40 +31,6 @@ _FURTHER = (
     "power_ground_W", "power_lift_W", "winding_settled_C", "permissible_time_s", "adhesion_used", "status", "flags",
 )  # fmt: skip
 HISTORIES, CHAINS, GEARS = 4, 12, 2  # runs that a figure has room for
-_COURSES = "**What the instruments show over time**, of each run from rest."
-_HISTORY = (
-    "**Current and speeds over time.** Each run on its own slope, as its heading says; a run that goes backward is "
-    "drawn with backward positive. Stage I, starting: inrush until the movers slide fastest. Stage II, acceleration "
-    "with slipping: the shafts are up to speed, the robot is not, and friction pulls it along. Stage III, uniform: "
-    "sliding is back within V_s of the friction law."
-)
-_AVERAGED = " Samples are means over {:g} ms: the current's peak is higher for an instant."
-_SLIP = (
-    "**Slip over the start.** Left, the robot's speed V_x (1) and that of its movers V_x_teor = r_k ω_k (2); the "
-    "area between is way that the movers lose. Right, the slip s = 1 − V_x / V_x_teor. Dashed: its mean over each "
-    "stage, and over the acceleration time t′, 1 − ∫V_x dt / ∫V_x_teor dt."
-)
-_RIPPLE = (
-    "**Total current at the end of the run, enlarged.** On tracks it repeats with the grousers' pitch, eq. (34); on "
-    "wheels only the belt's teeth are left."
-)
-_TOUCHDOWN = (
-    "**What a grouser does when it lands.** Below, the load on each grouser (one line each) as it passes under the "
-    "robot."
-)
-_REACTIONS = "**Normal reactions of one side.** On tracks grousers come and go; on wheels two contacts stay."
-_POSTURE = (
-    "**The robot from the side**, as its levers stand in the first run: left at rest on its ground, right on the "
-    "highest step on which it stands with its centre of mass (dot) over the edge. A higher step it does not get over "
-    "slowly, whatever the friction, with its levers held like this."
-)
-_STEPS = (
-    "**Highest step and margin of tipping over the angles of the levers**, 0° along the wheelbase outward, positive "
-    "up, ±180° folded; right the posture of the highest. Geometry alone: friction and torque may allow less."
-)
-_CHAIN = "**Power from the supply at the end of the run, split along the chain.** "
-_ON_GROUND = "Only the green part lifts the robot; everything else is lost. Downhill the slope gives power too."
-_ON_SHAFT = "What the gearboxes pass on is the load's: its friction, and what it lifts."
 
 
 def runs_document(
@@ -101,7 +56,7 @@ def runs_document(
     if not np.nan_to_num(table.get("voltage_cell_V", 0.0)).any():
         table.pop("voltage_cell_V", None)
     blocks: list[Block] = [run_tables.lead_note(file, model, "From standstill." if histories is not None else "")]
-    blocks += [run_tables.limits_table(used, "this run"), Note(run_tables.WARMING_SHARE, "key")] if used else []
+    blocks += [run_tables.limits_table(used, "this run"), catalogue.note("run.warming")] if used else []
     shown = run_tables.quantity_table(
         "runs", table, shown_columns, first=[(Column("run"), names)], file="runs.csv", wide=len(names) > SIDE_BY_SIDE,
         sideways=True,
@@ -176,7 +131,7 @@ def _histories(robot: Robot, runs: Mapping[str, np.ndarray], names: list[str], h
     which = [robot.configurations.index(str(c)) for c in runs["configuration"]]
     history, status = histories.history, np.asarray(histories.result.status)
     assert history is not None  # the fidelity was asked for it
-    cut = (Note(f"The first {HISTORIES} of {len(names)} runs; all are in `history.csv`."),) * (len(names) > HISTORIES)
+    cut = (catalogue.note("runs.cut", HISTORIES, len(names)),) * (len(names) > HISTORIES)
     if not robot.has_ground:
         if any(c.over_time for c in robot.channels):
             shown = history_figures.members_as_read(robot.channels, history, status, names[:HISTORIES])
@@ -186,21 +141,17 @@ def _histories(robot: Robot, runs: Mapping[str, np.ndarray], names: list[str], h
                 for s in shown
             ]
             read_heads = run_tables.reading_columns(robot.channels, {"": "largest", "last_": "at the end"})
-            table = Table("courses-table", (*columns("run", "ends"), *(column for _, column in read_heads)), ends)
-            figure = deferred_figure("courses", "channels over time", _COURSES, "history_figures.over_time", shown)
-            yield Section("Over time", (*cut, figure, table), "history-section")
+            table = catalogue.table("runs.courses-table", ends, *(column for _, column in read_heads))
+            yield Section("Over time", (*cut, catalogue.figure("runs.courses", shown), table), "history-section")
         return
     starts = history_figures.members_from_standstill(robot, history, status, which, names[:HISTORIES])
-    caption = _HISTORY
+    averaged = ""
     if history.reactions is not None:
-        caption += _AVERAGED.format(1e3 * float(history.time[0, 1] - history.time[0, 0]))
-    figure = deferred_figure(
-        "history", "current and speeds from standstill", caption, "history_figures.from_standstill", starts
+        averaged = catalogue.text("runs.averaged", 1e3 * float(history.time[0, 1] - history.time[0, 0]))
+    figure = catalogue.figure("runs.history", starts, more=averaged)
+    yield Section(
+        "From standstill", (*cut, figure, _starts(starts), catalogue.figure("runs.slip", starts)), "history-section"
     )
-    slip = deferred_figure(
-        "slip", "slip over the stages of a start", _SLIP, "history_figures.slip_over_start", starts
-    )
-    yield Section("From standstill", (*cut, figure, _starts(starts), slip), "history-section")
     if history.reactions is None:
         return
     share = np.asarray(histories.columns["guide_share"])
@@ -213,11 +164,6 @@ def _histories(robot: Robot, runs: Mapping[str, np.ndarray], names: list[str], h
 
 def _starts(starts: Sequence[Any]) -> Table:
     """Stages, currents and slip of each start; without stages where a run does not get under way."""
-    mean_slips = (f"mean slip > {share} [%] | .1f" for share in ("stage I", "stage II", "stage III", "over t′"))
-    heads = columns(
-        "run", "ends", "stage I until [s] | .3f", "stage II until [s] | .3f", "t′: V within 1 % of its end [s] | .3f",
-        "peak current [A] | .1f", "current at the end [A] | .2f", "V at the end [mm/s] | .0f", *mean_slips,
-    )  # fmt: skip
     rows = []
     for s in starts:
         numbers: list[float | None] = [None] * 10
@@ -227,43 +173,24 @@ def _starts(starts: Sequence[Any]) -> Table:
             ends = (s.sense * x for x in (s.peak, *s.ended))
             numbers = [*times, *ends, *(100 * x for x in slips)]
         rows.append((s.name, words.short_status(s.status), *numbers))
-    return Table("starts", heads, rows)
+    return catalogue.table("runs.starts", rows)
 
 
 def _gear(ripples: Sequence[Any]) -> Iterable[Block]:
     """Ripple of currents, speeds and reactions at the end of runs."""
     from sweeps.pages import gear_figures
 
-    heads = columns(
-        "run", "repeats with", "period found [ms] | .2f", "eq. (34) [ms] | .2f", "current ripple ± [%] | .2g",
-        "speed ripple ± [%] | .2g", "reaction ripple ± [%] | .2g", "weight on the guides [%] | .1f",
-    )  # fmt: skip
-    yield deferred_figure(
-        "ripple", "ripple of the total current at the end", _RIPPLE, "gear_figures.current_ripple", ripples
-    )
-    yield Table("ripple-table", heads, [tuple(gear_figures.ripple_numbers(g).values()) for g in ripples])
+    yield catalogue.figure("runs.ripple", ripples)
+    yield catalogue.table("runs.ripple-table", [tuple(gear_figures.ripple_numbers(g).values()) for g in ripples])
     for gear in [g for g in ripples if g.on_tracks][:1]:
-        title = f"{gear.name}: touchdowns dotted"
-        alternative = "current and reactions when grousers touch down"
-        yield deferred_figure("touchdown", alternative, _TOUCHDOWN, "gear_figures.draw_touchdowns", gear, title)
-    yield deferred_figure(
-        "reactions", "normal reactions of one side", _REACTIONS, "gear_figures.draw_reactions", ripples
-    )
+        yield catalogue.figure("runs.touchdown", gear, f"{gear.name}: touchdowns dotted")
+    yield catalogue.figure("runs.reactions", ripples)
 
 
 def _posture(stands: Postures, names: Sequence[str]) -> Section:
-    figures = [
-        deferred_figure(
-            "posture", "the robot from the side, at rest and on its highest step", _POSTURE,
-            "posture_figures.rest_and_step", stands,
-        ),
-        deferred_figure(
-            "steps", "highest step and margin of tipping over the angles of the levers", _STEPS,
-            "posture_figures.draw_highest_steps", stands.over,
-        ),
-    ]  # fmt: skip
-    blocks: tuple[Block, ...] = (*figures[: 1 + (len(names) == 1)], posture_words.posture_table(stands, names))
-    return Section("Posture", blocks, "posture-section")
+    steps = [catalogue.figure("runs.steps", stands.over)] if len(names) == 1 else []
+    table = posture_words.posture_table(stands, names)
+    return Section("Posture", (catalogue.figure("runs.posture", stands), *steps, table), "posture-section")
 
 
 def _power_chain(robot: Robot, runs: dict[str, np.ndarray], names: Sequence[str]) -> Iterable[Block]:
@@ -276,13 +203,10 @@ def _power_chain(robot: Robot, runs: dict[str, np.ndarray], names: Sequence[str]
         yield Note(f"{'. '.join(unknown).capitalize()}." if unknown else none)
         return
     if len(chain) < len(names):
-        yield Note(f"{len(chain)} of {len(names)} runs: the first {CHAINS} that end in steady travel.")
-    caption = _CHAIN + (_ON_GROUND if robot.has_ground else _ON_SHAFT)
-    yield deferred_figure(
-        "power", "power of the supply, split along the chain", caption,
-        "power_figures.draw_power_chain", {key: value[chain] for key, value in runs.items()},
-        [names[k] for k in chain], robot.has_ground,
-    )  # fmt: skip
+        yield catalogue.note("runs.chains", len(chain), len(names), CHAINS)
+    picked = {key: value[chain] for key, value in runs.items()}
+    more = catalogue.text("runs.on_ground" if robot.has_ground else "runs.on_shaft")
+    yield catalogue.figure("runs.power", picked, [names[k] for k in chain], robot.has_ground, more=more)
 
 
 def limits_used(robot: Robot, run: Mapping[str, Any]) -> list[dict[str, Any]]:

@@ -7,7 +7,8 @@ from pathlib import Path
 
 from calibration.data.settling import Settled, Stretch
 from calibration.words import settle_words as words
-from sweeps.report.document import Document, Note, Section, Table, columns, deferred_figure, remarks
+from sweeps.report import catalogue
+from sweeps.report.document import Document, Note, Section, Table, columns, remarks
 
 #: Imposed quantity of a log and its unit.
 IMPOSED = {
@@ -15,11 +16,6 @@ IMPOSED = {
     "motor_speed": ("motor speed", "rpm"),
     "motor_current": ("motor current", "A"),
 }
-_LOG = "**The log.** Shaded: settled stretches; thick: their means, the rows of `settled.csv`."
-_SDS = (
-    "±: standard deviation of the mean. It includes scatter and autocorrelation within the stretch, the step of the "
-    "instrument, the remaining change, and differences between repeated levels."
-)
 
 
 def settle_document(found: Settled, few: str = "", notes: tuple[str, ...] = ()) -> Document:
@@ -28,13 +24,12 @@ def settle_document(found: Settled, few: str = "", notes: tuple[str, ...] = ()) 
     next_step = Note(few, "lead", "few", terminal=True) if few else next_step
     said = (*words.settle_remarks(found), *notes)
     left = words.left_out(found.stretches, bool(few))
-    heads = columns("reason", "stretches |", "samples |", "rows, for example |", "what to do")
-    log = deferred_figure("log", words.settle_statement(found), _LOG, "settle_figures.over_log", found)
+    log = catalogue.figure("settle.log", found, finding=words.settle_statement(found))
     sections = [Section("Over the log", (log,))]
     if left:
-        sections.append(Section("Left out", (Table("left", heads, left, "left out"),)))
+        sections.append(Section("Left out", (catalogue.table("settle.left", left),)))
     levels = Note(words.levels_and_samples(found), "key")
-    settled = Section("Settled runs", (_settled(found), levels, Note(_SDS, "key")))
+    settled = Section("Settled runs", (_settled(found), levels, catalogue.note("settle.sds")))
     return Document(
         f"Settled runs of {Path(found.runs.source).name}",
         words.settle_statement(found),

@@ -11,8 +11,9 @@ from calibration.sizing.chart import LIMITS, Chart
 from calibration.sizing.design import OBJECTIVES
 from calibration.sizing.design_search import SizedDesign
 from mmrjax.errors import count_noun
+from sweeps.report import catalogue
 from sweeps.report.check_report import requirements_sheet
-from sweeps.report.document import Cell, Document, Figure, Note, Section, Table, columns, deferred_figure
+from sweeps.report.document import Cell, Document, Figure, Note, Section, Table, columns
 from sweeps.results.size_results import SizeResult, design_verdict, missed_limits, objective_text
 
 _HEADINGS = {"mass": "mass", "energy": "energy", "cost": "price of motors and gearboxes"}
@@ -25,15 +26,6 @@ COLUMNS = columns(
 #: Motors that the terminal shows.
 SHOWN = 5
 _DESIGNS = "The best, and the best with other parts, with ratios of the makers' sheets and whole cells."
-_MOTORS = (
-    "The best design of each motor, with any ratio of its gearboxes and fractions of a cell. If no design "
-    "meets the requirements, the limits that the nearest one misses."
-)
-_LIMITS = (
-    "The **colour** shows the nearest limit at each payload and slope, at the worse end of the charge. Beyond the "
-    "**black line** (pale) it is exceeded. Dashed: the required envelope."
-)
-_FRONT = "**Pareto front.** No other design with ratios of the sheets and whole cells is better in both."
 
 
 def size_document(found: SizeResult, robot_name: str) -> Document:
@@ -53,7 +45,7 @@ def size_document(found: SizeResult, robot_name: str) -> Document:
         (Note(lead, "lead"), *_limits(found, robot_name), *_front(found)),
         (
             Section("Designs", (Note(about), *tables), "designs"),
-            Section("Every motor", (Note(_MOTORS), motors), "motors"),
+            Section("Every motor", (catalogue.note("size.motors"), motors), "motors"),
         ),
     )
 
@@ -81,7 +73,7 @@ def _limits(found: SizeResult, robot_name: str) -> tuple[Figure, ...]:
     names = [] if best is None else [f"best: {best.drive.motor.name}, ratio {best.ratio:.4g}"]
     charts = dict(zip([*names, f"as it is: {robot_name}"], found.charts, strict=True))
     alternative = "; ".join(f"{name}: {_reach(c)}" for name, c in charts.items())
-    return (deferred_figure("limits", alternative, _LIMITS, "size_figures.draw_nearest_limits", found, charts),)
+    return (catalogue.figure("size.limits", found, charts, finding=alternative),)
 
 
 def _reach(c: Chart) -> str:
@@ -102,5 +94,5 @@ def _front(found: SizeResult) -> tuple[Figure | Note, ...]:
     )
     return (
         Note(f"{text}.", terminal=True),
-        deferred_figure("front", text, _FRONT, "size_figures.draw_pareto_front", found),
+        catalogue.figure("size.front", found, finding=text),
     )

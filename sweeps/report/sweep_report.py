@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections import Counter
 from collections.abc import Iterable, Sequence
 
@@ -11,16 +12,12 @@ from calibration.data.robot_file import RobotFile
 from mmrjax.errors import count_noun
 from sweeps import capabilities
 from sweeps.pages import words
-from sweeps.report import run_tables
+from sweeps.report import catalogue, run_tables
 from sweeps.report.condition_columns import imposed_column
-from sweeps.report.document import Document, Note, Section, Table, columns, deferred_figure, remarks
+from sweeps.report.document import Document, Section, Table, remarks
 from sweeps.report.run_tables import quantity_column
 
 Runs = dict[str, np.ndarray]
-_MAPS = (
-    "Hatched or crossed: no operating point, with the status that says why. Where several runs share a place, their "
-    "median. Of more than three voltages or speeds, three are drawn; all runs are in `runs.csv`."
-)
 
 
 def sweep_document(file: RobotFile, model: str, runs: Runs, notes: Sequence[str] = ()) -> Document:
@@ -30,13 +27,11 @@ def sweep_document(file: RobotFile, model: str, runs: Runs, notes: Sequence[str]
     known = [*words.STATUSES, *(statuses.keys() - words.STATUSES.keys())]
     over = {s: int(((runs["status"] == s) & (runs["flags"] != "")).sum()) for s in known}
     where = {s: "" if s in words.SETTLED else _where(runs, runs["status"] == s) for s in known}
-    maps = (
-        deferred_figure(
-            f"sweep_{c.name}", f"{c.label} over the grid", f"**{c.label.capitalize()}** [{c.unit}].",
-            "sweep_figures.draw_sweep", runs, c,
-        )
-        for c in file.robot.channels
-    )  # fmt: skip
+    maps = []
+    for c in file.robot.channels:
+        labels = c.label.capitalize(), c.unit
+        drawn = catalogue.figure("sweep.sweep", runs, c, finding=f"{c.label} over the grid", words=labels)
+        maps.append(dataclasses.replace(drawn, name=f"sweep_{c.name}"))
     axes = "; ".join(_levels(runs, c) for c in _axes(runs))
     extremes = (*(c.column for c in file.robot.channels), "slip", "winding_settled_C")
     return Document(
@@ -49,7 +44,7 @@ def sweep_document(file: RobotFile, model: str, runs: Runs, notes: Sequence[str]
             _extremes(shown, extremes),
             *remarks(notes),
         ),
-        (Section("Over the grid", (Note(_MAPS), *maps), "maps"),),
+        (Section("Over the grid", (catalogue.note("sweep.maps"), *maps), "maps"),),
     )
 
 
@@ -78,8 +73,7 @@ def _limits(runs: Runs) -> Table:
         over = np.array([flag in str(f).split(";") for f in kinds])[which]
         if over.any():
             rows.append((f"{meaning} (`{flag}`)", int(over.sum()), _where(runs, over)))
-    heads = columns("limit exceeded", "runs | ,", "~where")
-    return Table("limits", heads, rows)
+    return catalogue.table("sweep.limits", rows)
 
 
 def _axes(runs: Runs) -> list[str]:
@@ -122,4 +116,4 @@ def _extremes(runs: Runs, names: Iterable[str]) -> Table:
         (value,) = run_tables.quantity_cells({c: runs[c][k : k + 1]}, c)
         place = "; ".join(_levels(runs, axis, slice(k, k + 1)) for axis in _axes(runs))
         rows.append((f"largest {column.heading}", f"{column.text(value)} {column.unit}".strip(), place))
-    return Table("extremes", columns("extreme of the settled runs", "value |", "at"), rows)
+    return catalogue.table("sweep.extremes", rows)

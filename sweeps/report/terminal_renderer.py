@@ -34,8 +34,8 @@ def print_table(table: Table) -> None:
     printed = rich.table.Table(title=table.title or None, title_justify="left", box=None, pad_edge=False)
     kept = [k for k, column in enumerate(shown.columns) if column.terminal]
     for k in kept:
-        column = shown.columns[k]
-        printed.add_column(plain_text(column.full_title), justify="right" if column.form else "left")
+        column, number = shown.columns[k], bool(shown.columns[k].form)
+        printed.add_column(plain_text(column.full_title), justify="right" if number else "left", no_wrap=number)
     for row in rows:
         printed.add_row(
             *(Text(plain_text(shown.columns[k].text(row[k])), TONES.get(cell_tone(row[k]), "")) for k in kept)

@@ -13,8 +13,8 @@ from mmrjax.model.channels import SIDES
 from mmrjax.model.robot import Robot
 from sweeps import capabilities
 from sweeps.pages import words
-from sweeps.report import run_tables
-from sweeps.report.document import Document, Note, Section, Table, columns, deferred_figure, remarks
+from sweeps.report import catalogue, run_tables
+from sweeps.report.document import Document, Section, Table, remarks
 from sweeps.report.runs_report import run_headings
 from sweeps.report.words import turn_words
 
@@ -25,25 +25,6 @@ _ROWS = (
     ("motor speed [rpm]", "motor_speed_{}_rpm", "z.0f"),
     ("electrical power [W]", "power_{}_W", "z.1f"),
     ("winding, long running [°C]", "winding_{}_C", "z.0f"),
-)
-_CIRCLE = "**The path** of the centre of mass, and the centre about which the robot rotates."
-_PATH = "**The path** of the centre of mass: the robot at the start, half way and at the end."
-_TURNS = (
-    "**What other turns take** at the same duty of the faster side, from straight travel to turning on the spot; "
-    "dots: this one. All of them are in `turns.csv`."
-)
-_COURSE = "**Over time**; the inrush of the start goes beyond the axis of the current. All of it is in `history.csv`."
-_ASSUMED = (
-    "Friction of a contact is the law of straight travel, of the size of its whole sliding velocity, on an ellipse "
-    "of longitudinal and lateral friction. "
-)
-_GROUSERS = (
-    "Grousers and wheels bear as the ground presses on each, and the robot pitches and rolls on them. See "
-    "`docs/explanation/track-model.md`."
-)
-_RIGID = (
-    "Loads are those of a rigid robot in balance. Tracks bear along the whole wheelbase, wheels at its ends. See "
-    "`docs/explanation/turning.md`."
 )
 
 
@@ -66,22 +47,15 @@ def turn_document(
     robot, row = file.robot, {name: values[0] for name, values in run.items()}
     sides, going = sides_table(robot, row), turn_words.is_going(row)
     sections = []
-    if sides.rows:
-        above = "path", "the path of the robot from above"
-        circle = (
-            deferred_figure(*above, _CIRCLE, "turn_figures.draw_turn_circle", robot, row) if history is None
-            else deferred_figure(*above, _PATH, "turn_figures.draw_history_path", robot, row, history)
-        )  # fmt: skip
-        sections.append(Section("From above", (circle,)))
+    if sides.rows and history is None:
+        sections.append(Section("From above", (catalogue.figure("turn.circle", robot, row),)))
+    elif sides.rows:
+        sections.append(Section("From above", (catalogue.figure("turn.path", robot, row, history),)))
     if history is not None:
-        course = "currents, motor speeds and yaw rate over time"
-        figure = deferred_figure("course", course, _COURSE, "turn_figures.draw_turn_course", history)
-        sections.append(Section("Over time", (figure,)))
+        sections.append(Section("Over time", (catalogue.figure("turn.course", history),)))
     elif turns is not None:
-        others = "current of either side and power over the yaw rate"
-        figure = deferred_figure("turns", others, _TURNS, "turn_figures.over_yaw_rate", turns, row)
-        sections.append(Section("Other turns", (figure,)))
-    assumed = _ASSUMED + (_GROUSERS if model == "track" else _RIGID)
+        sections.append(Section("Other turns", (catalogue.figure("turn.turns", turns, row),)))
+    assumed = catalogue.note("turn.grousers" if model == "track" else "turn.rigid")
     return Document(
         f"Turn of {run_headings(run)[0]}",
         turn_words.turn_answer(row, ended),
@@ -90,7 +64,7 @@ def turn_document(
             sides,
             *remarks([*(turn_words.turn_notes(robot, row) if going else []), *notes]),
         ),
-        (*sections, Section("What is assumed", (Note(assumed),))),
+        (*sections, Section("What is assumed", (assumed,))),
     )
 
 
@@ -102,4 +76,4 @@ def sides_table(robot: Robot, row: Mapping[str, np.ndarray]) -> Table:
         values = [float(row[column.format(side)]) for side in SIDES]
         if column.format(SIDES[0]) not in idle:
             rows.append((label, *(words.NONE_SETTLES if math.isinf(v) else format(v, form) for v in values)))
-    return Table("sides", columns("", "left |", "right |"), rows)
+    return catalogue.table("turn.sides", rows)

@@ -21,7 +21,7 @@ def of_parquet(path: Path, name: str) -> tuple[Signal, ...]:
     """Signals of a Parquet file, read column by column."""
     from pyarrow import parquet
 
-    file = parquet.ParquetFile(path, memory_map=True)
+    file = parquet.ParquetFile(path)
     rows, schema = file.metadata.num_rows, file.schema_arrow
     size = input_files.VALUE * rows * file.metadata.num_columns
     input_files.check_declared(name, file.metadata.num_columns, size, path.stat().st_size)
@@ -33,20 +33,33 @@ def of_parquet(path: Path, name: str) -> tuple[Signal, ...]:
 
 
 def of_arrow(path: Path, name: str) -> tuple[Signal, ...]:
-    """Signals of a Feather or Arrow file, or an Arrow stream."""
+    """Signals of a Feather or Arrow file, or an Arrow stream, read column by column.
+
+    The file is not mapped into memory, since a file that is cut off while it is mapped ends the program.
+    """
     import pyarrow as pa
 
-    with pa.memory_map(str(path)) as probe:
-        stream = probe.read(6) != b"ARROW1"
+    def reader(file: Any, **options: Any) -> Any:
+        stream = file.read(6) != b"ARROW1"
+        file.seek(0)
+        return (pa.ipc.open_stream if stream else pa.ipc.open_file)(file, **options)
 
-    mapped, before = pa.memory_map(str(path)), pa.total_allocated_bytes()
-    reader = pa.ipc.open_stream(mapped) if stream else pa.ipc.open_file(mapped)
-    input_files.check_declared(name, len(reader.schema))
-    batches = []
-    for batch in reader if stream else map(reader.get_batch, range(reader.num_record_batches)):
-        batches.append(batch)
-        input_files.check_memory(name, pa.total_allocated_bytes() - before)  # of a compressed file
-    return of_table(pa.Table.from_batches(batches, reader.schema))
+    def column(k: int) -> Any:
+        with pa.OSFile(str(path)) as file:
+            return reader(file, options=pa.ipc.IpcReadOptions(included_fields=[k])).read_all()
+
+    with pa.OSFile(str(path)) as file:
+        schema = reader(file).schema
+    input_files.check_declared(name, len(schema))
+    rows = column(0).num_rows if len(schema) else 0
+
+    def values(k: int) -> Callable[[], np.ndarray]:
+        return lambda: of_column(column(k).column(0))
+
+    def whole(k: int) -> Callable[[list[str]], Any]:
+        return lambda names: column(k)
+
+    return tuple(s for k, field in enumerate(schema) for s in _signals(field, rows, values(k), whole(k)))
 
 
 def of_table(table: Any) -> tuple[Signal, ...]:

@@ -1,0 +1,125 @@
+"""The report of a calibration: adequate or not, its parameters, errors before and after, and their certainty."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from calibration.data.columns import Layout
+from calibration.inference import blocks
+from calibration.inference.identifiability import HELD
+from calibration.inference.result import METHOD, CalibrationResult
+from calibration.inference.simulation_errors import OF_SIZE
+from calibration.words import fit_words
+from mmrjax.errors import count_noun
+from sweeps.pages import words
+from sweeps.report import catalogue, fit_tables, run_tables
+from sweeps.report.document import Block, Document, Note, Section, Table, remarks
+
+
+def calibration_document(found: CalibrationResult, robot_name: str) -> Document:
+    """The report of a calibration of a robot of that name or file."""
+    sized = Layout.of(found.robot).crosses_zero
+    chi, about = found.chi_square, found.identifiability
+    estimated = "" if chi.tests_adequacy else catalogue.text("calibration.estimated")
+    facts = catalogue.note(
+        "calibration.facts", count_noun(len(found), "row"), found.model, len(found.parameters), METHOD, chi.value,
+        chi.degrees_of_freedom, estimated, int(np.sum(about.singular_values > 1)), len(found.parameters), about.rank,
+    )  # fmt: skip
+    search = Note(f"{found.starts.statement()}.", "" if found.converged else "warn", "search", terminal=True)
+    rms = [fit_tables.rms_table(found.rms, found.channels)] if sized else []
+    answer = fit_words.calibration_answer(found)
+    before_after = catalogue.figure("calibration.before_after", found, finding=answer, words=(OF_SIZE,))
+    table = found.rows()
+    kinds = {"": "measured", "after_": "fitted"}
+    return Document(
+        f"Calibration of {words.words_shown(Path(robot_name).name)} to {Path(found.source).name}",
+        answer,
+        (
+            Note(f"{found.adequacy.statement}.", "lead", "adequate", terminal=True),
+            _parameters(found),
+            _errors(found),
+            *rms,
+            search,
+            *run_tables.curve_warning(found.robot),
+            *remarks(found.notes),
+            facts,
+        ),
+        (
+            Section("Parameters before and after", tuple(_shifts(found)), "parameters-section"),
+            Section("Errors before and after, seen and unseen", (before_after,)),
+            *_over_rows(found, sized),
+            *fit_tables.clusters_section(found.residual_clusters),
+            Section("How sure", tuple(_certainty(found))),
+            fit_tables.rows_section(table, found.channels, kinds, sized),
+        ),
+    )
+
+
+def _parameters(found: CalibrationResult) -> Table:
+    rows = []
+    for name, p in found.parameters.items():
+        ends = zip(("≤ ", "≥ "), p.interval_open, p.interval, strict=True)
+        interval = " to ".join(f"{sign * beyond}{value:.3g}" for sign, beyond, value in ends)
+        bound = f", {p.at_bound} bound" if p.at_bound else ""
+        shift, median = fit_tables.shift_cell(p.shift), p.prior.median
+        numbers = (p.value, p.sd, interval, p.unit, median, shift, p.variance_ratio)
+        rows.append((f"`{name}`", *numbers, found.determined(name) + bound, p.meaning))
+    title = f"{count_noun(len(found), 'row')}, {found.model}"
+    return catalogue.table("calibration.parametertable", rows, title=title)
+
+
+def _errors(found: CalibrationResult) -> Table:
+    """rms errors before, after, and of rows held out, with the number of rows that each reaches."""
+    lines = {"before": found.errors_before, "after": found.errors_after}
+    lines |= {f"after, held out by {blocks.kind_in_words(k)}": found.held_out[k].errors for k in found.held_out_alike}
+    rows = [
+        (
+            which, f"{max(e.rows for e in by.values())}/{len(found)}",
+            *(e.rms_percent if e.rows else None for e in by.values()),
+        )
+        for which, by in lines.items()
+    ]  # fmt: skip
+    title = f"rms of simulated - measured [% of {OF_SIZE}]"
+    return catalogue.table("calibration.errors", rows, *(f"{c.label} | .1f" for c in found.channels), title=title)
+
+
+def _shifts(found: CalibrationResult) -> Iterable[Block]:
+    yield catalogue.figure("calibration.parameters", found, words=(HELD,))
+    if found.tied:
+        yield Note(f"Tied: {'; '.join(f'`{n}` = {t.ratio:.4g} x `{t.leader}`' for n, t in found.tied.items())}.")
+    yield Note(fit_tables.noise_sentence(found.noise, found.channels))
+
+
+def _over_rows(found: CalibrationResult, sized: bool) -> Iterable[Section]:
+    """Simulated readings over time, over the measured ones, and their errors over each condition."""
+    table = found.rows()
+    table |= {f"simulated_{c.column}": table[f"after_{c.column}"] for c in found.channels}
+    answer, shown = fit_words.calibration_answer(found), found.channels
+    if found.axis:
+        lines = {"after_": "calibrated", "before_": "before"}
+        yield Section("Histories", (catalogue.figure("fit.overlay", table, shown, lines, finding=answer),))
+    unit = "the channel's unit; band: ±2 sd of the readings" if sized else f"percent of the {OF_SIZE}"
+    along = {found.axis: "time [s]"} if found.axis else {}
+    figures = (
+        catalogue.figure("calibration.parity", table, shown, not sized, more="" if sized else " Band: ±5 %."),
+        catalogue.figure("calibration.residuals", table, shown, sized, along, words=(unit,)),
+    )  # fmt: skip
+    yield from (Section(h, (f,)) for h, f in zip(("Parity", "Residuals over every condition"), figures, strict=True))
+
+
+def _certainty(found: CalibrationResult) -> Iterable[Block]:
+    if found.profiled:
+        yield catalogue.figure("calibration.profiles", found)
+    yield catalogue.figure("calibration.correlations", found)
+    if len(found.posterior) > 1:
+        yield catalogue.figure("calibration.pairs", found)
+    weak = [
+        (value, " ".join(f"{x:+.2f} `{n}`" for n, x in parts.items()))
+        for value, parts in found.identifiability.weak_directions()
+    ]
+    if weak:
+        yield catalogue.note("calibration.weak-note")
+        yield catalogue.table("calibration.weak", weak)

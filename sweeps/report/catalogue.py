@@ -1,0 +1,68 @@
+"""Figures, tables and notes of reports whose words are in `pages/templates/catalogue.toml`, by report and name."""
+
+from __future__ import annotations
+
+import functools
+import importlib
+from collections.abc import Sequence
+from importlib import resources
+from typing import Any
+
+from calibration.data.input_files import toml_content
+from sweeps.report.document import Column, Figure, Note, Table, columns
+
+
+@functools.cache
+def _content() -> dict[str, Any]:
+    words = (resources.files("sweeps.pages") / "templates" / "catalogue.toml").read_text("utf-8")
+    return toml_content(words, "catalogue.toml")
+
+
+def _entry(name: str) -> dict[str, Any]:
+    """Words of a figure, table or note, `report.name` of the catalogue."""
+    room, _, key = name.partition(".")
+    found: dict[str, Any] = _content()[room][key]
+    return found
+
+
+def text(name: str, *words: Any) -> str:
+    """A text of the catalogue, with values in it."""
+    said: str = _entry(name).get("text", "")
+    return said.format(*words) if words else said
+
+
+def figure(name: str, *drawn: Any, finding: str = "", words: Sequence[Any] = (), more: str = "") -> Figure:
+    """A figure of the catalogue; what draws it is imported when it is drawn, as matplotlib costs half a second.
+
+    Args:
+        name: in the catalogue, `report.name`; drawn: arguments of the function that draws it.
+        finding: in words, if it depends on the result; words: values in the caption; more: end of the caption.
+    """
+    entry = _entry(name)
+    module, _, function = entry["draws"].partition(".")
+
+    def draw() -> Any:
+        return getattr(importlib.import_module(f"sweeps.pages.{module}"), function)(*drawn)
+
+    return Figure(name.partition(".")[2], finding or entry["finding"], text(name, *words) + more, draw)
+
+
+def table(name: str, rows: Sequence[Sequence[Any]], *more: Column | str, **fields: Any) -> Table:
+    """A table of the catalogue.
+
+    Args:
+        name: in the catalogue, `report.name`; more: columns, or their titles, in the place of "..." there.
+    """
+    entry = _entry(name)
+    heads: list[Column] = []
+    for title in entry["columns"]:
+        between = (c if isinstance(c, Column) else columns(c)[0] for c in more) if title == "..." else columns(title)
+        heads += between
+    fixed = {key: entry[key] for key in ("title", "file", "wide", "terminal", "sideways") if key in entry}
+    return Table(name.partition(".")[2], tuple(heads), rows, **(fixed | fields))
+
+
+def note(name: str, *words: Any) -> Note:
+    """A note of the catalogue, with values in its text."""
+    entry = _entry(name)
+    return Note(text(name, *words), entry.get("kind", ""), entry.get("name", ""), entry.get("terminal", False))

@@ -1,0 +1,92 @@
+"""Blocks that the reports of fits share: shifts, noise, errors in units, residual clusters, and the rows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from calibration.inference.residual_clusters import ResidualCluster
+from mmrjax.model.channels import Channel
+from sweeps.report import catalogue, run_tables
+from sweeps.report.condition_columns import condition_formats
+from sweeps.report.document import Cell, Column, Section, Table, remarks
+
+#: Names of fits that rms errors are of.
+FITS = {
+    "before": "before", "after": "after", "held_out": "held out", "held_out_before": "before, held out",
+    "held_out_after": "after, held out",
+}  # fmt: skip
+
+
+def shift_cell(shift: float) -> Cell:
+    """A shift in prior standard deviations, marked beyond two and three."""
+    return Cell(shift, "bad" if abs(shift) > 3 else "fair" if abs(shift) > 2 else "")
+
+
+def error_cell(percent: float) -> Cell:
+    """An error in per cent, marked by its size: the paper claims 7 %."""
+    size = abs(percent)
+    return Cell(percent, "" if not np.isfinite(size) else "good" if size <= 5 else "fair" if size <= 10 else "bad")
+
+
+def noise_sentence(noise: Mapping[str, Any], shown: Iterable[Channel]) -> str:
+    """Standard deviation of each channel with its source."""
+    shares = {name: n.median_percent for name, n in noise.items()}
+    parts = (
+        f"{c.label} {f'{shares[c.name]:.2f} % ' * (shares[c.name] is not None)}({noise[c.name].source})"
+        for c in shown
+        if c.name in noise
+    )
+    return f"Noise (sd): {'; '.join(parts)}."
+
+
+def rms_table(rms: Mapping[str, Mapping[str, float]], shown: Sequence[Channel]) -> Table:
+    """rms errors in the units of their channels, by fit."""
+    rows = [(FITS[fit], *(by.get(c.name) for c in shown)) for fit, by in rms.items()]
+    return catalogue.table("fit.rms", rows, *(f"{c.label} [{c.unit}] | .3g" for c in shown))
+
+
+def clusters_section(clusters: Sequence[ResidualCluster]) -> tuple[Section, ...]:
+    """Columns without a role that residuals go with, if there are any."""
+    if not clusters:
+        return ()
+    statements = (f"{c.statement}." for c in clusters)
+    return (
+        Section(
+            "What the residuals cluster by",
+            (*remarks(statements, "clusters"), catalogue.figure("fit.clusters", clusters)),
+        ),
+    )
+
+
+def rows_section(
+    table: Mapping[str, np.ndarray], shown: Sequence[Channel], kinds: Mapping[str, str], sized: bool, **more: Any
+) -> Section:
+    """The rows with their conditions, readings, and the error of the last kind of readings.
+
+    Args:
+        kinds: words of each kind of readings by the prefix of its columns; more: `first` and `last` columns, by name.
+        sized: True if errors are in the channel's unit, and not in per cent.
+    """
+    conditions = condition_formats(dict(table))
+    heads = [Column(word) for word in more.get("first", {})] + [Column("configuration")]
+    cells: list[Any] = [*more.get("first", {}).values(), table["configuration"]]
+    for column, (heading, form) in conditions.items():
+        heads.append(Column(heading, form=form))
+        cells.append(table[column])
+    last = list(kinds)[-1]
+    for c in shown:
+        for key, head in run_tables.reading_columns((c,), kinds):
+            heads.append(head)
+            cells.append(table[key])
+        if sized:
+            heads.append(Column("error", c.unit, f"{{:+.{c.resolution}f}}", c.label))
+            cells.append(table[f"{last}{c.column}"] - table[c.column])
+        elif f"error_{c.name}_percent" in table:
+            heads.append(Column("error", "%", "{:+.1f}", c.label))
+            cells.append([error_cell(float(e)) for e in table[f"error_{c.name}_percent"]])
+    heads += [Column(word) for word in more.get("last", {})]
+    rows = list(zip(*cells, *more.get("last", {}).values(), strict=True))
+    return Section("Rows", (catalogue.table("fit.rowtable", rows, *heads),))

@@ -1,0 +1,174 @@
+"""The report of a sensitivity study: the answer first, then every output, interactions, convergence, next runs."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable
+
+import numpy as np
+
+from calibration.data.robot_file import RobotFile
+from calibration.sensitivity.result import NEGLIGIBLE, NextRuns, OutputStudy, SensitivityResult, interactions
+from calibration.words import sensitivity_words
+from sweeps.pages.words import short_name
+from sweeps.report import catalogue, run_tables
+from sweeps.report.document import Block, Document, Note, Section, Table, remarks
+
+#: Pairs of a table of interactions, and outputs that are shown unfolded.
+PAIRS, UNFOLDED = 5, 3
+#: Measure of the shares of the overview, by method.
+_OF = {"local": " to first order", "derivative": ", at most", "morris": ", by squared effects"}
+
+
+def sensitivity_document(found: SensitivityResult, file: RobotFile) -> Document:
+    """The report of a finished study."""
+    method = f"Method: {sensitivity_words.METHODS[found.method]} (`{found.method}`)"
+    ran = f", {found.evaluations:,} model evaluations in {found.seconds:.1f} s." if found.evaluations else "."
+    overview = catalogue.figure(
+        "sensitivity.overview", found, words=(_OF.get(found.method, ""), _ranges(found), 100 * NEGLIGIBLE),
+        more=catalogue.text("sensitivity.sobol") if found.method == "sobol" else "",
+    )  # fmt: skip
+    idle = "less than {:g} % everywhere: {}".format(100 * NEGLIGIBLE, ", ".join(found.negligible))
+    said = [*([idle] if found.negligible else []), *_next_runs_in_words(found), *found.notes]
+    return Document(
+        "Which parameters matter",
+        found.statement(),
+        (run_tables.lead_note(file, found.model, method + ran), _leading(found), overview, *remarks(said)),
+        page_sections=lambda: _sections(found),
+    )
+
+
+def _sections(found: SensitivityResult) -> Iterable[Section]:
+    yield Section("Output by output", (catalogue.note("sensitivity.legend"),), "outputs")
+    for k, (name, study) in enumerate(found.outputs.items()):
+        yield Section(study.row.label.capitalize(), (Note(_sentence(study, found)),), name, level=3)
+        if bool(study.studied.any()) and bool(np.isfinite(study.value).any()) and _decided(study):
+            folded = "tornado, shares, where" if k >= UNFOLDED else ""
+            yield Section("", tuple(_output(name, study, found)), folded=folded)
+    if found.next_runs is not None:
+        yield Section("What to measure next", tuple(_next_runs(found, found.next_runs)), "measure")
+    yield Section("Inputs", (_inputs(found), catalogue.note("sensitivity.largest")), "inputs")
+    if any(study.convergence for study in found.outputs.values()):
+        figure = catalogue.figure("sensitivity.convergence", found)
+        yield Section("Convergence", (figure,), "convergence-of-indices")
+    if found.comparison:
+        rows = [
+            (
+                found.outputs[name].row.label, *("yes" if c[f"{end}_holds"] else "no" for end in ("upper", "lower")),
+                100 * c["largest_excess"],
+            )
+            for name, c in found.comparison.items()
+        ]  # fmt: skip
+        above = catalogue.note("sensitivity.sampled")
+        yield Section(
+            "Bounds against sampled indices", (above, catalogue.table("sensitivity.bounds", rows)), "bounds"
+        )
+
+
+def _decided(study: OutputStudy) -> bool:
+    """True if any input changes an output."""
+    return bool(study.overall_share.max(initial=0.0) > 0)
+
+
+def _leading(found: SensitivityResult) -> Table:
+    """The inputs that decide each output."""
+    rows = []
+    for study in found.outputs.values():
+        share = study.overall_share
+        top = [k for k in np.argsort(-share)[:3] if share[k] >= NEGLIGIBLE]
+        cells = [f"{short_name(found.names[k])} {100 * share[k]:.0f} %" for k in top]
+        rows.append((study.row.label, *cells, *[""] * (3 - len(cells))))
+    return catalogue.table("sensitivity.leading", rows)
+
+
+def _output(name: str, study: OutputStudy, found: SensitivityResult) -> Iterable[Block]:
+    """Tornado and indices of an output, and interactions that are sure, the strongest first."""
+    label = study.row.label
+    for kind in ("tornado", "indices"):
+        figure = catalogue.figure(
+            f"sensitivity.{kind}", study, found, finding=_sentence(study, found), words=(label.capitalize(),)
+        )
+        yield dataclasses.replace(figure, name=f"{kind}_{name}")
+    sure = [pair for pair in interactions(study, found.names) if pair.sure and pair.second >= NEGLIGIBLE / 2]
+    rows = [(" with ".join(p.pair), 100 * p.second, "{:.1f} to {:.1f}".format(*(100 * x for x in p.interval)))
+            for p in sure[:PAIRS]]  # fmt: skip
+    if rows:
+        yield dataclasses.replace(catalogue.table("sensitivity.pairs", rows), name=f"pairs_{name}")
+    elif study.second is not None:
+        yield catalogue.note("sensitivity.none")
+
+
+def _sentence(study: OutputStudy, found: SensitivityResult) -> str:
+    """Sentence on the inputs that decide an output, with its spread."""
+    share, row = study.overall_share, study.row
+    if not _decided(study):
+        return "No number at any of these operating points, or nothing changes it."
+    order = np.argsort(-share, kind="stable")[:3]
+    top = [k for k in order if share[k] >= NEGLIGIBLE] or order[:1]
+    who = ", ".join(f"{sensitivity_words.input_in_words(found, found.names[k])} {100 * share[k]:.0f} %" for k in top)
+    value, sd = study.value / row.factor, study.sd / row.factor
+    finite = np.isfinite(value) & np.isfinite(sd)
+    unit = "" if row.unit_shown == "-" else f" {row.unit_shown}"
+    digits = row.resolution
+    low, high = value[finite].min(), value[finite].max()
+    spans = f"from {low:.{digits}f} to {high:.{digits}f}{unit} over the operating points"
+    spread = f"uncertain by ±{np.median(sd[finite]):.{digits}f}{unit} (one sd, median of the points)"
+    return f"{who[0].upper()}{who[1:]}. It goes {spans}, and is {spread}."
+
+
+def _inputs(found: SensitivityResult) -> Table:
+    """Every input with its distribution, the most important first."""
+    importance, rows = found.importance(), []
+    for k in np.argsort(-importance, kind="stable"):
+        name, share = found.names[k], importance[k]
+        x = found.inputs[name]
+        largest = f"{100 * share:.0f} %" if share >= NEGLIGIBLE else f"< {100 * NEGLIGIBLE:g} %"
+        interval = "{:.3g} to {:.3g}".format(*x.interval)
+        rows.append((f"`{name}`", x.meaning, x.unit, x.distribution, x.median, interval, largest))
+    return catalogue.table("sensitivity.inputs", rows)
+
+
+def _next_runs_in_words(found: SensitivityResult) -> Iterable[str]:
+    n = found.next_runs
+    if n is not None:
+        labels = "; ".join(n.points.label(k) for k in range(len(n.points)))
+        yield f"next runs, of {n.candidates} ({n.source}), read to {n.noise}: {labels}"
+
+
+def _next_runs(found: SensitivityResult, n: NextRuns) -> Iterable[Block]:
+    """Runs that tell most of the inputs, and what they leave uncertain."""
+    yield catalogue.note("sensitivity.optimal", n.candidates, n.source, n.noise)
+    points = n.points
+    imposed = "supply [V] | g" if points.motor_speed is None else "motor speed [rpm] | g"
+    ground = {"payload [kg] | g": points.payload, "slope [°] | g": points.slope_deg} if points.has_ground else {}
+    rows = [
+        (k + 1, str(points.configuration[k]), points.imposed[1][k], *(x[k] for x in ground.values()), n.gain[k])
+        for k in range(len(points))
+    ]
+    yield catalogue.table("sensitivity.next-runs", rows, imposed, *ground)
+    yield catalogue.figure("sensitivity.next_runs", n, found)
+    left = []
+    for name, sds in n.output_sd.items():
+        row = found.outputs[name].row
+        if np.isfinite(sds).all() and sds[0] > 0:
+            unit = "" if row.unit_shown == "-" else f" {row.unit_shown}"
+            ends = sds[0] / row.factor, sds[-1] / row.factor
+            left.append((row.label, *(f"±{_two(sd)}{unit}" for sd in ends), 100 * ends[1] / ends[0]))
+    yield catalogue.table("sensitivity.left", left)
+    yield catalogue.note("sensitivity.first-order")
+
+
+def _two(sd: float) -> str:
+    """Two digits of an sd, without an exponent."""
+    return f"{sd:.{int(np.clip(1 - np.floor(np.log10(sd)), 0, 6))}f}"
+
+
+def _ranges(found: SensitivityResult) -> str:
+    """Values of the operating points at which any output was studied."""
+    p = found.points.at(np.any([o.studied for o in found.outputs.values()], axis=0))
+    parts = [", ".join(dict.fromkeys(map(str, p.configuration)))]
+    _, own, symbol = p.imposed
+    for _, x, unit in (("", own, f" {symbol}"), *p.ground):
+        on_battery = unit == " V" and np.isnan(x).all()
+        parts.append("battery" if on_battery else ", ".join(f"{v:g}" for v in np.unique(x)) + unit)
+    return "; ".join(parts)
