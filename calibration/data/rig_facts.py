@@ -230,8 +230,9 @@ def doubtful_current(runs: Runs, robot: Robot) -> str:
         return ""
     torques = [[float(x) for x in (load.loss_coulomb, load.torque_constant, load.torque_gravity)] for load in loads]
     needed = max(_current(robot, sum(map(abs, torque))) for torque in torques)
-    largest = float(np.nanmax(np.abs(runs[column])))
-    if needed == 0 or LEAST < largest / needed < MOST:
+    turning = runs["held"] < 0.5 if runs.has("held") else np.full(len(runs), True)
+    largest = float(np.nanmax(np.abs(runs[column][turning]), initial=0.0))
+    if needed == 0 or not turning.any() or LEAST < largest / needed < MOST:
         return ""
     theirs = runs.headings.get(column, column)
     return (
