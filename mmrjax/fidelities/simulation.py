@@ -93,6 +93,11 @@ def simulate(
     conditions = check_conditions(robot, conditions)
     _check_battery(robot, conditions)
     _check_turning(robot, conditions, profile)
+    if conditions.held is not None and (model != "steady" or robot.has_ground or conditions.motor_speed is not None):
+        raise UsageError(
+            "held: a clamp holds the output of a shaft in settled runs at an imposed voltage or current; expected "
+            "such runs, or leave held out"
+        )
     braked = conditions.load_torque is not None or (profile is not None and profile.load_torque is not None)
     if braked and robot.has_ground:
         raise UsageError(f"load_torque: {NO_BRAKE}; state slope_deg or payload")
