@@ -274,7 +274,7 @@ def test_posterior_of_a_robot_is_its_inputs_and_gives_runs_their_uncertainty(mmr
     (["--outputs", "current"], 2, "--outputs current: no such output; did you mean total_current? allowed: total_"),
     (["--outputs", "sped"], 2, "--outputs sped: no such output; did you mean speed? allowed: total_current"),
     (["--evaluations", "10"], 2, "--evaluations: got 10; expected 1000 or more"),
-    (["--vary", "voltage=28:20"], 2, "--vary voltage: got 28 to 20; expected a range within -100 to 100 V"),
+    (["--vary", "voltage=28:20"], 2, "--vary voltage: got 28 to 20; expected a range within -10000 to 10000 V"),
     (["--vary", "voltage"], 2, "--vary: got voltage; expected name=low:high with numbers, such as voltage=22:26"),
     (["--vary", "tension=1:2"], 2, "--vary tension: no such condition; "),
     (["--vary", "voltage=20:28", "--voltages", "24"], 2, "--vary voltage: --voltages states it too; give one of them"),

@@ -32,6 +32,7 @@ from mmrjax.model.signals import (
 )
 from mmrjax.numerics.rosenbrock import error_norm, step_longest
 from mmrjax.turning import circling
+from mmrjax.turning.two_sides import SIDES
 
 # Units of the unknowns (current, motor speed, speed, distance, discharge), which scale them to the order of one.
 # The memories of effects follow, each in its own unit.
@@ -245,11 +246,13 @@ def _integrated(
     times: Array,
     tolerance: float,
     max_steps: int,
+    currents: int = 1,
 ) -> tuple[Float[Array, "times unknowns"], Array]:
     """The unknowns at those times, and whether the integrator reached the last of them.
 
     Args:
         law: rates of the unknowns; size: norm of their error; moves: 0 for robots at rest, else 1.
+        currents: number of currents, the first of the unknowns.
     """
     import diffrax  # only here: the import takes half a second
 
@@ -257,7 +260,7 @@ def _integrated(
 
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda _, y, run: law(run[0], run[1], y) * run[2]),
-        Rodas4(),
+        Rodas4(lambda y, run: jnp.abs(y[:currents]) * _UNITS[CURRENT] > run[0].driver.current_limit),
         times[0],
         times[-1],
         dt0=jnp.asarray(1e-4, y0.dtype),
@@ -283,7 +286,7 @@ def _turning(
     parked = jnp.asarray(False) if rolling else circling.holds(robot, conditions)
     moves = jnp.where(parked, circling.changing_at_rest(y0), 1.0)
     ys, went = _integrated(
-        circling.turning_rates, circling.norm, robot, conditions, moves, y0, times, tolerance, max_steps
+        circling.turning_rates, circling.norm, robot, conditions, moves, y0, times, tolerance, max_steps, len(SIDES)
     )
     motion = jax.vmap(lambda y: circling.motion_of(robot, y))(ys)
     travel = jax.vmap(lambda m: balances.turning_signals(robot, conditions, m))(motion)

@@ -8,6 +8,7 @@ one row, a new condition a row and a field of `Conditions`, a new output a row a
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping
@@ -62,9 +63,9 @@ def unit_at_end(text: str, known: Iterable[str]) -> str | None:
     return max(found, key=len, default=None)
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Quantity:
-    """A number with its unit, its range and the rule for its sign.
+    """A number with its unit, its range and the rule for its sign; a row is equal to itself alone.
 
     Attributes:
         name: noun; with the unit, the name of its column.
@@ -115,7 +116,7 @@ class Quantity:
         """Name of the field of Python that holds it."""
         return self.name
 
-    @property
+    @functools.cached_property
     def column(self) -> str:
         """Name of its column in tables, with the unit."""
         return self._column(unit_in_column(self.unit))
@@ -135,7 +136,7 @@ class Quantity:
         """Axes of an envelope of use that it depends on."""
         return tuple(axis for axis in AXES if axis not in self.ignores)
 
-    @property
+    @functools.cached_property
     def sizes(self) -> dict[str, float]:
         """SI value of each unit that its columns may state, its own first; no slope in per cent."""
         alike: Mapping[str, float] = next((units for units in DIMENSIONS if self.unit in units), {})
@@ -147,7 +148,7 @@ class Quantity:
         """Further units that its columns may state."""
         return (*[unit for unit in self.sizes if unit not in (self.unit, PERCENT)], *[PERCENT] * self.percent)
 
-    @property
+    @functools.cached_property
     def units(self) -> dict[str, float]:
         """Value of one unit in the unit of its column, by its spelling, that of the column first."""
         return {unit_in_column(unit): size / self.factor for unit, size in self.sizes.items()}
@@ -172,7 +173,7 @@ class Quantity:
         return low / self.units[unit], high / self.units[unit]
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Condition(Quantity):
     """A quantity that is set from outside before a run starts.
 
@@ -204,13 +205,13 @@ class Condition(Quantity):
         """Its field of `Conditions`, or its name if it has none."""
         return self.field or self.name
 
-    @property
+    @functools.cached_property
     def sizes(self) -> dict[str, float]:
         """SI value of each unit that its columns may state; of its own alone if no file may state it."""
         return super().sizes if self.in_tables or self.in_profiles else {self.unit: self.factor}
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Channel(Quantity):
     """A quantity that an instrument can show.
 
@@ -255,7 +256,7 @@ class Channel(Quantity):
         """True if its sign is that of the motion."""
         return bool(self.sign)
 
-    @property
+    @functools.cached_property
     def deviation(self) -> Quantity:
         """Standard deviation of its readings, as a column of tables."""
         label = f"standard deviation of {self.label}"
@@ -377,6 +378,10 @@ TABLE: dict[str, tuple[Quantity, ...]] = {
         Condition(
             "load_torque", "Nm", "torque of a brake on the output of each drive, positive against forward rotation",
             _TORQUES, heading="load torque [N·m]", shown="{:.4g}", in_tables=True, acts=SHAFT, in_profiles=True,
+        ),
+        Condition(
+            "held", "", "1 where a clamp holds the output at rest and carries its torque", (0.0, 1.0), heading="held",
+            in_tables=True, imposed=("voltage", "motor_current"), acts=SHAFT,
         ),
         Condition("battery", "", "on-board battery instead of the external supply", (0.0, 1.0)),
         Condition("discharge", "C", "charge already taken from the battery", (0.0, 360_000.0)),

@@ -18,12 +18,7 @@ from sweeps.points.zarr_store import STORE, Layout
 
 #: Columns of conditions, as tables of runs and options have them, and the value of a unit of each in that of the
 #: store; what has no such column keeps its name.
-COLUMNS = {
-    "voltage": ("supply_voltage_V", 1.0),
-    "slope_deg": ("slope_deg", 1.0),
-    "payload": ("payload_kg", 1.0),
-    "load_torque": ("load_torque_Nm", 1.0),
-    "total_mass": ("total_mass_kg", 1.0),
+COLUMNS = {c.field: (c.column, 1.0) for c in quantities.SET if c.in_tables and c.field} | {
     "motor_speed": ("motor_speed_rpm", quantities.RPM),
     "motor_current": ("motor_current_A", 1.0),
     "discharge": ("discharge_mAh", COULOMB_PER_MAH),

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from scipy.integrate import solve_ivp
 from worlds import paper
 
 STEEP = 500.0  # by how much of the duty a driver lowers it for each share of current beyond its limit [-]
@@ -89,3 +90,29 @@ def settled(
     way = np.where(torque(none, none + 1) > 0, 1.0, np.where(torque(none, none - 1) < 0, -1.0, 0.0))
     speed = way * halved(lambda x: way * torque(way * x, way), none, none + FASTEST)
     return current(speed), np.where(way == 0, 0.0, speed)
+
+
+def started(
+    motor: dict[str, float], volts: float, limit: float, times: np.ndarray, rest: float = 0.01
+) -> tuple[np.ndarray, np.ndarray]:
+    """Current [A] and motor speed [rad/s] of a dyno from rest at `times`, by Radau.
+
+    Args:
+        motor: as for `settled`, with L and the inertias J of the motor and J_l of the load, its friction dry and
+            viscous; rest: speed of the load within which friction is smooth [rad/s].
+    """
+    i, eta = motor["i"], motor["eta"]
+
+    def rates(_: float, y: np.ndarray) -> list[float]:
+        duty = np.clip(1 - np.sign(y[0]) * STEEP * max(abs(y[0]) / limit - 1, 0), -1, 1)
+        x = min(max(y[1] / i / rest, -1), 1)
+        way = 0.5 * x * (3 - x * x)
+        drive = motor["C"] * y[0] - motor["M_f"] * way - motor["K_f"] * y[1]
+        load = motor["dry"] * way + motor["viscous"] * y[1] / i
+        flow = way * (np.sign(drive * motor["J_l"] + i * motor["J"] * load) or np.sign(way))
+        gained = 1 + flow * (eta - 1 if flow >= 0 else 1 - 1 / eta)
+        turning = i * (i * gained * drive - load) / (motor["J"] * i**2 * gained + motor["J_l"])
+        return [(duty * volts - motor["C"] * y[1] - motor["R"] * y[0]) / motor["L"], turning]
+
+    run = solve_ivp(rates, times[[0, -1]], [0, 0], "Radau", times, rtol=1e-9, atol=[1e-10, 1e-7], max_step=2e-3)
+    return run.y[0], run.y[1]
