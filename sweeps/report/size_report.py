@@ -56,7 +56,8 @@ def _table(
     left_out = found.sizing.unmeetable
     rows = [
         (
-            Cell(design_verdict(f, left_out), "good" if f.feasible and not left_out else "bad"), f.drive.motor.name,
+            Cell(design_verdict(f, left_out), ("fair" if left_out else "good") if f.feasible else "bad"),
+            f.drive.motor.name,
             f"{f.drive.family}, {count_noun(f.drive.stages, 'stage')}", f.ratio, 1000 * f.radius,
             f"{f.in_series} × {f.parallel:.3g} {f.cell.name}", *(f.objectives.get(k) for k in OBJECTIVES),
             ", ".join(f.binds if f.feasible else missed_limits(f)) or "none",
