@@ -67,6 +67,30 @@ def test_order_of_levels_that_rise_one_way_and_then_the_other_is_that_of_the_lev
     assert max(order_collinearity(shuffled(columns, seed), np.ones(18), axes) for seed in range(20)) < 0.7
 
 
+@pytest.mark.parametrize("driven", ["supply_voltage_V", "duty"])
+def test_order_of_a_sorted_table_is_no_driver(driven):
+    """A propeller's rows by rising duty, the supply sagging; steps are uneven."""
+    level = np.cumsum(np.random.default_rng(3).uniform(0.05, 1, 30) ** 4)
+    columns = {
+        "configuration": np.full(30, "bench"), "supply_voltage_V": np.full(30, 24.0), "order": np.arange(30.0),
+        "total_current_A": RNG.uniform(1, 5, 30), driven: level / level[-1],
+    }  # fmt: skip
+    scope = bases.Scope(("electrical", "track"), ("supply_voltage_V",))
+    assert "order" not in variables(curve_families(columns, np.ones(30), scope=scope))
+    assert not [v for v in variables(window_families(columns, np.ones(30), scope=scope)) if v.startswith("order")]
+    for seed in range(5):
+        assert "order" in variables(curve_families(shuffled(columns, seed), np.ones(30), scope=scope))
+
+
+def test_time_of_a_single_ramp_is_no_driver():
+    time = np.arange(40.0)
+    columns = {"configuration": np.full(40, "bench"), "time_s": time, "total_current_A": RNG.uniform(1, 5, 40)}
+    scope = bases.Scope(("electrical",), ("supply_voltage_V",))
+    for voltage, expected in ((time / 4, False), (np.full(40, 9.0), True), (np.abs(time - 19.5), True)):
+        families = curve_families(columns | {"supply_voltage_V": voltage}, np.ones(40), scope=scope)
+        assert ("time" in variables(families)) == expected
+
+
 def test_collinearity_is_not_made_by_the_number_of_terms():
     """R² of noise is the share of the parameters; adjusted for them it is about 0."""
     found = [order_collinearity(shuffled(table(), seed), COUNTS) for seed in range(40)]

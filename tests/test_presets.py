@@ -55,7 +55,7 @@ def test_vesc_counts_electrical_turns_and_has_two_clocks(tmp_path):
     np.testing.assert_allclose(found["motor_speed_rpm"], [100, 200, 300])
     np.testing.assert_allclose(found["time_s"], [0, 0.14, 0.28])
     np.testing.assert_allclose(found["duty"], [0.1, 0.2, 0.3])
-    np.testing.assert_allclose(found["motor_current_A"], VESC["current_motor"])
+    np.testing.assert_allclose(found["motor_current_A"], np.sqrt(0.75) * np.array(VESC["current_motor"]))
     assert any("erpm, read as motor_speed_rpm, is electrical" in note for note in found.notes)
     with pytest.raises(
         BadConfiguration, match=r"pole_pairs is missing, the pairs of poles .* --columns vesc,pole_pairs=7"
@@ -63,14 +63,41 @@ def test_vesc_counts_electrical_turns_and_has_two_clocks(tmp_path):
         records.read_runs(tmp_path / "log.csv", rig, columns="vesc")
 
 
+def test_a_three_phase_motor_is_the_dc_motor_of_the_same_power_and_torque(tmp_path):
+    resistance, flux, poles, supply = 0.05, 0.01, 7, 40.0  # of a phase
+    duty, amplitude = np.array([0.3, 0.6, 0.9]), np.array([5.0, 10.0, 20.0])
+    voltage = duty * supply / np.sqrt(3)  # amplitude of a phase
+    speed = (voltage - resistance * amplitude) / (flux * poles)
+    log = {
+        "input_voltage": supply + 0 * duty, "duty_cycle": duty, "current_motor": amplitude,
+        "current_in": 1.5 * voltage * amplitude / supply, "erpm": speed * poles * 30 / np.pi,
+    }  # fmt: skip
+    rig = robot(tmp_path, "total_current", "motor_current", "motor_speed")
+    found = records.read_runs(log, rig, columns=f"vesc,pole_pairs={poles}")
+    current, constant = found["motor_current_A"], np.sqrt(3) * flux * poles
+    np.testing.assert_allclose(found["total_current_A"], duty * current, rtol=1e-6)
+    np.testing.assert_allclose(constant * current, 1.5 * poles * flux * amplitude, rtol=1e-6)  # torque
+    at_motor = 2 * resistance * current + constant * found["motor_speed_rpm"] * np.pi / 30
+    np.testing.assert_allclose(at_motor, duty * supply, rtol=1e-6)
+    assert any("equivalent DC motor" in note for note in found.notes)
+
+
+@pytest.mark.parametrize(("along_d", "noted"), [(0.1, False), (3.0, True)])
+def test_a_weakened_field_is_noted(tmp_path, along_d, noted):
+    log = {**VESC, "d_axis_current": [along_d, -along_d, along_d]}
+    rig = robot(tmp_path, "total_current", "motor_current", "motor_speed")
+    notes = records.read_runs(log, rig, columns="vesc,pole_pairs=7").notes
+    assert any("field is weakened" in note for note in notes) == noted
+
+
 def test_simplefoc_prints_milliamperes_and_no_header(tmp_path):
     (tmp_path / "log.txt").write_text("2.0\t2.00\t0\t150\t0\t10.0\t0.1\n3.0\t3.00\t0\t250\t0\t15.0\t0.2\n")
     found = records.read_runs(
         tmp_path / "log.txt", robot(tmp_path, "motor_current", "motor_speed"), columns="simplefoc"
     )
-    np.testing.assert_allclose(found["motor_current_A"], [0.15, 0.25])
+    np.testing.assert_allclose(found["motor_current_A"], np.sqrt(0.75) * np.array([0.15, 0.25]))
     np.testing.assert_allclose(found["motor_speed_rpm"], np.array([10.0, 15.0]) * 30 / np.pi)
-    np.testing.assert_allclose(found["supply_voltage_V"], [2, 3])
+    np.testing.assert_allclose(found["supply_voltage_V"], np.sqrt(3) * np.array([2, 3]))
 
 
 def test_sysid_has_a_run_for_each_test(tmp_path):

@@ -153,6 +153,41 @@ def test_noise_of_windows_is_that_of_their_readings(space, before):
     assert abs(chi2 - found.windows) < 4 * np.sqrt(2 * found.windows)
 
 
+@pytest.mark.parametrize("rows", [12, -7])
+def test_a_delay_of_many_rows_is_found(space, rows):
+    """Also one of readings that a log holds earlier than the voltage that drives them."""
+    columns = motor(seed=2, quadratic=0.0)
+    late = {"motor_speed_rpm", "motor_current_A"}
+    shape, first = (4, 150), slice(max(rows, 0), 150 + min(rows, 0))
+    shifted = {
+        name: (np.roll(x.reshape(shape), rows, 1) if name in late else x.reshape(shape))[:, first].ravel()
+        for name, x in columns.items()
+    }
+    delayed = posed(Runs("synthetic", shifted).of(space.bare.base), space.bare.base).bare
+    plan = shown_states.plan_of(delayed)
+    delay = weak_form.search_delay(delayed, plan)
+    assert delay.value == pytest.approx(rows * EVERY, abs=EVERY) and not delay.ended
+    found = weak_form.weak_form(delayed)
+    value = delayed.coordinates.value(found.z)
+    for name, true in TRUE.items():
+        assert value[delayed.coordinates.names.index(f"motor.{name}")] == pytest.approx(true, rel=0.02)
+
+
+def test_noise_of_simulated_states_is_not_that_of_readings(space):
+    """So it does not bias parameters."""
+    noisy, quiet = (posed(Runs("synthetic", motor(seed=4, noise=n, quadratic=0.0)).of(space.bare.base),
+                          space.bare.base).bare for n in ((1.0, 1.0), (1e-6, 1e-6)))  # fmt: skip
+    plan = shown_states.plan_of(noisy)
+    z = weak_form.weak_form(noisy).z
+    rows, exact = (shown_states.rows_and_windows(p, plan)[0] for p in (noisy, quiet))
+    smooth = weak_form.simulated_rows(noisy, plan, rows, z)
+    moving = np.asarray(rows.way) != 0
+    off, read = ((np.asarray(x.shown) - np.asarray(exact.shown))[moving] for x in (smooth, rows))
+    for k in range(off.shape[1]):
+        assert abs(np.corrcoef(off[:, k], read[:, k])[0, 1]) < 0.1
+    assert np.all(np.std(off, axis=0) < 0.05 * np.std(np.asarray(exact.shown), axis=0))
+
+
 def test_windows_across_a_jump_are_wrong(space, before, monkeypatch):
     names, plan = space.bare.coordinates.names, shown_states.plan_of(space.bare)
     rows, _, cut = shown_states.rows_and_windows(space.bare, plan)

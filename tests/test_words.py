@@ -91,6 +91,8 @@ SAMPLES = [
     of_fit.Agreement(1, 0, 0, 0.0, 1),
     of_fit.Agreement(4, 4, 0, 0.0, 0),
     of_fit.Agreement(4, 1, 2, 3.2, 1),
+    of_fit.Unsettled(("a", "b")),
+    of_fit.Unsettled(()),
     of_fit.Elsewhere(1, 3, ("a", "b")),
     of_fit.InPieces("rig.delay", 2),
     of_fit.Generations(96, 8, True),

@@ -23,7 +23,7 @@ PACKAGED = (
 #: Columns of a packaged preset that a source has at least for it to be recognised.
 OF_A_PRESET = 3
 #: Keys of a preset, and of one of its columns.
-KEYS, KEYS_OF_COLUMN = ("columns", "ask", "header"), ("column", "factor", "per", "times", "note", "needs")
+KEYS, KEYS_OF_COLUMN = ("columns", "ask", "header"), ("column", "factor", "per", "times", "note", "needs", "across")
 #: Keys of a number that a preset asks for.
 KEYS_OF_NUMBER = ("about", "usual")
 #: Between the name of a preset and the numbers that it asks for, `vesc,pole_pairs=7`.
@@ -39,6 +39,7 @@ class PresetColumn:
             file has is read.
         factor: from its unit to the unit of `mine`; note: its meaning, for a note.
         needs: column of this program without which it is not what drives the motor; empty: none.
+        across: column of the file with the current along d, zero where the field is not weakened; empty: none.
     """
 
     mine: str
@@ -46,6 +47,7 @@ class PresetColumn:
     factor: float = 1.0
     note: str = ""
     needs: str = ""
+    across: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -262,7 +264,10 @@ def _column(mine: str, theirs: Any, where: str, numbers: Mapping[str, float]) ->
     needs = table.get("needs", "")
     if not isinstance(needs, str):
         raise BadConfiguration(f"{where}.needs: got {needs!r}; expected the name of a column")
-    return PresetColumn(mine, tuple(_filled(name, where, numbers) for name in names), factor, note, needs)
+    across = table.get("across", "")
+    if not isinstance(across, str):
+        raise BadConfiguration(f"{where}.across: got {across!r}; expected the name of a column")
+    return PresetColumn(mine, tuple(_filled(name, where, numbers) for name in names), factor, note, needs, across)
 
 
 def _filled(name: str, where: str, numbers: Mapping[str, float]) -> str:

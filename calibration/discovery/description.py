@@ -2,37 +2,34 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from calibration.data.runs import Runs
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.loop_notes import Missed
+from calibration.discovery.prediction import HeldOutScore
 from calibration.inference import unused as unused_room
 from calibration.inference.lack_of_fit import EXPLAINED, UNDESCRIBED
 from calibration.inference.linearization import Linearization
 from calibration.inference.noise import UNSTATED, Noise
 
-#: Largest error, as a share of a channel's measured rms, of a fit with effects that describes runs which the refit
-#: misses by more than `UNDESCRIBED`: the effects are then the missing part.
-MENDED = 0.05
+#: Least share of the refit's error on unseen runs that effects have to remove where the refit misses a channel.
+REMOVED = 0.5
 
 
-def undescribed_channels(
-    space: CandidateSpace, runs: Runs, noise: Noise, refit: Linearization, found: Linearization | None = None
-) -> tuple[Missed, ...]:
+def missed_channels(space: CandidateSpace, runs: Runs, noise: Noise, refit: Linearization) -> tuple[Missed, ...]:
     """Channels that the refit misses by more than `UNDESCRIBED` of their rms, or with estimated noise that large.
 
-    None if the effects found bring all errors below `MENDED`. A channel with stated noise that large is described by
-    residuals up to `EXPLAINED` times its sds.
+    A channel with stated noise that large is described by residuals up to `EXPLAINED` times its sds.
 
     Args:
-        refit, found: the fits without and with effects, linearised; None without effects.
+        refit: the fit without effects, linearised.
     """
     stated = np.array([source not in UNSTATED for source in noise.source])
     share, sigma = _error_shares(space, runs, noise, refit)
     large = (share > UNDESCRIBED) & ~(stated & (sigma <= EXPLAINED))
-    if large.any() and found is not None and np.nanmax(_error_shares(space, runs, noise, found)[0]) < MENDED:
-        large[:] = False
     counts = space.weight[: len(runs)] > 0
     measured = np.where(counts, runs.measured(), np.nan)
     with np.errstate(invalid="ignore"):
@@ -43,6 +40,40 @@ def undescribed_channels(
         for k, c in enumerate(runs.channels)
         if large[k] or noisy[k] > UNDESCRIBED
     )
+
+
+def remaining_errors(
+    space: CandidateSpace, runs: Runs, missed: Sequence[Missed], refit: HeldOutScore, found: HeldOutScore
+) -> tuple[Missed, ...]:
+    """Errors on unseen runs, of channels that the refit misses, with the effects found.
+
+    None if these do not describe the runs either: more than `UNDESCRIBED` of a channel's rms remains, or less than
+    `REMOVED` of the refit's error is gone, or the noise is estimated as that large.
+
+    Args:
+        missed: as from `missed_channels`; refit, found: hold-out predictions without and with the effects.
+    """
+    before, after = _unseen_errors(space, runs, refit, found)
+    index = {c.name: k for k, c in enumerate(runs.channels)}
+    remaining = [m._replace(error=float(after[index[m.channel]])) for m in missed]
+    described = all(
+        m.noise <= UNDESCRIBED and m.error <= min(UNDESCRIBED, (1 - REMOVED) * before[index[m.channel]])
+        for m in remaining
+    )
+    return tuple(remaining) if described else ()
+
+
+def _unseen_errors(space: CandidateSpace, runs: Runs, *scores: HeldOutScore) -> np.ndarray:
+    """rms error of each fit on unseen runs over each channel's measured rms [-], over the readings that all predict;
+    NaN without any; shape (fits, channels)."""
+    measured = runs.measured()
+    counts = space.weight[: len(runs)] > 0
+    off = [[np.where(counts, reading - measured, np.nan) for reading in s.reading.values()] for s in scores]
+    each: np.ndarray = np.array(off).reshape(len(scores), -1, measured.shape[1])
+    each = np.where(np.isfinite(each).all(0), each, np.nan)
+    with np.errstate(invalid="ignore"):
+        size = np.nansum(np.where(counts, measured, np.nan) ** 2, 0) / counts.sum(0)
+        return np.sqrt(np.nansum(each**2, 1) / np.isfinite(each).sum(1) / size)
 
 
 def _error_shares(

@@ -28,7 +28,7 @@ from calibration.discovery.active_set import CandidateSpace, candidate_space
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import BaseFit, Candidate, fill_slots, fit_base, fit_candidates, start_of_fit
 from calibration.discovery.classes import Classes, find_classes, signature_cosines
-from calibration.discovery.description import undescribed_channels, unused_inputs
+from calibration.discovery.description import missed_channels, remaining_errors, unused_inputs
 from calibration.discovery.discrepancy import CurveBeside, Discrepancy, locate_discrepancy
 from calibration.discovery.experiments import Proposal, propose_denser_runs, propose_nothing, propose_separating
 from calibration.discovery.hidden import find_hidden_effects
@@ -58,7 +58,7 @@ from calibration.discovery.loop_notes import (
     Unwritten,
 )
 from calibration.discovery.loop_posterior import posterior_of_curve, posterior_of_fit
-from calibration.discovery.mechanism import find_mechanism
+from calibration.discovery.mechanism import find_mechanism, scored_once
 from calibration.discovery.outliers import (
     Screening,
     compile_ahead,
@@ -331,7 +331,8 @@ class LoopStages:
         beside: the curve of the base's discrepancy, if there is one.
         predicted: hold-out predictions of fits, as from `prediction.smallest_predictive_set`.
         mechanism: if no name is established; it may not be established either.
-        missed: channels that the model does not describe; unused: columns that vary and have no role.
+        missed: channels that the refit does not describe, except for `undescribed` with the error that the effects
+            leave on unseen runs; unused: columns that vary and have no role.
     """
 
     verdict: str
@@ -448,7 +449,7 @@ def trace(
     screened, sds = keep("base", functools.partial(_fit_base_and_noise, task, ranked))
     screened, left, searched = _search_until_clean(task, screened, sds, ranked)
     if searched is None:
-        missed = undescribed_channels(screened.base.space, runs, sds.noise, left.linear)
+        missed = missed_channels(screened.base.space, runs, sds.noise, left.linear)
         word = "undescribed" if missed else "none"
         return LoopStages(word, screened, left, sds, missed=missed, unused=unused_inputs(runs))
     return _verdict(task, screened, left, sds, searched)
@@ -566,9 +567,18 @@ def _verdict(task: _Task, screened: Screening, left: Diagnosis, sds: Sds, search
     where = dataclasses.replace(beside.where, by_duty=varied_by_duty(runs))
     model, searched, stood = choose_effects(runs, screened, left, searched, settings, progress, beside, predicted)
     stages = functools.partial(LoopStages, beside=beside, predicted=predicted)
-    missed = undescribed_channels(space, runs, sds.noise, left.linear, None if model is None else model[1].linear)
-    if missed:
-        return stages("undescribed", screened, left, sds, searched, missed=missed, unused=unused_inputs(runs))
+    leaves: tuple[Missed, ...] = ()
+    if missed := missed_channels(space, runs, sds.noise, left.linear):
+        progress(Step("held out"))
+        refit = scored_once(space, runs, base, predicted)
+        fits = {c.key: c for c in (model[0] if model else None, searched.best, *best_of_each_size(searched)) if c}
+        for fit in fits.values():
+            leaves = remaining_errors(space, runs, missed, refit, scored_once(space, runs, fit, predicted))
+            if leaves:
+                break
+        else:
+            return stages("undescribed", screened, left, sds, searched, missed=missed, unused=unused_inputs(runs))
+        stages = functools.partial(stages, missed=leaves)
     named = [] if model is None else [stood.established(e) for e in model[0].effects]
     level, found = "", None
     if not any(named):

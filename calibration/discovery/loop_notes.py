@@ -234,7 +234,7 @@ class Mechanism:
 
 
 class Missed(NamedTuple):
-    """A channel with a bad refit: rms error and estimated noise over its measured rms [-]."""
+    """A channel with a bad refit: rms error, or what effects leave of it, and noise, over its measured rms [-]."""
 
     channel: str
     error: float
@@ -253,7 +253,7 @@ class Summary:
         aside, of: number of isolated outliers if they are many (else 0), and of all rows.
         noise: wrong sds, if they are the only finding; cluster: common property of outliers.
         mechanism: if no name is established; it may not be established either.
-        missed: channels that the model does not describe; unused: columns of numbers that vary and are not used;
+        missed: as of `LoopStages`; unused: columns of numbers that vary and are not used;
             far: base parameters beyond three prior sds.
     """
 

@@ -201,7 +201,7 @@ def _families_of(where: DiscrepancyLocation) -> tuple[str, ...]:
 
 def _gain_of(space: CandidateSpace, runs: Runs, pair: Pair, predicted: Predicted) -> Gain:
     """Hold-out gain by the effects of a mechanism, over the readings that they change."""
-    seen, before = (_held_out(space, runs, c, predicted) for c in (pair.having, pair.without))
+    seen, before = (scored_once(space, runs, c, predicted) for c in (pair.having, pair.without))
     changed = _changed_readings(space, runs, _reading(space, pair.without), _reading(space, pair.having))
     return _gain_over_changed(seen, before, changed)
 
@@ -238,7 +238,7 @@ def _gain_of_curve(
     seen = {kind: _within_seen_range(space, beside, list(by.values())) for kind, by in kinds.items()}
     inside = {kind: np.where(seen[kind][:, None], x, np.nan) for kind, x in score.by_kind.items()}
     score = dataclasses.replace(score, by_kind=inside)
-    return _gain_over_changed(score, _held_out(space, runs, base, predicted), changed)
+    return _gain_over_changed(score, scored_once(space, runs, base, predicted), changed)
 
 
 def _within_seen_range(space: CandidateSpace, beside: CurveBeside, masks: Sequence[np.ndarray]) -> np.ndarray:
@@ -261,7 +261,8 @@ def _within_seen_range(space: CandidateSpace, beside: CurveBeside, masks: Sequen
     return seen
 
 
-def _held_out(space: CandidateSpace, runs: Runs, candidate: Candidate, predicted: Predicted) -> HeldOutScore:
+def scored_once(space: CandidateSpace, runs: Runs, candidate: Candidate, predicted: Predicted) -> HeldOutScore:
+    """Hold-out scores of a candidate; its predictions are taken from `predicted`, or added to it."""
     prediction_before = predicted.get(prediction.candidate_key(candidate))
     if prediction_before is not None:
         return _scored(space, runs, prediction_before)

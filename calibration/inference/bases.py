@@ -43,7 +43,8 @@ LEVELS = {name: (v.shown, v.unit_shown) for name, v in EVERY_VARIABLE.items() if
 #: Columns of conditions that a run may have.
 EVERY_AXIS = ("supply_voltage_V", "slope_deg", "payload_kg")
 MOST_LEVELS = 6
-#: Share of the variance of the order explained by the conditions, from which drift cannot be separated from them.
+#: Share of the variance of the order or the time explained by the conditions, from which drift cannot be separated
+#: from them.
 COLLINEAR = 0.9
 #: Number of combinations of conditions over the number of runs, up to which each combination is a level there.
 FEW_CELLS = 1 / 3
@@ -207,7 +208,7 @@ def curve_families(
     for variable, column in VARIABLES.items():
         if column not in columns or (column in EVERY_AXIS and column not in scope.axes):
             continue
-        drift = variable == "order" and order_collinearity(columns, weight, scope.axes) > COLLINEAR
+        drift = variable in AXES and order_collinearity(columns, weight, scope.axes, column) > COLLINEAR
         if drift and not over:
             continue
         # A skipped variable is replaced by another, so that tables of one size share compiled programs.
@@ -351,24 +352,25 @@ def window_families(
 
 
 def order_collinearity(
-    columns: Mapping[str, np.ndarray], weight: np.ndarray, axes: Sequence[str] | None = None
+    columns: Mapping[str, np.ndarray], weight: np.ndarray, axes: Sequence[str] | None = None, column: str = "order"
 ) -> float:
-    """Share of the variance of the order of runs that their conditions explain (R²).
+    """Share of the variance of the order of runs, or of their time, that their conditions explain (R²).
 
     At 1, drift from run to run cannot be separated from effects of the conditions. Conditions enter as a polynomial
-    of the slope and a level for each combination of configuration, imposed quantity and payload. If these
+    of the slope and a level for each combination of configuration, imposed quantity, duty and payload. If these
     combinations are many compared with the runs, they enter instead as a level for each configuration and direction,
-    and polynomials of the others.
+    and polynomials of the others and of their ranks.
 
     Args:
-        columns, weight: as in `curve_families`; axes: columns of the conditions, None: of the packaged robot's.
+        columns, weight: as in `curve_families`; axes: columns of the conditions, None: of the packaged robot's;
+            column: `order` or `time_s`.
     """
     counts = weight > 0
-    x = np.asarray(columns["order"], float)[counts]
+    x = np.asarray(columns[column], float)[counts]
     if len(x) < 4 or np.ptp(x) == 0:
         return 1.0
     _, configuration = np.unique(np.asarray(columns["configuration"])[counts], return_inverse=True)
-    conditions = axes_of(None) if axes is None else axes
+    conditions = (*(axes_of(None) if axes is None else axes), *(["duty"] if "duty" in columns else []))
     others = [c for c in conditions if c != VARIABLES["slope"]]
     values = np.stack([configuration, *(np.asarray(columns[c], float)[counts] for c in others)], 1)
     _, which = np.unique(np.c_[configuration, np.sign(values[:, 1:])], axis=0, return_inverse=True)
@@ -376,7 +378,11 @@ def order_collinearity(
     few = cell.max() + 1 <= FEW_CELLS * len(x)
     smooth = [VARIABLES["slope"]] * (VARIABLES["slope"] in conditions) if few else conditions
     level = cell.ravel() if few else which.ravel()
-    each = [legendre.legvander(scale_to_unit_range(columns[c], weight)[counts], DEGREE)[:, 1:] for c in smooth]
+    spans = [scale_to_unit_range(np.asarray(columns[c], float), weight)[counts] for c in smooth]
+    each = [legendre.legvander(span, DEGREE)[:, 1:] for span in spans]
+    for span in spans:  # a sorted table's order is the rank
+        rank = np.searchsorted(np.sort(span), span, "left") + np.searchsorted(np.sort(span), span, "right")
+        each.append(rank[:, None] / (2 * len(x)))
     terms = np.concatenate([np.zeros((len(x), 1)), *each], 1)
     # Without the means of each level: a matrix with a column for each level would be rows times rows.
     count = np.bincount(level)
@@ -384,8 +390,8 @@ def order_collinearity(
     ways, size, _ = np.linalg.svd(inner, full_matrices=False)
     ways = ways[:, size > len(x) * np.finfo(float).eps * np.linalg.norm(terms)]
     left = left - ways @ (ways.T @ left)
-    rank = len(count) + ways.shape[1]
-    freedom = (len(x) - 1) / max(len(x) - rank, 1)
+    terms_used = len(count) + ways.shape[1]
+    freedom = (len(x) - 1) / max(len(x) - terms_used, 1)
     return float(1 - freedom * np.sum(left**2) / np.sum((x - x.mean()) ** 2))
 
 

@@ -286,7 +286,11 @@ def _search(
 ) -> tuple[SearchResult, np.ndarray | None]:
     """The searches of a problem, and where they began at the optimum of `steady`, that optimum."""
     rng, size = np.random.default_rng(seed), len(posed.coordinates)
-    points = posed.observe.starts(posed, rng, starts)
+    every = None
+    if runs.log is not None:
+        sd = np.broadcast_to(np.median(known.sd, 0), runs.log.measured().shape)
+        every = observers.pose_problem(runs.log, base, posed.coordinates, sd)
+    points = posed.observe.starts(posed, rng, starts, every)
     if not posed.observe.long:
         return multistart.search_from_starts(posed, known, points, solver), None
     if not posed.observe.eased:

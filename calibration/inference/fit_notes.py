@@ -114,6 +114,16 @@ class Fact(Note):
     what: str
 
 
+class Unsettled(Note):
+    """A search that ended at its best point before it converged.
+
+    Attributes:
+        names: parameters that the data do not determine.
+    """
+
+    names: tuple[str, ...]
+
+
 # --- of a table -----------------------------------------------------------------------------------------
 
 

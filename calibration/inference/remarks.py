@@ -21,6 +21,7 @@ from calibration.inference.fit_notes import (
     OnlyTogether,
     ProductAlone,
     SamePredictions,
+    Unsettled,
 )
 from calibration.inference.identifiability import Z95
 from calibration.inference.population import EDGE
@@ -53,7 +54,7 @@ def _noise(found: CalibrationResult) -> Iterator[Note]:
 
 def _search(found: CalibrationResult) -> Iterator[Note]:
     if not found.converged:
-        yield Fact("not converged")
+        yield Unsettled(found.undetermined)
     apart = {n: abs(p.with_steady.apart_in_sd) for n, p in found.parameters.items() if p.with_steady is not None}
     if apart:
         worst = max(apart, key=apart.__getitem__)

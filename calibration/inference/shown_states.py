@@ -204,6 +204,11 @@ class Windows:
     bend: np.ndarray
     steps: np.ndarray
 
+    def part(self, which: np.ndarray) -> Windows:
+        """Some of the windows."""
+        arrays = self.rows, self.weight, self.slope, self.bend, self.steps
+        return Windows(self.run, *(x[which] for x in arrays))
+
 
 def window_function(share: np.ndarray, length: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """w = sin⁸ π s, w' and w'' of a window at shares s of its length [s]; 0 outside.

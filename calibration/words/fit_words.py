@@ -28,7 +28,6 @@ FAR = {
 }
 #: Facts without a name or a number.
 FACTS = {
-    "not converged": "the search did not converge; values and intervals are not to be trusted",
     "not profiled": "no profiles were made: intervals are linear, and too symmetric where the model is curved",
     "no covariance": "the posterior has no finite covariance: values stand, intervals do not",
     "no grip": "no run grips: static friction, and slip below it, are known by their priors alone",
@@ -132,6 +131,16 @@ def search_agreement(note: fit_notes.Agreement) -> str:
     if note.open:
         parts.append(f"{note.open} did not converge")
     return ", ".join(parts)
+
+
+def unsettled_search(note: fit_notes.Unsettled) -> str:
+    """A search that ended before it converged."""
+    names = ", ".join(note.names)
+    determined = f"these data do not determine {names}" if names else "the data determine them all"
+    return (
+        f"the search ended before it converged: parameters are the best that it found, their intervals are not to be "
+        f"trusted, and {determined}"
+    )
 
 
 def calibrated_header(found: CalibrationResult, robot_name: str) -> str:
@@ -319,6 +328,7 @@ SAID: dict[type, str | Callable[[Any], str]] = {
     fit_notes.SamePredictions: same_predictions,
     fit_notes.BlockNotConverged: "a search without a block of {kind} did not converge",
     fit_notes.Agreement: search_agreement,
+    fit_notes.Unsettled: unsettled_search,
     fit_notes.Elsewhere: "{searches} of {of} searches converged at other values of {names}",
     fit_notes.InPieces: "{name}: the values within its 95 % interval are in {pieces} pieces, with worse ones between "
     "them; samples closer together would tell them apart",

@@ -61,19 +61,19 @@ def verdict_sentences(said: loop_notes.Summary) -> str:
 
 
 def _verdict(said: loop_notes.Summary) -> str:
-    where, p = said.where, said.p
+    where = said.where
     if said.verdict == "undescribed":
         return _undescribed(said)
     if said.verdict == "none":
-        return f"Nothing is missing: the residuals are consistent with noise (family-wise p = {p:.2g})."
+        return f"Nothing is missing: the residuals are consistent with noise (family-wise p = {said.p:.2g})."
     if said.verdict in WITHOUT_NAME and where is not None:
         found = said.mechanism
         if said.verdict == "mechanism" and found is not None:
             within = _within(where) if where.family in found.families else ""
-            text = f"Missing: {_mechanism(found, within)} (family-wise p {p_value(p)}). "
+            text = f"Missing: {_mechanism(found, within)} ({_evidence(said)}). "
             text += "No law of the library is established."
         else:
-            text = _without_name(where, p, "is established" if said.missing else "explains it")
+            text = _without_name(where, _evidence(said), "is established" if said.missing else "explains it")
             text += f" No mechanism is established: {no_mechanism(found)}." if found is not None else ""
         if said.missing:
             text += _tentative(said.missing, said.support)
@@ -85,7 +85,16 @@ def _verdict(said: loop_notes.Summary) -> str:
     names = [_named(one) for one in said.missing if one.established]
     in_model = _tentative([one for one in said.missing if not one.established], said.support)
     left = "" if where is None else f" Something remains in the {bases.place_in_words(where.place)}."
-    return f"Missing: {'; '.join(names)} (family-wise p {p_value(p)}).{in_model}{left}"
+    return f"Missing: {'; '.join(names)} ({_evidence(said)}).{in_model}{left}"
+
+
+def _evidence(said: loop_notes.Summary) -> str:
+    """p-value, and the errors that remain where the refit misses a channel."""
+    remaining = [
+        f"{channels.find_channel(m.channel).label} by {100 * m.error:.0f} % of its measured rms" for m in said.missed
+    ]
+    unseen = f", but on unseen runs this model still misses {', '.join(remaining)}" * bool(remaining)
+    return f"family-wise p {p_value(said.p)}{unseen}"
 
 
 def loop_headline(found: loop_notes.Headline) -> str:
@@ -277,13 +286,13 @@ def so_far(effects: Sequence[str], families: Sequence[str]) -> str:
     )
 
 
-def _without_name(where: DiscrepancyLocation, p: float, no_effect: str) -> str:
+def _without_name(where: DiscrepancyLocation, evidence: str, no_effect: str) -> str:
     others = [bases.place_in_words(p).removesuffix(" balance") for p in where.alike if p != where.place]
     also = f" (or {', '.join(others)}, which these data do not distinguish)" if others else ""
     what = f": {where.family}" if where.variable in bases.VARIABLES else ""
     return (
         f"Something is missing in the {bases.place_in_words(where.place)}{also}, {_shown(where)}{what}; no effect of "
-        f"the library {no_effect} (family-wise p {p_value(p)})."
+        f"the library {no_effect} ({evidence})."
     )
 
 

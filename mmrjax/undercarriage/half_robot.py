@@ -440,7 +440,7 @@ def stand(run: System, turned: Scalar = 0.0) -> Motion:
 
     recess = jnp.maximum(run.path.gear.guide_recess, 0.0) * run.chassis.on_tracks
     given = run.path, run.chassis, turned, weight, forward, up, axle, cos, sin
-    (sunk, pitch), _ = root(unbalanced, (2e-4 + recess, jnp.zeros_like(recess)), None, given, SUNK, False, False)
+    (sunk, pitch), _ = root(unbalanced, (2e-4 + recess, jnp.zeros_like(recess)), None, given, SUNK, None, False)
     stands = tipping_margin(run) > 0
     q = placed(turned, axle - jnp.where(stands, sunk, 0.0), jnp.where(stands, pitch, 0.0))
     memory = {effect.name: jnp.zeros_like(axle) for effect in run.robot.remembering}

@@ -27,6 +27,8 @@ Mapped = tuple[tuple[str, str, float], ...]
 EXTRA_VALUES = 20_000_000
 #: Column with the run of each row.
 RUN = "run_id"
+#: Ratio of the rms currents along d and q above which the field is weakened [-].
+WEAKENED = 0.3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -147,9 +149,29 @@ def _of_table(arrays: NamedArrays, layout: Layout, columns: Preset | None) -> Re
     if arrays.header and not any(theirs in by_name for _, theirs, _ in mapped):
         raise _none_of(arrays.name, columns, arrays.header)
     columns.check_needed(mapped, layout.imposed_column, arrays.name)
+    notes = (*notes, *weakened_field_notes(columns, by_name))
     return Reading(
         dataclasses.replace(arrays, notes=(*arrays.notes, *notes)), presets_file.merge_columns(mapped, layout.mapped)
     )
+
+
+def weakened_field_notes(preset: Preset, values: Mapping[str, Raw]) -> tuple[str, ...]:
+    """Returns a note on each current of a preset whose part along d is large, so that no DC motor is equivalent.
+
+    Args:
+        values: cells of the file's columns, by name.
+    """
+    notes = []
+    for column in preset.columns:
+        theirs = next((name for name in column.theirs if name in values), None)
+        if theirs is not None and column.across in values:
+            q, d = (np.sqrt(np.nanmean(column_numbers(values[c]) ** 2)) for c in (theirs, column.across))
+            if d > WEAKENED * q:
+                notes.append(
+                    f"{preset.name}: {column.across} is {d / q:.0%} of {theirs}, so the field is weakened, "
+                    "which no DC motor does; leave those rows out"
+                )
+    return tuple(notes)
 
 
 def _none_of(name: str, columns: Preset, header: Sequence[str]) -> BadData:
@@ -193,6 +215,8 @@ def _of_signals(source: Source, layout: Layout, columns: Preset | None, between:
     else:
         values, more = _in_rows(source, chosen), ()
         values |= _in_rows(source, extras, len(next(iter(values.values()), [])))
+    if columns is not None:
+        notes = (*notes, *weakened_field_notes(columns, values))
     units = tuple(
         quantities.unit_in_column(next((s.unit for c, s in chosen.items() if c == name), "")) for name in values
     )

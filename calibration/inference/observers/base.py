@@ -290,11 +290,13 @@ class Observer(eqx.Module):
             drawn: one of `draws`.
         """
 
-    def starts(self, problem: Problem, random: np.random.Generator, count: int) -> Float[np.ndarray, "starts z"]:
+    def starts(
+        self, problem: Problem, random: np.random.Generator, count: int, every: Problem | None = None
+    ) -> Float[np.ndarray, "starts z"]:
         """Initial coordinates of at most `count` searches of a base: the prior mean, and draws of the prior.
 
         Args:
-            problem: without effects in its coordinates.
+            problem: without effects in its coordinates; every: the same with all rows of a log that was thinned.
         """
         size = len(problem.coordinates)
         return np.concatenate([np.zeros((1, size)), random.standard_normal((max(count, 1) - 1, size))])

@@ -633,10 +633,12 @@ class Histories(Observer):
         noise = counts * jax.random.normal(jax.random.wrap_key_data(drawn), counts.shape)
         return linear.with_residual(noise - jacobian @ solve(jacobian.T @ jacobian, jacobian.T @ noise))
 
-    def starts(self, problem: Problem, random: np.random.Generator, count: int) -> Float[np.ndarray, "starts z"]:
-        """Starts as in the protocol: the fit of the log's equations in weak form (`weak_form`) and the prior mean.
+    def starts(
+        self, problem: Problem, random: np.random.Generator, count: int, every: Problem | None = None
+    ) -> Float[np.ndarray, "starts z"]:
+        """Starts as in the protocol: only the fit of the log's equations in weak form, if it shows its states.
 
-        On ground where the robot may slide, the starts of `settled_ends`.
+        On ground where the robot may slide, which they do not show, also a start of `settled_ends`.
         """
 
         def search(blunt: Problem, starts: np.ndarray, steps: int) -> Optimum:
@@ -644,15 +646,15 @@ class Histories(Observer):
             evaluate = _evaluator(blunt, weights, None)
             return search_rollouts(evaluate, starts, blunt.data, weights, steps, self.policy.batch)[0]
 
-        if not problem.base.has_ground or problem.base.rig.imposed != "voltage":  # no grip, so no local minima by it
-            shown = weak_form(problem)
-            if shown is not None:
-                return scans.place_at_minimum(
-                    problem, np.stack([shown.z, np.zeros(len(problem.coordinates))])[:count]
-                )
-            return scans.place_at_minimum(problem, super().starts(problem, random, count))
-        draws = random.standard_normal((settled_ends.DRAWS, len(problem.coordinates)))
-        return scans.place_at_minimum(problem, settled_ends.starts_from_settled_ends(problem, draws, search)[:count])
+        shown = weak_form(problem if every is None else every)
+        begins = np.zeros((0, len(problem.coordinates))) if shown is None else shown.z[None]
+        if problem.base.has_ground and problem.base.rig.imposed == "voltage":
+            draws = random.standard_normal((settled_ends.DRAWS, len(problem.coordinates)))
+            ends = settled_ends.starts_from_settled_ends(problem, draws, search)
+            begins = np.concatenate([begins, ends[: max(1, count - len(begins)) if shown is None else 1]])
+        elif shown is None:
+            begins = super().starts(problem, random, count)
+        return scans.place_at_minimum(problem, begins[:count])
 
     def scanned(self, problem: Problem) -> tuple[int, ...]:
         return scans.coordinates_beyond_a_basin(problem)

@@ -1,0 +1,148 @@
+"""The EMPS benchmark: a carriage on a ball screw, from its training record to the free-run error on its test record.
+
+    python benchmarks/emps.py --data DIR [--out docs/lab/emps.md]
+
+`DIR` holds `train.csv` and `test.csv` (`time_s`, `force_N`, `position_m`, 24 841 rows at 1 kHz). The robot's file
+below states what a user knows before any fit: the force acts on the carriage, and rough magnitudes. `mmrjax inspect`
+and `mmrjax loop` see the training record alone. Then each robot file of the run folder is simulated freely over the
+test record from its first 20 samples. No choice depends on the result.
+
+Source: A. Janot, M. Gautier, M. Brunot, Data Set and Reference Models of EMPS, Workshop on Nonlinear System
+Identification Benchmarks, Eindhoven, 2019.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+#: Samples that a free run may begin from.
+FIRST = 20
+#: Torque on the screw for a force of 1 N [N·m]: any lead gives the same force on the carriage.
+LEAD = 5.0
+ROBOT = f"""
+schema = "mmrjax.robot/2"
+base = "none"
+sides = 1
+imposed = "current"
+channels = ["position"]
+start = "measured"
+[columns]
+motor_current_A = {{column = "force_N", factor = {1e-3 * LEAD / (2 * np.pi):.9g}}}
+position_mm = {{column = "position_m", factor = 1000.0}}
+[motor]
+torque_constant = "1 ± 0"
+inertia = "1e-9 ± 0"
+[gearbox]
+ratio = 1.0
+efficiency_load = "1 ± 0"
+[carriage]
+load = "linear"
+mass_kg = "100 ± 30 %"
+lead_mm = {LEAD}
+force_coulomb_N = "20 ± 100 %"
+force_viscous_N_s_m = "200 ± 100 %"
+"""
+#: Free-run errors of others on the same split [mm], and their sources.
+PUBLISHED = (
+    ("GRU, LSTM", "220, 74", "Champneys et al. 2024, IFAC-PapersOnLine 58-15"),
+    ("linear state space, pNARX", "5.53, 5.17", "the same"),
+    ("structure chosen by a language-model agent, 15 runs of half an hour", "4.10", "Piga and Forgione 2026"),
+    ("dynoNet", "2.64", "Forgione and Piga 2021"),
+    ("mass, Coulomb and viscous friction, offset, by least squares on the simulated position", "4.9 to 5.0", "own"),
+)
+COMMAND = "import sys; from sweeps.cli import main; sys.exit(main())"
+
+
+def command(*arguments: str) -> tuple[str, float]:
+    """Output of an mmrjax command, and its seconds."""
+    began = time.perf_counter()
+    done = subprocess.run([sys.executable, "-c", COMMAND, *arguments], capture_output=True, text=True, check=False)
+    return done.stdout + done.stderr, time.perf_counter() - began
+
+
+def free_run(robot_file: Path, record: Path) -> float:
+    """Rms error of the position of a free run, after the samples that it begins from [mm]."""
+    from calibration.data import robot_file as files
+    from calibration.data import runs as records
+    from calibration.inference.preparation import prepare
+    from mmrjax.compile.precision import in_double
+    from sweeps.points.run import follow_histories
+
+    @in_double
+    def error() -> float:
+        robot = files.read_robot(robot_file)
+        runs = records.read_runs(str(record), robot=robot)
+        shown = follow_histories(prepare(runs, robot).robot, runs, None)
+        off = np.asarray(shown["position_mm"]) - np.asarray(runs["position_mm"])
+        return float(np.sqrt(np.mean(off[FIRST:] ** 2)))
+
+    return error()
+
+
+def parameters(robot_file: Path) -> list[str]:
+    """Lines of a robot's file that state fitted numbers."""
+    lines = robot_file.read_text(encoding="utf-8").splitlines()
+    return [line for line in lines if "±" in line or line.startswith("[") or "amplitude" in line]
+
+
+def page(folder: Path, listing: str, seconds: float, record: Path) -> str:
+    """The page of the lab."""
+    found = json.loads((folder / "result.json").read_text(encoding="utf-8"))
+    files = sorted(p for p in folder.glob("*.toml") if not p.name.startswith("config"))
+    scores = [(p.name, free_run(p, record)) for p in files]
+    effects = [
+        f"* `{'`, `'.join(e['members'])}`: {e['statement']}" if "statement" in e else f"* {json.dumps(e)[:300]}"
+        for e in found.get("effects", ())
+    ]
+    rows = [f"| {name} of this run | {error:.2f} | `benchmarks/emps.py` |" for name, error in scores]
+    rows += [f"| {name} | {error} | {source} |" for name, error, source in PUBLISHED]
+    fitted = [f"## `{p.name}`\n\n```toml\n" + "\n".join(parameters(p)) + "\n```\n" for p in files]
+    return "\n".join(
+        [
+            "# EMPS: a public benchmark\n",
+            "`python benchmarks/emps.py --data DIR` made this page. The loop saw `train.csv` alone.\n",
+            f"**{found['headline']['statement']}** The loop took {seconds:.0f} s.\n",
+            *effects,
+            "",
+            "| model | free-run rms on `test.csv` [mm] | source |",
+            "|---|---|---|",
+            *rows,
+            "",
+            *fitted,
+            "## `mmrjax inspect train.csv`\n\n```\n" + listing.strip() + "\n```\n",
+        ]
+    )
+
+
+def main() -> int:
+    """Runs the benchmark; returns the exit code of the loop."""
+    wanted = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    wanted.add_argument("--data", type=Path, required=True)
+    wanted.add_argument("--out", type=Path, default=Path("docs/lab/emps.md"))
+    wanted.add_argument("--runs", type=Path, help="keeps the run folder here")
+    given = wanted.parse_args()
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = given.runs or Path(scratch) / "loop"
+        robot = Path(scratch) / "emps.toml"
+        robot.write_text(ROBOT, encoding="utf-8")
+        train = str(given.data / "train.csv")
+        listing, _ = command("inspect", train)
+        told, seconds = command("loop", train, "--robot", str(robot), "--out", str(folder), "--force", "--no-report")
+        print(told)
+        if not (folder / "result.json").exists():
+            return 1
+        given.out.write_text(page(folder, listing, seconds, given.data / "test.csv"), encoding="utf-8")
+    print(given.out.read_text(encoding="utf-8"))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
