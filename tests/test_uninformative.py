@@ -10,7 +10,7 @@ from calibration.data import runs as records
 from calibration.data.input_errors import BadData
 from calibration.described import describe
 from calibration.discovery import discover
-from calibration.inference import noise, observers, ranges, uninformative
+from calibration.inference import noise, observers, preparation, ranges, uninformative
 
 RIG = """
 base = "none"
@@ -96,6 +96,22 @@ def test_a_channel_that_is_a_line_of_another_is_refused_by_the_loop(tmp_path, ro
 )
 def test_what_follows_another_within_noise_or_a_display_or_on_a_curve_is_no_copy(tmp_path, robot, torque):
     assert uninformative.copied_channels(table(tmp_path, robot, torque=torque), robot) == []
+
+
+def test_a_load_that_is_a_multiple_of_a_current_is_computed(tmp_path, robot, foreseen):
+    """No command fits it; friction, a coarse display and a meter's noise leave no multiple."""
+    current = np.round(CURRENT, 5)
+    runs = table(tmp_path, robot, current, load_torque_Nm=np.round(0.64 * current, 4))
+    foreseen(shown(runs))
+    with pytest.raises(
+        BadData, match=r"load_torque_Nm: in every row 0\.64\d* times motor_current_A.* never measured"
+    ):
+        preparation.prepare(runs, robot)
+    noisy = 0.64 * current + 2e-4 * RNG.standard_normal(12)
+    for torque in (0.64 * current - 0.03, np.round(0.64 * current, 2), noisy):
+        assert uninformative.computed_load(table(tmp_path, robot, current, load_torque_Nm=torque)) is None
+    few = np.round(current, 1)
+    assert uninformative.computed_load(table(tmp_path, robot, few, load_torque_Nm=0.64 * few)) is None
 
 
 def test_readings_that_a_rigid_gear_ties_are_said_and_not_refused(tmp_path, robot):

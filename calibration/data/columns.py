@@ -260,7 +260,7 @@ class Layout:
         Args:
             stated: columns that the table has, which are left out.
         """
-        none = {*stated, *self.idle, *self.deviation_columns, *WHEN, *WORDS}
+        none = {*stated, *self.idle, *self.deviation_columns, *WHEN, *WORDS, "held"}
         lacking = {column: quantity for column, quantity in self.quantities().items() if column not in none}
         spelled = {s: (column, unit) for column, q in lacking.items() for s, unit in q.columns().items()}
         unit = quantities.unit_at_end(name, {unit for _, unit in spelled.values()})

@@ -38,6 +38,7 @@ def complete_columns(name: str, columns: dict[str, np.ndarray], rows: int, layou
     """Fills columns that a table may leave out, and refuses values that contradict each other."""
     _fill(name, columns, rows, layout)
     _check_driving(name, columns)
+    _check_held(name, columns)
     _check_sides(name, columns, layout)
     _check_mass(name, columns)
     _check_deviations(name, columns, layout.channels)
@@ -123,6 +124,18 @@ def _check_sides(name: str, columns: dict[str, np.ndarray], layout: Layout) -> N
         )
 
 
+def _check_held(name: str, columns: dict[str, np.ndarray]) -> None:
+    """Refuses a clamp in a log, and a load torque beside it: what the clamp carries is a reading."""
+    held = columns.get("held", np.zeros(1)) > 0.5
+    if held.any() and set(TIME) <= set(columns):
+        raise BadData(f"{name}: column held is for settled rows; expected no time_s, or rows without a clamp")
+    for at in np.flatnonzero(held & (columns.get(LOAD, 0.0) != 0))[:1]:
+        raise BadData(
+            f"{name} row {at + 1}, {LOAD}: got {bound_text(columns[LOAD][at])} where held is 1; expected 0, as the "
+            "torque that a clamp carries is a reading: name its column output_torque"
+        )
+
+
 def _check_mass(name: str, columns: dict[str, np.ndarray]) -> None:
     if "total_mass_kg" not in columns:
         return
@@ -175,6 +188,8 @@ def _driven(name: str, columns: dict[str, np.ndarray], layout: Layout) -> tuple[
     sides = [c for c in layout.sides if c in columns]
     column = layout.imposed_column
     size = np.max(np.abs([columns[c] for c in sides]), 0) if sides else np.abs(columns[column])
+    if layout.imposed == "motor_speed" and LOAD in columns:  # a shaft at rest pushes against its load
+        size = size + np.abs(columns[LOAD])
     if layout.imposed == "voltage":
         size = size * np.abs(columns[SUPPLY] if sides else columns.get("duty", 1.0))
     idle = np.flatnonzero(size == 0)
@@ -191,8 +206,10 @@ def _driven(name: str, columns: dict[str, np.ndarray], layout: Layout) -> tuple[
                 f"{zero} is 0; expected what drives it, or remove the row"
             )
     if idle.size == len(size):
+        clamp = '; a held shaft: state imposed = "motor_current" or "voltage", a column held = 1, and output_torque'
         raise BadData(
             f"{name}: {zero} is 0 in every row, so nothing drives the motors; expected rows that are driven"
+            f"{clamp * (layout.imposed == 'motor_speed' and not layout.has_ground)}"
         )
     which = f"row {idle[0] + 1} is" if idle.size == 1 else f"{idle.size} rows, the first row {idle[0] + 1}, are"
     return size != 0, (

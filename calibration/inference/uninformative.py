@@ -6,7 +6,9 @@ import itertools
 
 import numpy as np
 
-from calibration.data.instruments import step_of
+from calibration.data.columns import LOAD
+from calibration.data.contradictions import CURRENTS
+from calibration.data.instruments import FEWEST, step_of
 from calibration.data.runs import Runs
 from calibration.inference.fit_notes import Copied, NothingVaries
 from calibration.inference.noise import Noise
@@ -54,6 +56,21 @@ def copied_channels(runs: Runs, robot: Robot) -> list[Copied]:
             copies.add(other.name)
             copied.append(Copied(runs.source, other.column, one.column, *line, _tied(one, other, robot)))
     return copied
+
+
+def computed_load(runs: Runs) -> Copied | None:
+    """Note that a load torque is a multiple of a current in all rows, to the digits of the file.
+
+    A motor's friction would leave an offset between the two, so a torque that was set or read is no multiple.
+    """
+    for column in CURRENTS if runs.has(LOAD) else ():
+        if not runs.has(column) or len(np.unique(runs[column])) < FEWEST:
+            continue
+        both = np.isfinite(runs[column])
+        line = _line(runs[column][both], runs[LOAD][both])
+        if line is not None and line[0] == 0.0:
+            return Copied(runs.source, LOAD, column, *line, tied=False)
+    return None
 
 
 def _tied(one: Channel, other: Channel, robot: Robot) -> bool:

@@ -46,7 +46,12 @@ def unexplained_torque_notes(runs: Runs) -> tuple[NoLoadGives, ...]:
     leaves more than `BRAKED` of the variance of the readings, a brake imposes the torque.
     """
     column = TORQUE.column
-    if runs.layout.has_ground or runs.has(LOAD) or not (runs.has(column) and TORQUE in runs.channels):
+    if (
+        runs.layout.has_ground
+        or runs.has(LOAD)
+        or runs.has("held")
+        or not (runs.has(column) and TORQUE in runs.channels)
+    ):
         return ()
     speed = next((runs[c] for c in (SPEED, "output_speed_rpm") if runs.has(c)), None)
     if speed is None or runs.sampled:

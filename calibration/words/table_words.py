@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+from calibration.data.columns import LOAD
 from calibration.data.input_errors import bound_text
 from calibration.inference import fit_notes
 
@@ -96,6 +97,11 @@ def copied_channel(note: fit_notes.Copied) -> str:
     said = f"{note.source}, {note.column}: in every row {start}{slope:.4g} times {note.of}, to the last digit"
     if note.tied:
         return f"{said}; if it is computed from it and no reading, remove it, as its noise then counts twice"
+    if note.column == LOAD:
+        return (
+            f"{said}: it is computed and was never measured, so it tells nothing of torque constant, friction or "
+            "efficiency; remove the column and keep the rows without a load, or give a torque that was set or read"
+        )
     return f"{said}: it is computed from it and no reading; remove it from channels and table, or read an instrument"
 
 

@@ -46,10 +46,13 @@ def travel_direction(robot: Robot, conditions: Conditions) -> Array:
     """Direction in which a robot can travel, 1 forward or -1 backward, from the torque on its shafts at rest.
 
     The torque is that of the motors at stall current, within the driver's limit, less gravity's. Friction can hold
-    the robot but not reverse it. With an imposed motor speed, the direction of that speed.
+    the robot but not reverse it. With an imposed motor speed, the direction of that speed; at speed 0, that in which
+    the motors push against the load torque.
     """
     if conditions.motor_speed is not None:
-        return jax.lax.stop_gradient(jnp.where(conditions.motor_speed >= 0, 1.0, -1.0))
+        way = jnp.asarray(conditions.motor_speed)
+        way = way if conditions.load_torque is None else jnp.where(way == 0, conditions.load_torque, way)
+        return jax.lax.stop_gradient(jnp.where(way >= 0, 1.0, -1.0))
     chassis = robot.chassis(conditions.configuration)
     mass = chassis.mass + conditions.payload if conditions.total_mass is None else conditions.total_mass
     stall = robot.motor.current_stall(voltage_at_rest(robot, conditions))

@@ -89,10 +89,15 @@ def simulate(
         stated = fidelities.fidelity_facts(model).resolved(duration=duration, step=step, **options)
     except ValueError as error:
         raise UsageError(f"model {model}, {error}") from error
-    _check_robot(robot)
+    check_robot(robot)
     conditions = check_conditions(robot, conditions)
     _check_battery(robot, conditions)
     _check_turning(robot, conditions, profile)
+    if conditions.held is not None and (model != "steady" or robot.has_ground or conditions.motor_speed is not None):
+        raise UsageError(
+            "held: a clamp holds the output of a shaft in settled runs at an imposed voltage or current; expected "
+            "such runs, or leave held out"
+        )
     braked = conditions.load_torque is not None or (profile is not None and profile.load_torque is not None)
     if braked and robot.has_ground:
         raise UsageError(f"load_torque: {NO_BRAKE}; state slope_deg or payload")
@@ -200,8 +205,8 @@ def _missions(robot: Robot, conditions: Conditions, profile: Profile, start: Sta
     )
 
 
-def _check_robot(robot: Robot) -> None:
-    """Raises for parameters outside the bounds of their fields."""
+def check_robot(robot: Robot) -> None:
+    """Raises for parameters that are no single number, or outside the bounds of their fields."""
     concrete = [p for p in params.walk_parameters(robot) if not isinstance(p.value, jax.core.Tracer)]
     for parameter, value in zip(concrete, jax.device_get([p.value for p in concrete]), strict=True):
         spec = parameter.spec

@@ -27,6 +27,7 @@ from mmrjax.fidelities.rest import (
 from mmrjax.fidelities.result import is_not_forward, result_of_signals, travel_status, withhold_numbers
 from mmrjax.model import balances, channels, ground, params
 from mmrjax.model.conditions import Conditions
+from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import (
     BATTERY_EMPTY,
@@ -59,15 +60,17 @@ def _settled_at(
 
     The unknowns are speed, current and motor speed, in the order of elimination of the balances. For any robot the
     slip determines the speed and the voltage the current; the torque then gives the motor speed. The current is the
-    one that the duty alone would drive, see `Driver.admitted`.
+    one that the duty alone would drive, see `Driver.admitted`. Where a clamp holds the output, the third unknown is
+    the torque that the clamp carries, in place of the motor speed.
     """
-    speed, wanted, speed_motor = unknowns
+    speed, wanted, third = unknowns
+    conditions, speed_motor = _clamped(conditions, third)
     current, held = admitted_current(robot, conditions, _CURRENT * wanted)
     state = State(current, _SPEED_MOTOR * speed_motor, _SPEED * speed, conditions.discharge)
     signals, creep = _balanced(without_diode(robot), conditions, state, sense)
     # Moving with balanced torques, or at rest with too little torque: speed >= 0 and torque <= 0 in the direction of
     # travel, and one of them is 0.
-    lacking, moving = -sense * signals.torque_net / _TORQUE, sense * speed_motor
+    lacking, moving = -sense * signals.torque_net / _TORQUE, sense * third
     torque = sense * jnp.where(moving < lacking, moving, lacking)
     slip, voltage = signals.speed_sliding - creep, (signals.voltage_left - held) / _VOLTAGE
     if conditions.motor_speed is not None:  # the torque determines the current; the motor speed is given
@@ -77,6 +80,22 @@ def _settled_at(
         settled = signals.voltage_back + signals.voltage_drop
         signals = dataclasses.replace(signals, voltage=settled, voltage_left=jnp.zeros_like(settled))
     return state, signals, (jnp.asarray(slip), jnp.asarray(voltage), torque)
+
+
+def _is_held(conditions: Conditions) -> Bool[Array, "..."]:
+    """True where a clamp holds the output, or an imposed speed of 0 holds it against a load torque."""
+    if conditions.motor_speed is not None and conditions.load_torque is not None:
+        return (conditions.motor_speed == 0) & (conditions.load_torque != 0)
+    return jnp.asarray(0.0 if conditions.held is None else conditions.held) > 0.5
+
+
+def _clamped(conditions: Conditions, third: Scalar) -> tuple[Conditions, Scalar]:
+    """Conditions with the clamp's torque as the load, and the motor speed in the unit of its unknown."""
+    if conditions.held is None:
+        return conditions, third
+    held, load = _is_held(conditions), 0.0 if conditions.load_torque is None else conditions.load_torque
+    carried = dataclasses.replace(conditions, load_torque=jnp.where(held, _TORQUE * third, load))
+    return carried, jnp.where(held, 0.0, third)
 
 
 @compiled
@@ -246,8 +265,10 @@ def _operating_at(
         status = jnp.where(beyond, jnp.where(slides, SLIDES, STALLED), status)
     if conditions.motor_speed is None:
         stands_still = (status == STALLED) & (jnp.abs(signals.speed_theoretical) < 1e-9)
-        static = standing_signals(robot, conditions, state)
+        stands_still &= ~_is_held(conditions) | (sense * unknowns[2] <= 1e-9)  # friction leaves the clamp nothing
+        static = standing_signals(robot, _clamped(conditions, 0.0)[0], state)
         signals = jax.tree.map(lambda rest, travel: jnp.where(stands_still, rest, travel), static, signals)
+    status = jnp.where(_is_held(conditions), CONVERGED, status)
     status = jnp.where(solved, status, FAILED)
     empty = (conditions.battery > 0.5) & robot.battery.empty(conditions.discharge)
     status = jnp.where(empty, BATTERY_EMPTY, status)

@@ -23,7 +23,7 @@ Number = float | Sequence[float] | np.ndarray | Array
 #: Conditions that can be stated for each side.
 OF_SIDES = ("duty_left", "duty_right", "open_left", "open_right", "motor_speed_left", "motor_speed_right")
 #: Conditions that may be true or false.
-SWITCHES = ("battery", "open", "open_left", "open_right")
+SWITCHES = ("battery", "open", "open_left", "open_right", "held")
 #: Conditions that free a robot to turn if they are stated.
 OF_TURNS = (*OF_SIDES, "heading_deg")
 #: Conditions that every run has.
@@ -100,6 +100,8 @@ class Conditions(eqx.Module):
             None: those of the running gear, folded as it states.
         load_torque: torque of a brake or load motor on the output of each drive [N·m]: positive against forward
             rotation, in both directions of rotation. Only for a load on a shaft; None: 0.
+        held: 1 where a clamp holds the output of each drive at rest; `output_torque` is then what the clamp carries.
+            Only for a load on a shaft at an imposed voltage or current, in settled runs; None: 0.
     """
 
     configuration: Any  # Int[Array, "..."] | Named
@@ -128,6 +130,7 @@ class Conditions(eqx.Module):
     levers_front_deg: Float[Array, "..."] | None
     levers_rear_deg: Float[Array, "..."] | None
     load_torque: Float[Array, "..."] | None
+    held: Float[Array, "..."] | None
 
     def __init__(
         self,
@@ -157,6 +160,7 @@ class Conditions(eqx.Module):
         levers_front_deg: Number | None = None,
         levers_rear_deg: Number | None = None,
         load_torque: Number | None = None,
+        held: Number | bool | None = None,
     ) -> None:
         # arrays come from other conditions or a table; users write a number or a few
         if not isinstance(duty, np.ndarray | jax.Array | None) and None not in (duty_left, duty_right):
@@ -267,11 +271,14 @@ def _number(name: str, x: Any, kind: type = float) -> Any:
     """Array of numbers of that kind; NumPy input stays NumPy's, so that no JAX operation is compiled for it.
 
     Raises:
-        UsageError: words, dates, complex numbers, truth values of a quantity, or parts of a whole number.
+        UsageError: words, dates, complex numbers, masked numbers, truth values of a quantity, or parts of a whole
+            number.
     """
     if isinstance(x, jax.Array):
         return jnp.asarray(x, kind)
     stated = np.asarray(x)
+    if np.ma.is_masked(x):
+        raise UsageError(f"Conditions: {name}: got masked numbers; expected numbers, or rows without the masked ones")
     whole = kind is float or stated.dtype.kind in "biu" or (stated.dtype.kind == "f" and not (stated % 1).any())
     if stated.dtype.kind not in ("biuf" if name in SWITCHES else "iuf") or not whole:
         expected = "numbers" if kind is float else "whole numbers" + ", or names" * (name == "configuration")

@@ -379,6 +379,10 @@ TABLE: dict[str, tuple[Quantity, ...]] = {
             "load_torque", "Nm", "torque of a brake on the output of each drive, positive against forward rotation",
             _TORQUES, heading="load torque [N·m]", shown="{:.4g}", in_tables=True, acts=SHAFT, in_profiles=True,
         ),
+        Condition(
+            "held", "", "1 where a clamp holds the output at rest and carries its torque", (0.0, 1.0), heading="held",
+            in_tables=True, imposed=("voltage", "motor_current"), acts=SHAFT,
+        ),
         Condition("battery", "", "on-board battery instead of the external supply", (0.0, 1.0)),
         Condition("discharge", "C", "charge already taken from the battery", (0.0, 360_000.0)),
         Condition("adhesion", "", "adhesion as a ratio to the one the robot is stated for", _RATIO),

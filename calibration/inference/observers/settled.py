@@ -140,6 +140,10 @@ class SettledRuns(Observer):
     def of(cls, runs: Runs, robot: Robot, fidelity: str | None = None) -> SettledRuns:
         chosen = fidelities.get_fidelity(fidelity or "steady")
         conditions = runs.conditions(robot)
+        if conditions.held is not None and chosen.name != "steady":
+            raise BadConfiguration(
+                f"{runs.source}, held: got model {chosen.name}; expected steady, which has a clamp"
+            )
         if not chosen.facts.rollout:
             try:
                 chosen.check(robot, conditions, chosen.facts.resolved())

@@ -1,0 +1,159 @@
+"""Shafts that a clamp holds: against formulas, beside free rows, and from tables to constant and resistance."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_shaft import DRIVE, bench
+
+import mmrjax as mm
+from calibration.data import rig_facts, robot_file
+from calibration.data import runs as records
+from calibration.data.input_errors import BadConfiguration, BadData
+from calibration.inference.observers import SettledRuns
+from mmrjax.errors import UsageError
+from mmrjax.fidelities.steady import steady_batch
+from mmrjax.model import params
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.rig import Rig
+from mmrjax.model.signals import STATUSES
+
+AMPERES = np.array([-8.0, -2.0, 0.5, 5.0])
+#: Friction of motor (N·m) and efficiency of `bench`; its load has none here.
+FRICTION, EFFICIENCY, RATIO = DRIVE["motor.friction_coulomb"], 0.8, 16.0
+
+
+def torque_of(current, constant=0.05):
+    """Torque at the clamp [N·m]: friction acts against the current, and holds what it can."""
+    left = np.maximum(constant * np.abs(current) - FRICTION, 0.0)
+    return np.sign(current) * RATIO * EFFICIENCY * left
+
+
+def clamped():
+    return bench(Rig(imposed="motor_current"), loss_coulomb=0.0, loss_viscous=0.0)
+
+
+def test_a_clamp_carries_what_current_and_friction_leave():
+    """Beside a free row; too little current for the friction leaves the clamp nothing."""
+    current, held = np.array([*AMPERES, 0.03, 5.0]), np.array([1.0, 1, 1, 1, 1, 0])
+    conditions = Conditions(motor_current=current, held=held, load_torque=np.array([0.0, 0, 0, 0, 0, 0.4]))
+    found = steady_batch(clamped(), conditions)
+    np.testing.assert_allclose(found.output_torque[:5], torque_of(current[:5]), rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(found.motor_voltage[:5], 3.0 * current[:5], rtol=1e-9)
+    assert not np.any(found.motor_speed[:5]) and float(found.motor_speed[5]) > 100
+    assert [STATUSES[s] for s in np.asarray(found.status)] == ["converged"] * 6
+
+
+def test_a_locked_rotor_draws_voltage_over_resistance():
+    """The current and its derivative by the resistance, and that of the torque by the constant, are the formulas'."""
+    volts = np.array([-6.0, 3.0, 9.0])
+
+    def read(x):
+        robot = params.replace(bench(loss_coulomb=0.0), {"motor.resistance": x[0], "motor.torque_constant": x[1]})
+        found = steady_batch(robot, Conditions(voltage=volts, held=1.0))
+        return jnp.stack([found.motor_current, found.output_torque])
+
+    at = jnp.array([3.0, 0.05])
+    current, slopes = volts / 3.0, jax.jacfwd(read)(at)
+    np.testing.assert_allclose(read(at), [current, torque_of(current)], rtol=1e-9)
+    np.testing.assert_allclose(slopes[0, :, 0], -current / 3.0, rtol=1e-8)
+    np.testing.assert_allclose(slopes[1, :, 1], RATIO * EFFICIENCY * current, rtol=1e-8)
+    np.testing.assert_allclose(jax.jacrev(read)(at), slopes, rtol=1e-8, atol=1e-12)
+
+
+def test_a_shaft_at_rest_pushes_against_its_load():
+    """At an imposed speed of 0, current follows from the torque in either direction."""
+    torque = torque_of(AMPERES)
+    found = steady_batch(clamped(), Conditions(motor_speed=0.0, load_torque=torque))
+    np.testing.assert_allclose(found.motor_current, AMPERES, rtol=1e-9)
+    assert [STATUSES[s] for s in np.asarray(found.status)] == ["converged"] * 4
+
+
+@pytest.mark.parametrize("wrong", [{"motor_speed": 3.0, "held": 1}, {"held": True, "model": "drive"}])
+def test_a_clamp_elsewhere_is_refused(wrong):
+    model = wrong.pop("model", "steady")
+    with pytest.raises(UsageError, match="held: a clamp holds the output of a shaft in settled runs"):
+        mm.simulate(bench(), Conditions(**wrong), model)
+
+
+RIG_HELD = """schema = "mmrjax.robot/2"
+base = "none"
+sides = 1
+imposed = "{imposed}"
+channels = [{channels}]
+[motor]
+resistance = "0.3 ± 30 %"
+torque_constant = "0.1 ± 30 %"
+friction_coulomb = "0.02 ± 50 %"
+[gearbox]
+ratio = "5 ± 0"
+efficiency_load = "1 ± 0"
+[brake]
+load = "shaft"
+inertia = 1e-4
+loss_coulomb = 0.0
+"""
+
+
+FREED = ("motor.resistance", "motor.torque_constant", "motor.friction_coulomb")
+
+
+def rig(tmp_path, imposed, channels):
+    path = tmp_path / "rig.toml"
+    path.write_text(RIG_HELD.format(imposed=imposed, channels=channels), encoding="utf-8")
+    return robot_file.read_robot(path)
+
+
+def table(held=True, **more):
+    """Columns of a test of sixteen currents: constant 0.12, friction 0.03 N·m, resistance 0.25 ohm."""
+    current = np.r_[-np.arange(2.0, 18, 2)[::-1], np.arange(2.0, 18, 2)]
+    rng = np.random.default_rng(5)
+    torque = 5 * (0.12 * current - 0.03 * np.sign(current)) + rng.normal(0, 0.01, 16)
+    volts = 0.25 * current + rng.normal(0, 0.01, 16)
+    columns = {"motor_current_A": current, "motor_voltage_V": volts, "output_torque_Nm": torque}
+    return {**columns, **({"held": np.ones(16)} if held else {}), **more}
+
+
+def test_a_test_with_the_shaft_held_gives_constant_friction_and_resistance(tmp_path):
+    robot = rig(tmp_path, "motor_current", '"motor_voltage", "output_torque"')
+    found = mm.calibrate(
+        records.read_runs(table(), robot=robot), robot, free=FREED, noise="motor_voltage=0.01V,output_torque=0.01Nm"
+    )
+    for name, right in (("resistance", 0.25), ("torque_constant", 0.12), ("friction_coulomb", 0.03)):
+        p = found.parameters[f"motor.{name}"]
+        assert abs(p.value - right) < 4 * p.sd and p.sd < 0.1 * right, (name, p.value, p.sd)
+
+
+def test_a_locked_rotor_with_voltage_alone_gives_the_resistance(tmp_path):
+    robot = rig(tmp_path, "voltage", '"motor_current"')
+    columns = table()
+    rows = {"supply_voltage_V": columns["motor_voltage_V"], "motor_current_A": columns["motor_current_A"]}
+    runs = records.read_runs({**rows, "held": columns["held"]}, robot=robot)
+    found = mm.calibrate(runs, robot, free=("motor.resistance",))
+    assert found.parameters["motor.resistance"].value == pytest.approx(0.25, rel=0.01)
+
+
+def test_a_clamp_with_another_model_is_refused(tmp_path):
+    robot = rig(tmp_path, "motor_current", '"motor_voltage", "output_torque"')
+    with pytest.raises(BadConfiguration, match="held: got model drive; expected steady"):
+        SettledRuns.of(records.read_runs(table(), robot=robot), robot, "drive")
+
+
+def test_rows_of_a_clamp_in_tables(tmp_path):
+    held = rig(tmp_path, "motor_current", '"motor_voltage", "output_torque"')
+    with pytest.raises(BadData, match=r"row 1, load_torque_Nm: got 1 where held is 1; expected 0, .* output_torque"):
+        records.read_runs(table(load_torque_Nm=np.ones(16)), robot=held)
+    with pytest.raises(BadData, match="column held is for settled rows"):
+        records.read_runs(table(time_s=np.arange(16.0)), robot=held)
+    speed = rig(tmp_path, "motor_speed", '"motor_current", "output_torque"')
+    with pytest.raises(BadData, match=r'nothing drives the motors; .* a held shaft: state imposed = "motor_current"'):
+        records.read_runs(table(held=False, motor_speed_rpm=np.zeros(16)), robot=speed)
+    rows = table(held=False, motor_speed_rpm=np.zeros(16), load_torque_Nm=np.r_[np.ones(15), 0.0])
+    assert len(records.read_runs(rows, robot=speed)) == 15
+    rows = table()
+    strong = {**rows, "motor_current_A": 5 * rows["motor_current_A"]}
+    assert rig_facts.doubtful_current(records.read_runs(strong, robot=held), held) == ""
+    strong["held"] = np.r_[np.zeros(15), 1.0]
+    assert "80 A, where the file's numbers turn the load" in rig_facts.doubtful_current(
+        records.read_runs(strong, robot=held), held
+    )
