@@ -148,7 +148,7 @@ def test_an_sd_in_per_cent_has_a_part_that_does_not_depend_on_the_reading(stated
     runs = dataclasses.replace(runs, columns={**runs.columns, **alone, "total_current_A": current})
     with np.errstate(invalid="ignore"):
         sd = noise.infer_noise(runs, SettledRuns.sizes(runs), stated).sd[:, 0]
-    np.testing.assert_allclose(sd, 0.02 * np.maximum(current, 0.25 * np.sqrt(np.mean(current**2))))
+    np.testing.assert_allclose(sd, 0.02 * np.maximum(current, 0.2 * np.sqrt(np.mean(current**2))))
 
 
 def test_replicates_are_drawn_with_sds_that_an_estimate_might_have_been_of():

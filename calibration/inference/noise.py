@@ -20,7 +20,7 @@ from mmrjax.model.channels import Channel
 #: Initial estimate of a noise as a share of the reading [-].
 START = 0.02
 #: Share of a channel's rms below which a reading's sd in per cent no longer decreases: instruments have a zero.
-LEAST_SIZE = 0.25
+LEAST_SIZE = 0.2
 #: Sources of sds that nobody states, with their names in messages.
 UNSTATED = {"assumed": "assumed", "series": "estimated"}
 
