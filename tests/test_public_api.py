@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import datetime
 import os
 import re
 import subprocess
@@ -13,13 +14,17 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
+import polars as pl
 import pytest
 import test_fidelities
 
 import mmrjax as mm
-from calibration.data.input_errors import BadConfiguration
+from calibration.data.input_errors import BadConfiguration, BadData
+from calibration.inference import priors
 from mmrjax import fidelities
 from mmrjax.effects import ALL
+from mmrjax.errors import LONGEST
 from mmrjax.fidelities import outputs
 from mmrjax.fidelities.drive import drive_batch
 from mmrjax.fidelities.steady import steady_batch
@@ -396,9 +401,9 @@ WRONG = {
     "slope_deg[0, 2]: got 60; expected -45 to 45 deg": dict(slope_deg=[[0.0, 1.0, 60.0]]),
     "payload: got -1; expected 0 to 300 kg": dict(payload=-1.0),
     "payload: got 301; expected 0 to 300 kg": dict(payload=301.0),
-    "voltage: got -240; expected -100 to 100 V": dict(voltage=-240.0),
-    "voltage: got nan; expected -100 to 100 V": dict(voltage=np.nan),
-    "voltage[2]: got inf; expected -100 to 100 V": dict(voltage=[1.0, 2.0, np.inf]),
+    "voltage: got -24000; expected -10000 to 10000 V": dict(voltage=-24000.0),
+    "voltage: got nan; expected -10000 to 10000 V": dict(voltage=np.nan),
+    "voltage[2]: got inf; expected -10000 to 10000 V": dict(voltage=[1.0, 2.0, np.inf]),
     "battery: got 2; expected 0 to 1": dict(battery=2.0),
     "discharge: got -5; expected 0 to 360000 C": dict(discharge=-5.0),
     "adhesion: got 0; expected 0.001 to 100": dict(adhesion=0.0),
@@ -465,6 +470,108 @@ def test_other_wrong_use_is_said(robot):
     assert said == "history: got 1001 runs; at most 1000 can be kept over time; state history=False"
     with pytest.raises(ValueError, match="shapes do not broadcast"):
         mm.Conditions(voltage=[1.0, 2.0], payload=[1.0, 2.0, 3.0])
+
+
+MASKED = np.ma.masked_array([24.0, 12.0], [False, True])
+FREE = "motor.resistance"
+MEASURED = ROOT / "calibration" / "data" / "measured.csv"
+
+
+@pytest.fixture(scope="module")
+def table():
+    return pd.read_csv(MEASURED).head(6)
+
+
+#: Functions of the robot and a sound table; the class of error and words of its sentence.
+REFUSED = {
+    **{
+        f"configuration {value}": (lambda r, t, v=value: mm.simulate(r, mm.Conditions(v)), mm.UsageError, words)
+        for value, words in ((1.5, "got 1.5; expected whole numbers, or names"), (True, "got True; expected whole"))
+    },
+    **{
+        f"voltage {value!r}": (lambda r, t, v=value: mm.simulate(r, mm.Conditions(voltage=v)), mm.UsageError, words)
+        for value, words in (
+            (True, "got True; expected numbers"),
+            ([True, False], "got [True, False]; expected numbers"),
+            (datetime.timedelta(1), "got datetime.timedelta(days=1); expected numbers"),
+            (np.timedelta64(24, "s"), "expected numbers"),
+            ("abc", "got 'abc'; expected numbers"),
+            (24 + 1j, "got (24+1j); expected numbers"),
+            (MASKED, "got masked numbers; expected numbers"),
+        )
+    },
+    **{
+        f"{call} {value!r}": (
+            lambda r, t, v=value, call=call: DOORS[call](params.replace(r, {"motor.resistance": v}), t), error, words
+        )
+        for call, error in (("simulate", mm.UsageError), ("calibrate", BadConfiguration))
+        for value, words in (
+            ("abc", "motor.resistance: got 'abc'; expected one number"),
+            (datetime.timedelta(1), "got datetime.timedelta(days=1); expected one number"),
+            (1j, "got 1j; expected one number"),
+            (None, "got None; expected one number"),
+            (np.ones(2), "got shape (2,); expected one number"),
+            (jnp.ones(2), "got shape (2,); expected one number"),
+            (MASKED, "got shape (2,); expected one number"),
+        )
+    },
+    **{
+        f"{name} {value}": (lambda r, t, n=name, v=value: DOORS["calibrate"](r, t, **{n: v}), BadConfiguration, words)
+        for name, words, values in (
+            ("starts", "expected a whole number from 1 to 100000", (10**12, 0, -1, True, 1.5)),
+            ("seed", "expected a whole number from 0 to 4294967295", (-1, 2**70, 0.5)),
+            ("noise", "expected a positive number", ("total_current=-1",)),
+        )
+        for value in values
+    },
+    **{
+        f"prior's sd {sd}": (
+            lambda r, t, sd=sd: priors.parameter_coordinates(r, [FREE], {FREE: (0.6, sd)}),
+            BadConfiguration,
+            f"{FREE}: got a standard deviation of {sd}; expected more than 0",
+        )
+        for sd in (-0.1, 0, np.nan)
+    },
+    **{
+        f"calibrate {type(runs).__name__}": (lambda r, t, x=runs: mm.calibrate(x, r), BadConfiguration, "expected Runs")
+        for runs in (pd.DataFrame({"a": [1.0]}), MEASURED, str(MEASURED), None)
+    },
+    "empty path": (lambda r, t: mm.read_runs(""), BadData, "got an empty path; expected a path"),
+    "no source": (lambda r, t: mm.read_runs(None), BadData, "got NoneType; expected a path"),
+    "sd of a table": (
+        lambda r, t: mm.read_runs(t.assign(total_current_sd_A=-1.0)), BadData, "total_current_sd_A: got -1; expected more"
+    ),
+    "one name twice": (
+        lambda r, t: mm.read_runs(pd.concat([t, t["slope_deg"]], axis=1)), BadData, "slope_deg: has the name of another"
+    ),
+    "complex readings": (
+        lambda r, t: mm.read_runs(t.assign(total_current_A=1j)), BadData, "total_current_A: holds complex numbers"
+    ),
+}  # fmt: skip
+DOORS = {
+    "simulate": lambda robot, table: mm.simulate(robot, mm.Conditions()),
+    "calibrate": lambda robot, table, **options: mm.calibrate(mm.read_runs(table), robot, **options),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_wrong_arguments_are_refused_in_a_sentence(case, robot, table):
+    call, error, words = REFUSED[case]
+    with pytest.raises(error) as refusal:
+        call(robot, table)
+    assert words in str(refusal.value) and len(str(refusal.value)) <= LONGEST
+
+
+def test_lazy_and_masked_tables_are_read_as_others(robot, table):
+    """A lazy frame is collected; a masked reading is missing."""
+    wanted = mm.read_runs(table).columns
+    lazy = mm.read_runs(pl.from_pandas(table).lazy()).columns
+    for name, values in wanted.items():
+        np.testing.assert_array_equal(lazy[name], values)
+    current = np.ma.masked_array(table["total_current_A"], np.arange(len(table)) == 2)
+    masked = mm.read_runs({name: table[name].tolist() for name in table} | {"total_current_A": current})
+    assert np.isnan(masked["total_current_A"]).tolist() == [False, False, True, False, False, False]
+    np.testing.assert_array_equal(mm.Conditions(voltage=np.ma.masked_array([24.0, 12.0])).voltage, [24.0, 12.0])
 
 
 @pytest.mark.slow

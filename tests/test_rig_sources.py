@@ -106,6 +106,41 @@ def test_armature_without_a_ratio_turns_with_the_load(tmp_path):
     assert found["bench.inertia"] == pytest.approx(0.5 * 0.5 * 0.08**2 + 0.0016, rel=1e-6)
 
 
+BARE = FREE.replace('damping="0.02" frictionloss="0.05" ', "")
+SHEET = {"voltage": "24 V", "no-load-current": "0.3 A", "resistance": "0.6 ohm", "no-load-speed": "8810 rpm"}
+DCMOTOR = '<dcmotor joint="left" gear="20" motorconst="0.03" resistance="1.2"%s/>'
+
+
+@pytest.mark.parametrize("kind", ["wheeled", "bench"])
+@pytest.mark.parametrize("motor", ["sheet", "dcmotor", "dcmotor without a voltage"])
+def test_losses_that_a_model_leaves_at_0_are_free_up_to_a_share_of_the_stall_torque(kind, motor, tmp_path):
+    """5 % of k n U / R, and of it over the no-load speed U / (k n)."""
+    text = BARE
+    if motor != "sheet":
+        native = DCMOTOR % (' ctrlrange="-24 24"' if motor == "dcmotor" else "")
+        text = BARE.replace('<motor joint="left" gear="20"/>', native)
+    assert "damping" not in text
+    (tmp_path / "model.xml").write_text(text)
+    rig = rig_new.new_rig_text(kind, tmp_path / "model.xml", "left", SHEET if motor == "sheet" else None)
+    found, sds = values(rig, tmp_path)
+    losses = "rover.track" if kind == "wheeled" else "bench"
+    constant, resistance = found["motor.torque_constant"], found["motor.resistance"]
+    assert found[f"{losses}.loss_viscous"] == 0
+    assert sds[f"{losses}.loss_viscous"] == pytest.approx(0.05 * (20 * constant) ** 2 / resistance, rel=0.03)
+    if motor == "dcmotor":
+        assert found[f"{losses}.loss_coulomb"] == 0
+        assert sds[f"{losses}.loss_coulomb"] == pytest.approx(0.05 * 20 * constant * 24 / resistance, rel=0.03)
+    elif motor != "sheet":
+        assert '0 is held at 0, "0.0 ± 0.01" frees it' in rig and f"{losses}.loss_coulomb" not in sds
+
+
+def test_losses_of_a_model_without_motor_constants_keep_the_lines_of_the_template(tmp_path):
+    (tmp_path / "free.xml").write_text(BARE)
+    text = rig_new.new_rig_text(None, tmp_path / "free.xml", "left", None)
+    assert '# loss_viscous = "0.001 ± 100 %"' in text and "held at 0" in text
+    assert "rover.track.loss_viscous" not in values(text, tmp_path)[1]
+
+
 def test_name_with_a_line_break_stays_in_its_comment(tmp_path):
     robot = DIFFBOT.read_text().replace("left_wheel", "left&#10;mass = 1 #")
     (tmp_path / "r.urdf").write_text(robot)

@@ -414,6 +414,68 @@ def doubtful_torque(runs: Runs, robot: Robot) -> str:
     )
 
 
+#: Share of its largest value above which a reading is not one at rest; share of a run, and of the range of what is
+#: imposed, over which a reading that stays the same is held; share of the power of either sign that shows a swap.
+MOVES, HELD, SWAPPED = 0.05, 0.1, 0.3
+
+
+def still_sentence(runs: Runs) -> str:
+    """Sentence on a log in which nothing moves; empty for others."""
+    moving = [k for k, c in enumerate(runs.channels) if c.zero_at_rest]
+    measured = runs.measured()[:, moving]
+    if not (runs.sampled and moving and np.isfinite(measured).any()) or np.nanmax(np.ptp(measured, axis=0)) > 0:
+        return ""
+    columns = ", ".join(runs.headings.get(c, c) for c in (runs.channels[k].column for k in moving))
+    return (
+        f"{runs.source}, {columns}: the same in every row, so nothing moves; the log shows at most the resistance of "
+        "windings; log a run in which the shaft turns, or name the column that shows it"
+    )
+
+
+def held_sentence(runs: Runs) -> str:
+    """Sentence on readings that repeat the last value while what is imposed changes; empty for others."""
+    imposed = runs.layout.imposed_column
+    if not (runs.sampled and runs.has(imposed)):
+        return ""
+    drive, range_ = runs[imposed], float(np.ptp(np.nan_to_num(runs[imposed])))
+    for name in np.unique(runs.run_names):
+        rows = runs.in_order(name)
+        for channel, shown in zip(runs.channels, runs.measured()[rows].T, strict=True):
+            begins = np.flatnonzero(np.r_[True, np.diff(shown) != 0])
+            for begin, end in zip(begins, np.r_[begins[1:], len(rows)], strict=True):
+                moves = abs(shown[begin]) > MOVES * np.nanmax(np.abs(shown), initial=0.0)
+                if moves and end - begin > HELD * len(rows) and np.ptp(drive[rows[begin:end]]) > HELD * range_ > 0:
+                    column, last = runs.headings.get(channel.column, channel.column), rows[end - 1] + 1
+                    return (
+                        f"{runs.source} rows {rows[begin] + 1} to {last}, {column}: the same reading "
+                        f"while {runs.headings.get(imposed, imposed)} changes, as if held at the last value; "
+                        "empty these cells, and the other rows are used"
+                    )
+    return ""
+
+
+def swapped_sentence(runs: Runs) -> str:
+    """Sentence on a speed whose sign swaps within a log, by the power of the drive; empty for others."""
+    imposed = runs.layout.imposed_column
+    if not (runs.sampled and runs.has(imposed) and np.nanmin(runs[imposed]) < 0 < np.nanmax(runs[imposed])):
+        return ""  # what never changes its sign may lack one, which other checks report
+    for name in np.unique(runs.run_names):
+        rows = runs.in_order(name)
+        for channel, shown in zip(runs.channels, runs.measured()[rows].T, strict=True):
+            power = np.nan_to_num(runs[imposed][rows] * shown)
+            total = np.cumsum(power) / max(float(np.abs(power).sum()), 1e-300)
+            turn = int(np.argmax(np.abs(total)))
+            first, rest = total[turn], total[-1] - total[turn]
+            if channel.zero_at_rest and channel.settled and first * rest < 0 and min(abs(first), abs(rest)) > SWAPPED:
+                column = runs.headings.get(channel.column, channel.column)
+                return (
+                    f"{runs.source} row {rows[turn] + 2}, {column}: from here on it has the other sign compared with "
+                    f"{runs.headings.get(imposed, imposed)}; correct the sign of either half, or give each its own "
+                    "run_id and file"
+                )
+    return ""
+
+
 def log_doubts(runs: Runs, robot: Robot) -> tuple[str, ...]:
     """Sentences on a log's times, its levels and limits, and on units that do not fit the robot."""
     every = (
@@ -421,6 +483,9 @@ def log_doubts(runs: Runs, robot: Robot) -> tuple[str, ...]:
         jitter_sentence(runs),
         saturation_sentence(runs),
         one_level(runs),
+        still_sentence(runs),
+        held_sentence(runs),
+        swapped_sentence(runs),
         doubtful_time(runs, robot),
         doubtful_current(runs, robot),
         doubtful_torque(runs, robot),

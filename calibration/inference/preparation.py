@@ -11,6 +11,7 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 
 from calibration.data import instruments, own_mass, rig_facts, surfaces
+from calibration.data.input_errors import BadConfiguration
 from calibration.data.runs import Runs
 from calibration.inference import checks, observers, repeats
 from calibration.inference import noise as noise_room
@@ -18,6 +19,8 @@ from calibration.inference.fit_notes import Notes
 from calibration.inference.foreign import inherited_priors
 from calibration.inference.noise import Noise
 from calibration.inference.observers import Observer
+from mmrjax.errors import UsageError
+from mmrjax.fidelities.simulation import check_robot
 from mmrjax.model.robot import Robot
 
 
@@ -64,8 +67,13 @@ def prepare(
 
     Raises:
         BadData: a table that contradicts itself, its robot or its model, see `checks.check_data`.
-        BadConfiguration: an invalid noise or prior, or any raised by `choose`.
+        BadConfiguration: parameters that are no single number within their bounds, an invalid noise or prior, or any
+            raised by `choose`.
     """
+    try:
+        check_robot(robot)
+    except UsageError as error:
+        raise BadConfiguration(str(error)) from error
     observe = observers.observer_kind(runs)
     robot = surfaces.with_surface_configurations(instruments.with_inferred_instruments(robot, runs), runs)
     priors = surfaces.of_surfaces(stated or {}, robot, runs)

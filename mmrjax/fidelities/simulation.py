@@ -89,7 +89,7 @@ def simulate(
         stated = fidelities.fidelity_facts(model).resolved(duration=duration, step=step, **options)
     except ValueError as error:
         raise UsageError(f"model {model}, {error}") from error
-    _check_robot(robot)
+    check_robot(robot)
     conditions = check_conditions(robot, conditions)
     _check_battery(robot, conditions)
     _check_turning(robot, conditions, profile)
@@ -205,8 +205,8 @@ def _missions(robot: Robot, conditions: Conditions, profile: Profile, start: Sta
     )
 
 
-def _check_robot(robot: Robot) -> None:
-    """Raises for parameters outside the bounds of their fields."""
+def check_robot(robot: Robot) -> None:
+    """Raises for parameters that are no single number, or outside the bounds of their fields."""
     concrete = [p for p in params.walk_parameters(robot) if not isinstance(p.value, jax.core.Tracer)]
     for parameter, value in zip(concrete, jax.device_get([p.value for p in concrete]), strict=True):
         spec = parameter.spec

@@ -271,11 +271,14 @@ def _number(name: str, x: Any, kind: type = float) -> Any:
     """Array of numbers of that kind; NumPy input stays NumPy's, so that no JAX operation is compiled for it.
 
     Raises:
-        UsageError: words, dates, complex numbers, truth values of a quantity, or parts of a whole number.
+        UsageError: words, dates, complex numbers, masked numbers, truth values of a quantity, or parts of a whole
+            number.
     """
     if isinstance(x, jax.Array):
         return jnp.asarray(x, kind)
     stated = np.asarray(x)
+    if np.ma.is_masked(x):
+        raise UsageError(f"Conditions: {name}: got masked numbers; expected numbers, or rows without the masked ones")
     whole = kind is float or stated.dtype.kind in "biu" or (stated.dtype.kind == "f" and not (stated % 1).any())
     if stated.dtype.kind not in ("biuf" if name in SWITCHES else "iuf") or not whole:
         expected = "numbers" if kind is float else "whole numbers" + ", or names" * (name == "configuration")

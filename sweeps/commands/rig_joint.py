@@ -21,6 +21,8 @@ TURNING = (*VEHICLES, "bench", "dyno", "pendulum", "servo")
 LEAST_WEIGHT = 1e-9
 #: Largest distance of a wheel's centre from its axis, as a share of its radius; largest sine between their axes.
 OFF_AXIS = 0.02
+#: Share of the stall torque that a loss may take that a model does not state.
+UNSTATED = 0.05
 #: Width of each number: models round masses and guess losses.
 WIDTHS = {
     "mass": "20 %", "radius": "5 %", "inertia": "50 %", "ratio": "5 %", "armature": "50 %", "friction": "100 %",
@@ -99,7 +101,36 @@ class JointNumbers:
             inertia = (inertia[0] + self.armature[0], f"{inertia[1]}, and armature")
             found["motor.inertia"] = Stated(0.0, "kg·m^2", "no ratio found, so the load's inertia contains it")
         put("load.inertia", "kg·m^2", "inertia", inertia)
-        return found | dict(self.drive)
+        return found | {name.replace("load.loss", f"{losses}.loss"): number for name, number in self.drive.items()}
+
+
+def free_unstated_losses(kind: str, numbers: Mapping[str, Stated]) -> dict[str, Stated]:
+    """Numbers of a rig of a kind, with losses of the joint free that its model lacks or leaves at the default 0.
+
+    Each may take `UNSTATED` of the stall torque k n U / R, that with the speed at no-load speed U / (k n). Without
+    motor constants and ratio, or without the voltage U for the constant loss, the template's line is kept, and 0 is
+    held.
+    """
+    found = dict(numbers)
+    constant, resistance, ratio, limit = (
+        found[name].value if name in found else 0.0
+        for name in ("motor.torque_constant", "motor.resistance", "gearbox.ratio", "motor.voltage_limit")
+    )
+    torque = UNSTATED * constant * ratio / resistance if resistance > 0 else 0.0  # [N·m/V]
+    losses = "load.track" if kind in VEHICLES else "load"
+    for key, unit, width in (
+        ("loss_coulomb", "N·m", torque * limit),
+        ("loss_viscous", "N·m·s", torque * constant * ratio),
+    ):
+        name, reason = f"{losses}.{key}", f"not in the model; ± is {100 * UNSTATED:g} % of the stall torque"
+        if name in found and found[name].value != 0:
+            continue
+        if width > 0:
+            found[name] = Stated(0.0, unit, reason, f"{width:.2g}")
+        elif name in found:
+            held = f'{found[name].source}; 0 is held at 0, "0.0 ± 0.01" frees it'
+            found[name] = dataclasses.replace(found[name], source=held)
+    return found
 
 
 def hanging_torque_and_angle(torque: float, torque_quarter: float) -> tuple[float, float] | None:

@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 from calibration.data.input_errors import BadConfiguration, allowed_words
 from calibration.data.input_files import file_bytes
 from calibration.data.writing import write_text
-from sweeps.commands.rig_joint import JointNumbers
+from sweeps.commands.rig_joint import JointNumbers, free_unstated_losses
 from sweeps.commands.rig_template import KINDS, Stated, example_numbers, fill_rig_template, rig_template
 from sweeps.console import print_output
 
@@ -71,6 +71,8 @@ def new_rig_text(kind: str | None, source: Path | None, joint: str | None, sheet
     kind = kind or USUAL
     if not origins:
         return rig_template(kind)
+    if source is not None:
+        numbers = free_unstated_losses(kind, numbers)
     origin = f"kind {kind}, filled in from {' and '.join(origins)}"
     return fill_rig_template(kind, numbers, f"{origin}; a comment names the source of each number, ± is a guess.")
 
