@@ -19,19 +19,6 @@ from sweeps.store import DONE, SOLVER_FAILED, Folder
 Page = Callable[[Path], Any]
 
 
-def page_writer(name: str, *found: Any, **known: Any) -> Page:
-    """Writer of the page `sweeps/pages/{name}_page.py`, of what its `write_{name}_page` takes after the folder.
-
-    The module is imported when the page is written: figures cost half a second, which --no-report saves.
-    """
-
-    def write(folder: Path) -> None:
-        module = importlib.import_module(f"sweeps.pages.{name}_page")
-        getattr(module, f"write_{name}_page")(folder, *found, **known)
-
-    return write
-
-
 def print_report(document: Document, file: RobotFile | None = None) -> Page:
     """Print a document and return its page, which ends with the robot's parameters if its file is given."""
     terminal_renderer.print_document(document)

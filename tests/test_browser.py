@@ -12,8 +12,7 @@ from test_settle import made as made_log
 from test_time_overlay import overlay
 
 from sweeps import pages
-from sweeps.pages import loop_page
-from sweeps.report import page_renderer
+from sweeps.report import loop_report, page_renderer
 from sweeps.report.document import Document, Figure, Section
 
 pytestmark = [
@@ -124,7 +123,10 @@ def test_the_page_of_nothing_missing_can_be_read_everywhere(browser, tmp_path):
     found = commanded().found
     summary = dataclasses.replace(found.summary, verdict="none")
     none = dataclasses.replace(found, verdict="none", effects=(), support=None, summary=summary)
-    assert wrong(browser, loop_page.write_loop_page(tmp_path, none, robot_name="nominal")) == {}
+    assert (
+        wrong(browser, page_renderer.write_report_page(tmp_path, loop_report.loop_document(none, "nominal", {})))
+        == {}
+    )
 
 
 def test_the_page_of_histories_can_be_read_everywhere(browser, tmp_path):

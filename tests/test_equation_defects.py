@@ -14,8 +14,8 @@ from calibration.inference.observers.turns import TurnLinearization
 from mmrjax import effects
 from mmrjax.model import channels
 from mmrjax.model.signals import Signals
+from sweeps.commands import loop as page
 from sweeps.pages import loop_figures
-from sweeps.pages import loop_page as page
 
 ROWS, COUNT, RANDOM = 12, 3, np.random.default_rng(0)
 #: Sizes of voltage, torque and speed; and how many sds of a reading a defect of that size is.

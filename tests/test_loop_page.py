@@ -27,8 +27,9 @@ from calibration.words import loop_words as words
 from mmrjax.model import channels
 from sweeps.commands import loop as room
 from sweeps.pages import loop_figures
-from sweeps.pages import loop_page as loop_page
 from sweeps.pages import page as page_room
+from sweeps.report import loop_report, page_renderer
+from sweeps.report.terminal_renderer import print_document
 
 SCHEMA = json.loads((Path(__file__).parents[1] / "docs" / "schemas" / "loop.schema.json").read_text("utf-8"))
 
@@ -72,6 +73,16 @@ MADE = {
 CASES = [n if n == "churning" else pytest.param(n, marks=pytest.mark.slow) for n in MADE]
 
 
+def documented(found):
+    """The report of a result, as the command makes it."""
+    return loop_report.loop_document(found, "nominal", room.changes_by_effect(found))
+
+
+def page_of(folder, found):
+    """The page of a result."""
+    return page_renderer.write_report_page(folder, documented(found)).read_text("utf-8")
+
+
 @pytest.fixture(scope="module")
 def shown(tmp_path_factory):
     """A case → its result, result.json, page and terminal output; made once."""
@@ -81,11 +92,11 @@ def shown(tmp_path_factory):
         if name not in known:
             found = MADE[name]()
             folder = tmp_path_factory.mktemp(name)
-            text = loop_page.write_loop_page(folder, found, robot_name="nominal").read_text("utf-8")
+            text = page_of(folder, found)
             document = finite_or_null(found.to_json())
             known[name] = SimpleNamespace(found=found, document=document, text=text, page=Tables(text))
         capsys.readouterr()
-        room.print_discovery(known[name].found)
+        print_document(documented(known[name].found))
         return SimpleNamespace(**vars(known[name]), printed=" ".join(capsys.readouterr().out.split()))
 
     return of
@@ -95,7 +106,7 @@ def written(folder, found):
     """The page of a result, without its figures: pages with them are those of `shown`."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(page_room, "figure_as_svg", lambda figure: "<svg/>")
-        return loop_page.write_loop_page(folder, found, robot_name="nominal").read_text("utf-8")
+        return page_of(folder, found)
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -162,7 +173,7 @@ def test_class_with_a_stated_value_is_listed_and_said(shown, capsys, tmp_path):
     page = Tables(written(tmp_path, found))
     assert "motor.resistance is 1.41 ohm (stated 0.611, +13.1 sds)" in page.tables["effects"][1][-1]
     capsys.readouterr()
-    room.print_discovery(found)
+    print_document(documented(found))
     assert "motor.resistance is 1.41 ohm" in " ".join(capsys.readouterr().out.split())
 
 
@@ -182,7 +193,7 @@ def test_what_is_ruled_out_by_its_size_is_on_the_page(shown, capsys, tmp_path):
     assert said in page.text and page.tables["implausible"][1][-1] == why
     assert text.index('id="ruled_out"') < text.index('id="effects"')
     capsys.readouterr()
-    room.print_discovery(found)
+    print_document(documented(found))
     assert said in " ".join(capsys.readouterr().out.split())
 
 
@@ -248,7 +259,7 @@ def test_first_screen_answers_in_a_minute(shown, capsys, tmp_path):
         and words.completeness_answer(found) in page.text
     )
     a = effect.parameters["amplitude"]
-    size, change = f"{a.value:.3g} ± {a.sd:.2g} {a.unit}", loop_page.changes_by_effect(found)[effect.name]
+    size, change = f"{a.value:.3g} ± {a.sd:.2g} {a.unit}", room.changes_by_effect(found)[effect.name]
     size += f", which changes the {change.channel.label} by {change.rms:.2g} %"
     assert f"{effect.families[0]} ({effect.name}): {size}; {words.how_sure(found, effect)}." in page.text
     stated, again, with_it = page.tables["summary"][1:]
@@ -276,11 +287,11 @@ def test_what_an_effect_changes_is_that_of_the_robot_without_it(shown, capsys):
     """And the law that is drawn is of the robot that is written, as the dots are."""
     found = shown("churning", capsys).found
     (effect,) = found.effects
-    change = loop_page.changes_by_effect(found)[effect.name]
+    change = room.changes_by_effect(found)[effect.name]
     k = [c.name for c in found.channels].index(change.channel.name)
     here = found.included
     np.testing.assert_allclose(change.with_it[here], found.readings_of_rows.after[here, k], rtol=1e-5)
-    assert change.rms > 1.0 and "brush_drop" not in loop_page.changes_by_effect(found)
+    assert change.rms > 1.0 and "brush_drop" not in room.changes_by_effect(found)
     assert "laws" in drawn(shown("churning", capsys).text)
 
 
@@ -309,12 +320,12 @@ def test_a_page_of_nothing_missing_says_what_would_have_been_seen(shown, capsys,
     )
     text = written(tmp_path, none)
     assert "What was looked for" in text and "laws" not in drawn(text) and '<ul id="found">' not in text
-    listed = loop_page.would_be_seen(none)
-    assert [one["times"] for one in listed] == sorted(one["times"] for one in listed)
-    strong = next(s for s in none.scores if s.name == listed[0]["name"])
+    listed = loop_report.would_be_seen(none)
+    assert [one[-1] for one in listed] == sorted(one[-1] for one in listed)
+    strong = next(s for s in none.scores if s.name == listed[0][0].strip("`"))
     level = none.before.kinds["single"].threshold
-    assert listed[0]["times"] * strong.sigmas_per_prior_sd == pytest.approx(level)
-    assert Tables(text).tables["would_be_seen"][1][0] == listed[0]["name"]
+    assert listed[0][-1] * strong.sigmas_per_prior_sd == pytest.approx(level)
+    assert Tables(text).tables["would_be_seen"][1][0] == listed[0][0].strip("`")
 
 
 def test_squares_of_readings_and_of_priors_are_apart(shown, capsys):
@@ -356,7 +367,7 @@ def test_what_a_name_could_hide_is_said(shown, capsys, tmp_path):
         ["brush_drop", "0.21 V", "5.5", "stall (expected 7.2 σ)"], ["load_slip", "0.0001 1/N", "5.1", ""]
     ]  # fmt: skip
     capsys.readouterr()
-    room.print_discovery(found)
+    print_document(documented(found))
     assert (
         "Could be hidden behind what was found: brush_drop up to 0.21 V (stall would show it), load_slip up to 0.0001 1/N."
         in " ".join(capsys.readouterr().out.split())
@@ -415,7 +426,7 @@ def test_what_the_track_model_says_is_shown(shown, capsys, tmp_path, p, outside,
     assert page.tables["resolved_constants"][1][0] == "running_gear.guide_recess"
     assert [row[-1] for row in page.tables["resolved_constants"][1:]] == ["yes", "no"]
     capsys.readouterr()
-    room.print_discovery(found)
+    print_document(documented(found))
     assert says in " ".join(capsys.readouterr().out.split())
     found.save(tmp_path / "saved")
     assert (tmp_path / "saved" / "robot_track.toml").exists()

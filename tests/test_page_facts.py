@@ -1,7 +1,6 @@
 """What pages say of limits, scales and tables: what is judged, by which measure, and that nothing overruns."""
 
 import dataclasses
-import inspect
 import re
 
 import matplotlib.pyplot as plt
@@ -9,14 +8,15 @@ import numpy as np
 import pytest
 
 import mmrjax as mm
+from calibration.data.robot_file import RobotFile
 from mmrjax import effects
 from mmrjax.model import paper_robots, params
 from mmrjax.model.paper_tables import TRACKED, WHEELED
-from sweeps.pages import page as frame
-from sweeps.pages import sweep_figures, words
+from sweeps.pages import sweep_figures
 from sweeps.paper import run_figures as paper_runs
-from sweeps.report import run_tables
+from sweeps.report import page_renderer, run_tables
 from sweeps.report import runs_report as page
+from sweeps.report.document import Document, Section
 from sweeps.results.resonance_results import ResonanceResult
 
 
@@ -87,16 +87,18 @@ def test_every_table_of_a_page_scrolls_in_itself(mmrjax, tmp_path):
     assert text.count("</table></div>") == len(tables) and ".scroll { overflow-x: auto; }" in text
 
 
-def test_every_page_warns_of_curves_that_nobody_has_named(robot):
-    """No page is rendered without a word on them; the warning comes before the contents."""
-    assert inspect.signature(frame.render_page).parameters["curves"].default is inspect.Parameter.empty
+def test_every_page_warns_of_curves_that_nobody_has_named(robot, tmp_path):
+    """The warning comes before the contents."""
     curved = dataclasses.replace(robot, effects=(effects.UNNAMED["curve_electrical_current"](), effects.ALL[0]()))
-    assert frame.unnamed_curves(robot) == [] and frame.unnamed_curves(curved) == ["curve_electrical_current"]
-    text = frame._with_contents(
-        "<h1>a</h1><h2>b</h2>", {"curve-warning": words.of_curves(frame.unnamed_curves(curved))}
-    )
-    assert 0 < text.index("<code>curve_electrical_current</code>") < text.index('<nav id="contents"')
-    assert "curve-warning" not in frame._with_contents("<h1>a</h1><h2>b</h2>", {"curve-warning": words.of_curves([])})
+    document = Document("a", "b.", (), (Section("c", ()),))
+    for shown, warned in ((curved, True), (robot, False)):
+        text = page_renderer.write_report_page(tmp_path, document, RobotFile(shown, "x")).read_text("utf-8")
+        assert ('id="curve-warning"' in text) == warned
+        if warned:
+            warning = text.index('id="curve-warning"')
+            assert (
+                0 < warning < text.index("<code>curve_electrical_current</code>") < text.index('<nav id="contents"')
+            )
 
 
 @pytest.mark.slow

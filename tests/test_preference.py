@@ -19,8 +19,8 @@ from calibration.discovery.result import HeldOutAlternative, Worse
 from calibration.discovery.settings import HELD_OUT, settings_for
 from calibration.inference.observers import SettledRuns
 from mmrjax.model import channels, paper_robots
-from sweeps.commands import loop as room
-from sweeps.pages import loop_page as loop_page
+from sweeps.report import loop_report, page_renderer
+from sweeps.report.terminal_renderer import print_document
 
 NAMES = channels.USUAL
 
@@ -167,17 +167,20 @@ def test_what_gets_worse_stands_before_effects_on_page_and_terminal(traced, tmp_
     before = document["errors"]["before"]["fitted"]
     assert stated["total_current"]["rms_sigma"] > before["total_current"]["rms_sigma"]
 
-    room.print_discovery(found)
+    print_document(loop_report.loop_document(found, "nominal", {}))
     printed = capsys.readouterr().out
     assert said in " ".join(printed.split()) and printed.index("Predicts worse") < printed.index("effect ")
-    assert printed.index("as stated, nothing fitted") < printed.index("before, fitted")
+    assert printed.index("as stated") < printed.index("fitted again")
 
-    text = loop_page.write_loop_page(tmp_path, found, robot_name="nominal").read_text("utf-8")
+    document_shown = loop_report.loop_document(found, "nominal", {})
+    text = page_renderer.write_report_page(tmp_path, document_shown).read_text("utf-8")
     page = Tables(text)
     assert said in page.text
-    assert text.index('id="summary"') < text.index('id="worse"') < text.index('id="use"')
+    assert text.index('id="summary"') < text.index('id="worse"') < text.index('id="advice"')
     assert [row[0] for row in page.tables["summary"][1:3]] == ["as stated", "fitted again"]
     assert len(page.tables["alternatives_held_out"]) == 1 + len(traced.held_out)
 
     found = dataclasses.replace(found, held_out_worse=())
-    assert 'id="worse"' not in loop_page.write_loop_page(tmp_path, found, robot_name="nominal").read_text("utf-8")
+    assert "worse" not in {
+        getattr(block, "name", "") for block in loop_report.loop_document(found, "nominal", {}).blocks
+    }

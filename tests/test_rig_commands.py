@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import json
 import re
-from importlib import resources
 
 import jax
-import jinja2
 import numpy as np
 import pytest
 
@@ -16,12 +14,12 @@ from calibration.data.columns import Layout
 from calibration.data.runs import Runs
 from calibration.inference.simulation_errors import relative_error, sized_error
 from mmrjax import fidelities
-from mmrjax.model import params, quantities
+from mmrjax.model import channels, params, quantities
 from mmrjax.model.paper_robots import nominal
 from sweeps import capabilities
 from sweeps.commands import rig_new
-from sweeps.pages.page import printed_number
 from sweeps.points import imposed
+from sweeps.report import fit_tables
 from tests.commands import rows as rows_of
 
 #: Words of the paper's robot, its parts, its tables and its surfaces; none is a rig's.
@@ -518,14 +516,9 @@ def test_forbidden_words_are_seen():
     assert words_of_others('<img src="data:image/svg+xml;base64,paper">') == []
 
 
-@pytest.mark.parametrize("page", ["loop", "calibration"])
-def test_a_page_shows_a_dash_for_a_channel_without_readings(page):
+def test_a_report_shows_a_dash_for_a_channel_without_readings():
     """Of the row of errors by fit, which knows nothing of it."""
-    text = (resources.files("sweeps.pages") / "templates" / f"{page}.html.j2").read_text("utf-8")
-    (row,) = re.findall(r"{% for c in columns %}<td>{{ by.*?</td>{% endfor %}", text)
-    environment = jinja2.Environment(undefined=jinja2.StrictUndefined)
-    environment.filters["number"] = printed_number
-    assert (
-        environment.from_string(row).render(columns=["speed", "position"], by={"speed": 1.0})
-        == "<td>1</td><td>–</td>"
-    )
+    shown = [channels.find_channel(name) for name in ("speed", "output_angle")]
+    table = fit_tables.rms_table({"before": {"speed": 1.0}}, shown)
+    (row,) = table.rows
+    assert [column.text(cell) for column, cell in zip(table.columns, row, strict=True)] == ["before", "1", "–"]

@@ -16,6 +16,8 @@ from mmrjax.effects.base import THE_SIDE
 from mmrjax.model import paper_robots
 from sweeps import config, inputs
 from sweeps.pages import page
+from sweeps.report import page_renderer
+from sweeps.report.document import Document, Section
 from tests.test_turn_effects import OF_SIDES, amplitude, with_amplitudes
 
 OWN = '''
@@ -72,14 +74,15 @@ def test_a_file_of_unlike_sides_is_said_to_turn_and_by_how_much(tmp_path, capsys
     assert remark in capsys.readouterr().err.replace("\n", " ")
     assert "33 V on level ground, it turns: 4W2T by 0.0175 rad/s to the right at 1.31 m/s ahead (--left" in remark
     assert "6T2A" not in remark  # whose sides are alike
-    assert page.robot_section(file)["remarks"] == file.remarks
+    assert [w.text for w in page.robot_section(file)["warnings"]] == [". ".join(file.remarks)]
     assert inputs.load_robot(config.Simulate(robot=file.source, left_V=9.0, right_V=9.0)).remarks == ()
     assert of_file(tmp_path, SIDE_RADIUS.replace("0.01", "0.0")).remarks == ()
     (narrow,) = of_file(tmp_path, SIDE_RADIUS, set={"4W2T.turning.width": 0.0}).remarks
     assert narrow.endswith("how it would turn is not known: the robot's file lacks 4W2T.turning.width [m], needed for "
                            "a turn")  # fmt: skip
-    warned = page._with_contents("<h1>a</h1><h2>b</h2>", {"robot-warning": remark})
-    assert f'id="robot-warning"><span>{remark}' in warned
+    document = Document("a", "b.", (), (Section("c", ()),))
+    warned = page_renderer.write_report_page(tmp_path, document, file).read_text("utf-8")
+    assert 'id="robot-warning"' in warned and "33 V on level ground, it turns: 4W2T" in warned
     found.reading["yaw_rate"] = [0.0, 0.0]
     assert of_file(tmp_path, SIDE_RADIUS).remarks == ()
 

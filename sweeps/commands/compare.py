@@ -70,7 +70,8 @@ def compare_with_table(
             fit_of(file, runs), notes=(*notes, *of_draws), against=_name_of(config, file, second),
         )  # fmt: skip
         shown = print_report(comparison_report.comparison_document(found), dataclasses.replace(file, robot=robot))
-        further = {"errors": summary, "notes": [*file.remarks, *notes]}
+        answer = comparison_report.comparison_answer(found)
+        further = {"statement": answer, "errors": summary, "notes": [*file.remarks, *notes]}
         result = run.SimulationResult("compare", config.model, robot, runs, table, further)
         return run.write_run_folder(folder, config, result, shown)
 
@@ -112,9 +113,9 @@ def _over_time(
         shown = print_report(
             comparison_report.comparison_document(found), dataclasses.replace(file, robot=ready.robot)
         )
-        result = run.SimulationResult(
-            "compare", HISTORIES, ready.robot, runs, table, {"errors": summary, "notes": [*file.remarks, *notes]}
-        )
+        answer = comparison_report.comparison_answer(found)
+        further = {"statement": answer, "errors": summary, "notes": [*file.remarks, *notes]}
+        result = run.SimulationResult("compare", HISTORIES, ready.robot, runs, table, further)
         return run.write_run_folder(folder, config, result, shown)
 
 

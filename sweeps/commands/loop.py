@@ -11,10 +11,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
-from rich.table import Table
+import numpy as np
 
+import mmrjax as mm
 from calibration.data import effect_file, robot_file
-from calibration.data.columns import Layout
 from calibration.described import in_words
 from calibration.discovery import findings
 from calibration.discovery.discover import discover
@@ -22,15 +22,19 @@ from calibration.discovery.kept import REFIT_FILE, OutOfTime
 from calibration.discovery.resolve import check_resolvable, resolve
 from calibration.discovery.result import DiscoveryResult, Ranking
 from calibration.discovery.settings import fewest_replicates
-from calibration.inference import blocks, observers, priors
-from calibration.inference.simulation_errors import OF_SIZE
+from calibration.inference import observers, priors
+from calibration.inference.details import EquationDefects
+from calibration.inference.simulation_errors import root_mean_square
 from calibration.words import loop_words
 from calibration.words.step_words import expected_time
+from mmrjax.model import params
+from mmrjax.model.robot import Robot
 from sweeps import config as configuration
 from sweeps.console import print_message, print_output, step_reporter
 from sweeps.inputs import load_robot, read_runs
-from sweeps.pages import words
-from sweeps.skeleton import finish_run_folder, page_writer
+from sweeps.report import loop_report
+from sweeps.report.fit_tables import Change
+from sweeps.skeleton import finish_run_folder, print_report
 from sweeps.store import SOLVER_FAILED, RunFolder, open_folder
 
 T = TypeVar("T")
@@ -113,7 +117,8 @@ def _loop(
             raise
         if config.resolve:
             found = _resolved(found, config, members, progress)
-        print_discovery(found)
+        document = loop_report.loop_document(found, config.robot, changes_by_effect(found))
+        shown = print_report(document)
         if config.resolve and found.resolved is None:
             print_output(
                 "The track model was not asked: nothing remains in slip, track or ground that it has a say in."
@@ -122,7 +127,6 @@ def _loop(
         if config.report:
             progress("writing the report")
         manifest = {"seed": config.seed, "verdict": found.verdict}
-        shown = page_writer("loop", found, robot_name=config.robot)
         return finish_run_folder(folder, config, manifest, solved=found.converged, page=shown, runs=found.runs)
 
 
@@ -209,77 +213,26 @@ def _say_kept(stages: dict[str, Any], folder: RunFolder, robot_name: str) -> Non
     print_message(f"the best that is known so far is the refit, {folder.partial / REFIT_FILE}")
 
 
-def _effects(found: DiscoveryResult) -> Table:
-    """Table of the effects that were found."""
-    shown = Table(box=None, pad_edge=False)
-    numbers = ("amplitude", "lowers misfit by", "own p")
-    for heading in ("effect", "what is missing", *numbers, "indistinguishable from"):
-        number = heading in numbers
-        shown.add_column(heading, justify="right" if number else "left", no_wrap=number or heading == "effect")
-    for e in found.effects:
-        shown.add_row(
-            loop_words.effect_called(found, e), ", or ".join(e.families), loop_words.effect_amplitude(e),
-            f"{loop_words.misfit_text(e.score)} ({100 * e.share:.0f} %)", f"{e.p_value:.2g}",
-            loop_words.indistinguishable_effects(found, e) or "-",
-        )  # fmt: skip
-    return shown
+def changes_by_effect(found: DiscoveryResult) -> dict[str, Change]:
+    """Change of settled runs by each effect; empty for histories and for effects that the written robot lacks."""
+    added = [e.name for e in found.effects if e.name in {x.name for x in found.robot.effects}]
+    if not isinstance(found.detail, EquationDefects) or not added:
+        return {}
+    conditions = found.runs.conditions(found.robot)
 
+    def simulated(robot: Robot) -> dict[str, np.ndarray]:
+        results = mm.simulate(robot, conditions)
+        return {c.name: np.asarray(getattr(results, c.name)) for c in found.channels}
 
-def _errors(found: DiscoveryResult) -> Table:
-    """Table of the errors of the robot as stated, of its fits, and of rows held out."""
-    errors = Table(title=f"rms error [% of the {OF_SIZE}]", title_justify="left")
-    for heading in ("", "rows", *(c.label for c in found.channels)):
-        errors.add_column(heading, justify="right" if heading else "left")
-    whens = (0,) if found.refit_alone else (0, 1)
-    when = ("before", "after")
-    lines = {"as stated, nothing fitted": found.errors_as_stated}
-    lines |= {f"{when[k]}, fitted": found.errors[k] for k in whens}
-    for kind, both in found.errors_held_out.items():
-        lines |= {f"{when[k]}, held out by {blocks.kind_in_words(kind)}": both[k] for k in whens}
-    for text, by in lines.items():
-        cells = ("-" if e["rows"] == 0 else f"{e['rms_percent']:.1f}" for e in by.values())
-        errors.add_row(text, f"{max(e['rows'] for e in by.values())}/{len(found.runs)}", *cells)
-    return errors
-
-
-def print_discovery(found: DiscoveryResult) -> None:
-    """Verdict, effects, errors and remarks, for a person; the answer and the next step last."""
-    first = found.headline
-    if len(first.factors) > 1:
-        print_output(f"{first.level}: {loop_words.loop_headline(first)}.")
-    print_output(f"{found.verdict}: {found.statement}")
-    if not found.robot.has_ground and found.effects:
-        print_output("The track balance of a shaft is what its load loses.")
-    for said in (loop_words.support_sentence(found), loop_words.ruled_out(found)):
-        if said:
-            print_output(said)
-    rise = loop_words.rising_errors_sentence(found.held_out_worse, found.predicted)
-    if rise:
-        print_output(rise)
-    if found.effects:
-        print_output(_effects(found))
-        print_output(
-            "lowers misfit by: rise of χ² without it, all else refitted (share of the excess misfit); own p: among "
-            "the strongest of the library"
-        )
-    if found.hidden:
-        print_output(loop_words.hidden_effects_sentence(found))
-    if found.unnamed is not None:
-        print_output(loop_words.proposed_formula(found.unnamed))
-    if found.resolved is not None:
-        print_output(found.resolved.statement)
-        for note in found.resolved.notes:
-            print_output(f"- track model: {note}")
-    print_output(_errors(found))
-    if Layout.of(found.robot).crosses_zero:
-        shown_fits = {when: by for when, by in found.rms.items() if not (found.refit_alone and "after" in when)}
-        print_output(words.describe_rms(shown_fits))
-    if found.sensitivity:
-        print_output(f"{loop_words.at_other_noise(found.sensitivity)}")
-    for note in found.notes:
-        print_output(f"- {note}")
-    print_output(loop_words.completeness_answer(found))
-    after = found.next_experiment
-    if after is not None:
-        sigma = f" (expected {after.expected_sigma:.1f} σ)" if after.separates else ""
-        print_output(f"Next: {after.name}: {after.description}{sigma}")
+    with_it, most, measured = simulated(found.robot), {}, found.readings_of_rows.measured
+    for name in added:
+        without = simulated(params.replace(found.robot, {f"effects.{name}.amplitude": params.as_float(0.0)}))
+        moved = []
+        for k, c in enumerate(found.channels):
+            a, b = without[c.name], with_it[c.name]
+            size = root_mean_square(measured[found.included, k])
+            if np.isfinite(size) and size > 0:
+                moved.append(Change(c, 100 * root_mean_square((b - a)[found.included]) / size, a, b))
+        if moved:
+            most[name] = max(moved, key=lambda change: change.rms)
+    return most

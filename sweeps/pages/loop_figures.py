@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -30,6 +29,7 @@ from sweeps.pages.figure_style import (
 )
 from sweeps.pages.words import short_name
 from sweeps.report.condition_columns import UNITS, imposed_column
+from sweeps.report.fit_tables import Change
 
 #: Effects on the ladder and on the map of look-alikes.
 RUNGS, ALIKE = 20, 14
@@ -289,21 +289,6 @@ def depends_on(table: dict[str, np.ndarray], change: np.ndarray) -> tuple[np.nda
     whole = {k: v for k, v in every.items() if np.isfinite(v[use]).all()}
     label = min(whole, key=lambda k: roughness(whole[k][use], change[use]))
     return whole[label], label
-
-
-@dataclasses.dataclass(frozen=True)
-class Change:
-    """Change of the readings of the runs by an effect of the robot that is written.
-
-    Attributes:
-        channel: with the largest change; rms: of the change [% of the channel's measured rms].
-        without, with_it: simulated without and with the effect, otherwise the same [SI], shape (rows,).
-    """
-
-    channel: Channel
-    rms: float
-    without: np.ndarray
-    with_it: np.ndarray
 
 
 def draw_effect_laws(found: DiscoveryResult, table: dict[str, np.ndarray], changes: Mapping[str, Change]) -> Figure:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import urllib.parse
+from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -15,10 +16,8 @@ from markupsafe import Markup, escape
 
 from calibration.data.robot_file import RobotFile
 from calibration.data.writing import write_text
-from mmrjax import __version__, effects
+from mmrjax import __version__
 from mmrjax.errors import printable
-from mmrjax.model import channels
-from mmrjax.model.channels import Channel
 from mmrjax.model.robot import Robot
 from sweeps import capabilities
 from sweeps.pages import words
@@ -31,9 +30,9 @@ from sweeps.pages.figure_style import (
     has_colour_scale,
 )
 from sweeps.pages.time_overlay import TimeOverlay
+from sweeps.report import run_tables
 from sweeps.report.document import PAGE_ROWS as ROWS
 from sweeps.report.document import SIDE_BY_SIDE, Column, Note, Section, Table, cell_tone
-from sweeps.report.markup import download_link, marked_html
 
 
 class Album:
@@ -88,14 +87,17 @@ def _inline(svg: str, name: str, looks: str) -> str:
 
 
 def robot_section(file: RobotFile) -> dict[str, Any]:
-    """The `robot`'s name and its section of a page (`about_robot`), with its remarks and unnamed curves.
+    """The `robot`'s name, its section of a page (`about_robot`), and `warnings` of remarks and unnamed curves.
 
     A packaged robot with other parameters is called changed.
     """
     from mmrjax.model.paper_robots import ROBOTS
 
-    about = {"robot": capabilities.shown_name(file), "curves": unnamed_curves(file.robot), "remarks": file.remarks}
-    return about | {"about_robot": _section(file, ROBOTS["nominal"]())}
+    remarks = [Note(". ".join(file.remarks), "warn", "robot-warning")] if file.remarks else []
+    return {
+        "robot": capabilities.shown_name(file), "about_robot": _section(file, ROBOTS["nominal"]()),
+        "warnings": (*run_tables.curve_warning(file.robot), *remarks),
+    }  # fmt: skip
 
 
 def _section(file: RobotFile, nominal: Robot) -> Section:
@@ -117,50 +119,6 @@ def _section(file: RobotFile, nominal: Robot) -> Section:
     )
 
 
-def unnamed_curves(robot: Robot) -> list[str]:
-    """Curves of a robot for what is missing without a name."""
-    return [e.name for e in robot.effects if e.name in effects.UNNAMED]
-
-
-def conditions_in_words(table: dict[str, np.ndarray], row: int) -> str:
-    """The conditions of a row in words: what is imposed, and on a vehicle payload, slope and a rig's surface."""
-    parts = [str(table["configuration"][row])]
-    if "supply_voltage_V" in table:
-        parts.append(printed_supply(table["supply_voltage_V"][row]))
-    elif "motor_speed_rpm" in table:
-        parts.append(f"{table['motor_speed_rpm'][row]:g} rpm")
-    elif "motor_current_A" in table and "simulated_motor_current_A" not in table:
-        parts.append(f"{table['motor_current_A'][row]:g} A")
-    if "payload_kg" in table:
-        parts += [f"{table['payload_kg'][row]:g} kg", f"{table['slope_deg'][row]:g}°"]
-    if "load_torque_Nm" in table:
-        parts.append(f"{table['load_torque_Nm'][row]:.4g} N·m")
-    if "duty_left" in table:
-        parts.append(f"duties {table['duty_left'][row]:.3g} and {table['duty_right'][row]:.3g}")
-    return ", ".join(parts)
-
-
-def channel_columns(shown: Iterable[Channel]) -> dict[str, str]:
-    """Column of each channel, as in the tables of runs."""
-    return {c.name: c.column for c in shown}
-
-
-def first_rows(table: dict[str, np.ndarray]) -> list[dict[str, Any]]:
-    """The rows of a table that a page has room for."""
-    return [{k: v[i] for k, v in table.items()} for i in range(min(len(next(iter(table.values()))), ROWS))]
-
-
-def status_rows(table: dict[str, np.ndarray]) -> list[dict[str, Any]]:
-    """Count, share and meaning of each status that a table has, in the order of `words`."""
-    known = [*words.STATUSES, *(set(map(str, table["status"])) - set(words.STATUSES))]
-    total = len(table["status"])
-    return [
-        {"name": s, "count": n, "percent": 100 * n / total, "meaning": words.status_meaning(s)}
-        for s in known
-        if (n := int((table["status"] == s).sum()))
-    ]
-
-
 def printed_number(value: Any, form: str = "{:.2f}") -> str:
     """A number as a page prints it, nothing without a sign; what is not finite is a dash."""
     if isinstance(value, int | float | np.number):
@@ -169,52 +127,17 @@ def printed_number(value: Any, form: str = "{:.2f}") -> str:
     return str(value)
 
 
-def printed_winding(value: Any) -> str:
-    """A winding's temperature after long running [°C] as a page prints it."""
-    return words.NONE_SETTLES if math.isinf(float(value)) else printed_number(value, "{:.0f}")
-
-
-def printed_supply(value: Any) -> str:
-    """A supply voltage [V] as a page prints it; runs on the battery have none."""
-    return "battery" if math.isnan(float(value)) else f"{float(value):g} V"
-
-
-def printed_reading(value: Any, channel: str) -> str:
-    """A reading with one digit less than its channel's resolution."""
-    digits = max(channels.find_channel(channel).resolution - 1, 0)
-    return printed_number(value, f"{{:.{digits}f}}")
-
-
-def printed_error(value: Any, channel: str) -> str:
-    """A difference of readings, with its sign, with a digit more than they."""
-    return printed_number(value, f"{{:+.{channels.find_channel(channel).resolution}f}}")
-
-
 def _grade(value: Any) -> str:
     """Class of a cell by the size of its error [%]: the paper claims 7 %."""
     size = abs(float(value))
     return "none" if not math.isfinite(size) else "good" if size <= 5 else "fair" if size <= 10 else "bad"
 
 
-def render_page(
-    folder: Path,
-    template: str,
-    album: Album,
-    *,
-    curves: Sequence[str],
-    remarks: Sequence[str] = (),
-    of_channels: Iterable[Channel] = (),
-    **known: Any,
-) -> Path:
+def render_page(folder: Path, template: str, album: Album, **known: Any) -> Path:
     """Write `report.html` from a template, the album's pictures and the template's values.
 
     Adds the parts of every page: contents after the answer, files of the folder (`files`: unusual meanings), tables
     that scroll.
-
-    Args:
-        curves: unnamed curves of the robot, for a warning (see `unnamed_curves`).
-        remarks: further warnings about the robot.
-        of_channels: channels of the page.
     """
     templates = resources.files("sweeps.pages") / "templates"
     environment = jinja2.Environment(
@@ -226,25 +149,19 @@ def render_page(
     )
     environment.filters |= {
         "number": printed_number,
-        "reading": printed_reading,
         "grade": _grade,
-        "error": printed_error,
-        "winding": printed_winding,
     }
     environment.filters |= {"marked": marked_html, "download": download_link, "tone": cell_tone}
     environment.globals |= {
         "page_rows": ROWS,
         "side_by_side": SIDE_BY_SIDE,
-        "channels": {c.name: (c.label, c.unit) for c in of_channels},
         "status_words": {name: status.short for name, status in words.STATUSES.items()},
-        "settled_words": words.SETTLED,
         "version": __version__,
     }
     known["files"] = _beside(Path(folder), words.FILES | known.get("files", {}))
     page = environment.get_template(template).render(pictures=album.pictures, overlays=album.overlays, **known)
     page = page.replace("<table", '<div class="scroll" tabindex="0"><table').replace("</table>", "</table></div>")
-    warnings = {"curve-warning": words.of_curves(curves), "robot-warning": escape(". ".join(remarks))}
-    page = _with_contents(page, warnings)
+    page = _with_contents(page)
     path = Path(folder) / "report.html"
     write_text(path, printable(page))
     return path
@@ -263,8 +180,8 @@ def _beside(folder: Path, meanings: dict[str, str]) -> dict[str, str]:
 _HEADING = re.compile(r"<h2(?: id=\"([^\"]+)\")?>(.*?)</h2>", re.S)
 
 
-def _with_contents(page: str, warnings: Mapping[str, str]) -> str:
-    """A page with links to its headings, and what warnings there are, before the first of them."""
+def _with_contents(page: str) -> str:
+    """A page with links to its headings before the first of them."""
     links = []
 
     def with_id(found: re.Match[str]) -> str:
@@ -275,9 +192,19 @@ def _with_contents(page: str, warnings: Mapping[str, str]) -> str:
 
     page = _HEADING.sub(with_id, page)
     first = page.index("<h2")
-    cards = "".join(
-        f'<div class="card warn" id="{name}"><span>{warning}</span></div>\n'
-        for name, warning in warnings.items()
-        if warning
+    return f'{page[:first]}<nav id="contents" aria-label="contents">{" ".join(links)}</nav>\n{page[first:]}'
+
+
+def marked_html(text: str) -> Markup:
+    """A text as HTML, with its bold words and names."""
+    html = re.sub(r"\*\*(.+?)\*\*", r"<b>\1</b>", str(escape(text)))
+    return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", html))
+
+
+def download_link(table: Table) -> Markup:
+    """A link that saves a table as CSV: the file of the run folder that holds more rows, or the table itself."""
+    if len(table.rows) > ROWS:
+        return Markup('<a class="csv" download href="{0}">all rows as CSV</a>').format(table.file)
+    return Markup('<a class="csv" download="{}.csv" href="data:text/csv;charset=utf-8,{}">CSV</a>').format(
+        table.name, urllib.parse.quote(table.csv)
     )
-    return f'{page[:first]}{cards}<nav id="contents" aria-label="contents">{" ".join(links)}</nav>\n{page[first:]}'

@@ -14,8 +14,8 @@ from matplotlib.ticker import MaxNLocator
 from mmrjax.model.channels import Channel
 from sweeps.pages import words
 from sweeps.pages.figure_style import FAINT, INK, axis_label, corner_note, new_figure
-from sweeps.pages.page import printed_reading
 from sweeps.report.condition_columns import UNITS, imposed_column
+from sweeps.report.run_tables import reading_text
 
 _PANELS = 3  # voltages drawn of a configuration
 _CELLS = 12  # along an axis up to which cells are labelled
@@ -108,7 +108,7 @@ def _map(axes: Axes, runs: dict[str, np.ndarray], index: np.ndarray, channel: Ch
         for j, i in zip(*np.nonzero(np.isfinite(image)), strict=True):
             shade = colormaps["viridis"](norm(image[j, i]))
             ink = "white" if 0.299 * shade[0] + 0.587 * shade[1] + 0.114 * shade[2] < 0.52 else INK
-            axes.text(i, j, printed_reading(image[j, i], channel.name), color=ink, fontsize=7.5, **_INSIDE)
+            axes.text(i, j, reading_text(image[j, i], channel), color=ink, fontsize=7.5, **_INSIDE)
     for i, j, wide, tall in _blocks(set(missing), joined=not labelled):
         axes.add_patch(Rectangle((i - 0.5, j - 0.5), wide, tall, fc="#f4f4f4", ec="#b5b5b5", hatch="////", lw=0.4))
     _say_missing(axes, missing, labelled)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import NamedTuple
-
-from mmrjax.model import channels
 
 
 class Status(NamedTuple):
@@ -98,17 +96,6 @@ FILES = {
     "manifest.json": "versions, machine, time, hashes",
     "figures/": "the figures, as SVG",
 }
-
-
-def of_curves(names: Sequence[str]) -> str:
-    """A warning of a robot with curves that nobody has named; empty for none."""
-    if not names:
-        return ""
-    curves = " and ".join(f"<code>{n}</code>" for n in names)
-    return (
-        f"This robot holds {curves}: a smooth curve fitted to what its model lacks, which nobody has named. "
-        "Trust it only under the conditions of the runs that it was fitted to."
-    )
 
 
 #: What `verdict` in result.json of the loop means, the least first; an alias after its word.
@@ -215,23 +202,6 @@ def short_status(status: str) -> str:
 def status_meaning(status: str) -> str:
     """A status for the reader of a report."""
     return STATUSES[status].meaning if status in STATUSES else ""
-
-
-#: Names of fits that rms errors are of.
-_FITS = {
-    "before": "before", "after": "after", "held_out": "held out", "held_out_before": "before, held out",
-    "held_out_after": "after, held out",
-}  # fmt: skip
-
-
-def describe_rms(rms: Mapping[str, Mapping[str, float]]) -> str:
-    """rms errors in the units of their channels, in a line; by fit and channel."""
-    units = {c.name: (c.label, c.unit) for c in channels.EVERY}
-    parts = [
-        f"{_FITS[when]} " + ", ".join(f"{units[name][0]} {value:.3g} {units[name][1]}" for name, value in by.items())
-        for when, by in rms.items()
-    ]
-    return "rms error: " + "; ".join(parts)
 
 
 _PAPERS_NAMES = {"nominal": "nominal (PM)", "sm1": "SM-1", "sm2": "SM-2"}

@@ -9,11 +9,12 @@ import numpy as np
 
 from calibration.data import runs
 from calibration.inference import simulation_errors
+from mmrjax.model.channels import find_channel
 from mmrjax.model.paper_tables import CONFIGURATIONS, TRACKED, WHEELED
 from mmrjax.model.quantities import MM, RPM
 from mmrjax.model.robot import Robot
-from sweeps.pages.page import printed_reading
 from sweeps.paper import data
+from sweeps.report.run_tables import reading_text
 
 
 def variant_errors(variants: dict[str, np.ndarray], rows: data.Rows) -> list[dict[str, Any]]:
@@ -111,11 +112,11 @@ def _same_mode(table: runs.Runs, k: int) -> np.ndarray:
 def _cells(channel: str, measured: float, paper: float, own: float, raised: float, weighed: float) -> dict[str, Any]:
     """Texts of one channel in a row; differences by (35) of the nominal (raised, own mass) from paper and bench."""
     return {
-        "measured": printed_reading(measured, channel),
-        "paper": printed_reading(paper, channel),
-        "own": printed_reading(own, channel) if np.isfinite(own) else "slides",
-        "raised": printed_reading(raised, channel) if np.isfinite(raised) else "no number",
-        "weighed": printed_reading(weighed, channel) if np.isfinite(weighed) else "no number",
+        "measured": reading_text(measured, find_channel(channel)),
+        "paper": reading_text(paper, find_channel(channel)),
+        "own": reading_text(own, find_channel(channel)) if np.isfinite(own) else "slides",
+        "raised": reading_text(raised, find_channel(channel)) if np.isfinite(raised) else "no number",
+        "weighed": reading_text(weighed, find_channel(channel)) if np.isfinite(weighed) else "no number",
         "to_paper": float(simulation_errors.relative_error(np.array(raised), np.array(paper))),
         "to_paper_weighed": float(simulation_errors.relative_error(np.array(weighed), np.array(paper))),
         "to_measured": float(simulation_errors.relative_error(np.array(raised), np.array(measured))),

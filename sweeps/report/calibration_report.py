@@ -90,7 +90,8 @@ def _shifts(found: CalibrationResult) -> Iterable[Block]:
     yield catalogue.figure("calibration.parameters", found, words=(HELD,))
     if found.tied:
         yield Note(f"Tied: {'; '.join(f'`{n}` = {t.ratio:.4g} x `{t.leader}`' for n, t in found.tied.items())}.")
-    yield Note(fit_tables.noise_sentence(found.noise, found.channels))
+    noises = {name: (n.median_percent, n.source) for name, n in found.noise.items()}
+    yield Note(fit_tables.noise_sentence(noises, found.channels))
 
 
 def _over_rows(found: CalibrationResult, sized: bool) -> Iterable[Section]:

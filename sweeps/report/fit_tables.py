@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,6 +20,20 @@ FITS = {
 }  # fmt: skip
 
 
+class Change(NamedTuple):
+    """Change of the readings of the runs by an effect of the robot that is written.
+
+    Attributes:
+        channel: with the largest change; rms: of the change [% of the channel's measured rms].
+        without, with_it: simulated without and with the effect, otherwise the same [SI], shape (rows,).
+    """
+
+    channel: Channel
+    rms: float
+    without: np.ndarray
+    with_it: np.ndarray
+
+
 def shift_cell(shift: float) -> Cell:
     """A shift in prior standard deviations, marked beyond two and three."""
     return Cell(shift, "bad" if abs(shift) > 3 else "fair" if abs(shift) > 2 else "")
@@ -31,13 +45,11 @@ def error_cell(percent: float) -> Cell:
     return Cell(percent, "" if not np.isfinite(size) else "good" if size <= 5 else "fair" if size <= 10 else "bad")
 
 
-def noise_sentence(noise: Mapping[str, Any], shown: Iterable[Channel]) -> str:
-    """Standard deviation of each channel with its source."""
-    shares = {name: n.median_percent for name, n in noise.items()}
+def noise_sentence(noise: Mapping[str, tuple[float | None, str]], shown: Iterable[Channel]) -> str:
+    """Standard deviation of each channel, as its median share of the reading [%], with its source."""
+    of_channels = ((c.label, *noise[c.name]) for c in shown if c.name in noise)
     parts = (
-        f"{c.label} {f'{shares[c.name]:.2f} % ' * (shares[c.name] is not None)}({noise[c.name].source})"
-        for c in shown
-        if c.name in noise
+        f"{label} {'' if share is None else f'{share:.2f} % '}({source})" for label, share, source in of_channels
     )
     return f"Noise (sd): {'; '.join(parts)}."
 

@@ -22,5 +22,5 @@ def write_report_page(folder: Path, document: Document, file: RobotFile | None =
     for block in document.every_block:
         if isinstance(block, Figure):
             album.add(block.name, block.draw)
-    robot: dict[str, Any] = {"curves": (), "about_robot": None} if file is None else robot_section(file)
-    return render_page(folder, "document.html.j2", album, title=document.title, document=document, **robot)
+    about: dict[str, Any] = {"warnings": (), "about_robot": None} if file is None else robot_section(file)
+    return render_page(folder, "document.html.j2", album, title=document.title, document=document, **about)

@@ -1,0 +1,413 @@
+"""The report of the loop: the answer, what was found and how sure that is, errors, and what to do next."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calibration.data.columns import Layout
+from calibration.described import describe
+from calibration.discovery.result import DiscoveryResult
+from calibration.discovery.settings import WITHOUT_NAME
+from calibration.inference import blocks
+from calibration.inference.details import EquationDefects, TimeStatistics
+from calibration.inference.fit_notes import Copied, Determination, FarFromPrior, Repeats
+from calibration.inference.simulation_errors import OF_SIZE
+from calibration.words import loop_words
+from mmrjax.effects import BY_NAME
+from mmrjax.errors import count_noun
+from mmrjax.model import params
+from sweeps.pages import words
+from sweeps.report import catalogue, fit_tables, run_tables
+from sweeps.report.document import Block, Cell, Document, Note, Section, Table, remarks
+from sweeps.report.fit_tables import Change
+
+#: Change of an rms error that is marked [%].
+NOTABLE = 0.05
+#: Verdicts that leave something open.
+OPEN = ("class", "undescribed", *WITHOUT_NAME)
+
+
+def loop_document(found: DiscoveryResult, robot_name: str, changes: Mapping[str, Change]) -> Document:
+    """The report of a pass of the loop.
+
+    Args:
+        robot_name: name or file of the robot that it began with; changes: of settled runs by each effect.
+    """
+    missing = found.verdict not in ("none", "undescribed")
+    rise = loop_words.rising_errors_sentence(found.held_out_worse, found.predicted)
+    return Document(
+        f"Is the {words.words_shown(Path(robot_name).name)} model complete?",
+        loop_answer(found),
+        (
+            *([Note(tuple(_findings(found, changes)), name="found")] if found.effects else []),
+            _summary(found),
+            *([Note(rise, name="worse", terminal=True)] if rise else []),
+            _advice(found),
+            *run_tables.curve_warning(found.robot),
+        ),
+        tuple(_sections(found, changes, missing)),
+    )
+
+
+def loop_answer(found: DiscoveryResult) -> str:
+    """The answer in one sentence or two: the claim that holds at every noise tried, and what is missing."""
+    first = found.headline
+    if len(first.factors) == 1:
+        return loop_words.completeness_answer(found)
+    claim = f"{loop_words.loop_headline(first)}."
+    if first.level == found.verdict:
+        return f"{loop_words.completeness_answer(found)} {claim}"
+    return f"{'Perhaps' if first.level == 'open' else 'No'}. {claim}"
+
+
+def rows_of(found: DiscoveryResult) -> dict[str, np.ndarray]:
+    """Rows of the result as figures and page show them: of a rig each surface is a configuration of its own."""
+    table = found.rows_table()
+    if Layout.of(found.robot).crosses_zero:
+        table["configuration"] = found.runs.configurations_named(found.robot)
+    return table
+
+
+def _rows_are(found: DiscoveryResult) -> str:
+    return "samples" if isinstance(found.detail, TimeStatistics) else "runs"
+
+
+def _findings(found: DiscoveryResult, changes: Mapping[str, Change]) -> Iterable[str]:
+    """Each effect of the model: what it is, how large, how sure, what else it could be."""
+    for e in found.effects:
+        size, other = loop_words.effect_amplitude(e), loop_words.indistinguishable_effects(found, e)
+        if e.name in changes:
+            size += f", which changes the {changes[e.name].channel.label} by {changes[e.name].rms:.2g} %"
+        or_else = f" Or {other}." if other else ""
+        kinds = ", or ".join(e.families)
+        yield f"**{kinds}** (`{e.name}`): {size}; {loop_words.how_sure(found, e)}.{or_else}"
+
+
+def _marked(text: str, change: float) -> Cell:
+    """A cell of errors with an arrow where they change."""
+    if not abs(change) >= NOTABLE:
+        return Cell(text)
+    return Cell(f"{text} ↓", "good") if change < 0 else Cell(f"{text} ↑", "bad")
+
+
+def _summary(found: DiscoveryResult) -> Table:
+    """Errors as stated, fitted again, and with what was found: seen, and unseen by the first kind of block.
+
+    A change is marked if both lines are over the same number of rows.
+    """
+    kind, unseen = next(iter(found.errors_held_out.items()), ("", ({}, {})))
+    total, before = len(found.runs), dict[str, tuple[float, int]]()
+    lines = [("as stated", found.errors_as_stated, {}), ("fitted again", found.errors[0], unseen[0])]
+    if not found.refit_alone:
+        lines.append(("with what was found", found.errors[1], unseen[1]))
+    rows = []
+    for what, seen, held in lines:
+        cells = []
+        for c, e in seen.items():
+            other = f" ({held[c]['rms_percent']:.1f} %)" if c in held and held[c]["rows"] else ""
+            last, rows_before = before.get(c, (e["rms_percent"], e["rows"]))
+            change = e["rms_percent"] - last if rows_before == e["rows"] else 0.0
+            cells.append(_marked(f"{e['rms_percent']:.1f} %{other}", change) if e["rows"] else Cell("-"))
+        before = {c: (float(e["rms_percent"]), int(e["rows"])) for c, e in seen.items()}
+        reached, also = (max((int(e["rows"]) for e in by.values()), default=0) for by in (seen, held))
+        rows.append((what, *cells, f"{reached}/{total}" + (f" ({also}/{total})" if also else "")))
+    by = blocks.kind_in_words(kind) if kind else "nothing"
+    heads = f"rms error, seen and (unseen, by {by})", *(f"{c.label} |" for c in found.channels)
+    return catalogue.table("loop.summary", rows, *heads, f"{_rows_are(found)} reached |")
+
+
+def held_out_table(found: DiscoveryResult) -> Table:
+    """Errors of the refit and with what was found, by kind of block held out, with the rows that each reaches."""
+    total, many, rows = len(found.runs), not found.refit_alone, list[tuple[Any, ...]]()
+    for kind, both in {"": found.errors, **found.errors_held_out}.items():
+        worse = {w.channel for w in found.held_out_worse if w.kind == kind}
+        cells = []
+        for c in both[0]:
+            texts = [f"{e[c]['rms_percent']:.1f}" if e[c]["rows"] else "-" for e in both[: 1 + many]]
+            change = both[1][c]["rms_percent"] - both[0][c]["rms_percent"] if many else 0.0
+            shown = np.inf if c in worse else change if not kind or change < 0 else 0.0
+            cells.append(_marked(" → ".join(texts), shown))
+        reached = max(int(e["rows"]) for e in both[0].values())
+        what = f"unseen: another {blocks.kind_in_words(kind)}" if kind else "seen by the fit"
+        rows.append((what, *cells, f"{reached} of {total}"))
+    for kind in found.held_out_unpredictable:
+        if kind not in found.errors_held_out:
+            what = f"unseen: another {blocks.kind_in_words(kind)}"
+            rows.append((what, *["-"] * len(found.channels), "not predictable from the others"))
+    return catalogue.table("loop.errors", rows, *(f"{c.label} |" for c in found.channels))
+
+
+def check_first(found: DiscoveryResult) -> list[str]:
+    """Points to check before use: the reading with the largest weight, parameters that moved far, contradictions."""
+    far = [describe(note) for note in found.remarks if isinstance(note, FarFromPrior | Repeats | Copied)]
+    against = [note for note in found.remarks if isinstance(note, str)]
+    said = [loop_words.largest_share(found), *far, *against[:1]]
+    # a sentence begins with a capital, a parameter's name does not
+    return [f"{text if '.' in text.split()[0] else text[0].upper() + text[1:]}." for text in said if text]
+
+
+def _advice(found: DiscoveryResult) -> Table:
+    after = found.next_experiment
+    if after is None:
+        known = {"none", "undescribed", "named"}
+        next_step = catalogue.text(f"loop.next-{found.verdict if found.verdict in known else 'other'}")
+    else:
+        tells = f" Tells {', '.join(after.separates)}; expected separation {after.expected_sigma:.1f} σ."
+        undecided = " Some pairs stay undecided." if found.verdict == "class" and not after.settles else ""
+        next_step = f"**{after.name}**: {after.description}.{tells * bool(after.separates)}{undecided}"
+    rows = [
+        ("use it?", " ".join(loop_words.use_it(found)) or "No runs could be held out."),
+        ("check first", " ".join(check_first(found)) or "Nothing unusual."),
+        ("do next", next_step),
+    ]
+    return catalogue.table("loop.advice", rows)
+
+
+def _effects(found: DiscoveryResult) -> Iterable[Block]:
+    """What was found, effects and a discrepancy without a name."""
+    rows = []
+    for e in found.to_json()["effects"]:
+        effect = next((x for x in found.effects if x.name == e["name"]), None)
+        over = f"none of the library; shown over {str(e.get('variable')).replace('_', ' ')}"
+        lowers, kinds = loop_words.misfit_text(e["score"]), ", or ".join(e["families"])
+        if effect is None:
+            alike = ", ".join(b for b in e["balances_alike"] if b != e["balance"])
+            rows.append((e["name"], kinds, e["balance"], over, "-", lowers, e["p_value"], "a curve", alike))
+            continue
+        rows.append(
+            (
+                loop_words.effect_called(found, effect), kinds, e["balance"], e["equation"] or over,
+                loop_words.effect_amplitude(effect), f"{lowers} ({100 * e['share']:.0f} %)", e["p_value"],
+                loop_words.tentative_reason(found, effect) or e["standing"],
+                loop_words.indistinguishable_effects(found, effect) or "nothing else of plausible size",
+            )
+        )  # fmt: skip
+    if rows:
+        yield catalogue.table("loop.effects", rows)
+        yield catalogue.note("loop.definitions")
+
+
+def _certainty(found: DiscoveryResult, missing: bool) -> Table:
+    """Verdict, adequacy, rows and prediction, each with the numbers that it rests on."""
+    (chi_before, chi_after), (before, after) = found.chi2_of_readings, found.chi2
+    chi = f"{chi_before:.0f} → {chi_after:.0f}" if missing else f"{chi_before:.0f}"
+    priors = f"{before:.0f} → {after:.0f}" if missing else f"{before:.0f}"
+    adequate = bool(found.after.adequate)
+    left, set_aside = len(found.unusable), len(found.outliers)
+    aside = f"{left} not reached by the fitted model, {set_aside} set aside as outliers"
+    p = loop_words.p_value(found.before.p_value)
+    rows = [
+        (
+            Cell(catalogue.text(f"loop.verdict-{found.verdict}"), "fair" if found.verdict in OPEN else "good"),
+            f"family-wise p {p}, from {found.replicates} bootstrap tables",
+        ),
+        (
+            Cell("adequate" if adequate else "residuals exceed the noise", "good" if adequate else "fair"),
+            f"squares of {found.readings} readings {chi} σ², with priors {priors} σ²",
+        ),
+        (
+            f"{int(found.included.sum())} of {len(found.runs)} {_rows_are(found)}",
+            aside if left or set_aside else "all used",
+        ),
+    ]  # fmt: skip
+    if missing and found.gain is not None:
+        better, error = found.gain.mean > 0, found.gain.se
+        spread = f" ± {error:.2f}" if np.isfinite(error) else ""
+        gain = f"{found.gain.mean:+.2f}{spread} nat a reading that was held out"
+        robot = f"robot.toml is {'what was found' if found.written else 'the refit'}"
+        verb = "better" if better else "worse"
+        rows.append((Cell(f"predicts {verb} than the refit", "good" if better else "fair"), f"{gain}; {robot}"))
+    return catalogue.table("loop.certainty", rows)
+
+
+def _resolved(found: DiscoveryResult) -> Section:
+    assert found.resolved is not None
+    d = found.resolved.to_json()
+    rows = [
+        (f"`{n}`", e["value"], e["sd"], e["unit"], "no" if e["held_by_prior"] else "yes")
+        for n, e in d["constants"].items()
+    ]
+    labels = {c.name: c.label for c in found.channels}
+    rms = "; ".join(f"{labels[c]} {e['before']:.2g} → {e['after']:.2g} %" for c, e in d["rms_percent"].items())
+    pairs = "; ".join(f"{a['a']} and {a['b']} ({a['correlation']:+.2f})" for a in d["alike"])
+    trade = catalogue.text("loop.alike", pairs) if pairs else ""
+    table = catalogue.table("loop.resolved_constants", rows)
+    return Section("What the track model says", (table, catalogue.note("loop.resolved-errors", rms, trade)))
+
+
+def _certain(found: DiscoveryResult, missing: bool) -> Iterable[Section]:
+    """How sure the answer is, and what to know before it is used."""
+    reasons = {"standing": loop_words.support_sentence(found), "ruled_out": loop_words.ruled_out(found)}
+    also = [loop_words.hidden_effects_sentence(found)] if found.hidden else []
+    also += [loop_words.proposed_formula(found.unnamed)] if found.unnamed is not None else []
+    also += [] if found.resolved is None else [found.resolved.statement, *found.resolved.notes]
+    noise = loop_words.at_other_noise(found.sensitivity) if found.sensitivity else ""
+    noises = {name: (n["median_percent"], n["source"]) for name, n in found.noise.items()}
+    notes = [*found.notes, noise, fit_tables.noise_sentence(noises, found.channels)]
+    blocks = [
+        Note(f"{found.verdict}: {found.statement}", name="statement", terminal=True),
+        *([Note(loop_words.cluster_sentence(found.cluster), name="cluster")] if found.cluster else []),
+        *(Note(text, name=name, terminal=True) for name, text in reasons.items() if text),
+        *remarks(also, "also"),
+        *([catalogue.note("loop.of-a-shaft")] if not found.robot.has_ground and found.effects else []),
+        *_effects(found),
+        _certainty(found, missing),
+    ]
+    yield Section("How sure that is", tuple(blocks))
+    yield Section("What to know before using it", remarks(filter(None, notes)))
+    if found.resolved is not None:
+        yield _resolved(found)
+
+
+def _sections(found: DiscoveryResult, changes: Mapping[str, Change], missing: bool) -> Iterable[Section]:
+    table, looked_for = rows_of(found), Section("What was looked for", tuple(_looked_for(found)))
+    yield Section("Measured and simulated, run by run", tuple(_run_by_run(found, table)))
+    yield from [] if missing else [looked_for]
+    where = "Where it is missing" if missing else "What each equation lacks"
+    yield Section(where, tuple(_where_missing(found, table, changes)))
+    yield from fit_tables.clusters_section(found.residual_clusters)
+    errors = catalogue.figure("loop.errors-figure", found, words=(OF_SIZE,))
+    fits = {when: by for when, by in found.rms.items() if not (found.refit_alone and "after" in when)}
+    sized = Layout.of(found.robot).crosses_zero
+    in_units = [fit_tables.rms_table(fits, found.channels)] if sized else []
+    yield Section("Errors on runs that the fit has seen, and has not", (errors, held_out_table(found), *in_units))
+    yield from _certain(found, missing)
+    yield Section("Candidates", tuple(_candidates(found)))
+    hidden = catalogue.figure("loop.null", found.before), catalogue.figure("loop.look_alikes", found)
+    yield Section("", hidden, folded="how thresholds were found, and which effects look alike")
+    yield from [looked_for] if missing else []
+    yield Section("Parameters before and after", (catalogue.figure("loop.base_shift", found), _base(found)))
+    first = {"row": table["row"]}
+    if isinstance(found.detail, TimeStatistics):
+        first |= {"run": table.get("run_id", table["row"]), "t [s]": table["time_s"]}
+    kinds = {"": "measured", "before_": "before", "after_": "after"}
+    yield fit_tables.rows_section(table, found.channels, kinds, False, first=first, last={"use": table["use"]})
+    yield Section("Words", (catalogue.table("loop.words", list(words.GLOSSARY.items())),))
+
+
+def _run_by_run(found: DiscoveryResult, table: dict[str, np.ndarray]) -> Iterable[Block]:
+    verdict = "none" if found.refit_alone else found.verdict
+    if isinstance(found.detail, EquationDefects):
+        yield catalogue.figure("loop.before_after", table, found.channels, verdict, words=("",))
+        return
+    lines = {"after_": "with what was found", "before_": "before"}
+    lines = {"after_": "simulated"} if verdict == "none" else lines
+    yield catalogue.figure("fit.overlay", table, found.channels, lines, finding=loop_answer(found))
+    runs = found.to_json()["series"]["runs"]
+    some = f", of the first 8 of {runs} runs" if runs > 8 else ""
+    yield catalogue.figure("loop.over_time", found.runs, table, found.channels, verdict, words=(some,))
+
+
+def _where_missing(
+    found: DiscoveryResult, table: dict[str, np.ndarray], changes: Mapping[str, Change]
+) -> Iterable[Block]:
+    verdict, sized = "none" if found.refit_alone else found.verdict, Layout.of(found.robot).crosses_zero
+    if changes:
+        yield catalogue.figure("loop.laws", found, table, changes)
+    if isinstance(found.detail, TimeStatistics):
+        d = found.to_json()["series"]
+        memory = d["before"]["memory"]
+        numbers = (memory["deviate"], d["after"]["memory"]["deviate"], memory["threshold"], (2 * d["runs"]) ** 0.5)
+        names = ", ".join(map(str, d["orders_unresolved"]))
+        more = catalogue.text("loop.unresolved", names) if names else ""
+        yield catalogue.figure("loop.series", found.detail, found.channels, verdict, words=numbers, more=more)
+    else:
+        drawn = table, verdict, sized
+        yield catalogue.figure(
+            "loop.defects", *drawn, words=(_closed(found, table) if sized else catalogue.text("loop.three"),)
+        )
+    if found.unnamed is not None:
+        curve = found.unnamed
+        key = "tentative" if found.effects else "written" if found.written else "left"
+        yield catalogue.figure("loop.curve", curve, words=(catalogue.text(f"loop.curve-{key}", curve.effect),))
+        yield Note(loop_words.proposed_formula(curve), name="proposal")
+
+
+def _closed(found: DiscoveryResult, table: dict[str, np.ndarray]) -> str:
+    """Equations that the channels close."""
+    from sweeps.pages import loop_figures
+
+    sides = max(1, len(loop_figures.defects_of(table, "before", "track")))
+    closed, of_sides = loop_figures.closed_equations(table), " of each side" if sides > 1 else ""
+    if len(found.channels) < len(closed) * sides:
+        return catalogue.text("loop.fewer", " of both sides" if sides > 1 else "")
+    names = ", ".join(n.replace("electrical", "voltage").replace("track", "torque") for n in closed)
+    return catalogue.text("loop.closes", count_noun(len(closed), "equation"), of_sides, names)
+
+
+def _candidates(found: DiscoveryResult) -> Iterable[Block]:
+    """Scores of all effects, and what else explains the data."""
+    share, allowed = found.settings.shares["single"], found.settings.family_wise_error
+    yield catalogue.figure("loop.ladder", found, words=(100 * (1 - share), 100 * (allowed - share)))
+    several = [(_named(a.effects), a.rise_chi2) for a in found.alternatives]
+    curves = "; none of them is adequate, or curves are the better explanation"
+    sizes = [(_named(a.effects), _named(a.sizes), a.rise_chi2, a.why) for a in found.implausible]
+    hidden = [
+        (
+            h.name, f"{h.amplitude:.3g} {h.unit}".removesuffix(" -"), h.sigmas,
+            f"{h.experiment} (expected {h.separation:.1f} σ)" if h.experiment else "",
+        )
+        for h in found.hidden
+    ]  # fmt: skip
+    held = [
+        (
+            f"**{', '.join(a.effects)}**" if a.leads else ", ".join(a.effects), a.rise_chi2, a.rms_sigma,
+            *a.by_kind.values(), a.lost,
+        )
+        for a in found.alternatives_held_out
+    ]  # fmt: skip
+    kinds = (
+        [] if not held else [f"by {blocks.kind_in_words(k)} | .2f" for k in found.alternatives_held_out[0].by_kind]
+    )
+    tables: dict[str, tuple[str, Sequence[Any], Sequence[str], tuple[str, ...]]] = {
+        "alternatives": ("alternatives", several, (), (curves if found.verdict in WITHOUT_NAME else "",)),
+        "hidden": ("hidden", hidden, (), ()),
+        "held": ("alternatives_held_out", held, kinds, ()),
+        "implausible": ("implausible", sizes, (), ()),
+    }
+    for above, (name, rows, more, values) in tables.items():
+        if rows:
+            yield catalogue.note(f"loop.{above}-above", *values)
+            yield catalogue.table(f"loop.{name}", rows, *more)
+
+
+def _named(values: Mapping[str, float]) -> str:
+    return ", ".join(f"{name} {value:.3g}" for name, value in values.items())
+
+
+def would_be_seen(found: DiscoveryResult) -> list[tuple[str, str, str, float]]:
+    """From what size each effect of the library would have been noticed, the first in its typical sizes first."""
+    level, listed = found.before.kinds["single"].threshold, []
+    for s in found.scores:
+        if s.name in BY_NAME and s.sigmas_per_prior_sd > 0:
+            spec = next(p.spec for p in params.walk_parameters(BY_NAME[s.name]()) if p.spec.amplitude)
+            times = level / s.sigmas_per_prior_sd
+            size = f"{times * spec.prior_sd(0.0):.2g} {spec.unit}"
+            listed.append((f"`{s.name}`", BY_NAME[s.name].family(), size, times))
+    return sorted(listed, key=lambda row: row[-1])
+
+
+def _looked_for(found: DiscoveryResult) -> Iterable[Block]:
+    yield catalogue.note("loop.seen-above")
+    yield catalogue.table("loop.would_be_seen", would_be_seen(found))
+    unseen = {
+        "cannot_see": found.cannot_see, "needs_series": found.needs_histories, "needs_reverse": found.needs_reverse
+    }  # fmt: skip
+    texts = (catalogue.text(f"loop.{key}", ", ".join(names)) for key, names in unseen.items() if names)
+    yield Note("".join(texts), name="unseen")
+
+
+def _base(found: DiscoveryResult) -> Table:
+    rows = [
+        (
+            f"`{name}`", p.prior, p.before, p.after, p.sd_after, p.unit, fit_tables.shift_cell(p.shift_before),
+            fit_tables.shift_cell(p.shift_after), describe(Determination.of(name, p.held_by_prior, found.together)),
+            p.meaning,
+        )
+        for name, p in found.base_shift.items()
+    ]  # fmt: skip
+    return catalogue.table("loop.base", rows)
