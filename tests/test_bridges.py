@@ -11,6 +11,7 @@ import pytest
 from worlds import bridges, paper
 
 import mmrjax as mm
+from mmrjax.derived import requirements
 from mmrjax.fidelities import drive
 from mmrjax.fidelities.steady import steady_outputs
 from mmrjax.model import paper_robots, params
@@ -133,6 +134,37 @@ def test_derivatives_in_each_mode_are_differences_of_the_bisection(one_way):
         assert np.isfinite(got).all()
     limited = np.abs(here[0]) > limits
     assert (np.abs(slope[1][limited]) > 1).sum() > 20 and (slope[1][~limited] != 0).sum() > 20
+
+
+@pytest.mark.parametrize("one_way", [False, True])
+def test_requirements_behind_a_limit_or_a_diode_are_those_of_a_bisection(one_way):
+    """At points of an envelope as `check` and `size` evaluate them, limits from 1 to 3 A."""
+    rng = np.random.default_rng(1)
+    robot, number = paper_robots.nominal(), 100
+    robot = dataclasses.replace(robot, driver=dataclasses.replace(robot.driver, returns_current=not one_way))
+    volts, limits, payload, slope, which = (
+        rng.uniform(10, 33, number), np.exp(rng.uniform(0, 1.1, number)), rng.uniform(0, 8, number), rng.uniform(-15, 15, number),
+        rng.integers(0, 2, number),
+    )  # fmt: skip
+    names = [robot.configurations.names[k] for k in which]
+    of = [bridges.vehicle(c, payload, np.radians(slope)) for c in ("6T2A", "4W2T")]
+    load = {key: np.where(np.array(names) == "4W2T", of[1][key], of[0][key]) for key in of[0]}
+
+    @jax.jit
+    @jax.vmap
+    def values(limit, which, volts, slope, payload):
+        point = requirements.EnvelopePoint(which, 1.0, 1.0, 0.0, volts, 0.0, 1.0, slope, payload, 25.0, 0.0)
+        mine = params.replace(robot, {"driver.current_limit": limit})
+        found, outcome = requirements.travel_quantities(mine, point, requirements.ratings(robot))
+        return found["current"], found["motor_speed_rpm"], outcome
+
+    found = values(*map(jnp.asarray, (limits, which, volts, slope, payload)))
+    way, none = np.full(number, one_way), np.zeros(number, bool)
+    exact = bridges.settled(VEHICLE, load, volts, np.ones(number), limits, way, none)
+    assert not (found[2] == STATUSES.index("failed")).any()
+    for got, right in zip(found[:2], (exact[0], np.abs(exact[1])), strict=True):
+        np.testing.assert_allclose(got, right, rtol=1e-9, atol=1e-9)
+    assert (np.abs(exact[0]) > limits).sum() > 10
 
 
 def turned(one_way, number):
