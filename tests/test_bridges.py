@@ -11,12 +11,14 @@ import pytest
 from worlds import bridges, paper
 
 import mmrjax as mm
+from mmrjax.derived import requirements
 from mmrjax.fidelities import drive
 from mmrjax.fidelities.steady import steady_outputs
 from mmrjax.model import paper_robots, params
 from mmrjax.model.robot import Configurations
 from mmrjax.model.shaft import Shaft
 from mmrjax.model.signals import STATUSES
+from mmrjax.turning import circling
 
 P = paper.NOMINAL
 VEHICLE = {
@@ -132,6 +134,84 @@ def test_derivatives_in_each_mode_are_differences_of_the_bisection(one_way):
         assert np.isfinite(got).all()
     limited = np.abs(here[0]) > limits
     assert (np.abs(slope[1][limited]) > 1).sum() > 20 and (slope[1][~limited] != 0).sum() > 20
+
+
+@pytest.mark.parametrize("one_way", [False, True])
+def test_requirements_behind_a_limit_or_a_diode_are_those_of_a_bisection(one_way):
+    """At points of an envelope as `check` and `size` evaluate them, limits from 1 to 3 A."""
+    rng = np.random.default_rng(1)
+    robot, number = paper_robots.nominal(), 100
+    robot = dataclasses.replace(robot, driver=dataclasses.replace(robot.driver, returns_current=not one_way))
+    volts, limits, payload, slope, which = (
+        rng.uniform(10, 33, number), np.exp(rng.uniform(0, 1.1, number)), rng.uniform(0, 8, number), rng.uniform(-15, 15, number),
+        rng.integers(0, 2, number),
+    )  # fmt: skip
+    names = [robot.configurations.names[k] for k in which]
+    of = [bridges.vehicle(c, payload, np.radians(slope)) for c in ("6T2A", "4W2T")]
+    load = {key: np.where(np.array(names) == "4W2T", of[1][key], of[0][key]) for key in of[0]}
+
+    @jax.jit
+    @jax.vmap
+    def values(limit, which, volts, slope, payload):
+        point = requirements.EnvelopePoint(which, 1.0, 1.0, 0.0, volts, 0.0, 1.0, slope, payload, 25.0, 0.0)
+        mine = params.replace(robot, {"driver.current_limit": limit})
+        found, outcome = requirements.travel_quantities(mine, point, requirements.ratings(robot))
+        return found["current"], found["motor_speed_rpm"], outcome
+
+    found = values(*map(jnp.asarray, (limits, which, volts, slope, payload)))
+    way, none = np.full(number, one_way), np.zeros(number, bool)
+    exact = bridges.settled(VEHICLE, load, volts, np.ones(number), limits, way, none)
+    assert not (found[2] == STATUSES.index("failed")).any()
+    for got, right in zip(found[:2], (exact[0], np.abs(exact[1])), strict=True):
+        np.testing.assert_allclose(got, right, rtol=1e-9, atol=1e-9)
+    assert (np.abs(exact[0]) > limits).sum() > 10
+
+
+def turned(one_way, number):
+    """Random turns on a supply: robot with its limits, conditions, their settled motion and duties of the sides."""
+    rng = np.random.default_rng(3)
+    duties, volts = rng.uniform(-1, 1, (2, number)), rng.uniform(12, 33, number)
+    limits, which = np.exp(rng.uniform(np.log(0.3), np.log(5), number)), rng.choice(["4W2T", "6T2A"], number).tolist()
+    duties[:, 0], volts[0], limits[0], which[0] = (0.5, 0.8), 24.0, 1.0, "4W2T"
+    robot = paper_robots.nominal()
+    robot = dataclasses.replace(robot, driver=dataclasses.replace(robot.driver, returns_current=not one_way))
+    robot = params.replace(robot, {"driver.current_limit": jnp.asarray(limits)})
+    runs = mm.Conditions(which, voltage=volts, duty_left=duties[0], duty_right=duties[1]).resolved(robot)
+    axes = jax.tree.map(lambda x: 0 if jnp.ndim(x) else None, robot)
+    found = jax.jit(jax.vmap(circling.circling_signals, in_axes=(axes, 0)))(robot, runs)
+    assert set(np.asarray(found[2]).tolist()) <= {STATUSES.index(s) for s in ("converged", "stalled")}
+    assert (np.abs(found[1].current) > limits[:, None]).any(1).sum() > number / 4
+    return robot, axes, runs, found, limits, duties
+
+
+@pytest.mark.parametrize("one_way", [False, True])
+def test_settled_turns_with_a_limit_or_a_diode_are_solved(one_way):
+    _, _, runs, (travel, motion, _), limits, duties = turned(one_way, 20)
+    volts, shape = np.asarray(runs.voltage)[:, None], (20, 2)
+    current = bridges.current_at(
+        VEHICLE, np.asarray(motion.speed_motor), lambda _: volts + np.zeros(shape), np.ones(shape), duties.T,
+        limits[:, None] + np.zeros(shape), np.full(shape, one_way),
+    )  # fmt: skip
+    np.testing.assert_allclose(motion.current, current, rtol=1e-9, atol=1e-9)
+    blocked = (np.abs(current) < 1e-9) & (np.abs(motion.speed_motor) > 1)
+    assert blocked.any() == one_way
+    for rate in (travel.acceleration, travel.acceleration_yaw, travel.signals.acceleration_wheel):
+        np.testing.assert_allclose(rate, 0.0, atol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("one_way", [False, True])
+def test_a_hundred_turns_with_a_limit_or_a_diode_settle_as_over_time(one_way):
+    robot, axes, runs, (_, motion, status), *_ = turned(one_way, 100)
+    times = jnp.asarray([0.0, 20.0])
+    history = jax.jit(jax.vmap(lambda r, c: drive.drive(r, c, times), in_axes=(axes, 0)))(robot, runs)
+    assert not (history.result.status == STATUSES.index("failed")).any()
+    # Few still approach their speed slowly at the limit.
+    rolls = (np.asarray(status) == STATUSES.index("converged")) & (history.result.status == status)
+    assert rolls.sum() > 60
+    for name in ("current", "speed_motor"):
+        ended = np.asarray(getattr(history.signals, name))[rolls, -1]
+        np.testing.assert_allclose(ended, np.asarray(getattr(motion, name))[rolls], rtol=1e-3, atol=1e-4)
 
 
 def test_a_start_leaves_the_current_limit_as_by_radau():

@@ -207,3 +207,35 @@ def test_robots_of_the_paper_and_small_changes_are_their_own(tmp_path):
 def test_heavier_robot_on_tracks_is_compared_with_the_tracks_it_is_like(tmp_path):
     (said,) = inherited_priors(read(tmp_path, "[6T2A]\nmass = 30.0\n"))
     assert (said.part, said.changed) == ("6T2A", (("mass", 30.0, 13.1),)) and "6T2A.track.guide_share" in said.kept
+
+
+def test_the_loop_frees_a_mass_that_the_file_states_with_an_error(tmp_path):
+    text = """
+base = "none"
+imposed = "voltage"
+channels = ["total_current", "motor_speed"]
+[motor]
+resistance = "0.9 ± 5 %"
+torque_constant = 0.028
+inertia = "4e-6 ± 10 %"
+[gearbox]
+ratio = 30
+efficiency_load = 1.0
+[rover]
+load = "vehicle"
+movers = "wheels"
+mass = {mass}
+radius = "0.06 ± 1 %"
+inertia = 1e-6
+[rover.track]
+[rover.ground]
+rolling_resistance = 0.02
+[rover.ground.friction]
+static = 0.6
+"""
+    freed = []
+    for mass in ('"10 ± 20 %"', "10"):
+        (tmp_path / "rig.toml").write_text(text.format(mass=mass), encoding="utf-8")
+        freed.append(priors.free_names(robot_file.read_robot(tmp_path / "rig.toml"), ["rover"]))
+    assert set(freed[0]) - set(freed[1]) == {"rover.mass"}
+    assert "motor.inertia" not in freed[0]  # settled runs do not show it

@@ -130,6 +130,27 @@ def test_series_that_go_backward_are_others():
     assert [len(s) for s in series_noise.series_along(longer, "supply_voltage_V")] == [3, 3]
 
 
+def test_voltages_that_differ_by_the_sag_of_the_supply_are_one_level():
+    sagging = np.array([11.989, 11.408, 10.828, 17.988, 17.408, 16.827, 23.988, 23.407, 22.827])
+    levels = np.repeat([11.989, 17.988, 23.988], 3)
+    np.testing.assert_array_equal(series_noise.without_sag(sagging), levels)
+    for kept in (np.array([12.0, 12.0, 24.0, 24.0]), np.linspace(5, 24, 20)):
+        np.testing.assert_array_equal(series_noise.without_sag(kept), kept)
+    np.testing.assert_array_equal(series_noise.without_sag(np.array([36.5, 36.1, 35.6])), np.full(3, 36.5))
+
+
+@pytest.mark.parametrize("stated", [None, "current=2%,motor_speed=0.5%"])
+def test_an_sd_in_per_cent_has_a_part_that_does_not_depend_on_the_reading(stated):
+    """An ammeter has a zero: with 2 % of 0.1 A a small reading would establish any offset."""
+    runs = table(0.0)
+    current, random = np.linspace(0.01, 10, len(runs)), np.random.default_rng(0)
+    alone = {name: random.random(len(runs)) for name in ("slope_deg", "payload_kg")}
+    runs = dataclasses.replace(runs, columns={**runs.columns, **alone, "total_current_A": current})
+    with np.errstate(invalid="ignore"):
+        sd = noise.infer_noise(runs, SettledRuns.sizes(runs), stated).sd[:, 0]
+    np.testing.assert_allclose(sd, 0.02 * np.maximum(current, 0.2 * np.sqrt(np.mean(current**2))))
+
+
 def test_replicates_are_drawn_with_sds_that_an_estimate_might_have_been_of():
     factors = _factors(np.array([7.45, np.inf]), 2, 20_000, seed=3)
     assert np.all(factors[:, 1] == 1.0)

@@ -64,8 +64,7 @@ def test_turns_are_found_past_kinks_of_friction_and_gears():
         robot = params.replace(paper_robots.nominal(), values)
         run = mm.Conditions(**stated, open_right=0.0)
         unknowns, solved = turning._unknowns(robot, run)
-        motion, loads = turning._motion(robot, run, unknowns)
-        travel = turning._turning(robot, run, motion, loads)
+        travel, motion = turning._circled(robot, run, unknowns)
         gains = travel.acceleration, travel.acceleration_lateral, travel.acceleration_yaw
         return motion.speed, jnp.stack(gains), solved
 

@@ -106,7 +106,7 @@ from calibration.inference.linearization import Linearization
 from calibration.inference.noise import Noise
 from calibration.inference.noise_factor import common_factors, noise_remarks
 from calibration.inference.residual_clusters import residual_clusters
-from mmrjax import effects
+from mmrjax import effects, fidelities
 from mmrjax.compile.precision import SINGLE, Threads, in_double, is_double
 from mmrjax.effects import Effect
 from mmrjax.errors import count_noun
@@ -687,7 +687,10 @@ def pose_candidates(
     robot = own_mass.with_table_mass(robot, runs)
     kind = observers.observer_kind(runs)
     index, real = padded_rows(len(runs), kind.sizes_padded)
-    names = priors.free_names(robot, runs.configurations_named(robot), *kind.free())
+    idle = (*(() if kind.axis else priors.OVER_TIME), *(f"{n}.mass" for n in own_mass.stated_masses(robot, runs)))
+    names = priors.free_names(robot, runs.configurations_named(robot), *kind.free(), idle)
+    unread = fidelities.unread_parameters("drive" if kind.axis else "steady", names, runs.turns)
+    names = tuple(n for n in names if n not in unread)
     coordinates = priors.parameter_coordinates(robot, names, dict(stated or {}), any_surface=True)
     bare = observers.pose_problem(runs.where(index), robot, coordinates, sd[index])
     shown = visible_effects(library, robot, kind, goes_both_ways(runs), has_pulses(runs))

@@ -95,7 +95,7 @@ def predict_identifiability(runs: Runs, robot: Robot, noise: str | None = None, 
     ready = prepare(runs, robot, noise)
     observe, robot, known = ready.observe, ready.robot, ready.noise
     present = {robot.configurations.names[k] for k in runs.configurations(robot)}
-    names = priors.free_names(robot, present, *observe.free())
+    names = priors.free_names(robot, present, *observe.free(), () if observe.axis else priors.OVER_TIME)
     if not observe.axis:
         names = tuple(n for n in names if n not in fidelities.unread_parameters("steady", names, runs.turns))
     if not names:

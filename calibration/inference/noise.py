@@ -19,6 +19,8 @@ from mmrjax.model.channels import Channel
 
 #: Initial estimate of a noise as a share of the reading [-].
 START = 0.02
+#: Share of a channel's rms below which a reading's sd in per cent no longer decreases: instruments have a zero.
+LEAST_SIZE = 0.2
 #: Sources of sds that nobody states, with their names in messages.
 UNSTATED = {"assumed": "assumed", "series": "estimated"}
 
@@ -117,6 +119,8 @@ def noise_from_table(runs: Runs, sizes: np.ndarray, stated: str | None = None) -
     """
     shares = parse_noise(stated, runs.channels) if stated else {}
     measured, columns = runs.measured(), runs.deviations()
+    rms = np.sqrt(np.nanmean(np.where(np.isfinite(measured).any(0), measured, 0.0) ** 2, 0))
+    sizes = np.maximum(sizes, LEAST_SIZE * rms)
     sd, source = np.ones_like(measured), []
     for k, channel in enumerate(runs.channels):
         finite = np.isfinite(measured[:, k])

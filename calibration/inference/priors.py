@@ -251,12 +251,16 @@ BENCH = (
 
 
 def free_names(
-    robot: Robot, configurations: Iterable[str], drive: Sequence[str] = (), chassis: Sequence[str] = ()
+    robot: Robot,
+    configurations: Iterable[str],
+    drive: Sequence[str] = (),
+    chassis: Sequence[str] = (),
+    idle: tuple[str, ...] = OVER_TIME,
 ) -> tuple[str, ...]:
-    """Parameters that the loop frees for data of these configurations.
+    """Parameters that the loop frees for data of these configurations, among them all that the file states with ±.
 
     Args:
-        drive, chassis: further parameters that the data determine, see `Observer.free`.
+        drive, chassis: further parameters that the data determine, see `Observer.free`; idle: as of `stated_names`.
     """
     present = set(configurations)
     names = [
@@ -270,7 +274,14 @@ def free_names(
         )
     ]
     names = [n for n in names if _leader(robot, n) is None]
-    return (*_uncertain(robot, (*_drive(robot, (*BENCH, *drive)), *names)), *initial_state_names(robot))
+    decided = (*(f".{n}" for n in (*SHAFT, *OF_TURNS)), ".radius")  # above, by what the channels show
+    stated = stated_names(robot, present, idle)
+    owned = (n for n in stated if not n.endswith(decided) and ".track." not in n and f".{GROUND}" not in n)
+    return tuple(
+        dict.fromkeys(
+            [*_uncertain(robot, (*_drive(robot, (*BENCH, *drive)), *names)), *owned, *initial_state_names(robot)]
+        )
+    )
 
 
 def _leader(robot: Robot, name: str) -> str | None:

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy import sparse
 
-from calibration.data.columns import DRIVEN
+from calibration.data.columns import DRIVEN, SUPPLY
 from calibration.data.instruments import display_step
 from calibration.data.runs import Runs
 from mmrjax.model.channels import Channel
@@ -29,6 +29,8 @@ FEWEST = 4.0
 NEGLIGIBLE = 0.01
 #: Size of a difference with a wrong reading, in scales of the median, and the largest share of such differences.
 WRONG, MOST = 5.0, 0.25
+#: Largest range of a voltage that sags with the load, over its largest value [-].
+SAG = 0.15
 #: Columns that distinguish rows in addition to the axes.
 LABELS = ("configuration", "surface", "mode")
 
@@ -75,11 +77,15 @@ def estimate_noise(runs: Runs, sizes: Float[np.ndarray, "rows channels"]) -> tup
 
 
 def series_along(runs: Runs, axis: str) -> list[np.ndarray]:
-    """Rows of each series along an axis, three or more; backward travel is a separate series."""
+    """Rows of each series along an axis, three or more; backward travel is a separate series.
+
+    Voltages that differ only by the sag of the supply are the same level.
+    """
     others = [c for c in (*LABELS, *runs.axes) if runs.has(c) and c != axis]
+    level = {c: without_sag(runs[c]) if c == SUPPLY else runs[c] for c in others}
     driving = [c for c in (*runs.layout.axes[:1], "supply_voltage_V", "duty") if runs.has(c)]
     keys: list[tuple] = [
-        (*(str(runs[c][row]) for c in others), *(float(np.sign(runs[c][row])) for c in driving))
+        (*(str(level[c][row]) for c in others), *(float(np.sign(runs[c][row])) for c in driving))
         for row in range(len(runs))
     ]
     together: dict[tuple, list[int]] = {}
@@ -88,6 +94,22 @@ def series_along(runs: Runs, axis: str) -> list[np.ndarray]:
     if runs.has("mode"):
         together = {k: rows for k, rows in together.items() if runs["mode"][rows[0]] == DRIVEN[0]}
     return [np.array(rows) for rows in together.values() if len(rows) > 2]
+
+
+def without_sag(voltage: np.ndarray) -> np.ndarray:
+    """Level of each voltage: the largest of its group.
+
+    Groups are narrower than `SAG` and than a third of the distance to the next; without such groups each voltage is
+    its own level.
+    """
+    levels = np.unique(voltage)
+    gaps = np.diff(levels)
+    for apart in (np.inf, *np.unique(gaps)[::-1]):  # from one group to many
+        groups = np.split(levels, np.flatnonzero(gaps >= apart) + 1)
+        if all(np.ptp(g) <= min(SAG * np.abs(g).max(), apart / 3) for g in groups):
+            ends = np.array([g[-1] for g in groups])
+            return ends[np.searchsorted(ends, voltage)]
+    return voltage
 
 
 def _noise_of_channel(

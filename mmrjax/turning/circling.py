@@ -126,8 +126,8 @@ def turning_start(robot: Robot, conditions: Conditions, rolling: bool = False) -
     if not rolling:
         return y / size
     unknowns, solved = _unknowns(robot, conditions)
-    settled, loads = _motion(robot, conditions, unknowns)
-    signals = balances.turning_signals(robot, conditions, settled, loads).signals
+    travel, settled = _circled(robot, conditions, unknowns)
+    signals = travel.signals
     memory = [jax.vmap(lambda s, e=e: e.settled(robot, s))(signals) for e in robot.remembering]
     flat = [settled.current, settled.speed_motor, *(jnp.reshape(getattr(settled, name), 1) for name in _OF_ROBOT)]
     rolls = jnp.concatenate([*flat, *memory]).at[7].set(y[7])
@@ -195,8 +195,7 @@ class _Search(eqx.Module):
 
 def _balance(robot: Robot, conditions: Conditions, y: Float[Array, " 9"]) -> Float[Array, " 9"]:
     """Rates of the unknowns that settle [1/s], and minus the errors of the loads."""
-    travel = _turning(robot, conditions, *_motion(robot, conditions, y))
-    return _left(robot, conditions, y, travel)
+    return _left(robot, conditions, y, _circled(robot, conditions, y)[0])
 
 
 def _left(robot: Robot, conditions: Conditions, y: Float[Array, " 9"], travel: balances.Travel) -> Float[Array, " 9"]:
@@ -339,9 +338,18 @@ def _unknowns(robot: Robot, conditions: Conditions) -> tuple[Float[Array, " 9"],
     return end.y + inverse(-slope)[0] @ jnp.where(sound, _balance(robot, conditions, end.y), 0.0), sound
 
 
-def _motion(robot: Robot, conditions: Conditions, y: Float[Array, " 9"]) -> tuple[PlaneMotion, Float[Array, " 2"]]:
-    """The motion of a settled turn and its loads, see `turning.grip`."""
-    return motion_of(robot, _whole(conditions, y)), _loads(robot, conditions, y)
+def _circled(robot: Robot, conditions: Conditions, y: Float[Array, " 9"]) -> tuple[balances.Travel, PlaneMotion]:
+    """Signals of both sides and motion at the unknowns of a search.
+
+    Their currents are those that the duties alone would drive, see `rest.admitted_current`.
+    """
+    motion = motion_of(robot, _whole(conditions, y))
+    current, held = jax.vmap(lambda c, x: rest.admitted_current(robot, c, x))(conditions.of_sides(), motion.current)
+    motion = dataclasses.replace(motion, current=current)
+    travel = _turning(rest.without_diode(robot), conditions, motion, _loads(robot, conditions, y))
+    signals = travel.signals
+    signals = dataclasses.replace(signals, voltage=signals.voltage - held, voltage_left=signals.voltage_left - held)
+    return dataclasses.replace(travel, signals=signals), motion
 
 
 def solve_turn(robot: Robot, conditions: Conditions) -> tuple[Float[Array, " 9"], Bool[Array, ""]]:
@@ -353,8 +361,7 @@ def turn_results(
     robot: Robot, conditions: Conditions, unknowns: Float[Array, " 9"], found: Bool[Array, ""]
 ) -> tuple[Result, Signals, Float[Array, " 9"]]:
     """Result, signals of both sides and residuals of the balances at given unknowns, see `Implicit.shown`."""
-    motion, loads = _motion(robot, conditions, unknowns)
-    travel = balances.turning_signals(robot, conditions, motion, loads)
+    travel, motion = _circled(robot, conditions, unknowns)
     stays = unknowns - jax.lax.stop_gradient(_begins(robot, conditions))
     left = jnp.where(_moves(conditions), _left(robot, conditions, unknowns, travel), stays)
     status = _status(robot, conditions, travel, motion, found)
@@ -374,8 +381,7 @@ def circling_signals(robot: Robot, conditions: Conditions) -> tuple[balances.Tra
         sliding.
     """
     unknowns, solved = _unknowns(robot, conditions)
-    motion, loads = _motion(robot, conditions, unknowns)
-    travel = balances.turning_signals(robot, conditions, motion, loads)
+    travel, motion = _circled(robot, conditions, unknowns)
     return travel, motion, _status(robot, conditions, travel, motion, solved)
 
 

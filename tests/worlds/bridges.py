@@ -41,6 +41,33 @@ def vehicle(c: str, payload: np.ndarray, slope: np.ndarray, p: dict[str, float] 
     }
 
 
+def current_at(
+    motor: dict[str, Any],
+    speed: np.ndarray,
+    source: Callable[[np.ndarray], np.ndarray],
+    way_supply: np.ndarray,
+    duty: np.ndarray,
+    limit: np.ndarray,
+    one_way: np.ndarray,
+    sides: float = 2.0,
+) -> np.ndarray:
+    """Current of a motor [A] at its speed [rad/s].
+
+    Args:
+        source: voltage of the supply at a current that all motors draw; way_supply: its sign.
+    """
+    R, back = motor["R"], motor["C"] * speed
+
+    def left(I: np.ndarray) -> np.ndarray:  # noqa: E741
+        over = np.maximum(np.abs(I) / limit - 1, 0)
+        D = np.clip(duty - way_supply * np.sign(I) * STEEP * over, -1, 1)
+        U = np.where(one_way & (D * way_supply * I < 0), back, D * source(sides * D * I))
+        return U - back - R * I
+
+    most = (np.abs(source(0.0 * limit)) + 50 + np.abs(back)) / R + limit
+    return halved(left, -most, most)
+
+
 def settled(
     motor: dict[str, Any],
     load: dict[str, Any],
@@ -59,7 +86,7 @@ def settled(
         load: dry, viscous, constant: at the output.
         battery: True on the paper's full battery, else the supply of `volts`.
     """
-    R, C, ratio, eta = motor["R"], motor["C"], motor["i"], motor["eta"]
+    C, ratio, eta = motor["C"], motor["i"], motor["eta"]
 
     def source(drawn: np.ndarray) -> np.ndarray:
         p = paper.NOMINAL
@@ -71,15 +98,7 @@ def settled(
     way_supply = np.where(~battery & (volts < 0), -1.0, 1.0)
 
     def current(speed: np.ndarray) -> np.ndarray:
-        def left(I: np.ndarray) -> np.ndarray:  # noqa: E741
-            over = np.maximum(np.abs(I) / limit - 1, 0)
-            D = np.clip(duty - way_supply * np.sign(I) * STEEP * over, -1, 1)
-            back = C * speed
-            U = np.where(one_way & (D * way_supply * I < 0), back, D * source(sides * D * I))
-            return U - back - R * I
-
-        most = (np.abs(volts) + 50 + C * np.abs(speed)) / R + limit
-        return halved(left, -most, most)
+        return current_at(motor, speed, source, way_supply, duty, limit, one_way, sides)
 
     def torque(speed: np.ndarray, way: np.ndarray) -> np.ndarray:
         drive = C * current(speed) - way * motor["M_f"] - motor["K_f"] * speed

@@ -34,8 +34,9 @@ def of_ulog(path: Path, name: str) -> tuple[Signal, ...]:
     sizes: dict[str, int] = {}
     for topic in formats:
         input_files.check_declared(name, _field_count(topic, formats, sizes))
-    with contextlib.redirect_stdout(io.StringIO()):  # the library reports damage there
-        log = ULog(str(path))
+    # the library reports damage to stdout, and leaves a file open that it opened and cannot parse
+    with path.open("rb") as stream, contextlib.redirect_stdout(io.StringIO()):
+        log = ULog(stream)
     if log.file_corruption or not log.data_list:
         raise BadData(
             f"{name}: is a damaged ULog file, or one without data; expected a whole log; download it again from the "
