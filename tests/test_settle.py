@@ -17,12 +17,12 @@ from worlds.settled import write_table
 from calibration.data import contradictions, rig_facts, robot_file, settling
 from calibration.data import runs as records
 from calibration.data.input_errors import BadData
+from calibration.data.settling import rolling_readings
 from calibration.inference import checks, observers
 from calibration.inference import noise as noises
 from calibration.inference.foresight import Foresight
 from calibration.words import settle_words as words
 from sweeps.commands import rig_check
-from sweeps.commands.settle import rolling_readings
 
 
 def made(tmp_path, seed=1, kind="bench", imposed="voltage", **options):
@@ -468,7 +468,7 @@ def test_what_does_not_move_and_what_nothing_drives_is_left_out(tmp_path):
 
 
 def test_an_acceleration_that_takes_current_is_no_settled_run(tmp_path):
-    from sweeps.commands.settle import acceleration_currents
+    from calibration.data.settling import acceleration_currents
 
     columns = stairs(levels=(12.0,), hold=600)
     columns["motor_speed_rpm"] = 2000 + 2.0 * columns["time_s"]  # 0.6 % over the log

@@ -8,6 +8,7 @@ import math
 from collections.abc import Iterator, Mapping
 from itertools import pairwise
 
+import jax.numpy as jnp
 import numpy as np
 
 from calibration.data.columns import LOAD, SPEED, TIME
@@ -17,9 +18,11 @@ from calibration.data.input_errors import BadData, bound_text
 from calibration.data.instruments import step_of
 from calibration.data.runs import Runs
 from mmrjax.errors import count_noun
-from mmrjax.model import channels
+from mmrjax.model import balances, channels
 from mmrjax.model.channels import Channel
+from mmrjax.model.conditions import Conditions
 from mmrjax.model.robot import Robot
+from mmrjax.model.signals import State
 
 #: Share of a signal's largest size below which it counts as zero: the motors are not driven, the output is at rest.
 STILL = 0.02
@@ -910,3 +913,50 @@ def _nothing(found: Settled, loop: str) -> str:
         "undriven": "the driver brakes or coasts in every row; log rows in which it drives the motors",
     }
     return f"{source} {rows}, no settled stretch: {others[why]}"
+
+
+# --- numbers of the robot that settling needs ---
+
+
+def rolling_readings(robot: Robot) -> dict[str, dict[str, float]]:
+    """Readings of speeds in each configuration at 1 rad/s of the motors, the load rolling [unit of the column].
+
+    By channel; only speeds of shafts for a vehicle, which slips.
+    """
+    found = {}
+    for k, (name, load) in enumerate(robot.configurations.items()):
+        none, turns = jnp.zeros(()), float(load.radius) / float(robot.gearbox.ratio)
+        state = State(none, jnp.ones(()), jnp.asarray(turns), none)
+        speeds = {c.name: _shown(robot, k, c, state) for c in settled_channels(robot) if c.zero_at_rest}
+        found[name] = {n: x for n, x in speeds.items() if n != "speed" or not robot.has_ground}
+    return found
+
+
+def acceleration_currents(robot: Robot) -> dict[str, Inertia]:
+    """Current that acceleration takes in each configuration, where it is known."""
+    constant, ratio = float(robot.motor.torque_constant), float(robot.gearbox.ratio)
+    found = {}
+    for k, (name, load) in enumerate(robot.configurations.items()):
+        moved = float(load.mass) * float(load.radius) ** 2 / float(robot.sides)
+        at_motor = float(robot.motor.inertia) + (float(load.inertia) + moved) / ratio**2
+        none, one = jnp.zeros(()), jnp.ones(())
+        rolling = float(load.radius) / ratio
+        states = State(one, none, none, none), State(none, one, jnp.asarray(rolling), none)  # of 1 A, and of 1 rad/s
+        currents, speeds = ({c.name: _shown(robot, k, c, state) for c in settled_channels(robot)} for state in states)
+        current = next((n for n, x in currents.items() if x and not speeds[n]), "")
+        speed = next((n for n, x in speeds.items() if x), "")
+        known = current or robot.rig.imposed == "motor_current"
+        currents[""] = 1.0  # of the imposed one
+        if known and speed and at_motor > 0 and constant > 0:
+            per_rate = at_motor / constant * currents[current] / speeds[speed]
+            found[name] = Inertia(speed, current, per_rate, least=1e-3)
+    return found
+
+
+def _shown(robot: Robot, configuration: int, channel: Channel, state: State) -> float:
+    """Reading of a channel that follows from a state alone [unit of its column]; 0 for others."""
+    signals = balances.begin_signals(robot, Conditions(configuration), state)
+    try:
+        return float(channel.read(robot, signals)) / channel.factor
+    except (AttributeError, TypeError):  # a signal that the balances fill in
+        return 0.0

@@ -6,20 +6,14 @@ import shlex
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from calibration.data import robot_file, settling
-from calibration.data.settling import Inertia, Settled
+from calibration.data.settling import Settled
 from calibration.described import sentences
 from calibration.inference import ranges
 from calibration.inference.observers import SettledRuns
 from calibration.words import settle_words
-from mmrjax.model import balances
-from mmrjax.model.channels import Channel
-from mmrjax.model.conditions import Conditions
-from mmrjax.model.robot import Robot
-from mmrjax.model.signals import State
 from sweeps import config as configuration
 from sweeps.inputs import load_robot, read_runs
 from sweeps.report import settle_report
@@ -37,8 +31,8 @@ def settle_to_folder(config: configuration.Settle, source: str, out: Path | None
         runs,
         shortest=config.shortest_s,
         drift=config.drift,
-        inertia=acceleration_currents(robot),
-        rolling=rolling_readings(robot),
+        inertia=settling.acceleration_currents(robot),
+        rolling=settling.rolling_readings(robot),
         loop=loop,
     )
     few = settle_words.too_few(found, SettledRuns.fewest, loop)
@@ -52,52 +46,6 @@ def settle_to_folder(config: configuration.Settle, source: str, out: Path | None
         turned = sentences(ranges.turned_signs(found.settled_runs(), robot))
         shown = print_report(settle_report.settle_document(found, few, turned))
         return finish_run_folder(folder, config, {"seed": None, "settled": len(found.kept)}, page=shown, runs=runs)
-
-
-def rolling_readings(robot: Robot) -> dict[str, dict[str, float]]:
-    """Readings of speeds in each configuration at 1 rad/s of the motors, the load rolling [unit of the column].
-
-    By channel; only speeds of shafts for a vehicle, which slips.
-    """
-    found = {}
-    for k, (name, load) in enumerate(robot.configurations.items()):
-        none, turns = jnp.zeros(()), float(load.radius) / float(robot.gearbox.ratio)
-        state = State(none, jnp.ones(()), jnp.asarray(turns), none)
-        speeds = {c.name: _shown(robot, k, c, state) for c in settling.settled_channels(robot) if c.zero_at_rest}
-        found[name] = {n: x for n, x in speeds.items() if n != "speed" or not robot.has_ground}
-    return found
-
-
-def acceleration_currents(robot: Robot) -> dict[str, Inertia]:
-    """Current that acceleration takes in each configuration, where it is known."""
-    constant, ratio = float(robot.motor.torque_constant), float(robot.gearbox.ratio)
-    found = {}
-    for k, (name, load) in enumerate(robot.configurations.items()):
-        moved = float(load.mass) * float(load.radius) ** 2 / float(robot.sides)
-        at_motor = float(robot.motor.inertia) + (float(load.inertia) + moved) / ratio**2
-        none, one = jnp.zeros(()), jnp.ones(())
-        rolling = float(load.radius) / ratio
-        states = State(one, none, none, none), State(none, one, jnp.asarray(rolling), none)  # of 1 A, and of 1 rad/s
-        currents, speeds = (
-            {c.name: _shown(robot, k, c, state) for c in settling.settled_channels(robot)} for state in states
-        )
-        current = next((n for n, x in currents.items() if x and not speeds[n]), "")
-        speed = next((n for n, x in speeds.items() if x), "")
-        known = current or robot.rig.imposed == "motor_current"
-        currents[""] = 1.0  # of the imposed one
-        if known and speed and at_motor > 0 and constant > 0:
-            per_rate = at_motor / constant * currents[current] / speeds[speed]
-            found[name] = Inertia(speed, current, per_rate, least=1e-3)
-    return found
-
-
-def _shown(robot: Robot, configuration: int, channel: Channel, state: State) -> float:
-    """Reading of a channel that follows from a state alone [unit of its column]; 0 for others."""
-    signals = balances.begin_signals(robot, Conditions(configuration), state)
-    try:
-        return float(channel.read(robot, signals)) / channel.factor
-    except (AttributeError, TypeError):  # a signal that the balances fill in
-        return 0.0
 
 
 def stretches_table(found: Settled) -> dict[str, np.ndarray]:

@@ -214,12 +214,9 @@ def _table(data: Runs | str, joint: Joint) -> Runs:
         )
     if runs.sampled:
         from calibration.data import settling
-        from sweeps.commands import settle
 
-        found = settling.settle_log(
-            runs, inertia=settle.acceleration_currents(robot), rolling=settle.rolling_readings(robot)
-        )
-        runs = found.settled_runs()
+        numbers = settling.acceleration_currents(robot), settling.rolling_readings(robot)
+        runs = settling.settle_log(runs, inertia=numbers[0], rolling=numbers[1]).settled_runs()
     here = runs.configurations_named(robot) == joint.configuration
     if not here.any():
         raise BadData(f"{runs.source}: no run of {joint.configuration}; expected runs of the exported configuration")
