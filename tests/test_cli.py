@@ -400,7 +400,7 @@ def test_full_disk_names_the_file_whichever_it_is(mmrjax, tmp_path, monkeypatch)
     honest = Path.write_text
 
     def full(path, text, **options):
-        if path.name == "result.json":
+        if path.name == ".result.writing.json":  # written aside first
             raise OSError(28, "No space left on device")
         return honest(path, text, **options)
 
@@ -478,7 +478,9 @@ def test_partial_folder_of_another_run_is_not_taken_up(mmrjax, tmp_path, monkeyp
     monkeypatch.setattr(scale.Compiled, "__call__", interrupted)
     assert mmrjax(*arguments)[0] == 130 and kept.exists()
     monkeypatch.setattr(scale.Compiled, "__call__", honest)
-    mmrjax(*arguments, "--set", "motor.resistance=0.9")
+    code, _, err = mmrjax(*arguments, "--set", "motor.resistance=0.9")
+    assert code == 2 and "--force" in err and kept.exists()
+    mmrjax(*arguments, "--set", "motor.resistance=0.9", "--force")
     mmrjax(*arguments[:-1], "t", "--set", "motor.resistance=0.9")
     assert (tmp_path / "s" / "runs.csv").read_text() == (tmp_path / "t" / "runs.csv").read_text()
 

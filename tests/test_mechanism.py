@@ -53,7 +53,7 @@ def found(monkeypatch):
     )  # fmt: skip
     score = HeldOutScore({}, {})
     monkeypatch.setattr(room.blocks_room, "predictable_blocks", lambda *_: {})
-    monkeypatch.setattr(room, "_held_out", lambda *_: score)
+    monkeypatch.setattr(room, "scored_once", lambda *_: score)
     monkeypatch.setattr(room, "_scored", lambda *_: score)
     monkeypatch.setattr(room, "_reading", lambda *_: None)
     monkeypatch.setattr(room, "_changed_readings", lambda *_: None)

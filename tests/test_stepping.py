@@ -184,7 +184,7 @@ WRONG = {
     "configuration: got 6T3A; did you mean 6T2A?": dict(conditions=mm.Conditions("6T3A")),
     "slope_deg: got 95; expected -45 to 45 deg": dict(conditions=mm.Conditions(slope_deg=95.0)),
     "duty: got nan; expected -1 to 1": dict(command=math.nan),
-    "voltage: got nan; expected -100 to 100 V": dict(command={"voltage": math.nan}),
+    "voltage: got nan; expected -10000 to 10000 V": dict(command={"voltage": math.nan}),
     "command: got volts; did you mean voltage?": dict(command={"volts": 12.0}),
     "command, duty: got 'full'; expected a number": dict(command="full"),
     "command, duty: got shape (2,); expected one number": dict(command=[0.5, 1.0]),

@@ -232,7 +232,7 @@ BAD = {
     "surface and adhesion": ({"axes": {"adhesion": [1]}, "conditions": {"surface": "asphalt"}}, r"conditions\.surface: got asphalt beside adhesion"),
     "unknown surface": ({"axes": {"payload": [1]}, "conditions": {"surface": "ice"}}, r"conditions\.surface: got 'ice'; allowed: linoleum"),
     "unknown condition": ({"axes": {"payload": [1]}, "conditions": {"volts": 3}}, r"conditions\.volts: no such condition; did you mean voltage"),
-    "condition out of bounds": ({"axes": {"payload": [1]}, "conditions": {"voltage": 300}}, r"conditions\.voltage: got 300; expected -100 to 100 V"),
+    "condition out of bounds": ({"axes": {"payload": [1]}, "conditions": {"voltage": 30000}}, r"conditions\.voltage: got 30000; expected -10000 to 10000 V"),
     "unknown design": ({"samples": SAMPLES | {"design": "halton"}}, r"samples\.design: got 'halton'; allowed: latin_hypercube, sobol, random"),
     "list of designs": ({"samples": SAMPLES | {"design": ["sobol"]}}, r"samples\.design: got \['sobol'\]; .*allowed: latin_hypercube"),
     "list of distributions": ({"samples": SAMPLES | {"over": {"payload": UNIFORM | {"distribution": ["uniform"]}}}}, r"payload\.distribution: got \['uniform'\]; .*"),

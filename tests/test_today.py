@@ -224,8 +224,8 @@ def test_the_command_line_reverses(mmrjax, tmp_path):
     assert "-33 V" in (tmp_path / "c" / "report.html").read_text()
     code, out, _ = mmrjax("simulate", "--voltage", 0, "--slope", 20, "--model", "drive", "--no-report", "--out", "d")
     assert code == 0 and "rolls_back: gravity drives the robot" in out
-    code, _, err = mmrjax("simulate", "--voltage", "-101")
-    assert code == 2 and "supply_voltage_V: got -101; expected -100 to 100" in err
+    code, _, err = mmrjax("simulate", "--voltage", "-10001")
+    assert code == 2 and "supply_voltage_V: got -10001; expected -10000 to 10000" in err
 
 
 COLUMNS = "configuration,supply_voltage_V,total_mass_kg,payload_kg,slope_deg,total_current_A,motor_speed_rpm"

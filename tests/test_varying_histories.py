@@ -393,7 +393,7 @@ def test_columns_of_the_driver_are_read(tmp_path):
         (f"{HEADER},duty", "a,0,6T2A,24,0,0,0,11,", r"row 1, duty: got an empty cell; expected a number, -1 to 1"),
         (f"{HEADER},duty,mode", "a,0,6T2A,24,0,0,0,11,0.3,brake",
          r"row 1, duty: got 0.3 in mode brake; expected 0 or an empty cell"),
-        (HEADER, "a,0,6T2A,-101,0,0,0,11", r"row 1, supply_voltage_V: got -101; expected -100 to 100"),
+        (HEADER, "a,0,6T2A,-10001,0,0,0,11", r"row 1, supply_voltage_V: got -10001; expected -10000 to 10000"),
         (f"{HEADER.replace('time_s', 'order')},mode", "a,0,6T2A,24,0,0,0,11,brake",
          r"column mode is for time histories; add time_s, or remove it"),
     ],

@@ -293,6 +293,8 @@ def change_robot(robot: Robot, values: Mapping[str, Any], where: str, notes: lis
             refused.setdefault(why, []).append(name)
     if refused:
         sentences = [f"{list_some(names, 80)}: {why}" for why, names in refused.items()]
+        if len(sentences) > 1:  # one message has room for all of them without the allowed names
+            sentences = [sentence.partition(" allowed: ")[0] for sentence in sentences]
         raise BadConfiguration(f"{where}, {'; also '.join(sentences)}")
     robot = params.replace(robot, {name: jnp.asarray(value, float) for name, value in stated.items()})
     robot = rig_file.moved_priors(robot, stated)

@@ -155,6 +155,14 @@ class Implicit:
     shown: Callable[[Robot, Conditions, Array, Array], tuple[Result, Signals, Array]]
 
 
+def _no_check(robot: Robot, conditions: Conditions, options: Mapping[str, float]) -> None:  # results are pickled
+    """Accepts every run."""
+
+
+def _no_cautions(robot: Robot, conditions: Conditions) -> list[str]:
+    return []
+
+
 @dataclasses.dataclass(frozen=True)
 class Fidelity:
     """One way to simulate a robot. Each module of a fidelity ends with one.
@@ -179,8 +187,8 @@ class Fidelity:
     outputs: Callable[[Robot, Conditions, tuple[str, ...]], dict[str, Array]] | None = None
     implicit: Implicit | None = None
     histories: Simulate | None = None
-    check: Callable[[Robot, Conditions, Mapping[str, float]], None] = lambda *_: None
-    cautions: Callable[[Robot, Conditions], list[str]] = lambda *_: []
+    check: Callable[[Robot, Conditions, Mapping[str, float]], None] = _no_check
+    cautions: Callable[[Robot, Conditions], list[str]] = _no_cautions
     columns: tuple[str, ...] = ()
 
     @property
