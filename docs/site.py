@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 DOCS = Path(__file__).parent
-FIGURES = ("before_after", "laws", "errors")
+FIGURES = ("before_after", "laws", "errors-figure")
 PACKAGES = ("mmrjax", "calibration", "sweeps")
 #: What the tutorial about the loop was written from, and the parts of `result.json` in it.
 RECORD = DOCS / "start" / "loop.json"
@@ -383,7 +383,7 @@ small:
 |---|---|---|---|---|---|
 {unseen}
 
-![Errors of runs that the fit has seen and has not seen](figures/errors.svg)
+![Errors of runs that the fit has seen and has not seen](figures/errors-figure.svg)
 
 ## What next?
 
