@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import dataclasses
 import itertools
 import re
@@ -87,7 +88,16 @@ def propose_columns(signals: Sequence[Signal], spelled: set[str]) -> Iterator[tu
     """
     columns = {q.stem or q.name: q.columns() for q in Layout(channels=channels.EVERY).quantities().values()}
     taken = {signal.name.rpartition("_")[0] for signal in signals if signal.name in spelled}
-    pool = [c for s in signals if s.name not in spelled and (c := _candidate(s, signals, columns)) is not None]
+    known = {unit for units in columns.values() for unit in units.values()} - {"", "s", "ms", "us", "ns", "min", "h"}
+    units = [_unit(signal, known) for signal in signals]
+    count = collections.Counter(units)
+    pool = [
+        candidate
+        for signal, unit in zip(signals, units, strict=True)
+        if signal.name not in spelled
+        and (unit is None or unit in known)
+        and (candidate := _candidate(signal, unit, count[unit] == 1, columns)) is not None
+    ]
     groups: dict[str, list[Candidate]] = {}
     for candidate in _by_power(pool):
         groups.setdefault(candidate.quantity, []).append(candidate)
@@ -115,29 +125,30 @@ def _joint(signal: Signal, signals: Sequence[Signal]) -> str:
 
 
 def _candidate(
-    signal: Signal, signals: Sequence[Signal], columns: Mapping[str, Mapping[str, str]]
+    signal: Signal, unit: str | None, alone: bool, columns: Mapping[str, Mapping[str, str]]
 ) -> Candidate | None:
-    """Quantity that a signal may show; None if its unit, its behaviour or its name excludes every one."""
+    """Quantity that a signal may show; None if its unit, its behaviour or its name excludes every one.
+
+    Args:
+        unit: that it states, a column's; None: it states none. alone: True if no other signal states it.
+        columns: names of the columns of each quantity, and their units.
+    """
     if signal.refused:
-        return None
-    known = {unit for units in columns.values() for unit in units.values()} - {"", "s", "ms", "us", "ns", "min", "h"}
-    unit = _unit(signal, known)
-    if unit is not None and unit not in known:
         return None
     name = _words(signal.path)
     matches = [m.quantity for m in MEANINGS if m.pattern.search(name)]
     fitting = [q for q in matches if unit is None or unit in columns[q].values()]
-    if not matches and unit is not None and sum(_unit(s, known) == unit for s in signals) == 1:
+    if not matches and unit is not None and alone:
         fitting = [q for q in BY_UNIT if unit in columns[q].values()]
     command = bool(COMMAND.search(name))
     fitting = [q for q in fitting if not OTHER.search(name) and (not command or q in IMPOSED)]
     if not fitting or (signal.words and fitting[0] != "run_id"):
         return None
-    quantity, factor, question = fitting[0], 1.0, ""
+    quantity, question = fitting[0], ""
     units = columns[quantity]
     if quantity == "run_id":
         return Candidate(signal, quantity, quantity)
-    values = np.asarray(signal.load(), float) if not signal.words else np.zeros(0)
+    values = np.asarray(signal.load(), float)
     values = values[np.isfinite(values)]
     if not _is_reading(values):
         return None
@@ -155,7 +166,7 @@ def _candidate(
     elif "effort" in name:
         question = "effort may be a torque or a current: check it"
     column = next(c for c, u in units.items() if u == unit)
-    return Candidate(signal, quantity, column, question, factor)
+    return Candidate(signal, quantity, column, question)
 
 
 def _words(path: str) -> str:

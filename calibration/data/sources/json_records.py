@@ -13,6 +13,7 @@ import numpy as np
 from calibration.data import input_files
 from calibration.data.input_errors import BadData
 from calibration.data.sources.recorded_signals import (
+    RUN,
     Signal,
     encodable_text,
     of_arrays,
@@ -24,8 +25,6 @@ from calibration.data.sources.recorded_signals import (
 
 #: Largest JSON file [bytes]: its objects take some ten times as much memory; most levels within one another.
 LARGEST, DEEPEST = 2**28, 16
-#: Column with the test of each row, if a file has several tables with the same columns.
-RUN = "run_id"
 #: Keys that state the sampling of episodes: rates [Hz] and steps [s], with the power that makes a step of them.
 RATES = {
     **dict.fromkeys(("rate_hz", "sample_rate_hz", "sampling_rate_hz", "frequency_hz", "fps", "fs"), -1),

@@ -17,7 +17,14 @@ from calibration.data.input_errors import BadData
 from calibration.data.named_arrays import NamedArrays, Raw, column_numbers, column_texts
 from calibration.data.presets_file import Preset
 from calibration.data.sources import one_clock, opening
-from calibration.data.sources.recorded_signals import Signal, Source, find_signal, matching_signals, suggested_paths
+from calibration.data.sources.recorded_signals import (
+    RUN,
+    Signal,
+    Source,
+    find_signal,
+    matching_signals,
+    suggested_paths,
+)
 from mmrjax.errors import list_some
 from mmrjax.model import channels, quantities
 
@@ -25,8 +32,6 @@ from mmrjax.model import channels, quantities
 Mapped = tuple[tuple[str, str, float], ...]
 #: Most values of columns without a role; they are read to find correlations with residuals.
 EXTRA_VALUES = 20_000_000
-#: Column with the run of each row.
-RUN = "run_id"
 #: Ratio of the rms currents along d and q above which the field is weakened [-].
 WEAKENED = 0.3
 

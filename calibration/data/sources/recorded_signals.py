@@ -18,6 +18,8 @@ from mmrjax.errors import similar_words
 CLOCKS = ("time", "t", "timestamp", "timestamps", "stamp", "elapsed", "clock", "timestamp_sample")
 #: Units that the name of a clock may end with, and the seconds of one.
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
+#: Column with the run of each row, where a source has several.
+RUN = "run_id"
 #: Most paths that a message lists.
 LISTED = 12
 #: Separators of the parts of a path.
