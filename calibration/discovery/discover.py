@@ -968,8 +968,9 @@ def assemble_result(
     written = _fit_of_verdict(traced, progress)
     progress(Step("errors"))
     known = [traced.predicted.get(prediction.candidate_key(c)) for c in (base, best)]
+    kinds = blocks_room.predictable_blocks(runs, space.bare)
     seen = findings.readings_of_rows(
-        runs, noise.sd, written.before, written.after, known[0], None if best is base else known[1]
+        runs, noise.sd, kinds, written.before, written.after, known[0], None if best is base else known[1]
     )
     compared = traced.held_out
     nameless = traced.verdict in WITHOUT_NAME

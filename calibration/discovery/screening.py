@@ -33,6 +33,8 @@ FURTHER = 3
 
 #: Largest initial amplitude of a fit [prior sds of a fit].
 FAR = 1.5
+#: Least gain by a set that needs another program, as a share of the largest gain of any set.
+ANOTHER = 0.05
 #: Number of effects in the first program of a log's fits, and of those among them that are similar to the first.
 ROOM, NEAR = 8, 5
 
@@ -113,17 +115,20 @@ def confirm_by_simulation(space: CandidateSpace, screened: Sequence[Candidate], 
     """Simulate the first sets of a round that was screened by regression.
 
     These are the plausible set that explains most, its nearest rival, the nearest of another family, and any
-    implausible set that explains more. If the first explains less than its regression by more than
-    `Settings.same`, the simulation decides, and the next by regression is tried too. Further sets must be in the
-    program, or must promise more.
+    implausible set that explains more. If the program has the first, rivals outside it stay regressions. If the first
+    explains less than its regression by more than `Settings.same`, the simulation decides, and the next by
+    regression is tried too. Further sets must be in the program, or must promise more.
     """
     fits = lambda c: {*c.effects} <= {*space.room}  # noqa: E731
     # Sets outside the program need another program, and have to promise that much more. For verdicts at other noises
     # they are omitted.
     screened = [c for c in screened if fits(c)] if space.near else screened
-    order = sorted(screened, key=lambda c: c.cost + (0.0 if fits(c) else settings.same / 2))
+    costs = [c.cost for c in screened if np.isfinite(c.cost)]
+    more = max(settings.same / 2, ANOTHER * float(np.ptp(costs))) if costs else 0.0
+    order = sorted(screened, key=lambda c: c.cost + (0.0 if fits(c) else more))
     order = [c for c in order if np.isfinite(c.cost)]
-    first, found = _first_to_simulate(space, order), dict[tuple[str, ...], Candidate]()
+    within = [c for c in order if fits(c)] if order and fits(order[0]) else order
+    first, found = _first_to_simulate(space, within), dict[tuple[str, ...], Candidate]()
     space = space.with_room([*space.room, *(n for c in first for n in c.effects)])  # one program for all of them
     said = {c.active: c for c in order}
 
@@ -184,7 +189,8 @@ class Beforehand:
     Attributes:
         base: the fit without effects, by regression. None if the load may slide on its ground, which the
             equations do not show, so that a search should not begin there.
-        room: effects in the program of all fits; scores: of every instance; windows: number of equations.
+        room: effects in the program of all fits, if the equations show that one is missing.
+        scores: of every instance; windows: number of equations.
         null: root of the strongest score of tables under the null hypothesis [σ], shape (replicates,).
     """
 
@@ -223,7 +229,8 @@ def screen_by_weak_form(space: CandidateSpace, settings: Settings) -> Beforehand
     at = Optimum(*of_fit)
     base = dataclasses.replace(candidate_of_fit(space, empty_slots(settings), at, settings), simulated=False)
     slides = problem.base.has_ground and problem.base.rig.imposed == "voltage"
-    room = _program_room(space, base, found, scores, settings)
+    missing = np.mean(null >= np.max(np.abs(single))) < settings.family_wise_error
+    room = _program_room(space, base, found, scores, settings) if missing else ()
     return Beforehand(None if slides else base, room, scores, found.windows, null)
 
 
