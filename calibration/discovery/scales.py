@@ -36,6 +36,7 @@ from mmrjax.model.signals import Signals
 
 #: Reference quantity of each balance; terms are shares of it.
 WHOLE: dict[str, Callable[[Robot, Signals], object]] = {
+    "duty": lambda robot, s: s.duty,
     "supply": lambda robot, s: s.voltage,
     "electrical": lambda robot, s: s.voltage,
     "motor": lambda robot, s: s.torque_electromagnetic,
@@ -70,6 +71,9 @@ UNKNOWN = 4.0
 #: Largest error of an instrument, as a share of the channel's rms reading: a larger one would be noticed (47 A on
 #: readings of 114 A are no ammeter's offset).
 MOST_OFF = 0.25
+#: The same as a share of the reading at rated load and speed: a motor without load draws little of the current that
+#: its ammeter is made for (0.4 A on readings of 0.56 A is an offset of a meter for 20 A).
+MOST_OFF_RATED = 0.03
 #: Signals that grow with the motors' current, and signals that grow with their speed.
 LOADS = (
     "current",
@@ -207,7 +211,8 @@ def _scale_effect(kind: type[Effect], mine: tuple[Robot, Signals], theirs: tuple
         limits = factor * min(1.0, _ratio(own, rated))
     else:
         low, high = amplitude_of(grown).spec.bounds
-        limits = min(factor, MOST_OFF / (max(-low, high) * _unit_share(grown, *mine)))
+        own, rated = (_unit_share(grown, mine[0], s) for s in (mine[1], _at_rated_load(*mine)))
+        limits = min(factor, max(MOST_OFF / own, MOST_OFF_RATED / rated) / max(-low, high))
     return scaled_effect(kind, (float(factor), float(stretch), float(limits)))
 
 
