@@ -16,6 +16,7 @@ from typing import Annotated, Any, NamedTuple
 
 import typer
 
+from calibration.data import Names
 from calibration.data.input_errors import BadConfiguration, InputError
 from mmrjax import SOUND_AT_LEVEL_0, WORKER, __version__, fidelities
 from mmrjax.errors import printable, shorten
@@ -74,7 +75,7 @@ def _command(
     example: str,
     failure: str = "the solver failed at some runs (status failed). Runs that stall or slide are answers: 0",
     beside: type[config.Part] | None = None,
-    arguments: tuple[str, ...] = (),
+    arguments: Names = (),
     resolve: Callable[..., config.Part] | None = None,
 ) -> Callable[[Callable[..., int]], Callable[..., int]]:
     """Decorator for a command whose options are the fields of a configuration, in addition to its function's own.
@@ -671,7 +672,7 @@ def _prepared(resolved: Any, no_cache: bool = False) -> Any:
 WHOLE = 1_000_000
 
 
-def _start_jax(no_cache: bool, flags: tuple[str, ...] = (), options: tuple[str, ...] = ()) -> None:
+def _start_jax(no_cache: bool, flags: Names = (), options: Names = ()) -> None:
     """Import jax with double precision, XLA flags and the compilation cache, unless `no_cache`.
 
     Compiler options are added to that of `SOUND_AT_LEVEL_0`.

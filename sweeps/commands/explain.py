@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from calibration.data import effect_file
+from calibration.data import Names, effect_file
 from calibration.data.input_errors import BadConfiguration, bound_text
 from calibration.words import effect_words
 from mmrjax import derived, effects
@@ -32,7 +32,7 @@ WIDTH, INDENT = 80, 16
 EVERY_OUTPUT: tuple[Any, ...] = (*outputs.FURTHER, *derived.TABLE, *mission_batch.OUTPUTS, *mission_batch.OF_TURNS)
 
 
-def explain_name(name: str | None, files: tuple[str, ...] = ()) -> int:
+def explain_name(name: str | None, files: Names = ()) -> int:
     """Explain an effect, status, flag, output, channel or parameter by its name; without a name, list all.
 
     Raises:
