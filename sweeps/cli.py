@@ -16,6 +16,7 @@ from typing import Annotated, Any, NamedTuple
 
 import typer
 
+from calibration.data import Names
 from calibration.data.input_errors import BadConfiguration, InputError
 from mmrjax import SOUND_AT_LEVEL_0, WORKER, __version__, fidelities
 from mmrjax.errors import printable, shorten
@@ -74,7 +75,7 @@ def _command(
     example: str,
     failure: str = "the solver failed at some runs (status failed). Runs that stall or slide are answers: 0",
     beside: type[config.Part] | None = None,
-    arguments: tuple[str, ...] = (),
+    arguments: Names = (),
     resolve: Callable[..., config.Part] | None = None,
 ) -> Callable[[Callable[..., int]], Callable[..., int]]:
     """Decorator for a command whose options are the fields of a configuration, in addition to its function's own.
@@ -637,7 +638,8 @@ def inspect_file(
 @app.command(rich_help_panel=ELSEWHERE, epilog="Example: mmrjax explain series_resistance")
 def explain(
     name: Annotated[
-        str | None, typer.Argument(help="An effect, status, flag, output, channel or parameter; none lists them.")
+        list[str] | None,
+        typer.Argument(help="Effect, status, flag, output, channel, parameter or word of a report. None lists them."),
     ] = None,
     effects: _Effects = None,
     no_cache: _NoCache = False,
@@ -649,7 +651,7 @@ def explain(
     _start_jax(no_cache)
     from sweeps.commands import explain as room
 
-    return room.explain_name(name, tuple(effects or ()))
+    return room.explain_name(" ".join(name) if name else None, tuple(effects or ()))
 
 
 def _prepared(resolved: Any, no_cache: bool = False) -> Any:
@@ -671,7 +673,7 @@ def _prepared(resolved: Any, no_cache: bool = False) -> Any:
 WHOLE = 1_000_000
 
 
-def _start_jax(no_cache: bool, flags: tuple[str, ...] = (), options: tuple[str, ...] = ()) -> None:
+def _start_jax(no_cache: bool, flags: Names = (), options: Names = ()) -> None:
     """Import jax with double precision, XLA flags and the compilation cache, unless `no_cache`.
 
     Compiler options are added to that of `SOUND_AT_LEVEL_0`.

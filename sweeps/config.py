@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, Self, TypeVar
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
-from calibration.data import presets_file
+from calibration.data import Json, Names, presets_file
 from calibration.data.columns import ROWS
 from calibration.data.input_errors import SEEDS, BadConfiguration, allowed_words, parse_number
 from calibration.data.input_files import toml_content, toml_text
@@ -66,7 +66,7 @@ class RobotPart(Part):
     set: dict[str, bool | float] = option_field(
         {}, "Change a parameter, SI units, repeatable: 6T2A.ground.friction.static=0.6"
     )
-    effects: tuple[str, ...] = option_field(
+    effects: Names = option_field(
         (), "A Python file with effects of your own, repeatable; its code is run", verbatim=True, executes=True
     )
 
@@ -247,7 +247,7 @@ class GridPart(Part):
     A robot has voltages or motor speeds, on the battery neither; payloads, slopes and surface are of a vehicle.
     """
 
-    configurations: Annotated[tuple[str, ...], Field(min_length=1)] | None = option_field(
+    configurations: Annotated[Names, Field(min_length=1)] | None = option_field(
         None, "Comma-separated, of the robot's", usual="all that it has"
     )
     voltages_V: Voltages | None = option_field(
@@ -275,7 +275,7 @@ class GridPart(Part):
 class InferencePart(Part):
     """Prior knowledge and data of a fit."""
 
-    prior: tuple[str, ...] = option_field(
+    prior: Names = option_field(
         (), "A prior in SI units, repeatable: 6T2A.ground.friction.static=0.45±0.05", verbatim=True
     )
     noise: str = option_field(
@@ -529,7 +529,7 @@ class Climb(RobotPart, SupplyPart, OutputPart):
     find: Literal["step", "stairs", "gap"] | None = option_field(
         None, "Look for the largest that it gets over, in place of one run; of stairs the rise at --stairs' tread"
     )
-    derivatives: tuple[str, ...] = option_field(
+    derivatives: Names = option_field(
         (),
         "Derivatives of margins, time, energy and currents by these, comma-separated: parameters, adhesion, payload, "
         "voltage, levers_front_deg, levers_rear_deg, obstacle_mm",
@@ -575,10 +575,8 @@ class Calibrate(RobotPart, DataPart, InferencePart, OutputPart):
     model: Annotated[str, AfterValidator(_fidelity)] | None = option_field(
         None, f"Fidelity: {', '.join(fidelities.NAMES)}", usual="drive for a log over time, else steady"
     )
-    free: tuple[str, ...] = option_field(
-        (), "Parameters to free, comma-separated; default is the default set, motor.* a group"
-    )
-    fix: tuple[str, ...] = option_field((), "Parameters to hold, comma-separated")
+    free: Names = option_field((), "Parameters to free, comma-separated; default is the default set, motor.* a group")
+    fix: Names = option_field((), "Parameters to hold, comma-separated")
     starts: Annotated[int, Field(ge=1, le=100_000)] | None = option_field(
         None, "Searches", usual="64; histories 8; settled turns 4; rows with drive or track 1"
     )
@@ -642,7 +640,7 @@ class Loop(RobotPart, DataPart, InferencePart, OutputPart):
         "By what one of several effects that these data cannot tell apart comes first, held-out being errors of "
         "blocks that a fit has not seen",
     )
-    forbid: tuple[str, ...] = option_field(
+    forbid: Names = option_field(
         (), "An experiment that cannot be done, repeatable: stall, lifted, 'one motor', or a configuration"
     )
     resolve: bool = option_field(
@@ -680,8 +678,8 @@ class Size(RequirementsPart, RobotPart, OutputPart):
     """A search for a robot that meets requirements."""
 
     objective: str = option_field("mass", "Quantity to minimise: mass (kg), energy (Wh/m), cost (EUR)")
-    pareto: tuple[str, ...] = option_field((), "Two objectives, comma-separated, for a front of both instead")
-    motors: tuple[str, ...] = option_field((), "Motors to choose from, comma-separated", usual="all of the sheets")
+    pareto: Names = option_field((), "Two objectives, comma-separated, for a front of both instead")
+    motors: Names = option_field((), "Motors to choose from, comma-separated", usual="all of the sheets")
     starts: Annotated[int, Field(ge=1, le=100_000)] = option_field(256, "Searches in one batch")
     seed: Seed = option_field(0, "Of the starts")
 
@@ -698,7 +696,7 @@ class Sensitivity(RobotPart, DataPart, FidelityPart, SupplyPart, OutputPart):
         "local, sobol, morris or derivative",
         usual="sobol; with --posterior local",
     )
-    configurations: Annotated[tuple[str, ...], Field(min_length=1)] | None = option_field(
+    configurations: Annotated[Names, Field(min_length=1)] | None = option_field(
         None, "Comma-separated, of the robot's", usual="all that it has"
     )
     voltages_V: Voltages | None = option_field(
@@ -712,13 +710,11 @@ class Sensitivity(RobotPart, DataPart, FidelityPart, SupplyPart, OutputPart):
         None, "Slopes, positive uphill", usual="of Table 8; of a rig 0"
     )
     surface: str | None = option_field(None, SURFACE, usual=f"{BENCH}; of a rig none")
-    parameters: tuple[str, ...] = option_field(
+    parameters: Names = option_field(
         (), "Uncertain parameters, comma-separated, motor.* a group", usual="all that have a prior"
     )
-    vary: tuple[str, ...] = option_field(
-        (), "A condition that is uncertain too, repeatable: voltage=22:26, slope_deg=0:5"
-    )
-    outputs: tuple[str, ...] = option_field(
+    vary: Names = option_field((), "A condition that is uncertain too, repeatable: voltage=22:26, slope_deg=0:5")
+    outputs: Names = option_field(
         (),
         "Outputs, comma-separated: those of a run, steepest_slope, highest_step, best_step, start for its three",
         usual="current, speeds, slip, power, efficiency, steepest slope",
@@ -749,7 +745,7 @@ class Sensitivity(RobotPart, DataPart, FidelityPart, SupplyPart, OutputPart):
 C = TypeVar("C", bound=Part)
 
 
-def read_toml(file: Path) -> dict[str, Any]:
+def read_toml(file: Path) -> Json:
     """The keys of a TOML file.
 
     Raises:
@@ -769,7 +765,7 @@ def fields_with(kind: type[Part], fact: str) -> list[str]:
     return [name for name, said in extra.items() if isinstance(said, dict) and said.get(fact)]
 
 
-def _keys(kind: type[Part], file: Path, beside: type[Part] | None) -> dict[str, Any]:
+def _keys(kind: type[Part], file: Path, beside: type[Part] | None) -> Json:
     """The keys of a file for a configuration, those of its table `[solver]` among them."""
     values = read_toml(file)
     table = values.pop("solver", {})
@@ -785,7 +781,7 @@ def _keys(kind: type[Part], file: Path, beside: type[Part] | None) -> dict[str, 
     return {**values, **{key: value for key, value in table.items() if key in own}}
 
 
-def resolve_beside(kind: type[C], file: Path | None, options: dict[str, Any], trust: bool = False) -> C:
+def resolve_beside(kind: type[C], file: Path | None, options: Json, trust: bool = False) -> C:
     """Returns the options of a command outside its configuration; a file may state their `[solver]` keys only.
 
     Args:
@@ -802,7 +798,7 @@ def resolve_beside(kind: type[C], file: Path | None, options: dict[str, Any], tr
 def resolve_configuration(
     kind: type[C],
     file: Path | None,
-    options: dict[str, Any],
+    options: Json,
     beside: type[Part] | None = None,
     trust: bool = False,
 ) -> C:
@@ -818,7 +814,7 @@ def resolve_configuration(
     return _checked(kind, file, {} if file is None else _keys(kind, file, beside), options, trust)
 
 
-def _checked(kind: type[C], file: Path | None, values: dict[str, Any], options: dict[str, Any], trust: bool) -> C:
+def _checked(kind: type[C], file: Path | None, values: Json, options: Json, trust: bool) -> C:
     given = {k: v for k, v in options.items() if v is not None}
     for name in fields_with(kind, "executes"):
         if file is not None and values.get(name) and name not in given and not trust:
@@ -837,7 +833,7 @@ def _checked(kind: type[C], file: Path | None, values: dict[str, Any], options: 
         raise BadConfiguration(_sentence(kind, error, file, given)) from None
 
 
-def _sentence(kind: type[Part], error: ValidationError, file: Path | None, given: dict[str, Any]) -> str:
+def _sentence(kind: type[Part], error: ValidationError, file: Path | None, given: Json) -> str:
     first, options = error.errors()[0], options_of_fields(kind)
 
     def called(name: str) -> str:
@@ -894,7 +890,7 @@ def parse_settings(options: list[str] | None) -> dict[str, bool | float] | None:
     return table
 
 
-def split_words(options: list[str] | None) -> tuple[str, ...] | None:
+def split_words(options: list[str] | None) -> Names | None:
     """Repeated, comma-separated options as one tuple."""
     return tuple(w.strip() for o in options for w in o.split(",") if w.strip()) if options else None
 

@@ -6,11 +6,12 @@ import dataclasses
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Literal, Self
 
 from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
 
+from calibration.data import Json, Names
 from calibration.data.input_errors import BadConfiguration, allowed_words
 from mmrjax.model.paper_tables import COULOMB_PER_MAH
 from mmrjax.model.quantities import RPM
@@ -78,10 +79,10 @@ class Campaign(RobotPart, ProfilePart, BatchPart, OutputPart):
         obstacle: that every point climbs, in place of a run of the fidelity.
     """
 
-    conditions: dict[str, Any] = Field(default_factory=dict)
-    axes: dict[str, Any] = Field(default_factory=dict)
-    samples: dict[str, Any] = Field(default_factory=dict)
-    outputs: tuple[str, ...] = ()
+    conditions: Json = Field(default_factory=dict)
+    axes: Json = Field(default_factory=dict)
+    samples: Json = Field(default_factory=dict)
+    outputs: Names = ()
     storage: Literal["float64", "float32"] = "float64"
     compression: Literal["none", "zstd"] = "none"
     obstacle: Obstacle | None = None
@@ -110,10 +111,10 @@ class How:
 
     shard: tuple[int, int] | None = None
     scheduler: str | None = None
-    export: tuple[str, ...] = ()
+    export: Names = ()
     dry_run: bool = False
     zarr: bool = False
-    outputs: tuple[str, ...] = ()
+    outputs: Names = ()
 
 
 def sweep_options(
@@ -153,7 +154,7 @@ def is_campaign(file: Path | None) -> bool:
     return file is not None and not set(KEYS).isdisjoint(read_toml(file))
 
 
-def resolve_campaign(file: Path | None, options: dict[str, Any], trust: bool = False) -> Campaign | Sweep:
+def resolve_campaign(file: Path | None, options: Json, trust: bool = False) -> Campaign | Sweep:
     """The configuration of a sweep into a store: of its file, or the grid of the options (or of such a file).
 
     A grid is one of a store's once the robot is known (`of_grid`).

@@ -7,6 +7,8 @@ from typing import Any
 
 from pydantic import BaseModel
 
+from calibration.data import Json
+
 #: Units that names of fields end with, the longest first, and as they are written.
 UNITS = {
     "rad_s": "rad/s",
@@ -21,7 +23,7 @@ UNITS = {
 }
 
 
-def schema_facts(kind: type[BaseModel]) -> dict[str, dict[str, Any]]:
+def schema_facts(kind: type[BaseModel]) -> dict[str, Json]:
     """Schema of each field of a configuration, in the order of its parts, its own first."""
     schema = kind.model_json_schema()["properties"]
     own = [
@@ -30,7 +32,7 @@ def schema_facts(kind: type[BaseModel]) -> dict[str, dict[str, Any]]:
     found = {}
     for name in dict.fromkeys(n for n in own if n in schema):
         stated = schema[name]
-        given: dict[str, Any] = next((a for a in stated.get("anyOf", ()) if a.get("type") != "null"), {})
+        given: Json = next((a for a in stated.get("anyOf", ()) if a.get("type") != "null"), {})
         found[name] = {**given, **stated}
     return found
 

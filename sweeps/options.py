@@ -10,6 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
+from calibration.data import Json, Names
 from sweeps import config
 from sweeps.config import Part
 from sweeps.flags import of_unit, option_of_field, schema_facts
@@ -51,7 +52,7 @@ def _default(name: str, fact: Mapping[str, Any]) -> str:
     )
 
 
-def option_parameters(kind: type[Part], arguments: tuple[str, ...] = ()) -> Iterator[inspect.Parameter]:
+def option_parameters(kind: type[Part], arguments: Names = ()) -> Iterator[inspect.Parameter]:
     """A parameter of a command's function for each field that can be chosen, None where it is not given.
 
     Args:
@@ -78,7 +79,7 @@ def _type(fact: Mapping[str, Any]) -> Any:
     return _LISTS[fact["items"]["type"]] if fact["type"] == "array" else _TYPES[fact["type"]]
 
 
-def take_options(kind: type[Part], values: dict[str, Any]) -> dict[str, Any]:
+def take_options(kind: type[Part], values: Json) -> Json:
     """Takes what was given for the fields of a configuration out of the values of a command, and reads their texts.
 
     Raises:

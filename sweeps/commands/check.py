@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.data import requirements_file, robot_file
+from calibration.data import Columns, requirements_file, robot_file
 from calibration.data.input_errors import BadConfiguration
 from calibration.described import in_words
 from calibration.sizing import sheet
@@ -81,7 +81,7 @@ def _write(folder: RunFolder, config: configuration.Check, found: CheckResult) -
     folder.write_json("result.json", found.to_json())
 
 
-def outcomes_table(found: CheckResult) -> dict[str, np.ndarray]:
+def outcomes_table(found: CheckResult) -> Columns:
     """Outcomes as a table, one row for each requirement."""
     nan = float("nan")
     return {

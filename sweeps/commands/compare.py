@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.data import instruments
+from calibration.data import Columns, instruments
 from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.robot_file import RobotFile
@@ -141,7 +141,7 @@ def _name_of(config: configuration.Compare, file: RobotFile, second: RobotFile |
     return str(config.against) if name == capabilities.shown_name(file) else name
 
 
-def missing_readings_notes(table: dict[str, np.ndarray], channels: Sequence[Channel]) -> list[str]:
+def missing_readings_notes(table: Columns, channels: Sequence[Channel]) -> list[str]:
     """Sentences on channels with missing readings."""
     lost = {c.column: int(np.isnan(table[c.column]).sum()) for c in channels}
     rows = len(table["status"])

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
-from calibration.data import robot_file
+from calibration.data import Json, robot_file
 from sweeps import config as configuration
 from sweeps.export.formats import Export, export_format
 from sweeps.inputs import load_robot
@@ -36,7 +35,7 @@ def export_to_folder(config: configuration.Export, out: Path | None, force: bool
         )
 
 
-def to_json(found: Export) -> dict[str, Any]:
+def to_json(found: Export) -> Json:
     """`result.json`."""
     compared = found.comparison
     return {

@@ -6,7 +6,7 @@ import math
 
 from rich.table import Table
 
-from calibration.data import contents, presets_file
+from calibration.data import Names, contents, presets_file
 from calibration.data.contents import SignalFacts
 from mmrjax.errors import count_noun
 from sweeps.console import print_json, print_output
@@ -46,7 +46,7 @@ def inspect_file(file: str, as_json: bool) -> int:
     return 0
 
 
-def _numbers(signal: SignalFacts) -> tuple[str, ...]:
+def _numbers(signal: SignalFacts) -> Names:
     if signal.refused:
         return ("",) * 5
     ends = (", ".join(signal.words), "") if signal.words else (_number(signal.least), _number(signal.greatest))

@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 import mmrjax as mm
-from calibration.data import effect_file, robot_file
+from calibration.data import Columns, Json, effect_file, robot_file
 from calibration.described import in_words
 from calibration.discovery import findings
 from calibration.discovery.discover import discover
@@ -75,7 +75,7 @@ def _loop(
         check_resolvable(runs, members)
     replicates = max(config.replicates, fewest_replicates(observers.observer_kind(runs)))
 
-    stages: dict[str, Any] = {}
+    stages: Json = {}
 
     def left() -> float | None:
         return None if within is None else max(within - (time.monotonic() - began), 0.0)
@@ -183,7 +183,7 @@ def _show_ranking(found: Ranking, folder: RunFolder, timed: Callable[[str], None
     folder.write_json(SCREENING_FILE, content)
 
 
-def _say_kept(stages: dict[str, Any], folder: RunFolder, robot_name: str) -> None:
+def _say_kept(stages: Json, folder: RunFolder, robot_name: str) -> None:
     """Say which stages are kept, and leave the robot of the base fit where there is one but no verdict."""
     if not stages:
         return
@@ -220,7 +220,7 @@ def changes_by_effect(found: DiscoveryResult) -> dict[str, Change]:
         return {}
     conditions = found.runs.conditions(found.robot)
 
-    def simulated(robot: Robot) -> dict[str, np.ndarray]:
+    def simulated(robot: Robot) -> Columns:
         results = mm.simulate(robot, conditions)
         return {c.name: np.asarray(getattr(results, c.name)) for c in found.channels}
 

@@ -5,12 +5,11 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Collection
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
 
-from calibration.data import profiles
+from calibration.data import Columns, Json, profiles
 from calibration.data import runs as records
 from calibration.data.columns import LOAD, ON_SHAFT, SUPPLY
 from calibration.data.input_errors import BadConfiguration
@@ -42,7 +41,7 @@ _LASTING = MARKS.index("battery_empty")  # events from here on are kept in histo
 
 def simulate_missions(
     config: configuration.Simulate,
-    given: str | dict[str, Any],
+    given: str | Json,
     stated: Collection[str],
     out: Path | None,
     force: bool,
@@ -183,9 +182,9 @@ def run_missions(robot: Robot, runs: records.Runs, source: ProfileTable, config:
     profile = source.profile(robot, conditions)
     names = runs["run_id"] if runs.has("run_id") else np.array([f"run-{k + 1}" for k in range(len(runs))])
     rows = max(LEAST_ROWS, min(MOST_ROWS, ALL_ROWS // len(runs)))
-    tables: list[dict[str, np.ndarray]] = []
-    segments: list[dict[str, np.ndarray]] = []
-    courses: list[dict[str, np.ndarray]] = []
+    tables: list[Columns] = []
+    segments: list[Columns] = []
+    courses: list[Columns] = []
     done, whole = 0, True
     with progress_bar(len(runs), quiet=False) as advance:
         for found in mission_batch.simulate_in_parts(robot, conditions, profile, source.start):
@@ -209,14 +208,12 @@ def run_missions(robot: Robot, runs: records.Runs, source: ProfileTable, config:
     return Missions({**about, **_below(tables)}, _below(segments), _below(courses), source, whole)
 
 
-def _below(tables: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+def _below(tables: list[Columns]) -> Columns:
     """Tables of the same columns one below the other."""
     return {key: np.concatenate([table[key] for table in tables]) for key in tables[0]}
 
 
-def _conditions(
-    robot: Robot, runs: records.Runs, source: ProfileTable, config: configuration.Simulate
-) -> dict[str, np.ndarray]:
+def _conditions(robot: Robot, runs: records.Runs, source: ProfileTable, config: configuration.Simulate) -> Columns:
     """Conditions of the runs, empty where the profile states them or the battery sets them."""
     nothing = np.full(len(runs), np.nan)
     unknown = {*source.stated, *(["supply_voltage_V"] if config.battery else [])}
@@ -229,7 +226,7 @@ def _conditions(
 
 def _segments(
     robot: Robot, conditions: Conditions, source: ProfileTable, found: Mission, names: np.ndarray
-) -> dict[str, np.ndarray]:
+) -> Columns:
     """A row for each segment of each cycle of each run, up to where the run has ended."""
     numbers = mission_batch.numbers_by_column(
         jax.device_get(mission_batch.mission_totals(found.segments, found.segment_peaks))
@@ -297,7 +294,7 @@ def rows_to_keep(segment: np.ndarray, current: np.ndarray, most: int, marked: np
 
 def _course(
     robot: Robot, conditions: Conditions, source: ProfileTable, found: Mission, k: int, name: str, most: int
-) -> dict[str, np.ndarray]:
+) -> Columns:
     """Rows of history.csv of one run."""
     course = jax.tree.map(lambda x: np.asarray(x[k]), found.course)
     filled = course.segment >= 0

@@ -8,6 +8,7 @@ from typing import Any
 
 import jax
 
+from calibration.data import Json
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.writing import replacing
 from mmrjax.fidelities.track import track_batch
@@ -24,7 +25,7 @@ from sweeps.store import DONE, SOLVER_FAILED
 
 
 def render_run(
-    config: configuration.Render, given: dict[str, Any], file: Path, begin: float, end: float | None, slow: float,
+    config: configuration.Render, given: Json, file: Path, begin: float, end: float | None, slow: float,
     force: bool,
 ) -> int:  # fmt: skip
     """Draw one run (of options, by column) from standstill, as a picture or a film; returns the exit code.

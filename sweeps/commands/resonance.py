@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from calibration.data import robot_file
+from calibration.data import Columns, Json, robot_file
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.runs import Runs
 from mmrjax.fidelities.track import track_batch
@@ -116,7 +116,7 @@ def _points(config: configuration.Resonance, robot: Robot) -> tuple[Runs, np.nda
 
 def _rippled(
     folder: RunFolder, robot: Robot, conditions: Conditions, config: configuration.Resonance, what: Passing
-) -> dict[str, np.ndarray]:
+) -> Columns:
     """The columns of ripple, chunk by chunk; chunks that an interrupted run left are not simulated again."""
     total, parts = conditions.shape[0], []
     size = min(CHUNK, total)
@@ -139,7 +139,7 @@ def _rippled(
     return {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
 
 
-def _columns(robot: Robot, ended: Any, what: Passing) -> dict[str, np.ndarray]:
+def _columns(robot: Robot, ended: Any, what: Passing) -> Columns:
     """Ripple of a batch of runs, in the units of the table."""
     found = vibrations_of_runs(robot, ended, what.pitch)
     status = np.array(STATUSES)[found.status]
@@ -157,9 +157,7 @@ def _columns(robot: Robot, ended: Any, what: Passing) -> dict[str, np.ndarray]:
     return columns
 
 
-def _found(
-    config: configuration.Resonance, robot: Robot, what: Passing, table: dict[str, np.ndarray]
-) -> ResonanceResult:
+def _found(config: configuration.Resonance, robot: Robot, what: Passing, table: Columns) -> ResonanceResult:
     """Natural frequencies at the middle voltage, and peaks and crossings at each payload."""
     assert config.configuration is not None
     payloads, middle = config.payloads_kg, config.voltages_V[len(config.voltages_V) // 2]
@@ -210,7 +208,7 @@ _COLUMNS = {
 }  # fmt: skip
 
 
-def _rows(rows: Iterable[dict[str, Any]], kind: type) -> dict[str, np.ndarray]:
+def _rows(rows: Iterable[Json], kind: type) -> Columns:
     """Rows of a named tuple as columns with units in their names; without rows the columns alone."""
     rows, unit = list(rows), "Hz" if kind is Mode else "m_s"
     keys = list(rows[0]) if rows else list(kind.__annotations__)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from calibration.data import rig_facts, settling
+from calibration.data import Json, Names, rig_facts, settling
 from calibration.data.columns import SUPPLY, Layout
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.rig_facts import Fact, Origin
@@ -54,7 +54,7 @@ class RigCheck:
     facts: tuple[Fact, ...]
     runs: Runs | None = None
     foresight: Foresight | None = None
-    doubts: tuple[str, ...] = ()
+    doubts: Names = ()
 
     def understood(self) -> list[str]:
         """Sentences on the rig, its drive and its sensors."""
@@ -114,7 +114,7 @@ class RigCheck:
             said.append("motor.voltage_limit is not stated: experiments are proposed up to what a table used")
         return said
 
-    def channels(self) -> list[dict[str, Any]]:
+    def channels(self) -> list[Json]:
         """Of each channel: name, the user's column, whether it is signed, its step [unit], source of its sd."""
         theirs = {mine: column for mine, column, _ in self.robot.rig.columns}
         shown, found = (self if self.foresight is None else self.foresight).robot.rig, []
@@ -133,7 +133,7 @@ class RigCheck:
             )
         return found
 
-    def columns(self) -> list[dict[str, Any]]:
+    def columns(self) -> list[Json]:
         """Of each column of the table: what it is used for, its range."""
         if self.runs is None:
             return []
@@ -197,7 +197,7 @@ class RigCheck:
         assert self.foresight is not None
         return describe(Determination.of(parameter.name, parameter.held, self.foresight.together))
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Json:
         """The whole, for machines."""
         runs = None
         if self.runs is not None:
@@ -271,9 +271,7 @@ def _use(column: str, robot: Robot) -> str:
     return "condition"
 
 
-def check_rig_file(
-    file: Path, data: str | None, effects: tuple[str, ...], as_json: bool, columns: str | None = None
-) -> int:
+def check_rig_file(file: Path, data: str | None, effects: Names, as_json: bool, columns: str | None = None) -> int:
     """Say what was understood of a rig's file, and what a table can tell of it; returns 0.
 
     Raises:
@@ -292,9 +290,7 @@ def check_rig_file(
     return 0
 
 
-def examine_rig_file(
-    file: Path, data: str | None, effects: tuple[str, ...] = (), columns: str | None = None
-) -> RigCheck:
+def examine_rig_file(file: Path, data: str | None, effects: Names = (), columns: str | None = None) -> RigCheck:
     """Remarks on a rig's file, and on a table whose columns a preset may name."""
     rig = load_robot(RobotPart(robot=str(file), effects=effects))
     lines, robot = rig.text.splitlines(), rig.robot

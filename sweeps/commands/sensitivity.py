@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from calibration.data import robot_file
+from calibration.data import Json, Names, robot_file
 from calibration.data.columns import Layout
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.robot_file import RobotFile
@@ -73,7 +72,7 @@ def study_sensitivity(config: configuration.Sensitivity, out: Path | None, force
     inputs = _inputs(config, file, runs, ranges)
     candidates = _candidates(config, robot, runs, bool(freed))
     conditions = runs.conditions(robot)
-    turned: dict[str, Any] = {name: np.full(len(runs), np.mean(ranges[name])) for name in freed}
+    turned: Json = {name: np.full(len(runs), np.mean(ranges[name])) for name in freed}
     check_runs_bearable(robot, dataclasses.replace(conditions, **turned), config)
     supply = Supply(float(config.battery), config.discharge_mAh * COULOMB_PER_MAH, np.asarray(conditions.adhesion))
     study = Study(
@@ -92,7 +91,7 @@ def study_sensitivity(config: configuration.Sensitivity, out: Path | None, force
         return finish_run_folder(folder, config, manifest, solved=found.solved, page=shown, runs=runs)
 
 
-def _ranges(vary: tuple[str, ...]) -> dict[str, tuple[float, float]]:
+def _ranges(vary: Names) -> dict[str, tuple[float, float]]:
     """`name=low:high` of every varied condition."""
     found: dict[str, tuple[float, float]] = {}
     for text in vary:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import shlex
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from calibration.data import robot_file, settling
+from calibration.data import Columns, Json, robot_file, settling
 from calibration.data.settling import Settled
 from calibration.described import sentences
 from calibration.inference import ranges
@@ -48,10 +47,10 @@ def settle_to_folder(config: configuration.Settle, source: str, out: Path | None
         return finish_run_folder(folder, config, {"seed": None, "settled": len(found.kept)}, page=shown, runs=runs)
 
 
-def stretches_table(found: Settled) -> dict[str, np.ndarray]:
+def stretches_table(found: Settled) -> Columns:
     """Every stretch of a log, a row each: where it is, why it is left out, means, their sds, changes."""
     every = found.stretches
-    table: dict[str, np.ndarray] = {
+    table: Columns = {
         "run_id": np.array([s.run for s in every]),
         "from_s": np.array([s.begin for s in every]),
         "until_s": np.array([s.end for s in every]),
@@ -72,7 +71,7 @@ def stretches_table(found: Settled) -> dict[str, np.ndarray]:
     return table
 
 
-def to_json(found: Settled, few: str = "") -> dict[str, Any]:
+def to_json(found: Settled, few: str = "") -> Json:
     """`result.json`; `few` is the sentence of `words.too_few`."""
     left = settle_words.left_out(found.stretches, bool(few))
     return {

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from calibration.data import profiles, robot_file
+from calibration.data import Json, profiles, robot_file
 from calibration.data.input_errors import BadConfiguration, InputError
 from calibration.data.robot_file import RobotFile
 from mmrjax.model.signals import STATUSES
@@ -294,7 +294,7 @@ def write_sweep_folder(store: SweepStore, config: Campaign, file: RobotFile, job
     skeleton.finish_run_folder(store, config, manifest, page=skeleton.print_report(document, file))
 
 
-def sweep_summary(layout: Layout, job: scale.Job, done: Iterable[Done]) -> dict[str, Any]:
+def sweep_summary(layout: Layout, job: scale.Job, done: Iterable[Done]) -> Json:
     """`result.json`."""
     done = list(done)
     units = {v.name: v.attributes["units"] for v in layout.variables if "units" in v.attributes}

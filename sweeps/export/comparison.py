@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 
+from calibration.data import Names
 from calibration.inference import solvers
 from calibration.inference.simulation_errors import share_of_measured
 from sweeps.export.joint import Joint, channels_of
@@ -36,7 +37,7 @@ class FormatLaw(Protocol):
         names: of the parameters; start: their values by translation [SI], all positive or zero.
     """
 
-    names: tuple[str, ...]
+    names: Names
     start: np.ndarray
 
     def __call__(self, theta: Any, command: Any, load: Any, way: Any) -> tuple[Any, Any]:

@@ -12,6 +12,7 @@ from matplotlib.axis import Axis
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 
+from calibration.data import Names
 from sweeps.pages.figure_style import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, SKY, VERMILION, corner_note, new_figure
 from sweeps.pages.words import short_name
 from sweeps.points.climbs import SIZE
@@ -29,7 +30,7 @@ class Varied(NamedTuple):
 
     values: np.ndarray
     label: str
-    words: tuple[str, ...] = ()
+    words: Names = ()
 
 
 def varied_names(values: np.ndarray, layout: Layout) -> dict[str, Varied]:

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from calibration.data import Columns
 from mmrjax.fidelities.base import History
 from mmrjax.model.quantities import MM, RPM
 from mmrjax.model.robot import Robot
@@ -127,7 +128,7 @@ def draw_turn_course(history: History) -> Figure:
     return fig
 
 
-def over_yaw_rate(turns: dict[str, np.ndarray], row: Mapping[str, Any]) -> Figure:
+def over_yaw_rate(turns: Columns, row: Mapping[str, Any]) -> Figure:
     """Current of either side and power over the yaw rate of settled turns, the one asked for marked."""
     fig, grid = new_figure(1, 2, 3.4)
 

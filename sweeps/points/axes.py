@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from calibration.data import Names
 from calibration.data.columns import IMPOSED as OF_IMPOSED
 from calibration.data.columns import LEVERS
 from calibration.data.contradictions import without_levers
@@ -55,7 +56,7 @@ class Plan:
     axes: dict[str, Axis]
     conditions: dict[str, float]
     surface: str | None = None
-    data: tuple[str, ...] = ()
+    data: Names = ()
     rows: Conditions | None = None
 
     @staticmethod
@@ -228,7 +229,7 @@ def _range(stated: Mapping[str, Any], where: str) -> np.ndarray:
     return np.linspace(start, stop, number) if scale == "linear" else np.geomspace(start, stop, number)
 
 
-def _keys(stated: Mapping[str, Any], allowed: tuple[str, ...], needed: tuple[str, ...], where: str) -> None:
+def _keys(stated: Mapping[str, Any], allowed: Names, needed: Names, where: str) -> None:
     for key in stated:
         if key not in allowed:
             raise BadConfiguration(f"{where}.{key}: no such key; {allowed_words(key, allowed)}")
@@ -302,7 +303,7 @@ def _posterior(stated: Any, robot: Robot, where: str, data: list[str]) -> Joint:
 
 
 #: Numbers that each distribution states.
-DISTRIBUTIONS: dict[str, tuple[str, ...]] = {
+DISTRIBUTIONS: dict[str, Names] = {
     "uniform": ("low", "high"),
     "loguniform": ("low", "high"),
     "normal": ("mean", "sd"),

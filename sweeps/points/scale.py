@@ -23,6 +23,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float
 
+from calibration.data import Columns, Names
 from mmrjax import WORKER, fidelities
 from mmrjax.compile.compiling import compiled
 from mmrjax.compile.precision import Threads
@@ -59,7 +60,7 @@ class Job:
     robot: Robot
     task: Task
     plan: Plan
-    outputs: tuple[str, ...]
+    outputs: Names
     storage: str
     blocks: Blocks
     profile: Profile | None = None
@@ -254,7 +255,7 @@ class Piece:
 Produced = Iterator[Piece]
 Advance = Callable[[float], None]
 #: Keeps a chunk by its number: values of its points by variable, and of its samples as `drawn_samples` gives them.
-Keep = Callable[[int, dict[str, np.ndarray], np.ndarray | None], Any]
+Keep = Callable[[int, Columns, np.ndarray | None], Any]
 
 
 def produce_chunks(
@@ -305,7 +306,7 @@ def share_counter(advance: Advance, count: int) -> Callable[[float], None]:
     return told
 
 
-def fetch_values(arrays: Mapping[str, Any], count: int) -> dict[str, np.ndarray]:
+def fetch_values(arrays: Mapping[str, Any], count: int) -> Columns:
     """The first `count` values of each array, on this machine."""
     return {name: np.asarray(values)[:count] for name, values in jax.device_get(dict(arrays)).items()}
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from calibration.data import Json, Names
 from mmrjax import fidelities
 from mmrjax.fidelities import outputs
 from mmrjax.fidelities.variation import FLAGS, Axis
@@ -18,7 +19,7 @@ from mmrjax.model.signals import FLAGS as LIMITS
 from sweeps.config_campaign import SIZE, Campaign
 from sweeps.points import climbs
 
-Attributes = dict[str, dict[str, Any]]
+Attributes = dict[str, Json]
 
 
 def nothing_further(stated: Mapping[str, np.ndarray], robot: Robot, where: str) -> dict[str, float]:
@@ -42,7 +43,7 @@ class Task:
     model: str
     options: Mapping[str, float]
     attributes: Attributes
-    usual: tuple[str, ...]
+    usual: Names
     slow: bool
     at_once: tuple[int, int]
     axes: Mapping[str, Axis] = dataclasses.field(default_factory=dict)

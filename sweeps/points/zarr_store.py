@@ -23,6 +23,7 @@ from typing import Any, TextIO
 
 import numpy as np
 
+from calibration.data import Json, Names
 from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.data.writing import naming_file
 from mmrjax.fidelities.variation import STATUS
@@ -79,7 +80,7 @@ class Layout:
     blocks: Blocks
     variables: tuple[Variable, ...]
     coordinates: Mapping[str, Mapping[str, Any]]
-    labels: Mapping[str, tuple[str, ...]]
+    labels: Mapping[str, Names]
     attributes: Mapping[str, Any]
     compression: str = "none"
 
@@ -480,7 +481,7 @@ def _compressed(content: Any) -> bytes:
     return bytes(Zstd(level=ZSTD["level"], checksum=ZSTD["checksum"]).encode(np.frombuffer(content, np.uint8)))
 
 
-ZSTD: dict[str, Any] = {"level": 1, "checksum": False}
+ZSTD: Json = {"level": 1, "checksum": False}
 
 
 def create_store(path: Path, layout: Layout) -> None:

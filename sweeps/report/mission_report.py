@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from calibration.data import Columns, Json
 from calibration.data.profiles import CONTROLLED, YAW_RATE
 from calibration.data.robot_file import RobotFile
 from mmrjax.errors import count_noun
@@ -109,7 +110,7 @@ def _from_above(robot: Robot, first: Mapping[str, Any], rows: Mapping[str, np.nd
     )
 
 
-def _names(runs: dict[str, np.ndarray]) -> list[str]:
+def _names(runs: Columns) -> list[str]:
     """Headings of runs; what the profile states in the place of a run's condition is left out."""
     parts = (label.split(", ") for label in run_headings(runs))
     return [", ".join([head, *(p for p in rest if not p.startswith("nan"))]) for head, *rest in parts]
@@ -132,7 +133,7 @@ def mission_answer(run: Mapping[str, Any]) -> str:
     return text + ("." if status == "converged" else f". It ends early: {words.status_meaning(status)}.")
 
 
-def mission_limits(robot: Robot, run: Mapping[str, Any]) -> list[dict[str, Any]]:
+def mission_limits(robot: Robot, run: Mapping[str, Any]) -> list[Json]:
     """Use of each limit by a mission."""
     motor, gearbox, heat = robot.motor, robot.gearbox, robot.knows(WARMING)
     speed, unknown = run["peak_motor_speed_rpm"], 0.0 if heat else np.nan

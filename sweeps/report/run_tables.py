@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from calibration.data import Json
 from calibration.data.robot_file import RobotFile
 from mmrjax import effects
 from mmrjax.model.channels import Channel
@@ -149,7 +150,7 @@ def limits_table(limits: Sequence[Mapping[str, Any]], what: str) -> Table:
     return catalogue.table("run.limits", rows, f"{what} |")
 
 
-def use_of_limits(asked: Iterable[tuple[str, Any, Any, str]], ambient: float) -> list[dict[str, Any]]:
+def use_of_limits(asked: Iterable[tuple[str, Any, Any, str]], ambient: float) -> list[Json]:
     """Use of each known limit: words, its value, the limit, and the share of it [%].
 
     A winding has the share of its permissible temperature rise.

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from calibration.data import Columns
 from calibration.data.robot_file import RobotFile
 from mmrjax.fidelities.base import History
 from mmrjax.model.channels import SIDES
@@ -34,7 +35,7 @@ def turn_document(
     run: Mapping[str, np.ndarray],
     ended: Mapping[str, float] | None,
     history: History | None,
-    turns: dict[str, np.ndarray] | None,
+    turns: Columns | None,
     notes: Sequence[str] = (),
 ) -> Document:
     """The report of one turn.
