@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from calibration.data import surfaces
+from calibration.data import Names, surfaces
 from calibration.data.columns import DRIVEN, DUTY, WORDS, Column, Layout
 from calibration.data.input_errors import allowed_words, bound_text, parse_number
 from calibration.data.named_arrays import Raw, column_numbers, column_texts, missing_readings
@@ -89,7 +89,7 @@ def refused_cell_sentence(where: str, meaning: Column, cell: str, layout: Layout
     return f"{where}, {meaning.shown}: got {cell or 'an empty cell'}; {hint}expected {allowed}"
 
 
-def _hint(meaning: Column, cell: str, units: bool, readings: tuple[str, ...]) -> str:
+def _hint(meaning: Column, cell: str, units: bool, readings: Names) -> str:
     """Guess at the meaning of a refused cell, with a semicolon at its end; empty without a guess."""
     if cell.lower() in NOTHING:
         return "leave the cell empty where there is no reading; " if meaning.column in readings else ""

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from calibration.data import counters
+from calibration.data import Names, counters
 from calibration.data.columns import Column
 from calibration.data.input_errors import bound_text
 from calibration.data.named_arrays import Raw, column_numbers
@@ -22,7 +22,7 @@ EPOCH, PARTS = (6.3e8, 4.2e9), {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _WITH_POINTS = re.compile(r"(\d\d)\.(\d\d)\.(\d{4})(?=[ T])")
 
 
-def from_the_first(name: str, meaning: Column, raw: Raw, runs: Sequence[str] | None) -> tuple[Raw, tuple[str, ...]]:
+def from_the_first(name: str, meaning: Column, raw: Raw, runs: Sequence[str] | None) -> tuple[Raw, Names]:
     """Returns a column of time as the time since the first row of each run, and notes on the changes.
 
     A run begins at its first row, whatever its clock shows there: the time since a controller started, or a time of
@@ -41,7 +41,7 @@ def from_the_first(name: str, meaning: Column, raw: Raw, runs: Sequence[str] | N
     )
     of_day = bool(np.isfinite(clock).all())
     names, run = (np.array([""]), None) if runs is None else np.unique(runs, return_inverse=True)
-    notes: tuple[str, ...] = ()
+    notes: Names = ()
     if not of_day:
         low, high = (limit * factor for limit in meaning.limits())
         count, notes = _counted(name, meaning, column_numbers(raw), run)
@@ -77,9 +77,7 @@ def from_the_first(name: str, meaning: Column, raw: Raw, runs: Sequence[str] | N
     )
 
 
-def _counted(
-    name: str, meaning: Column, count: np.ndarray, run: np.ndarray | None
-) -> tuple[np.ndarray, tuple[str, ...]]:
+def _counted(name: str, meaning: Column, count: np.ndarray, run: np.ndarray | None) -> tuple[np.ndarray, Names]:
     """Numbers of a clock without wraps and without stamps that rows share, and notes on these."""
     step = np.diff(count)
     if not len(step) or (step > 0).all() or not np.isfinite(step).all():

@@ -7,6 +7,7 @@ import difflib
 import re
 from collections.abc import Sequence
 
+from calibration.data import Names
 from calibration.data.columns import HEADING, SIDES, SPEED, SUPPLY, TIME, VOLTS, WORDS, Column, Layout
 from calibration.data.input_errors import BadData
 from calibration.data.named_arrays import NamedArrays
@@ -21,7 +22,7 @@ _SIDE = {"l": "left", "lh": "left", "lft": "left", "port": "left", "r": "right",
 
 def match_column_names(
     name: str, header: Sequence[str], layout: Layout, *, inferred: bool, of_turns: bool
-) -> tuple[list[str], Layout, tuple[str, ...]]:
+) -> tuple[list[str], Layout, Names]:
     """Returns the names of columns in this program's spelling, the layout with their channels, and notes.
 
     A note reports each name that differs in case.
@@ -40,7 +41,7 @@ def match_column_names(
     return named, layout, tuple(notes)
 
 
-def _in_case(name: str, header: Sequence[str], layout: Layout, inferred: bool) -> tuple[list[str], tuple[str, ...]]:
+def _in_case(name: str, header: Sequence[str], layout: Layout, inferred: bool) -> tuple[list[str], Names]:
     """A header with the capitals of the columns' names, and notes on changed names."""
     known = dataclasses.replace(layout, channels=channels.EVERY) if inferred else layout
     spelled: dict[str, set[str]] = {}

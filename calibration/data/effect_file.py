@@ -14,12 +14,12 @@ import sys
 import types
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from calibration.data import Json
 from calibration.data.input_errors import BadConfiguration, allowed_words, is_number
 from mmrjax import effects
 from mmrjax.effects import Effect
@@ -54,7 +54,7 @@ _STATED = {
 }
 _MOVERS = ("tracks", "wheels")
 #: Signals of the left side in a turn that are zero in straight travel; they change sign in the mirror image.
-TURN: dict[str, Any] = {
+TURN: Json = {
     "side": 1.0,
     "yaw_rate": 0.8,
     "speed_lateral": 0.1,

@@ -7,6 +7,8 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from calibration.data import Columns
+
 #: Types of libraries that are imported where they are needed.
 PandasFrame: TypeAlias = Any
 PolarsFrame: TypeAlias = Any
@@ -14,7 +16,7 @@ ArrowTable: TypeAlias = Any
 XarrayDataset: TypeAlias = Any
 
 
-def columns_of(result: Any) -> dict[str, np.ndarray]:
+def columns_of(result: Any) -> Columns:
     """Returns the table of a result, by column: of shape (rows,) each.
 
     Args:

@@ -9,6 +9,7 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
+from calibration.data import Json
 from calibration.data.input_errors import BadConfiguration, allowed_words, stated_number
 from calibration.data.input_files import toml_content, toml_text
 from mmrjax.derived.requirements import QUANTITIES
@@ -214,7 +215,7 @@ def _range(value: Any, where: str, low: float, high: float, unit: str) -> Range:
 
 def _envelope(base: Envelope, stated: Mapping[str, Any], where: str) -> Envelope:
     """`base` with the stated values in place of its own."""
-    found: dict[str, Any] = {}
+    found: Json = {}
     for key, value in stated.items():
         place = f"{where}.{key}"
         if key not in KEYS:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from calibration.data import surfaces
+from calibration.data import Columns, Names, surfaces
 from calibration.data.columns import (
     DEFAULTS,
     DRIVEN,
@@ -34,7 +34,7 @@ LEVELS_OF_SIGN = 3
 STILL = 0.02
 
 
-def complete_columns(name: str, columns: dict[str, np.ndarray], rows: int, layout: Layout) -> None:
+def complete_columns(name: str, columns: Columns, rows: int, layout: Layout) -> None:
     """Fills columns that a table may leave out, and refuses values that contradict each other."""
     _fill(name, columns, rows, layout)
     _check_driving(name, columns)
@@ -44,7 +44,7 @@ def complete_columns(name: str, columns: dict[str, np.ndarray], rows: int, layou
     _check_deviations(name, columns, layout.channels)
 
 
-def without_copies(name: str, columns: dict[str, np.ndarray]) -> tuple[np.ndarray, tuple[str, ...]]:
+def without_copies(name: str, columns: Columns) -> tuple[np.ndarray, Names]:
     """Returns False for rows of a log that are the row before once more, shape (rows,), and a sentence on them."""
     rows = len(next(iter(columns.values()), []))
     kept = np.full(rows, True)
@@ -71,7 +71,7 @@ def without_copies(name: str, columns: dict[str, np.ndarray]) -> tuple[np.ndarra
     return kept, (said,) if again.size else ()
 
 
-def _fill(name: str, columns: dict[str, np.ndarray], rows: int, layout: Layout) -> None:
+def _fill(name: str, columns: Columns, rows: int, layout: Layout) -> None:
     """Adds columns that a table of a rig may leave out: its only configuration, and conditions with a usual value."""
     if layout.complete:
         return
@@ -83,7 +83,7 @@ def _fill(name: str, columns: dict[str, np.ndarray], rows: int, layout: Layout) 
         columns.setdefault(column, np.full(rows, value))
 
 
-def _only(name: str, columns: dict[str, np.ndarray], layout: Layout) -> str:
+def _only(name: str, columns: Columns, layout: Layout) -> str:
     """Returns the configuration of a table without that column: the only one, or the only one with its surfaces."""
     labels = np.unique(columns.get("surface", np.zeros(0, str)))
     found = surfaces.common_configuration(layout.configurations, labels)
@@ -94,7 +94,7 @@ def _only(name: str, columns: dict[str, np.ndarray], layout: Layout) -> str:
     return found
 
 
-def _check_driving(name: str, columns: dict[str, np.ndarray]) -> None:
+def _check_driving(name: str, columns: Columns) -> None:
     if "mode" in columns and not set(TIME) <= set(columns):  # settled runs are driven
         raise BadData(f"{name}: column mode is for time histories; add {', '.join(TIME)}, or remove it")
     if "duty" not in columns:
@@ -112,7 +112,7 @@ def _check_driving(name: str, columns: dict[str, np.ndarray]) -> None:
     columns["duty"] = np.nan_to_num(duty)
 
 
-def _check_sides(name: str, columns: dict[str, np.ndarray], layout: Layout) -> None:
+def _check_sides(name: str, columns: Columns, layout: Layout) -> None:
     stated = [c for c in layout.sides if c in columns]
     if len(stated) == 1:
         (other,) = set(layout.sides) - set(stated)
@@ -124,7 +124,7 @@ def _check_sides(name: str, columns: dict[str, np.ndarray], layout: Layout) -> N
         )
 
 
-def _check_held(name: str, columns: dict[str, np.ndarray]) -> None:
+def _check_held(name: str, columns: Columns) -> None:
     """Refuses a clamp in a log, and a load torque beside it: what the clamp carries is a reading."""
     held = columns.get("held", np.zeros(1)) > 0.5
     if held.any() and set(TIME) <= set(columns):
@@ -136,7 +136,7 @@ def _check_held(name: str, columns: dict[str, np.ndarray]) -> None:
         )
 
 
-def _check_mass(name: str, columns: dict[str, np.ndarray]) -> None:
+def _check_mass(name: str, columns: Columns) -> None:
     if "total_mass_kg" not in columns:
         return
     total, payload = columns["total_mass_kg"], columns["payload_kg"]
@@ -149,7 +149,7 @@ def too_light(where: str, total: float, payload: float) -> str:
     return f"{where}, total_mass_kg: got {bound_text(total)}; expected {included}"
 
 
-def _check_deviations(name: str, columns: dict[str, np.ndarray], shown: tuple[Channel, ...]) -> None:
+def _check_deviations(name: str, columns: Columns, shown: tuple[Channel, ...]) -> None:
     for channel in shown:
         if channel.column in columns and channel.sd_column in columns:
             lost = np.isfinite(columns[channel.column]) & ~np.isfinite(columns[channel.sd_column])
@@ -160,9 +160,7 @@ def _check_deviations(name: str, columns: dict[str, np.ndarray], shown: tuple[Ch
                 )
 
 
-def driven_rows(
-    name: str, columns: dict[str, np.ndarray], layout: Layout
-) -> tuple[dict[str, np.ndarray], np.ndarray, tuple[str, ...]]:
+def driven_rows(name: str, columns: Columns, layout: Layout) -> tuple[Columns, np.ndarray, Names]:
     """Returns the columns of settled runs in rows where something drives the motors, True for these rows, and a note
     on the other ones.
 
@@ -179,7 +177,7 @@ def driven_rows(
     return columns, driven, (note,) if note else ()
 
 
-def _driven(name: str, columns: dict[str, np.ndarray], layout: Layout) -> tuple[np.ndarray, str]:
+def _driven(name: str, columns: Columns, layout: Layout) -> tuple[np.ndarray, str]:
     """True for rows of settled runs in which something drives the motors; a sentence on the other rows.
 
     Raises:
@@ -217,7 +215,7 @@ def _driven(name: str, columns: dict[str, np.ndarray], layout: Layout) -> tuple[
     )
 
 
-def _check_level(name: str, columns: dict[str, np.ndarray]) -> None:
+def _check_level(name: str, columns: Columns) -> None:
     """Refuses readings of turns on a slope, since no turn is settled there."""
     slope = columns["slope_deg"]
     if slope.any():
@@ -230,7 +228,7 @@ def _check_level(name: str, columns: dict[str, np.ndarray]) -> None:
         )
 
 
-def _check_signs(name: str, columns: dict[str, np.ndarray], layout: Layout) -> None:
+def _check_signs(name: str, columns: Columns, layout: Layout) -> None:
     """Refuses readings without a sign in rows that drive the robot backward."""
     column = layout.imposed_column
     imposed, unit = columns[column], column.split("_")[-1]
@@ -292,14 +290,14 @@ def _rises_through_zero(imposed: np.ndarray, readings: np.ndarray, backward: np.
     return bool(slope * np.ptp(levels) > 2 * scatter)
 
 
-def _doubt(columns: dict[str, np.ndarray], channel: Channel) -> np.ndarray | float:
+def _doubt(columns: Columns, channel: Channel) -> np.ndarray | float:
     """Largest excess of a reading beyond zero by noise: SIGN_SDS of its sd, or a share of the channel's rms."""
     readings = columns[channel.column]
     share = SIGN_SHARE * float(np.sqrt(np.nanmean(readings**2))) if np.isfinite(readings).any() else 0.0
     return np.fmax(share, SIGN_SDS * np.nan_to_num(columns.get(channel.sd_column, np.zeros(len(readings)))))
 
 
-def missing_data_notes(name: str, columns: dict[str, np.ndarray], layout: Layout) -> Iterator[str]:
+def missing_data_notes(name: str, columns: Columns, layout: Layout) -> Iterator[str]:
     """Yields notes on missing channels and readings, on copies of rows, and on runs with several rows."""
     for channel in layout.channels:
         if channel.column not in columns:
@@ -338,7 +336,7 @@ def missing_data_notes(name: str, columns: dict[str, np.ndarray], layout: Layout
             )
 
 
-def driven_backward_notes(name: str, columns: dict[str, np.ndarray], layout: Layout) -> Iterator[str]:
+def driven_backward_notes(name: str, columns: Columns, layout: Layout) -> Iterator[str]:
     """Yields a note on settled rows in which a load torque without a sign drives a shaft that runs backward."""
     on = np.flatnonzero(driven_on(columns, layout))
     if on.size and not set(TIME) & set(columns) and columns[LOAD].min() >= 0:

@@ -16,6 +16,9 @@ from typing import Any
 import numpy as np
 
 from calibration.data import (
+    Columns,
+    Json,
+    Names,
     cell_values,
     clock,
     column_names,
@@ -177,9 +180,9 @@ def of_arrays(
 
 def _columns(
     arrays: NamedArrays, meanings: Sequence[Column | None], layout: Layout, battery: bool
-) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
+) -> tuple[Columns, Names]:
     """Values of the columns with a meaning, and notes on cells that are read as another value."""
-    columns: dict[str, np.ndarray] = {}
+    columns: Columns = {}
     bad: list[tuple[int, int, str]] = []
     notes: list[str] = []
     count = 0
@@ -230,7 +233,7 @@ def _listed(name: str, said: Sequence[str], count: int) -> str:
     return f"{first}; also {'; '.join(more)}{rest}"
 
 
-def _without_repeats(name: str, columns: dict[str, np.ndarray], layout: Layout) -> Iterator[str]:
+def _without_repeats(name: str, columns: Columns, layout: Layout) -> Iterator[str]:
     """Takes readings that a log repeats out of its columns, with a sentence on each channel."""
     if not set(TIME) <= set(columns):
         return
@@ -307,7 +310,7 @@ def _refuse_stated(arrays: NamedArrays, voltages: Raw) -> None:
         )
 
 
-def single_run(cells: dict[str, Any], layout: Layout | None = None) -> Runs:
+def single_run(cells: Json, layout: Layout | None = None) -> Runs:
     """Returns one run from options by column name, each checked as a cell of a file; on a battery without a voltage.
 
     Args:
@@ -318,7 +321,7 @@ def single_run(cells: dict[str, Any], layout: Layout | None = None) -> Runs:
     """
     layout = Layout() if layout is None else layout
     rows = layout.quantities()
-    columns: dict[str, np.ndarray] = {}
+    columns: Columns = {}
     for column, value in cells.items():
         quantity = rows[column]
         meaning = Column(quantity, column, next(iter(quantity.units)))

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from calibration.data import counters
+from calibration.data import Columns, Names, counters
 from calibration.data.input_errors import BadData, bound_text
 from calibration.data.sources.recorded_signals import UNITS, Clock, Signal
 from mmrjax.errors import count_noun
@@ -84,7 +84,7 @@ def on_one_grid(
     is_held: Callable[[str], bool],
     is_measured: Callable[[str], bool],
     grid: str,
-) -> tuple[np.ndarray, dict[str, np.ndarray], tuple[str, ...]]:
+) -> tuple[np.ndarray, Columns, Names]:
     """Returns time [s] from the first row, values of each signal at these times, and notes on the resampling.
 
     The grid is the time stamps of the densest measured signal, or of the stated clock. Signals on its clock stay as
@@ -128,7 +128,7 @@ def on_one_grid(
                 f"{name}: {clocks[key].name} ends at {bound_text(time[-1])} s, before {clocks[main].name} and "
                 "every command have begun; expected clocks with a time in common"
             )
-    values: dict[str, np.ndarray] = {}
+    values: Columns = {}
     brought: dict[str, list[str]] = {}
     for column, signal in chosen.items():
         own, key, sorted_by = signal.load(), same[id(signal.clock)], order[id(signal.clock)]
