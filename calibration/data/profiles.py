@@ -191,13 +191,6 @@ class ProfileTable:
         return dataclasses.replace(made, adhesion=of(adhesion_ratio), adhesion_lateral=lateral)
 
 
-def known_columns() -> dict[str, tuple[str, str]]:
-    """Every column of numbers: field that it becomes, and unit."""
-    return {
-        column: (field, unit) for field, quantity in QUANTITIES.items() for column, unit in quantity.columns().items()
-    }
-
-
 def read_profile(source: str | Path) -> ProfileTable:
     """Returns a packaged profile, by its name, or the profile of a file in any format of a table.
 
@@ -297,7 +290,9 @@ def _columns(name: str, header: list[str]) -> dict[str, tuple[str, str]]:
     Raises:
         BadData: an unknown column or unit, a field twice, no time.
     """
-    known: dict[str, tuple[str, str]] = known_columns()
+    known: dict[str, tuple[str, str]] = {
+        column: (field, unit) for field, quantity in QUANTITIES.items() for column, unit in quantity.columns().items()
+    }
     found: dict[str, tuple[str, str]] = {}
     for column in header:
         if column in (MODE, SURFACE):

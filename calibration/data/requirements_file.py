@@ -250,7 +250,7 @@ def _envelope(base: Envelope, stated: Mapping[str, Any], where: str) -> Envelope
 def _requirements(name: str, value: Any, envelope: Envelope, where: str) -> list[Requirement]:
     """The one or two requirements (least, most) of one entry."""
     quantity = QUANTITIES[name]
-    table = dict(value) if isinstance(value, dict) else {quantity_key(quantity): value}
+    table = dict(value) if isinstance(value, dict) else {"least" if quantity.least else "most": value}
     limits = {s: _limit(table.pop(s), where, quantity) for s in ("least", "most") if s in table}
     source, duty, share = table.pop("source", ""), table.pop("duty", None), table.pop("share", None)
     tread = table.pop(TREAD) if TREAD in table and name == STAIRS else None
@@ -295,11 +295,6 @@ def _limit(value: Any, where: str, quantity: Quantity) -> float | None:
         return None
     limits = RANGES["slope_deg"][:2] if quantity.unit == "deg" else STATED
     return stated_number(value, where, *limits, quantity.unit)
-
-
-def quantity_key(quantity: Quantity) -> str:
-    """`least` or `most`: the meaning of a number alone."""
-    return "least" if quantity.least else "most"
 
 
 def _share(duty: Any, share: Any, where: str) -> float:

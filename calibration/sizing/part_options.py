@@ -75,13 +75,6 @@ def packable_cells() -> tuple[CellSheet, ...]:
     )
 
 
-def mass_per_charge() -> float:
-    """Mass of lithium-polymer cells [kg/C], from the only pack with a mass on its label."""
-    return next(
-        c.mass / (c.cells * c.capacity) for c in packaged_cells() if not math.isnan(c.mass) and c.chemistry == _LIPO
-    )
-
-
 _LIPO = "lithium-polymer"
 
 
@@ -138,7 +131,9 @@ def options_for_robot(robot: Robot, names: Names = ()) -> Options:
                 "ratio_least": d.ratios[0], "ratio_most": d.ratios[-1],
             }
         )  # fmt: skip
-    per_charge = mass_per_charge()
+    per_charge = next(
+        c.mass / (c.cells * c.capacity) for c in packaged_cells() if not math.isnan(c.mass) and c.chemistry == _LIPO
+    )
     resistance = float(battery.resistance) * paper_cell.capacity
     columns = [
         {
