@@ -19,14 +19,12 @@ from calibration.data import (
     Columns,
     Json,
     Names,
-    cell_values,
     clock,
     column_names,
     contradictions,
     delimited,
     instruments,
     presets_file,
-    repeated_readings,
     row_checks,
     sides,
 )
@@ -202,11 +200,11 @@ def _columns(
         elif meaning.column in layout.idle:
             _refuse_idle(arrays, meaning, raw, layout)
         else:
-            columns[meaning.column], refused = cell_values.convert_column(meaning, raw, layout)
+            columns[meaning.column], refused = column_names.convert_column(meaning, raw, layout)
             wrong = np.flatnonzero(refused).tolist()
             count += len(wrong)
             for k in wrong[:LISTED]:
-                said = cell_values.refused_cell_sentence(
+                said = column_names.refused_cell_sentence(
                     arrays.row(k), meaning, column_texts(raw[k : k + 1])[0], layout
                 )
                 bad.append((k, j, said))
@@ -239,7 +237,7 @@ def _without_repeats(name: str, columns: Columns, layout: Layout) -> Iterator[st
         return
     run = columns.get("run_id")
     for channel in (c for c in layout.channels if c.column in columns and c.column != layout.imposed_column):
-        values, rows = repeated_readings.used_once(columns[channel.column], columns["time_s"], run)
+        values, rows = row_checks.used_once(columns[channel.column], columns["time_s"], run)
         if rows:
             columns[channel.column] = values
             yield (
@@ -326,9 +324,9 @@ def single_run(cells: Json, layout: Layout | None = None) -> Runs:
         quantity = rows[column]
         meaning = Column(quantity, column, next(iter(quantity.units)))
         text = bound_text(value) if isinstance(value, float) else str(value)
-        columns[column], refused = cell_values.convert_column(meaning, [text], layout)
+        columns[column], refused = column_names.convert_column(meaning, [text], layout)
         if refused.any():
-            raise BadConfiguration(cell_values.refused_cell_sentence("option", meaning, text, layout, hints=False))
+            raise BadConfiguration(column_names.refused_cell_sentence("option", meaning, text, layout, hints=False))
     if layout.imposed == "voltage":
         columns.setdefault(SUPPLY, np.array([math.nan]))
     if "total_mass_kg" in cells and cells["total_mass_kg"] <= cells["payload_kg"]:

@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from calibration.data import Columns, Names, counters
+from calibration.data import Columns, Names
+from calibration.data.clock import unwrap_counter
 from calibration.data.input_errors import BadData, bound_text
 from calibration.data.sources.recorded_signals import UNITS, Clock, Signal
 from mmrjax.errors import count_noun
@@ -55,7 +56,7 @@ def clock_seconds(clock: Clock) -> Elapsed:
         raw = raw.astype(np.int64)
     unit, period = clock.unit or guessed_unit(raw), 0.0
     if (np.diff(raw) < 0).any():
-        raw, period = counters.unwrap_counter(raw.astype(float), np.zeros(len(raw), int))
+        raw, period = unwrap_counter(raw.astype(float), np.zeros(len(raw), int))
     one = UNITS[unit]
     return Elapsed((raw - raw[:1]) * one, float(raw[0]) * one, unit, period)
 
