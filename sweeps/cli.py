@@ -490,7 +490,8 @@ def inspect_file(
 @app.command(rich_help_panel=ELSEWHERE, epilog="Example: mmrjax explain series_resistance")
 def explain(
     name: Annotated[
-        str | None, typer.Argument(help="An effect, status, flag, output, channel or parameter; none lists them.")
+        list[str] | None,
+        typer.Argument(help="Effect, status, flag, output, channel, parameter or word of a report. None lists them."),
     ] = None,
     effects: _Effects = None,
     no_cache: _NoCache = False,
@@ -502,7 +503,7 @@ def explain(
     _start_jax(no_cache)
     from sweeps.commands import explain as room
 
-    return room.explain_name(name, tuple(effects or ()))
+    return room.explain_name(" ".join(name) if name else None, tuple(effects or ()))
 
 
 def _prepare(resolved: Any, no_cache: bool = False) -> None:

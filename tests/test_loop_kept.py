@@ -19,7 +19,6 @@ from calibration.data.input_errors import BadConfiguration
 from calibration.discovery import discover as room
 from calibration.discovery import kept
 from calibration.discovery.kept import OutOfTime
-from calibration.discovery.loop_notes import Outstanding
 from mmrjax.compile import programs
 from mmrjax.model import paper_robots
 from sweeps import config
@@ -213,7 +212,7 @@ def test_a_loop_of_kept_stages_finds_what_it_found(tmp_path):
 
     ended = room.discover(runs, robot, replicates=250, keep=slow, left=lambda: 0.0)
     assert ended.verdict == found.verdict and not ended.sensitivity
-    assert [n.factors for n in ended.remarks if isinstance(n, Outstanding)] == [tuple(sorted(factors))]
+    assert [n.factors for n in ended.remarks if n.code == "outstanding"] == [tuple(sorted(factors))]
 
 
 def test_nothing_is_kept_where_nobody_asks():
