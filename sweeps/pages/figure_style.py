@@ -28,6 +28,7 @@ from matplotlib.text import Annotation, Text
 from matplotlib.ticker import LogFormatter, NullFormatter, ScalarFormatter
 from matplotlib.transforms import Affine2D, Bbox
 
+from calibration.data import Json
 from mmrjax.model.channels import Channel
 from sweeps import pages
 
@@ -314,7 +315,7 @@ def _luminance(channels: np.ndarray) -> float:
     return float(linear @ [0.2126, 0.7152, 0.0722])
 
 
-def _place(fig: Figure, axes: Axes) -> dict[str, Any]:
+def _place(fig: Figure, axes: Axes) -> Json:
     """Position of axes in the drawing [pt from its upper left corner], and their ranges."""
     width, height = 72 * fig.get_size_inches()
     box = axes.get_position(original=False)
@@ -337,10 +338,10 @@ def _has_names(axis: Axis) -> bool:
     return not isinstance(axis.get_major_formatter(), ScalarFormatter | LogFormatter | NullFormatter)
 
 
-def _run(axis: Axis) -> dict[str, Any]:
+def _run(axis: Axis) -> Json:
     """The ends of an axis, whether it is logarithmic, and its names where its ticks have any."""
     ends = [float(f"{end:.6g}") for end in axis.get_view_interval()]
-    known: dict[str, Any] = {"ends": ends, "log": axis.get_scale() == "log"}
+    known: Json = {"ends": ends, "log": axis.get_scale() == "log"}
     if _has_names(axis):
         names = [(float(t.get_loc()), t.label1.get_text() or t.label2.get_text()) for t in axis.get_major_ticks()]
         if names and all(name for _, name in names):

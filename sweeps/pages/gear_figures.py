@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from calibration.data import Json
 from mmrjax.model.paper_tables import PITCH_GROUSER, PITCH_TOOTH
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import STATUSES
@@ -94,7 +95,7 @@ def members_with_gear(
     return answer
 
 
-def ripple_numbers(gear: Gear) -> dict[str, Any]:
+def ripple_numbers(gear: Gear) -> Json:
     """What ripples in a run, by how much and how often."""
     tail, signals = gear.tail(TAIL), gear.signals
     drawn, travel, reaction = (
@@ -112,7 +113,7 @@ def ripple_numbers(gear: Gear) -> dict[str, Any]:
     }
 
 
-def current_ripple(shown: list[Gear], title: str = "{}") -> tuple[Figure, list[dict[str, Any]]]:
+def current_ripple(shown: list[Gear], title: str = "{}") -> tuple[Figure, list[Json]]:
     """Total current at the end of each run, and what ripples by how much."""
     fig, grid = new_figure(1, len(shown), 3.0)
     look = configuration_looks(gear.name for gear in shown)

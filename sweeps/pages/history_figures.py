@@ -11,6 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from calibration.data import Columns
 from mmrjax.derived.start_figures import curve_peak
 from mmrjax.fidelities.start_stages import StartStages, count_finite_samples, last_samples, stages_of_histories
 from mmrjax.model import channels
@@ -313,7 +314,7 @@ class Course:
     name: str
     status: str
     time: np.ndarray
-    readings: dict[str, np.ndarray]
+    readings: Columns
 
     def largest(self, channel: str) -> float:
         """Reading that is largest in size."""
