@@ -147,16 +147,17 @@ def program(task: Task) -> tuple[str, int]:
 
 def summary(lines: list[dict]) -> list[str]:
     """The figures of a campaign."""
-    f = scores.Figures(lines)
+    confounded = scores.Figures([x for x in lines if x["kind"] == "confounded"])
+    _of_confounded(confounded)
+    f = scores.Figures([x for x in lines if x["kind"] != "confounded"])
     scores.findings(f)
     scores.mechanisms(f)
     _clean(f)
     _library(f)
     _outside(f)
-    _of_confounded(f)
     _identifiability(f)
     scores.ends(f)
-    return f.out
+    return confounded.out + f.out
 
 
 #: Properties for a breakdown of clean rigs.
