@@ -20,6 +20,7 @@ from calibration.inference.noise import infer_noise
 from calibration.inference.observers import Histories, SettledRuns
 from mmrjax.model import paper_robots
 from sweeps.commands import rig_check
+from sweeps.report.terminal_renderer import print_document
 
 EVERY, ROWS = 0.01, 300
 
@@ -193,7 +194,7 @@ def test_rig_check_says_how_many_rows_are_used(tmp_path, monkeypatch, capsys):
     found = rig_check.examine_rig_file(tmp_path / "rig.toml", str(tmp_path / "log.csv"))
     used = len(found.foresight.status)
     assert 0.9 * 4000 < used < 4200 < len(found.runs)
-    rig_check.print_check(found)
+    print_document(rig_check.check_document(found))
     assert f"readings of {used} of them" in " ".join(capsys.readouterr().out.split())
 
 
