@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import functools
 import json
 import os
 import re
@@ -39,7 +40,9 @@ LINT = {
 OUTCOMES = ("passed", "failed", "skipped")
 #: Flags of `make test`: programs compile faster and run slower.
 FLAGS = (
-    "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=1 --xla_cpu_parallel_codegen_split_count=1"
+    "--xla_cpu_use_fusion_emitters=false",
+    "--xla_backend_optimization_level=1",
+    "--xla_cpu_parallel_codegen_split_count=1",
 )
 #: Time for pytest to write its summary after an interrupt, before it is killed [s].
 GRACE = 30.0
@@ -127,11 +130,22 @@ def commands(tier: str, options: argparse.Namespace) -> dict[str, list[str]]:
     return {tier: [python, "-m", "pytest", *words]}
 
 
-def environment(log: Path, done: Path) -> dict[str, str]:
+@functools.cache
+def known_flags(python: str, *flags: str) -> str:
+    """Those of the flags that this version of XLA accepts; XLA aborts each process that is given another one."""
+
+    def accepted(flag: str) -> bool:
+        command = [python, "-c", "import jax; jax.devices()"]
+        return not subprocess.run(command, env={**os.environ, "XLA_FLAGS": flag}, capture_output=True).returncode
+
+    return " ".join(filter(accepted, flags))
+
+
+def environment(python: str, log: Path, done: Path) -> dict[str, str]:
     """Environment of a tier: this tree's packages first, fast compilation, and where tests are logged."""
     path = os.pathsep.join([str(ROOT), str(ROOT / "benchmarks"), *filter(None, [os.environ.get("PYTHONPATH")])])
     return {
-        "XLA_FLAGS": FLAGS,
+        "XLA_FLAGS": known_flags(python, *FLAGS),
         **os.environ,
         "PYTHONPATH": path,
         "PYTHONDONTWRITEBYTECODE": "",  # tests start processes, which would compile all modules again
@@ -187,12 +201,12 @@ def run_tier(tier: str, options: argparse.Namespace, until: float) -> None:
     for name, command in todo.items():
         if tier == "lint":
             usable = subprocess.run([*command[:3], "--version"], capture_output=True, cwd=ROOT).returncode == 0
-            code = run(command, log, until - time.time(), environment(log, done)) if usable else 0
+            code = run(command, log, until - time.time(), environment(options.python, log, done)) if usable else 0
             if code is not None:
                 outcome = "skipped" if not usable else "failed" if code else "passed"
                 note(log, test=name, outcome=outcome, text="" if usable else f"no module {command[2]}")
         else:
-            code = run(command, log, until - time.time(), environment(log, done))
+            code = run(command, log, until - time.time(), environment(options.python, log, done))
         codes.append(code)
     if None not in codes:
         note(log, code=max(codes, key=abs))  # type: ignore[arg-type]

@@ -7,7 +7,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from calibration.data import rig_file
+from calibration.data import Columns, rig_file
 from calibration.data.robot_file import RobotFile
 from mmrjax.fidelities import outputs
 from mmrjax.model import params, quantities
@@ -76,7 +76,7 @@ def idle_columns(robot: Robot) -> set[str]:
     return found
 
 
-def without_idle(robot: Robot, table: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def without_idle(robot: Robot, table: Columns) -> Columns:
     """A table without what means nothing for the robot, the columns of its channels aside."""
     idle = idle_columns(robot) - {c.column for c in robot.channels}
     ends = ("", "_sd", "_lower", "_upper")

@@ -5,9 +5,8 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Collection
 from pathlib import Path
-from typing import Any
 
-from calibration.data import effect_file, posterior_file, robot_file, surface_labels
+from calibration.data import Json, Names, effect_file, posterior_file, robot_file, surface_labels
 from calibration.data import runs as records
 from calibration.data.columns import IMPOSED, Layout
 from calibration.data.contradictions import misplaced_levers
@@ -20,9 +19,9 @@ from mmrjax.model.paper_tables import BENCH, SURFACES
 from mmrjax.model.quantities import RPM
 from mmrjax.model.robot import Robot, turn_error
 from sweeps import capabilities, store
-from sweeps.config import FidelityPart, OneRun, RobotPart
+from sweeps.config import FidelityPart, GivenRuns, OneRun, RobotPart, Simulate
 from sweeps.console import print_message
-from sweeps.flags import options_of_fields
+from sweeps.options import options_of_fields
 from sweeps.points import imposed
 from sweeps.report.words import turn_words
 
@@ -59,7 +58,7 @@ def load_robot(config: RobotPart) -> RobotFile:
     return dataclasses.replace(file, robot=robot, remarks=unlike)
 
 
-def _unlike(name: str, robot: Robot) -> tuple[str, ...]:
+def _unlike(name: str, robot: Robot) -> Names:
     """Sentence for straight travel: how a robot with different sides turns if both are driven the same."""
     if not robot.unlike or not robot.has_ground:
         return ()
@@ -94,7 +93,7 @@ def fit_of(file: RobotFile, runs: records.Runs) -> str:
     return "" if not fitted else "these" if runs.digest in fitted else "others"
 
 
-def check_configurations(robot: Robot, names: tuple[str, ...], where: str) -> None:
+def check_configurations(robot: Robot, names: Names, where: str) -> None:
     """Refuse a configuration that the robot does not have.
 
     Raises:
@@ -163,9 +162,14 @@ def read_runs(
     return runs
 
 
-def one_run(
-    robot: Robot, cells: dict[str, Any], battery: bool = False, elsewhere: Collection[str] = ()
-) -> records.Runs:
+def given_runs(robot: Robot, beside: GivenRuns, config: Simulate, elsewhere: Collection[str] = ()) -> records.Runs:
+    """Runs of a file, or one of options; `elsewhere`: columns that a profile states."""
+    if beside.runs is None:
+        return one_run(robot, beside.stated, config.battery, elsewhere)
+    return read_runs(str(beside.runs), robot, columns=config.columns, measured=False, battery=config.battery)
+
+
+def one_run(robot: Robot, cells: Json, battery: bool = False, elsewhere: Collection[str] = ()) -> records.Runs:
     """One run from options by column name; without a configuration it is the robot's first.
 
     Args:

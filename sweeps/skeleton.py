@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from calibration.data import Json
 from calibration.data.robot_file import RobotFile
 from calibration.data.runs import Runs
 from sweeps import config as configuration
@@ -30,7 +31,7 @@ def print_report(document: Document, file: RobotFile | None = None) -> Page:
 def finish_run_folder(
     folder: Folder,
     config: RobotPart,
-    manifest: dict[str, Any],
+    manifest: Json,
     *,
     solved: bool = True,
     page: Page | None = None,

@@ -20,6 +20,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from calibration.data import Columns, Json
 from calibration.data.effect_file import OWN_MODULE
 from mmrjax.effects.scaled import scaled_effect
 from mmrjax.model import channels
@@ -70,7 +71,7 @@ def read_stage(file: Path) -> Any:
         raise Unreadable(f"{type(error).__name__}: {error}") from error
 
 
-def read_arrays(file: Path) -> dict[str, np.ndarray]:
+def read_arrays(file: Path) -> Columns:
     """Arrays of a file of `np.savez` without objects; a damaged file raises whatever NumPy raises."""
     with file.open("rb") as stream, np.load(stream, allow_pickle=False) as arrays:
         return {key: arrays[key] for key in arrays.files}
@@ -173,7 +174,15 @@ class _Reader:
         if kind == "array":
             return self._array(*rest)
         if kind == "jax":
-            return _on_device(self._array(*rest[1:]), weak=rest[0])
+            x = self._array(*rest[1:])
+            weak = rest[0]
+            import jax.numpy as jnp
+
+            if not weak or not 0 < x.size <= FEW:
+                return jnp.asarray(x)
+            # Scalars of Python are of the weak kind, for which another program would be compiled.
+            scalars = [jnp.asarray(value) for value in x.ravel().tolist()]
+            return scalars[0] if x.shape == () else jnp.stack(scalars).reshape(x.shape)
         if kind == "type":
             return _class(*rest)
         if kind == "function":
@@ -195,7 +204,7 @@ class _Reader:
             raise Unreadable(f"array of {dtype}")
         return np.frombuffer(self._data, kind, math.prod(shape), at).reshape(shape, order=order).copy("K")
 
-    def _instance(self, module: str, name: str, factors: list[float] | None, fields: dict[str, Any]) -> Any:
+    def _instance(self, module: str, name: str, factors: list[float] | None, fields: Json) -> Any:
         kind = _class(module, name, factors)
         if not dataclasses.is_dataclass(kind) or not all(_holds(kind, name) for name in fields):
             raise Unreadable(f"{module}.{name} has other fields")
@@ -208,18 +217,8 @@ class _Reader:
 def _holds(kind: type, name: str) -> bool:
     """True if instances of a dataclass hold a value by that name: a field, or what they compute once and keep."""
     kept = inspect.getattr_static(kind, name, None)
-    fields: dict[str, Any] = getattr(kind, "__dataclass_fields__", {})
+    fields: Json = getattr(kind, "__dataclass_fields__", {})
     return name in fields or isinstance(kept, functools.cached_property)
-
-
-def _on_device(x: np.ndarray, weak: bool) -> Any:
-    import jax.numpy as jnp
-
-    if not weak or not 0 < x.size <= FEW:
-        return jnp.asarray(x)
-    # Scalars of Python are of the weak kind, for which another program would be compiled, and so is what they make.
-    scalars = [jnp.asarray(value) for value in x.ravel().tolist()]
-    return scalars[0] if x.shape == () else jnp.stack(scalars).reshape(x.shape)
 
 
 def _named_class(kind: type) -> tuple[str, str, list[float] | None]:

@@ -20,14 +20,14 @@ from typing import Any, TextIO, TypeVar
 
 import numpy as np
 
-from calibration.data import writing
+from calibration.data import Columns, Json, Names, writing
 from calibration.data.input_errors import BadConfiguration, InputError
 from calibration.data.runs import Runs
 from calibration.discovery.kept import REFIT_FILE
 from mmrjax import __version__
 from mmrjax.model import params
 from mmrjax.model.robot import Robot
-from sweeps.config import RobotPart
+from sweeps.config import FolderPart, RobotPart
 from sweeps.console import print_message
 
 T = TypeVar("T")
@@ -57,7 +57,7 @@ class Folder:
     """Files that a command leaves, in `path` + `.partial` until the folder is whole and moved into place."""
 
     #: Names beside those of the manifest that a finished folder may hold: what a kill while it was moved leaves.
-    further: tuple[str, ...] = (LOCK,)
+    further: Names = (LOCK,)
 
     def __init__(self, path: Path) -> None:
         """The folder that is to appear at `path`.
@@ -183,15 +183,15 @@ class Folder:
         with writing.naming_file(self.partial / name):
             (self.results() / name).write_bytes(content)
 
-    def write_json(self, name: str, content: dict[str, Any]) -> None:
+    def write_json(self, name: str, content: Json) -> None:
         """Write a JSON file; what is not finite becomes null."""
         writing.write_json(self.results() / name, content)
 
-    def write_table(self, name: str, columns: dict[str, np.ndarray]) -> None:
+    def write_table(self, name: str, columns: Columns) -> None:
         """Write a table as CSV, and as Parquet too where asked; what is not finite is an empty cell."""
         writing.write_table(self.results() / name, columns, self.tables)
 
-    def finish(self, manifest: dict[str, Any], runs: Runs | None = None) -> Path:
+    def finish(self, manifest: Json, runs: Runs | None = None) -> Path:
         """Write the manifest and move the folder into place; returns its path.
 
         Hashes of the folder's `robot.toml` and of the file that `runs` came from, if any, are added, and the names of
@@ -277,7 +277,7 @@ def try_to_lock(file: TextIO) -> bool:
     return True
 
 
-def _json(file: Path) -> dict[str, Any]:
+def _json(file: Path) -> Json:
     """Object of a small JSON file; empty if it cannot be read."""
     try:
         with file.open("rb") as stream:
@@ -294,7 +294,7 @@ class RunFolder(Folder):
     and goes on; another configuration begins the partial folder anew with `force`. One process at a time works on it.
     """
 
-    def __init__(self, path: Path, identity: dict[str, Any], *, force: bool = False) -> None:
+    def __init__(self, path: Path, identity: Json, *, force: bool = False) -> None:
         """Begin or take up a run folder.
 
         Args:
@@ -392,7 +392,7 @@ class RunFolder(Folder):
             self._lock.close()
             self._lock = None
 
-    def chunk(self, name: str) -> dict[str, np.ndarray] | None:
+    def chunk(self, name: str) -> Columns | None:
         """Chunk finished by an interrupted run; None if missing or unreadable."""
         from sweeps import stage_files
 
@@ -405,7 +405,7 @@ class RunFolder(Folder):
             print_message(f"{file}: damaged; computed again")
             return None
 
-    def keep_chunk(self, name: str, columns: dict[str, np.ndarray]) -> None:
+    def keep_chunk(self, name: str, columns: Columns) -> None:
         """Keep a finished chunk for a run that is taken up again."""
         file = self.partial / CHUNKS / f"{name}.npz"
         with writing.replacing(file) as aside, aside.open("wb") as stream:
@@ -455,7 +455,7 @@ class RunFolder(Folder):
 
 
 def open_folder(
-    command: str, config: RobotPart, robot: Robot, out: Path | None, force: bool, runs: Runs | None = None
+    command: str, config: RobotPart, robot: Robot, beside: FolderPart, runs: Runs | None = None
 ) -> RunFolder:
     """Run folder of a command. Its identity is the configuration and the program's source.
 
@@ -463,7 +463,7 @@ def open_folder(
 
     Args:
         command: its name; config: its configuration; robot: of the configuration, with its changes.
-        out: where the folder is to appear; None: a new one below `runs/`; force: replace an existing run folder.
+        beside: says where the folder is to appear, and if it replaces an existing one.
         runs: the table that it was given, if any.
     """
     import jax
@@ -478,12 +478,12 @@ def open_folder(
         "runs": None if runs is None else {key: value.tolist() for key, value in runs.columns.items()},
         "effects": [sha256_hex(Path(file).read_bytes()) for file in config.effects],
     }
-    folder = RunFolder(out or default_path(command), identity, force=force)
+    folder = RunFolder(beside.out or default_path(command), identity, force=beside.force)
     folder.tables = getattr(config, "table", folder.tables)
     return folder
 
 
-def result_provenance() -> dict[str, Any]:
+def result_provenance() -> Json:
     """Program, versions and devices that made a result."""
     import jax
     import jax.numpy as jnp

@@ -6,7 +6,6 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -15,10 +14,11 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float
 
+from calibration.data import Json, Names
 from calibration.data.input_errors import BadConfiguration, allowed_words
 from calibration.data.parts import CellSheet
 from calibration.data.requirements_file import Requirements
-from calibration.inference.fit_notes import Note, Step
+from calibration.inference.fit_notes import Remark, next_step
 from calibration.sizing import sheet
 from calibration.sizing.design import CONTINUOUS, OBJECTIVES, Design, Task, build_robot, evaluate_design, sizing_task
 from calibration.sizing.part_options import Drive, Options, options_for_robot
@@ -64,7 +64,7 @@ class SizedDesign:
     parallel: float
     objectives: dict[str, float]
     margins: dict[str, float]
-    bounds: tuple[str, ...]
+    bounds: Names
     robot: Robot
 
     @property
@@ -78,7 +78,7 @@ class SizedDesign:
         order = sorted(self.margins.items(), key=lambda item: item[1])
         return [*(label for label, m in order if m < BINDS), *self.bounds]
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Json:
         """Entry of `result.json`."""
         return {
             "motor": self.drive.motor.name, "gearbox": f"{self.drive.family}, stages {self.drive.stages}",
@@ -106,7 +106,7 @@ class Sizing:
     task: Task
     options: Options
     objective: str
-    unmeetable: tuple[str, ...]
+    unmeetable: Names
     ideal: SizedDesign | None
     best: SizedDesign | None
     alternatives: tuple[SizedDesign, ...]
@@ -233,12 +233,12 @@ def evaluate_designs(problem: Task, choice: Space, rows: np.ndarray, x: np.ndarr
 def size_robot(
     robot: Robot,
     asked: Requirements,
-    objectives: tuple[str, ...] = ("mass",),
+    objectives: Names = ("mass",),
     *,
     starts: int = 256,
-    motors: tuple[str, ...] = (),
+    motors: Names = (),
     seed: int = 0,
-    tell: Callable[[Note], None] = lambda note: None,
+    tell: Callable[[Remark], None] = lambda note: None,
 ) -> Sizing:
     """Search ratio, radius, cells and motor of a robot so that it meets requirements.
 
@@ -258,17 +258,17 @@ def size_robot(
     problem = sizing_task(robot, asked, chosen)
     choice = choice_space(robot, problem, chosen)
     columns = [list(OBJECTIVES).index(name) for name in objectives]
-    tell(Step("designs"))
+    tell(next_step("designs"))
     drawn = _random_designs(problem, choice, "cost" in objectives, np.random.default_rng(seed))
     kept = drawn.g.max(axis=0) >= 0
     unmeetable = tuple(label for label, k in zip(problem.labels, kept, strict=True) if not k)
     search = _Search(problem, choice, kept, columns)
     weights = search.weights(starts)
-    tell(Step("descents", (starts,)))
+    tell(next_step("descents", starts))
     free = search.descended(drawn, weights)
-    tell(Step("whole"))
+    tell(next_step("whole"))
     real = search.real(drawn, free, weights)
-    tell(Step("refined", (REFINED,)))
+    tell(next_step("refined", REFINED))
     # The best of these with any ratio and parts of a cell: no search may have begun from their choice of parts.
     top = np.argsort(search.cost(real))[:REFINED]
     free = free + search.refined(real.rows[top], real.x[top], search.first(len(top)), np.ones(3))

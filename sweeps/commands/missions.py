@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection
-from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
 
-from calibration.data import profiles
+from calibration.data import Columns, profiles
 from calibration.data import runs as records
 from calibration.data.columns import LOAD, ON_SHAFT, SUPPLY
 from calibration.data.input_errors import BadConfiguration
@@ -28,7 +25,7 @@ from mmrjax.model.robot import Robot
 from sweeps import capabilities
 from sweeps import config as configuration
 from sweeps.console import print_message, progress_bar
-from sweeps.inputs import OPTIONS, load_robot, one_run, read_runs
+from sweeps.inputs import OPTIONS, given_runs, load_robot
 from sweeps.points import imposed, run
 from sweeps.report import mission_report
 from sweeps.results.mission_results import Missions
@@ -40,17 +37,8 @@ MOST_ROWS, LEAST_ROWS, ALL_ROWS = 20_000, 200, 200_000
 _LASTING = MARKS.index("battery_empty")  # events from here on are kept in history.csv: stops and starts are too many
 
 
-def simulate_missions(
-    config: configuration.Simulate,
-    given: str | dict[str, Any],
-    stated: Collection[str],
-    out: Path | None,
-    force: bool,
-) -> int:
-    """Simulate runs of a file (its name), or one of options (by column), over a profile; returns the exit code.
-
-    Args:
-        stated: columns of conditions that options state.
+def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> int:
+    """Simulate runs of a file, or one of options, over a profile; returns the exit code.
 
     Raises:
         BadConfiguration: a condition that both the options and the profile state, a battery that is empty or below
@@ -67,23 +55,20 @@ def simulate_missions(
     _check_acting(robot, source)
     source.check_source(config.battery)
     for column in source.stated:
-        if column in stated and not isinstance(given, str):
+        if column in beside.stated:
             raise BadConfiguration(
                 f"{OPTIONS[column]}: got it beside {source.source}, which states {column}; expected one of the two"
             )
     _check_charge(robot, config)
-    if isinstance(given, str):
-        runs = read_runs(given, robot, columns=config.columns, measured=False, battery=config.battery)
-    else:
-        runs = one_run(robot, given, config.battery, source.stated)
+    runs = given_runs(robot, beside, config, source.stated)
     for column in source.stated:
-        if isinstance(given, str) and runs.has(column):
+        if beside.runs is not None and runs.has(column):
             print_message(f"{runs.source}, {column}: not used, {source.source} states it")
     if "current_other" in source.values and not config.battery:
         print_message(f"{source.source}, current_other_A: not used, other consumers are on the battery")
     _check_turning(robot, runs, source)
     _check_cutoff(robot, runs, source, config)
-    with open_folder("simulate", config, robot, out, force, runs) as folder:
+    with open_folder("simulate", config, robot, beside, runs) as folder:
         found = run_missions(robot, runs, source, config)
         folder.write_table("segments.csv", capabilities.without_idle(robot, found.segments))
         folder.write_table("history.csv", capabilities.without_idle(robot, found.course))
@@ -183,9 +168,9 @@ def run_missions(robot: Robot, runs: records.Runs, source: ProfileTable, config:
     profile = source.profile(robot, conditions)
     names = runs["run_id"] if runs.has("run_id") else np.array([f"run-{k + 1}" for k in range(len(runs))])
     rows = max(LEAST_ROWS, min(MOST_ROWS, ALL_ROWS // len(runs)))
-    tables: list[dict[str, np.ndarray]] = []
-    segments: list[dict[str, np.ndarray]] = []
-    courses: list[dict[str, np.ndarray]] = []
+    tables: list[Columns] = []
+    segments: list[Columns] = []
+    courses: list[Columns] = []
     done, whole = 0, True
     with progress_bar(len(runs), quiet=False) as advance:
         for found in mission_batch.simulate_in_parts(robot, conditions, profile, source.start):
@@ -209,14 +194,12 @@ def run_missions(robot: Robot, runs: records.Runs, source: ProfileTable, config:
     return Missions({**about, **_below(tables)}, _below(segments), _below(courses), source, whole)
 
 
-def _below(tables: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+def _below(tables: list[Columns]) -> Columns:
     """Tables of the same columns one below the other."""
     return {key: np.concatenate([table[key] for table in tables]) for key in tables[0]}
 
 
-def _conditions(
-    robot: Robot, runs: records.Runs, source: ProfileTable, config: configuration.Simulate
-) -> dict[str, np.ndarray]:
+def _conditions(robot: Robot, runs: records.Runs, source: ProfileTable, config: configuration.Simulate) -> Columns:
     """Conditions of the runs, empty where the profile states them or the battery sets them."""
     nothing = np.full(len(runs), np.nan)
     unknown = {*source.stated, *(["supply_voltage_V"] if config.battery else [])}
@@ -229,7 +212,7 @@ def _conditions(
 
 def _segments(
     robot: Robot, conditions: Conditions, source: ProfileTable, found: Mission, names: np.ndarray
-) -> dict[str, np.ndarray]:
+) -> Columns:
     """A row for each segment of each cycle of each run, up to where the run has ended."""
     numbers = mission_batch.numbers_by_column(
         jax.device_get(mission_batch.mission_totals(found.segments, found.segment_peaks))
@@ -297,7 +280,7 @@ def rows_to_keep(segment: np.ndarray, current: np.ndarray, most: int, marked: np
 
 def _course(
     robot: Robot, conditions: Conditions, source: ProfileTable, found: Mission, k: int, name: str, most: int
-) -> dict[str, np.ndarray]:
+) -> Columns:
     """Rows of history.csv of one run."""
     course = jax.tree.map(lambda x: np.asarray(x[k]), found.course)
     filled = course.segment >= 0

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
-from calibration.data import robot_file
+from calibration.data import Columns, Json, robot_file
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.runs import Runs
 from mmrjax.fidelities.track import track_batch
@@ -46,7 +45,7 @@ FEWEST = 5  # voltages over which a peak can be told
 SHORTEST = 0.5  # [s], of a run
 
 
-def map_resonance(config: configuration.Resonance, out: Path | None, force: bool) -> int:
+def execute(config: configuration.Resonance, beside: configuration.FolderPart) -> int:
     """Map the ripple of a robot and leave a run folder; returns the exit code.
 
     0 done; 3 done, but some runs did not settle, or slid, tipped or failed.
@@ -77,7 +76,7 @@ def map_resonance(config: configuration.Resonance, out: Path | None, force: bool
     runs, of_table8 = _points(config, robot)
     conditions = run.conditions_of_runs(robot, runs, config)
     run.check_runs_bearable(robot, conditions, config)
-    with open_folder("resonance", config, robot, out, force, runs) as folder:
+    with open_folder("resonance", config, robot, beside, runs) as folder:
         what = passing_parts(robot, robot.configurations.names.index(name))
         columns = _rippled(folder, robot, conditions, config, what)
         table = {**run.condition_table(robot, runs), "table8": of_table8, **columns}
@@ -116,7 +115,7 @@ def _points(config: configuration.Resonance, robot: Robot) -> tuple[Runs, np.nda
 
 def _rippled(
     folder: RunFolder, robot: Robot, conditions: Conditions, config: configuration.Resonance, what: Passing
-) -> dict[str, np.ndarray]:
+) -> Columns:
     """The columns of ripple, chunk by chunk; chunks that an interrupted run left are not simulated again."""
     total, parts = conditions.shape[0], []
     size = min(CHUNK, total)
@@ -139,7 +138,7 @@ def _rippled(
     return {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
 
 
-def _columns(robot: Robot, ended: Any, what: Passing) -> dict[str, np.ndarray]:
+def _columns(robot: Robot, ended: Any, what: Passing) -> Columns:
     """Ripple of a batch of runs, in the units of the table."""
     found = vibrations_of_runs(robot, ended, what.pitch)
     status = np.array(STATUSES)[found.status]
@@ -157,9 +156,7 @@ def _columns(robot: Robot, ended: Any, what: Passing) -> dict[str, np.ndarray]:
     return columns
 
 
-def _found(
-    config: configuration.Resonance, robot: Robot, what: Passing, table: dict[str, np.ndarray]
-) -> ResonanceResult:
+def _found(config: configuration.Resonance, robot: Robot, what: Passing, table: Columns) -> ResonanceResult:
     """Natural frequencies at the middle voltage, and peaks and crossings at each payload."""
     assert config.configuration is not None
     payloads, middle = config.payloads_kg, config.voltages_V[len(config.voltages_V) // 2]
@@ -210,7 +207,7 @@ _COLUMNS = {
 }  # fmt: skip
 
 
-def _rows(rows: Iterable[dict[str, Any]], kind: type) -> dict[str, np.ndarray]:
+def _rows(rows: Iterable[Json], kind: type) -> Columns:
     """Rows of a named tuple as columns with units in their names; without rows the columns alone."""
     rows, unit = list(rows), "Hz" if kind is Mode else "m_s"
     keys = list(rows[0]) if rows else list(kind.__annotations__)

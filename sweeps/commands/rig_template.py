@@ -7,6 +7,8 @@ import re
 from collections.abc import Mapping
 from importlib import resources
 
+from calibration.data import Names
+
 #: Kinds of rig, in words.
 KINDS = {
     "bench": "a motor with its gearbox that turns a shaft: brake, disk, worm, winch",
@@ -87,7 +89,7 @@ def _put(lines: list[str], table: str, key: str, line: str) -> None:
     lines.insert(end, line)
 
 
-def example_numbers(text: str) -> tuple[str, ...]:
+def example_numbers(text: str) -> Names:
     """Returns names and units of the numbers that are still those of an example, as `motor.resistance [ohm]`."""
     found, table = [], ""
     for line in text.splitlines():

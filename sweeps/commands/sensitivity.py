@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from calibration.data import robot_file
+from calibration.data import Json, Names, robot_file
 from calibration.data.columns import Layout
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.robot_file import RobotFile
@@ -57,7 +55,7 @@ AXES = {
 }
 
 
-def study_sensitivity(config: configuration.Sensitivity, out: Path | None, force: bool) -> int:
+def execute(config: configuration.Sensitivity, beside: configuration.FolderPart) -> int:
     """Study a robot and leave a run folder; returns the exit code.
 
     0 done; 3 done, but the solver failed at some operating points.
@@ -73,13 +71,13 @@ def study_sensitivity(config: configuration.Sensitivity, out: Path | None, force
     inputs = _inputs(config, file, runs, ranges)
     candidates = _candidates(config, robot, runs, bool(freed))
     conditions = runs.conditions(robot)
-    turned: dict[str, Any] = {name: np.full(len(runs), np.mean(ranges[name])) for name in freed}
+    turned: Json = {name: np.full(len(runs), np.mean(ranges[name])) for name in freed}
     check_runs_bearable(robot, dataclasses.replace(conditions, **turned), config)
     supply = Supply(float(config.battery), config.discharge_mAh * COULOMB_PER_MAH, np.asarray(conditions.adhesion))
     study = Study(
         robot, inputs, Points.of(runs), outputs, config.model, config.options, supply, in_words(print_message)
     )
-    with open_folder("sensitivity", config, robot, out, force, runs) as folder:
+    with open_folder("sensitivity", config, robot, beside, runs) as folder:
         found = analyse_sensitivity(study, config.method, config.evaluations, config.seed, candidates)
         folder.write_json("result.json", found.to_json())
         for name, table in found.tables().items():
@@ -92,7 +90,7 @@ def study_sensitivity(config: configuration.Sensitivity, out: Path | None, force
         return finish_run_folder(folder, config, manifest, solved=found.solved, page=shown, runs=runs)
 
 
-def _ranges(vary: tuple[str, ...]) -> dict[str, tuple[float, float]]:
+def _ranges(vary: Names) -> dict[str, tuple[float, float]]:
     """`name=low:high` of every varied condition."""
     found: dict[str, tuple[float, float]] = {}
     for text in vary:

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import shlex
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from calibration.data import robot_file, settling
+from calibration.data import Columns, Json, robot_file, settling
 from calibration.data.settling import Settled
 from calibration.described import sentences
 from calibration.inference import ranges
@@ -21,12 +19,12 @@ from sweeps.skeleton import finish_run_folder, print_report
 from sweeps.store import open_folder
 
 
-def settle_to_folder(config: configuration.Settle, source: str, out: Path | None, force: bool) -> int:
+def execute(config: configuration.Settle, beside: configuration.SettledLog) -> int:
     """Find the settled runs of a log and write a run folder with their table; returns the exit code, 0."""
     robot = load_robot(config).robot
-    runs = read_runs(source, robot, columns=config.columns, measured=True, series=True)
+    runs = read_runs(beside.data, robot, columns=config.columns, measured=True, series=True)
     named = [] if config.columns is None else ["--columns", config.columns]
-    loop = shlex.join(["mmrjax", "loop", source, "--robot", config.robot, *named])
+    loop = shlex.join(["mmrjax", "loop", beside.data, "--robot", config.robot, *named])
     found = settling.settle_log(
         runs,
         shortest=config.shortest_s,
@@ -36,7 +34,7 @@ def settle_to_folder(config: configuration.Settle, source: str, out: Path | None
         loop=loop,
     )
     few = settle_words.too_few(found, SettledRuns.fewest, loop)
-    with open_folder("settle", config, robot, out, force, runs) as folder:
+    with open_folder("settle", config, robot, beside, runs) as folder:
         robot_file.write_robot(
             robot, folder.results() / "robot.toml", note=f"the rig of this log, from {config.robot}"
         )
@@ -48,10 +46,10 @@ def settle_to_folder(config: configuration.Settle, source: str, out: Path | None
         return finish_run_folder(folder, config, {"seed": None, "settled": len(found.kept)}, page=shown, runs=runs)
 
 
-def stretches_table(found: Settled) -> dict[str, np.ndarray]:
+def stretches_table(found: Settled) -> Columns:
     """Every stretch of a log, a row each: where it is, why it is left out, means, their sds, changes."""
     every = found.stretches
-    table: dict[str, np.ndarray] = {
+    table: Columns = {
         "run_id": np.array([s.run for s in every]),
         "from_s": np.array([s.begin for s in every]),
         "until_s": np.array([s.end for s in every]),
@@ -72,7 +70,7 @@ def stretches_table(found: Settled) -> dict[str, np.ndarray]:
     return table
 
 
-def to_json(found: Settled, few: str = "") -> dict[str, Any]:
+def to_json(found: Settled, few: str = "") -> Json:
     """`result.json`; `few` is the sentence of `words.too_few`."""
     left = settle_words.left_out(found.stretches, bool(few))
     return {

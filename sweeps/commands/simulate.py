@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from pathlib import Path
-from typing import Any
+import importlib
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from calibration.data import Columns, Json
 from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration
 from mmrjax import fidelities
 from mmrjax.compile.compiling import SELDOM, compiled
-from mmrjax.derived.start_figures import curve_peak
-from mmrjax.fidelities import outputs, start_stages
+from mmrjax.derived.start_figures import curve_peak, stages_of_histories
+from mmrjax.fidelities import outputs
 from mmrjax.fidelities.base import History, Run
 from mmrjax.fidelities.result import result_of_signals
 from mmrjax.model import channels, ground, quantities
@@ -28,7 +28,7 @@ from mmrjax.model.signals import BATTERY_EMPTY, STATUSES
 from sweeps import capabilities
 from sweeps import config as configuration
 from sweeps.console import progress_bar
-from sweeps.inputs import beside_robot, load_robot, one_run, read_runs
+from sweeps.inputs import beside_robot, given_runs, load_robot
 from sweeps.pages import words
 from sweeps.points import run, scale, uncertainty
 from sweeps.points.job import showing_turns
@@ -53,32 +53,31 @@ PAD = 16
 PERMISSIBLE = "permissible_time_s"
 
 
-def simulate_to_folder(
-    config: configuration.Simulate, given: str | dict[str, Any], out: Path | None, force: bool
-) -> int:
-    """Simulate runs of a file (its name), or one of options (by column); leave a run folder; returns the exit code.
+def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> int:
+    """Simulate runs of a file, or one of options; leave a run folder; returns the exit code.
 
     Raises:
         BadConfiguration: more runs than histories can be kept of.
     """
+    if config.profile is not None or config.turns:
+        module = "turn" if config.profile is None else "missions"
+        code: int = importlib.import_module(f"sweeps.commands.{module}").execute(config, beside)
+        return code
     file = load_robot(config)
     robot = file.robot
-    if isinstance(given, str):
-        runs = read_runs(given, robot, columns=config.columns, measured=False, battery=config.battery)
-    else:
-        runs = one_run(robot, given, config.battery)
+    runs = given_runs(robot, beside, config)
     if fidelities.fidelity_facts(config.model).histories and len(runs) > _HISTORIES:
         raise BadConfiguration(
             f"--runs: got {len(runs)} runs; --model {config.model} keeps at most {_HISTORIES} histories"
         )
     drawn = None if config.posterior is None else beside_robot(file)
-    with open_folder("simulate", config, robot, out, force, runs) as folder:
+    with open_folder("simulate", config, robot, beside, runs) as folder:
         seen = showing_turns(robot, runs.axes)
         table, histories = _simulated(folder, seen, runs, config)
         table[PERMISSIBLE] = permissible_durations(robot, table)
         stands = posture_results.posture_of_runs(robot, runs, run.conditions_of_runs(robot, runs, config))
         notes = run_remarks(robot, table) + capabilities.unknown_numbers_sentence(robot)
-        further: dict[str, Any] = {"notes": [*file.remarks, *notes]}
+        further: Json = {"notes": [*file.remarks, *notes]}
         remarks = list(notes)
         if drawn is not None and config.posterior is not None:
             found = uncertainty.simulate_draws(robot, drawn, runs, config, config.posterior, folder)
@@ -99,7 +98,7 @@ def simulate_to_folder(
 
 def _simulated(
     folder: RunFolder, robot: Robot, runs: records.Runs, config: configuration.Simulate
-) -> tuple[dict[str, np.ndarray], Run | None]:
+) -> tuple[Columns, Run | None]:
     """The table of the runs; where the fidelity keeps them over time these are written, and returned too."""
     fidelity = fidelities.get_fidelity(config.model)
     if fidelity.histories is None:
@@ -117,7 +116,7 @@ def _simulated(
     return {**run.condition_table(robot, runs), **over_time(robot, batch)}, batch
 
 
-def over_time(robot: Robot, batch: Run) -> dict[str, np.ndarray]:
+def over_time(robot: Robot, batch: Run) -> Columns:
     """The columns of how runs that were kept over time ended, with what they came to.
 
     Of a run whose battery went empty they are those of its last instant before, and `time_end_s` is when: the charge
@@ -150,7 +149,7 @@ def over_time(robot: Robot, batch: Run) -> dict[str, np.ndarray]:
     return columns
 
 
-def permissible_durations(robot: Robot, table: dict[str, np.ndarray]) -> np.ndarray:
+def permissible_durations(robot: Robot, table: Columns) -> np.ndarray:
     """Permissible duration of each run's current from ambient temperature [s]; inf: continuous, NaN: no current."""
     current = motor_currents(robot, table)
     known = np.isfinite(current)
@@ -170,7 +169,7 @@ def _permissible(motor: Motor, currents: Float[Array, " runs"]) -> Scalar:
     return jax.vmap(motor.time_permissible)(currents)
 
 
-def motor_currents(robot: Robot, table: dict[str, np.ndarray]) -> np.ndarray:
+def motor_currents(robot: Robot, table: Columns) -> np.ndarray:
     """Size of the current of one motor [A], of sides driven apart the larger; NaN where no column tells it."""
     if all(column in table for column in _OF_SIDES):
         return np.asarray(np.max([np.abs(table[column]) for column in _OF_SIDES], axis=0))
@@ -180,7 +179,7 @@ def motor_currents(robot: Robot, table: dict[str, np.ndarray]) -> np.ndarray:
     return np.full(len(table["status"]), np.nan)
 
 
-def run_remarks(robot: Robot, table: dict[str, np.ndarray]) -> list[str]:
+def run_remarks(robot: Robot, table: Columns) -> list[str]:
     """Remarks that the numbers alone do not show, one sentence each, on a few runs at most."""
     said: list[str] = []
     several = len(table["status"]) > 1
@@ -226,7 +225,7 @@ def _names(runs: records.Runs) -> np.ndarray:
     return runs["run_id"] if runs.has("run_id") else np.array([f"run-{k + 1}" for k in range(len(runs))])
 
 
-def history_table(robot: Robot, history: History, runs: records.Runs) -> dict[str, np.ndarray]:
+def history_table(robot: Robot, history: History, runs: records.Runs) -> Columns:
     """Time histories of a batch as one table, a row a sample; the columns that series are read with."""
     signals = history.signals
     of_rig = {*robot.rig.channels, *(OF_VEHICLE if robot.has_ground else OF_SHAFT)}
@@ -243,12 +242,12 @@ def history_table(robot: Robot, history: History, runs: records.Runs) -> dict[st
     }
 
 
-def starts_from_standstill(robot: Robot, batch: Run, runs: records.Runs) -> list[dict[str, Any]]:
+def starts_from_standstill(robot: Robot, batch: Run, runs: records.Runs) -> list[Json]:
     """Of each run from standstill its stages, their slip (33) and the acceleration time; no stages where it does not
     get under way."""
     assert batch.history is not None  # the fidelity was asked for it
-    found = start_stages.stages_of_histories(robot, batch.history, runs.configurations(robot))
-    nothing: dict[str, Any] = {"stages": [], "acceleration_time_s": None, "slip_over_acceleration": None}
+    found = stages_of_histories(robot, batch.history, runs.configurations(robot))
+    nothing: Json = {"stages": [], "acceleration_time_s": None, "slip_over_acceleration": None}
     under_way = [STATUSES[int(s)] in words.UNDER_WAY for s in np.asarray(batch.result.status)]
     return [
         {"run_id": str(name), **(s.to_json() if s is not None and goes else nothing)}
@@ -256,7 +255,7 @@ def starts_from_standstill(robot: Robot, batch: Run, runs: records.Runs) -> list
     ]
 
 
-def reactions_table(history: History, runs: records.Runs) -> dict[str, np.ndarray]:
+def reactions_table(history: History, runs: records.Runs) -> Columns:
     """Loads inside one side's running gear over time [N], a row a sample."""
     loads = history.reactions
     assert loads is not None  # the fidelity resolves them

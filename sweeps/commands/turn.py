@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 import scipy.optimize
 
-from calibration.data import sides
+from calibration.data import Columns, Json, sides
 from calibration.data.columns import SIDES, SUPPLY
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.table import Runs
@@ -40,21 +39,21 @@ SHARES = np.linspace(1.0, -1.0, 97)
 SHOWN = tuple(c.name for c in channels.OF_TURNS)
 
 
-def simulate_turn(config: configuration.Simulate, given: str | dict[str, Any], out: Path | None, force: bool) -> int:
+def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> int:
     """Simulate one run of options whose sides are driven apart; leave a run folder; returns the exit code.
 
     Raises:
         BadConfiguration: runs of a file, a robot that cannot turn, a turn without a steady state.
     """
-    if isinstance(given, str):
+    if beside.runs is not None:
         raise BadConfiguration("--runs: got a file and --left, --right or --heading; state columns duty_left and "
                                "duty_right in it, or one run by options")  # fmt: skip
-    file = load_robot(config)
+    file, given = load_robot(config), beside.stated
     robot = file.robot
     check_can_turn(robot, given.get("configuration") or robot.configurations.names[0])
     runs = one_run(robot, {**given, **turn_columns(config, given)}, config.battery)
     settled = config.model == fidelities.NAMES[0]
-    with open_folder("simulate", config, robot, out, force, runs) as folder:
+    with open_folder("simulate", config, robot, beside, runs) as folder:
         asked = run.conditions_of_runs(robot, runs, config)
         run.check_runs_bearable(robot, asked, config)
         shown = _channels(robot, settled)
@@ -182,9 +181,9 @@ def check_can_turn(robot: Robot, named: str) -> None:
         raise BadConfiguration("--left, --right: the robot's file says that its motors are not driven by voltage")
 
 
-def turn_columns(config: configuration.TurnPart, given: dict[str, Any]) -> dict[str, Any]:
+def turn_columns(config: configuration.TurnPart, given: Json) -> Json:
     """Columns of the run: duties of the supply's voltage, which is the larger one where it is not stated."""
-    found: dict[str, Any] = {} if config.heading_deg is None else {"heading_deg": config.heading_deg}
+    found: Json = {} if config.heading_deg is None else {"heading_deg": config.heading_deg}
     if config.duty_left is not None:
         return found | {"duty_left": config.duty_left, "duty_right": config.duty_right}
     if config.left_V is None or config.right_V is None:  # those of a demand are found later
@@ -219,11 +218,11 @@ def _with_others(robot: Robot, asked: Conditions) -> tuple[Run, Conditions]:
     return jax.device_get(fidelities.get_fidelity(fidelities.NAMES[0]).run(robot, rows, {})), rows
 
 
-def _duties(conditions: Conditions) -> dict[str, np.ndarray]:
+def _duties(conditions: Conditions) -> Columns:
     return {name: np.asarray(getattr(conditions, name)) for name in SIDES}
 
 
-def _columns(robot: Robot, shown: tuple[Channel, ...], conditions: Conditions, batch: Run) -> dict[str, np.ndarray]:
+def _columns(robot: Robot, shown: tuple[Channel, ...], conditions: Conditions, batch: Run) -> Columns:
     radii = np.array([float(c.radius) for c in robot.configurations.members])
     reading = batch.result.reading
     return {
@@ -232,7 +231,7 @@ def _columns(robot: Robot, shown: tuple[Channel, ...], conditions: Conditions, b
     }
 
 
-def history_table(history: History, shown: tuple[Channel, ...]) -> dict[str, np.ndarray]:
+def history_table(history: History, shown: tuple[Channel, ...]) -> Columns:
     """A turn over time, a row a sample."""
     read = {c.column: np.ravel(history.reading[c.name]) / c.factor for c in shown if c.over_time}
     return {"time_s": np.ravel(history.time), **read, "displacement_m": np.ravel(history.distance)}

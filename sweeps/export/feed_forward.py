@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from calibration.data import Columns, Json, Names
 from calibration.data.writing import table_text
 from mmrjax import __version__
 from mmrjax.errors import printable
@@ -40,7 +41,7 @@ class Map(eqx.Module):
 
     speed: np.ndarray
     torque: np.ndarray
-    values: dict[str, np.ndarray]
+    values: Columns
 
     @property
     def efficiency(self) -> np.ndarray:
@@ -57,15 +58,13 @@ def symmetric_axis(largest: float) -> np.ndarray:
     return np.concatenate([-half[::-1], -near, [0.0], near, half])
 
 
-def steady_state_map(
-    module: ModuleType, params: Mapping[str, Any], speed: np.ndarray, torque: np.ndarray, guess: float
-) -> Map:
+def steady_state_map(module: ModuleType, params: Json, speed: np.ndarray, torque: np.ndarray, guess: float) -> Map:
     """Steady states at each speed [rad/s] and torque [N·m] of the joint; `guess`: resistance, of the first step."""
     speeds, torques = (jnp.asarray(x.ravel()) for x in np.meshgrid(speed, torque, indexing="ij"))
     params = {name: jnp.asarray(value, float) for name, value in params.items()}
 
     @jax.jit
-    def solved(params: Any) -> dict[str, Any]:
+    def solved(params: Any) -> Json:
         def lacking(voltage: Any) -> Any:
             return jax_actuator.settled_actuator(module, params, voltage, speeds)[0] - torques
 
@@ -89,7 +88,7 @@ class TableLaw(eqx.Module):
     torque: jax.Array
     voltage: jax.Array
     current: jax.Array
-    names: tuple[str, ...] = eqx.field(static=True, default=())
+    names: Names = eqx.field(static=True, default=())
     start: jax.Array = eqx.field(default_factory=lambda: jnp.zeros(0))
 
     def __call__(self, theta: Any, command: Any, load: Any, way: Any) -> tuple[Any, Any]:

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from calibration.data import Json, Names
 from sweeps.export.comparison import DROPPED, HELD, Fate
 from sweeps.export.joint import Joint, memory_grows
 from sweeps.export.law_source import Constant, constant_values, jax_source, module_from_source
@@ -37,7 +38,7 @@ class ActuatorLaw(eqx.Module):
     module: ModuleType = eqx.field(static=True)
     params: dict[str, jax.Array]
     guess: jax.Array
-    names: tuple[str, ...] = eqx.field(static=True, default=())
+    names: Names = eqx.field(static=True, default=())
     start: jax.Array = eqx.field(default_factory=lambda: jnp.zeros(0))
 
     def __call__(self, theta: Any, command: Any, load: Any, way: Any) -> tuple[Any, Any]:
@@ -54,9 +55,7 @@ class ActuatorLaw(eqx.Module):
         return settled_actuator(self.module, self.params, command, speed)[1]["current"], speed
 
 
-def settled_actuator(
-    module: ModuleType, params: Mapping[str, Any], command: Any, speed: Any
-) -> tuple[Any, dict[str, Any]]:
+def settled_actuator(module: ModuleType, params: Json, command: Any, speed: Any) -> tuple[Any, Json]:
     """Torque [N·m] and inside of an actuator at a constant voltage [V] and speed of the joint [rad/s]."""
     state = module.initial_state(jnp.shape(speed))
 
@@ -68,7 +67,7 @@ def settled_actuator(
     return torque, info
 
 
-def steady_params(joint: Joint, constants: Sequence[Constant], amplitudes: Mapping[str, float]) -> dict[str, Any]:
+def steady_params(joint: Joint, constants: Sequence[Constant], amplitudes: Mapping[str, float]) -> Json:
     """Parameters of the actuator in steady travel: without what repeats with an angle, whose mean is 0."""
     params = dict(constant_values(constants))
     waves = {p.name: 0.0 for p in joint.parts if memory_grows(p)}

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from calibration.data import Json, Names
 from calibration.data.input_errors import BadConfiguration, allowed_words
 from calibration.data.robot_file import RobotFile
 from mmrjax.effects import Effect
@@ -78,7 +79,7 @@ class Joint:
     robot: Robot
     inside: tuple[Effect, ...]
     outside: tuple[Effect, ...]
-    idle: tuple[str, ...]
+    idle: Names
     parts: tuple[Part, ...]
 
     @property
@@ -110,7 +111,7 @@ class Joint:
         return any(p.by for p in (*self.of("gearbox"), *self.of("track")))
 
     @property
-    def states(self) -> tuple[str, ...]:
+    def states(self) -> Names:
         """Names of the actuator's state: the current, memories of effects, and the speed one step before."""
         return ("current", *(p.name for p in self.remembering), *(("speed",) * self.accelerates))
 
@@ -131,7 +132,7 @@ class Joint:
         further += [f"{self.configuration}.inertia"] * self.accelerates
         return {n: known[n] for n in dict.fromkeys((*further, *used)) if n in known}
 
-    def surroundings(self) -> tuple[str, ...]:
+    def surroundings(self) -> Names:
         """Signals of the joint's surroundings that the law depends on, such as the normal load."""
         used = [n for part in self.parts for n in names_of(*_symbols(part)) if n.startswith("surroundings.")]
         return tuple(dict.fromkeys(used))
@@ -219,11 +220,11 @@ class _Tracer:
 
         return trace_function(slope if by else value, self.names, what)
 
-    def _given(self, known: dict[str, Any]) -> tuple[Robot, Signals]:
+    def _given(self, known: Json) -> tuple[Robot, Signals]:
         robot = params.replace(self.joint.robot, {n: known[n] for n in self.parameters})
         (load,) = robot.configurations.members
         robot = robot.within(0)
-        around: dict[str, Any] = {n: _STILL.get(n, known[f"surroundings.{n}"]) for n in self.around}
+        around: Json = {n: _STILL.get(n, known[f"surroundings.{n}"]) for n in self.around}
         around |= {field: known[name] for name, field in VARIABLES.items()}
         around.update(
             on_tracks=load.on_tracks,

@@ -9,8 +9,8 @@ import re
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from types import ModuleType
-from typing import Any
 
+from calibration.data import Json
 from calibration.data.input_errors import BadConfiguration
 from mmrjax import __version__
 from mmrjax.errors import printable
@@ -315,6 +315,6 @@ def _states_a_law(tree: ast.Module) -> bool:
     )
 
 
-def constant_values(constants: Sequence[Constant]) -> dict[str, Any]:
+def constant_values(constants: Sequence[Constant]) -> Json:
     """Values of constants by name."""
     return {c.name: c.value for c in constants}

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from calibration.data import Names
 from calibration.data.input_errors import BadConfiguration
 from mmrjax import __version__
 from mmrjax.errors import printable
@@ -62,7 +63,7 @@ class MujocoLaw(eqx.Module):
     coefficient: of the resistance's temperature [1/K].
     """
 
-    names: tuple[str, ...] = eqx.field(static=True)
+    names: Names = eqx.field(static=True)
     start: jax.Array
     ratio: jax.Array
     coefficient: jax.Array

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from calibration.data import Columns
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.posterior_file import FILE, Posterior
 from mmrjax.model import params
@@ -28,7 +29,7 @@ def draw_parameters(
     normal: float,
     draws: int,
     seed: int,
-) -> dict[str, np.ndarray]:
+) -> Columns:
     """Draws by format and name, `mujoco/resistance` and `actuator/motor.resistance`, each of shape (draws,).
 
     All numbers of a draw belong together, so they are correlated as the posterior is. A parameter of MuJoCo is
@@ -68,7 +69,7 @@ def draw_parameters(
     return {name: np.asarray(x) for name, x in found.items()} | actuator
 
 
-def randomization_files(found: Mapping[str, np.ndarray]) -> dict[str, str | bytes]:
+def randomization_files(found: Columns) -> dict[str, str | bytes]:
     """The draws as NumPy's archive and as JSON."""
     stream = io.BytesIO()
     arrays: Any = dict(found)

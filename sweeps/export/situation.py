@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from calibration.data import Names
 from calibration.data.columns import LOAD, Layout
 from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.data.runs import Runs
@@ -79,7 +80,7 @@ class Situation:
         """True if there are readings to compare with."""
         return bool(np.isfinite(self.measured).any())
 
-    def without(self, names: tuple[str, ...]) -> AtJoint:
+    def without(self, names: Names) -> AtJoint:
         """The joint's own model with amplitudes of some of its effects at 0."""
         _, signals = _solved(_absent(self.joint, names), self.conditions)
         ratio = float(self.joint.robot.gearbox.ratio)
@@ -108,7 +109,7 @@ class Situation:
         return np.stack([np.asarray(shown[c.name]) for c in channels_of(self.joint)], -1)
 
 
-def _absent(joint: Joint, names: tuple[str, ...] = ()) -> Robot:
+def _absent(joint: Joint, names: Names = ()) -> Robot:
     """The whole robot with amplitudes at 0: of effects outside the joint, and of others by name.
 
     It keeps these effects, so that all models of a comparison are one compiled program.

@@ -9,11 +9,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from calibration.data import Columns
 from mmrjax.model.channels import Channel
 from sweeps.pages.figure_style import axis_label, configuration_looks, corner_note, new_figure
 
 
-def draw_parity(table: dict[str, np.ndarray], channels: Sequence[Channel], band: bool = True) -> Figure:
+def draw_parity(table: Columns, channels: Sequence[Channel], band: bool = True) -> Figure:
     """Simulated over measured, one panel a channel; a reading that is missing is not drawn.
 
     Args:
@@ -47,7 +48,7 @@ def draw_parity(table: dict[str, np.ndarray], channels: Sequence[Channel], band:
 
 
 def errors_over(
-    table: dict[str, np.ndarray],
+    table: Columns,
     channels: Sequence[Channel],
     in_units: bool = False,
     beside: Mapping[str, str] | None = None,

@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from calibration.data import Json
 from mmrjax.model.paper_tables import PITCH_GROUSER, PITCH_TOOTH
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import STATUSES
-from mmrjax.undercarriage import ripple
+from mmrjax.undercarriage import ripple_peaks
 from sweeps.pages.figure_style import (
     BLUE,
     FAINT,
@@ -64,7 +65,7 @@ class Gear:
     def period(self) -> float:
         """Eq. (34) [s], at the mean speed of the driving pulley; the belt runs on the pulley on wheels too."""
         speed = float(self.signals.speed_wheel[self.tail(TAIL)].mean())
-        return ripple.period_pitch(PITCH_GROUSER if self.on_tracks else PITCH_TOOTH, speed, self.radius)
+        return ripple_peaks.period_pitch(PITCH_GROUSER if self.on_tracks else PITCH_TOOTH, speed, self.radius)
 
 
 def members_with_gear(
@@ -94,11 +95,11 @@ def members_with_gear(
     return answer
 
 
-def ripple_numbers(gear: Gear) -> dict[str, Any]:
+def ripple_numbers(gear: Gear) -> Json:
     """What ripples in a run, by how much and how often."""
     tail, signals = gear.tail(TAIL), gear.signals
     drawn, travel, reaction = (
-        ripple.ripple(gear.time[tail], x[tail]) for x in (signals.total_current, signals.speed, signals.normal)
+        ripple_peaks.ripple(gear.time[tail], x[tail]) for x in (signals.total_current, signals.speed, signals.normal)
     )
     return {
         "configuration": gear.name,
@@ -112,7 +113,7 @@ def ripple_numbers(gear: Gear) -> dict[str, Any]:
     }
 
 
-def current_ripple(shown: list[Gear], title: str = "{}") -> tuple[Figure, list[dict[str, Any]]]:
+def current_ripple(shown: list[Gear], title: str = "{}") -> tuple[Figure, list[Json]]:
     """Total current at the end of each run, and what ripples by how much."""
     fig, grid = new_figure(1, len(shown), 3.0)
     look = configuration_looks(gear.name for gear in shown)
@@ -139,7 +140,7 @@ def draw_touchdowns(gear: Gear, title: str = "grousers land (dotted)") -> Figure
     fig, grid = new_figure(2, 1, 5.0, sharex=True)
     last = gear.tail(SHOWN)
     time = 1e3 * (gear.time[last] - gear.time[last][0])
-    lands = ripple.touchdowns(time, gear.reactions.grouser[last], gear.reactions.place[last])
+    lands = ripple_peaks.touchdowns(time, gear.reactions.grouser[last], gear.reactions.place[last])
     upper, lower = grid[:, 0]
     upper.plot(time, gear.signals.total_current[last], color=BLUE)
     upper.set(ylabel="total current [A]")

@@ -11,8 +11,14 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from mmrjax.derived.start_figures import curve_peak
-from mmrjax.fidelities.start_stages import StartStages, count_finite_samples, last_samples, stages_of_histories
+from calibration.data import Columns
+from mmrjax.derived.start_figures import (
+    StartStages,
+    count_finite_samples,
+    curve_peak,
+    last_samples,
+    stages_of_histories,
+)
 from mmrjax.model import channels
 from mmrjax.model.channels import Channel
 from mmrjax.model.quantities import MM
@@ -313,7 +319,7 @@ class Course:
     name: str
     status: str
     time: np.ndarray
-    readings: dict[str, np.ndarray]
+    readings: Columns
 
     def largest(self, channel: str) -> float:
         """Reading that is largest in size."""

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
+from calibration.data import Columns
 from calibration.data.table import Runs
 from calibration.discovery.result import DiscoveryResult, Evidence, UnnamedDiscrepancy
 from calibration.discovery.settings import WITHOUT_NAME
@@ -22,8 +23,10 @@ from sweeps.pages.figure_style import (
     INK,
     ORANGE,
     SKY,
+    colour_bar,
     configuration_looks,
     corner_note,
+    is_narrow,
     legend_columns,
     new_figure,
 )
@@ -60,7 +63,7 @@ CONDITION_WORDS = {
 ABREAST = 110
 
 
-def before_after(table: dict[str, np.ndarray], channels: Sequence[Channel], verdict: str) -> Figure:
+def before_after(table: Columns, channels: Sequence[Channel], verdict: str) -> Figure:
     """Residual of every reading in sigmas, before and after; runs grouped by configuration and voltage."""
     own = imposed_column(table)
     beside = [c for c in ("payload_kg", "slope_deg", "load_torque_Nm") if c in table]
@@ -110,7 +113,7 @@ def _range(x: np.ndarray) -> str:
     return f"{low:g}" if low == high else f"{low:g} to {high:g}"
 
 
-def over_time(runs: Runs, table: dict[str, np.ndarray], channels: Sequence[Channel], verdict: str) -> Figure:
+def over_time(runs: Runs, table: Columns, channels: Sequence[Channel], verdict: str) -> Figure:
     """Residual of every history over time in sigmas, before and after; one column a run, samples as dots and their
     running mean as a line. The `table` is of the rows of `runs`."""
     names = list(dict.fromkeys(runs.run_names.tolist()))[:RUNS_SHOWN]
@@ -229,13 +232,14 @@ def draw_errors(found: DiscoveryResult) -> Figure:
             axes.barh(np.arange(len(lines)) + 0.4 * k - 0.2, values, height=0.38, color=colour, label=when)
             for row, v in enumerate(values):
                 axes.text(v, row + 0.4 * k - 0.2, f" {v:.2g}", va="center", fontsize=8, color=INK)
-        axes.set_yticks(range(len(lines)), list(lines) if place == 0 else [""] * len(lines))
+        axes.set_yticks(range(len(lines)), list(lines) if place == 0 or is_narrow() else [""] * len(lines))
         axes.invert_yaxis()
         axes.margins(x=0.16)
         axes.grid(axis="y", visible=False)
         axes.set_title(channel.label)
         axes.set_xlabel("rms error [%]")
-    fig.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside upper right", ncols=2)
+    labels = grid[0, 0].get_legend_handles_labels()[1]
+    fig.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside upper right", ncols=legend_columns(labels))
     return fig
 
 
@@ -243,7 +247,7 @@ def draw_errors(found: DiscoveryResult) -> Figure:
 NEAR = 1 / 12
 
 
-def imposed_axis(table: dict[str, np.ndarray]) -> tuple[np.ndarray, str]:
+def imposed_axis(table: Columns) -> tuple[np.ndarray, str]:
     """Imposed quantity of runs and its label; for a supply with a driver, the voltage after the duty."""
     own = imposed_column(table)
     if own == "supply_voltage_V" and "duty" in table and np.isfinite(table["duty"]).all():
@@ -259,7 +263,7 @@ def roughness(x: np.ndarray, y: np.ndarray) -> float:
     return float(np.mean((y - near @ y / near.sum(1)) ** 2) / max(np.var(y), 1e-300))
 
 
-def conditions_and_readings(table: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def conditions_and_readings(table: Columns) -> Columns:
     """Variables in which rows differ, by label: imposed quantity, payload, slope and readings.
 
     A variable of each side also appears as mean and difference.
@@ -278,7 +282,7 @@ def conditions_and_readings(table: dict[str, np.ndarray]) -> dict[str, np.ndarra
     return found
 
 
-def depends_on(table: dict[str, np.ndarray], change: np.ndarray) -> tuple[np.ndarray, str]:
+def depends_on(table: Columns, change: np.ndarray) -> tuple[np.ndarray, str]:
     """Abscissa of an effect and its label: the condition or reading that makes the change of a reading smoothest.
 
     Args:
@@ -291,7 +295,7 @@ def depends_on(table: dict[str, np.ndarray], change: np.ndarray) -> tuple[np.nda
     return whole[label], label
 
 
-def draw_effect_laws(found: DiscoveryResult, table: dict[str, np.ndarray], changes: Mapping[str, Change]) -> Figure:
+def draw_effect_laws(found: DiscoveryResult, table: Columns, changes: Mapping[str, Change]) -> Figure:
     """Contribution of each effect found: readings minus the robot without it, and the effect's change."""
     fig, grid = new_figure(1, len(changes), 3.4)
     for axes, (name, change) in zip(grid[0], changes.items(), strict=True):
@@ -310,19 +314,19 @@ def draw_effect_laws(found: DiscoveryResult, table: dict[str, np.ndarray], chang
     return fig
 
 
-def defects_of(table: dict[str, np.ndarray], when: str, balance: str) -> dict[str, np.ndarray]:
+def defects_of(table: Columns, when: str, balance: str) -> Columns:
     """Defects of a balance by side; the side's name is empty if both sides are the same."""
     sides = {side: f"defect_{when}_{balance}{'_' * bool(side)}{side}" for side in ("", *SIDES)}
     return {side: table[column] for side, column in sides.items() if column in table}
 
 
-def closed_equations(table: dict[str, np.ndarray]) -> list[str]:
+def closed_equations(table: Columns) -> list[str]:
     """Equations that the readings close: those with a defect somewhere, at least one."""
     found = [b for b in DEFECT_WORDS if any(np.nan_to_num(x).any() for x in defects_of(table, "before", b).values())]
     return found or ["track"]
 
 
-def _over(table: dict[str, np.ndarray], column: str, label: str, side: str = "") -> tuple[np.ndarray, str]:
+def _over(table: Columns, column: str, label: str, side: str = "") -> tuple[np.ndarray, str]:
     """Variable over which a defect is drawn, with its label, for one side if each side has its own.
 
     The imposed quantity replaces a variable that the table lacks or that does not vary.
@@ -337,7 +341,7 @@ def _over(table: dict[str, np.ndarray], column: str, label: str, side: str = "")
     return table[column], label
 
 
-def draw_defects(table: dict[str, np.ndarray], verdict: str, crosses_zero: bool = False) -> Figure:
+def draw_defects(table: Columns, verdict: str, crosses_zero: bool = False) -> Figure:
     """Defect of each equation by run, over the variable that shows it, before and after.
 
     Args:
@@ -387,7 +391,7 @@ def look_alikes(found: DiscoveryResult) -> Figure:
     axes.set_xticks(range(len(names)), names, rotation=60, ha="right")
     axes.set_yticks(range(len(names)), names)
     axes.grid(visible=False)
-    fig.colorbar(shown, ax=axes, label="|cos| of the signatures", shrink=0.8)
+    colour_bar(fig, shown, axes, label="|cos| of the signatures", shrink=0.8)
     return fig
 
 

@@ -14,6 +14,7 @@ import jinja2
 import numpy as np
 from markupsafe import Markup, escape
 
+from calibration.data import Json
 from calibration.data.robot_file import RobotFile
 from calibration.data.writing import write_text
 from mmrjax import __version__
@@ -86,7 +87,7 @@ def _inline(svg: str, name: str, looks: str) -> str:
     return re.sub(r'((?:href="|url\()#)(?=[^")]+)', rf"\g<1>{name}-", element)
 
 
-def robot_section(file: RobotFile) -> dict[str, Any]:
+def robot_section(file: RobotFile) -> Json:
     """The `robot`'s name, its section of a page (`about_robot`), and `warnings` of remarks and unnamed curves.
 
     A packaged robot with other parameters is called changed.

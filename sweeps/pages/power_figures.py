@@ -7,6 +7,7 @@ import itertools
 import numpy as np
 from matplotlib.figure import Figure
 
+from calibration.data import Columns
 from sweeps.pages.figure_style import BLUE, GREEN, INK, ORANGE, PURPLE, SKY, legend_columns, new_figure
 
 #: Where power goes, with its colour: losses in the order of the chain, then what is left.
@@ -21,7 +22,7 @@ ITEMS = {
 _DARK = (PURPLE, BLUE, GREEN, INK)
 
 
-def power_by_item(runs: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def power_by_item(runs: Columns) -> Columns:
     """Power [W] of each item, of every run, out of the powers of `runs.csv`.
 
     Rolling resistance holds the acceleration where a run has not settled.
@@ -32,12 +33,12 @@ def power_by_item(runs: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return dict(zip(ITEMS, [*losses, *ends], strict=True))
 
 
-def power_sources(runs: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+def power_sources(runs: Columns) -> tuple[np.ndarray, np.ndarray]:
     """Power [W] that the supply gives, and that the slope gives a run downhill."""
     return np.maximum(runs["power_supply_W"], 0.0), np.maximum(-runs["power_lift_W"], 0.0)
 
 
-def drawable_runs(runs: dict[str, np.ndarray]) -> np.ndarray:
+def drawable_runs(runs: Columns) -> np.ndarray:
     """Mask of runs with numbers and without negative losses."""
     parts, given = np.stack(list(power_by_item(runs).values())), sum(power_sources(runs))
     return np.isfinite(parts).all(0) & (parts >= -1e-6 * np.maximum(given, 1.0)).all(0) & (given > 0)
@@ -47,7 +48,7 @@ def drawable_runs(runs: dict[str, np.ndarray]) -> np.ndarray:
 ON_SHAFT = {"track and slip": "load"}
 
 
-def draw_power_chain(runs: dict[str, np.ndarray], names: list[str], has_ground: bool = True) -> Figure:
+def draw_power_chain(runs: Columns, names: list[str], has_ground: bool = True) -> Figure:
     """A bar a run [W], from the motor's losses to the power that lifts the robot, or that the load takes."""
     fig, grid = new_figure(1, 1, 1.15 + 0.42 * len(names))
     axes, parts = grid[0, 0], power_by_item(runs)

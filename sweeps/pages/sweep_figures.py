@@ -11,19 +11,20 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 
+from calibration.data import Columns, Json
 from mmrjax.model.channels import Channel
 from sweeps.pages import words
-from sweeps.pages.figure_style import FAINT, INK, axis_label, corner_note, new_figure
+from sweeps.pages.figure_style import FAINT, INK, axis_label, colour_bar, corner_note, new_figure
 from sweeps.report.condition_columns import UNITS, imposed_column
 from sweeps.report.run_tables import reading_text
 
 _PANELS = 3  # voltages drawn of a configuration
 _CELLS = 12  # along an axis up to which cells are labelled
 #: Of text in a cell, which has no part in the layout of the figure.
-_INSIDE: dict[str, Any] = {"ha": "center", "va": "center", "in_layout": False}
+_INSIDE: Json = {"ha": "center", "va": "center", "in_layout": False}
 
 
-def on_ground(runs: dict[str, np.ndarray]) -> bool:
+def on_ground(runs: Columns) -> bool:
     """True for runs of a vehicle, with slope and payload."""
     return "slope_deg" in runs and "payload_kg" in runs
 
@@ -46,17 +47,12 @@ def panels_by_imposed(voltages: np.ndarray, column: str = "supply_voltage_V") ->
     return [(f"{v:.4g} {unit}", voltages == v) for v in levels]
 
 
-def is_map(runs: dict[str, np.ndarray]) -> bool:
-    """True if the runs have at least two slopes and two payloads and so fill a map."""
-    return on_ground(runs) and np.unique(runs["slope_deg"]).size > 1 and np.unique(runs["payload_kg"]).size > 1
-
-
-def runs_with_number(runs: dict[str, np.ndarray], channel: Channel) -> np.ndarray:
+def runs_with_number(runs: Columns, channel: Channel) -> np.ndarray:
     """Mask of runs with a settled number; `drive` also leaves instantaneous numbers with other statuses."""
     return np.isin(runs["status"], words.SETTLED) & np.isfinite(runs[channel.column])
 
 
-def draw_sweep(runs: dict[str, np.ndarray], channel: Channel) -> Figure:
+def draw_sweep(runs: Columns, channel: Channel) -> Figure:
     """One channel over slope and payload, a panel for each voltage and configuration.
 
     With a single slope or payload the panels are lines over the other. A cell that did not settle is hatched
@@ -64,7 +60,7 @@ def draw_sweep(runs: dict[str, np.ndarray], channel: Channel) -> Figure:
     """
     kinds = list(dict.fromkeys(map(str, runs["configuration"])))
     volts = panels_by_imposed(runs[imposed_column(runs)], imposed_column(runs))
-    if not is_map(runs):
+    if not (on_ground(runs) and np.unique(runs["slope_deg"]).size > 1 and np.unique(runs["payload_kg"]).size > 1):
         return _lines(runs, channel, kinds)
     readings = runs[channel.column][runs_with_number(runs, channel)]
     low, high = (float(readings.min()), float(readings.max())) if readings.size else (0.0, 1.0)
@@ -79,12 +75,12 @@ def draw_sweep(runs: dict[str, np.ndarray], channel: Channel) -> Figure:
             axes.set(xlabel="slope [°]", ylabel="payload [kg]")
     from matplotlib.cm import ScalarMappable
 
-    bar = fig.colorbar(ScalarMappable(norm, "viridis"), ax=grid, shrink=0.8, pad=0.01)
+    bar = colour_bar(fig, ScalarMappable(norm, "viridis"), grid, shrink=0.8, pad=0.01)
     bar.set_label(axis_label(channel))
     return fig
 
 
-def _map(axes: Axes, runs: dict[str, np.ndarray], index: np.ndarray, channel: Channel, norm: Any) -> None:
+def _map(axes: Axes, runs: Columns, index: np.ndarray, channel: Channel, norm: Any) -> None:
     axes.grid(False)
     if not index.size:
         corner_note(axes, "no runs")
@@ -168,7 +164,7 @@ def _ticks(setter: Any, levels: np.ndarray) -> None:
     setter(np.interp(values, levels, np.arange(levels.size)), [f"{v:g}" for v in values])
 
 
-def _scatter(axes: Axes, runs: dict[str, np.ndarray], index: np.ndarray, channel: Channel, norm: Any) -> None:
+def _scatter(axes: Axes, runs: Columns, index: np.ndarray, channel: Channel, norm: Any) -> None:
     values = runs[channel.column][index]
     settles = runs_with_number(runs, channel)[index]
     x, y = runs["slope_deg"][index], runs["payload_kg"][index]
@@ -180,7 +176,7 @@ def _scatter(axes: Axes, runs: dict[str, np.ndarray], index: np.ndarray, channel
         axes.legend(loc="upper right", fontsize=7.5, frameon=True, markerscale=1.5)
 
 
-def _lines(runs: dict[str, np.ndarray], channel: Channel, kinds: list[str]) -> Figure:
+def _lines(runs: Columns, channel: Channel, kinds: list[str]) -> Figure:
     column, settles = channel.column, runs_with_number(runs, channel)
     over = own = imposed_column(runs)
     if on_ground(runs):

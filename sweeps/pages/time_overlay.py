@@ -5,11 +5,11 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
+from calibration.data import Columns, Json
 from calibration.data.table import Runs
 from mmrjax.model.channels import Channel
 from sweeps.pages.figure_style import BLUE, FAINT, INK, ORANGE, axis_label, new_figure
@@ -30,10 +30,10 @@ class TimeOverlay:
         rows: rows of each run in the order of time.
     """
 
-    table: Mapping[str, np.ndarray]
+    table: Columns
     channels: Sequence[Channel]
     simulated: Mapping[str, str]
-    rows: Mapping[str, np.ndarray]
+    rows: Columns
 
     @property
     def worst(self) -> str:
@@ -84,7 +84,7 @@ class TimeOverlay:
     def to_json(self) -> str:
         """Data of the interactive figure: for each run its times and, by channel, measured and simulated readings."""
         most = max(200, POINTS // (len(self.rows) * len(self.channels) * (1 + len(self.simulated))))
-        runs: dict[str, Any] = {}
+        runs: Json = {}
         spent = 0
         worst = self.worst
         for name in (worst, *(name for name in self.rows if name != worst)):
@@ -99,7 +99,7 @@ class TimeOverlay:
                     for c in self.channels
                 ],
             }
-        about: dict[str, Any] = {
+        about: Json = {
             "labels": ["measured", *self.simulated.values()],
             "channels": [{"label": c.label, "unit": c.unit} for c in self.channels],
             "runs": runs,
@@ -125,9 +125,7 @@ def _numbers(values: np.ndarray) -> list[float | None]:
     return [float(f"{v:.6g}") if np.isfinite(v) else None for v in values]
 
 
-def time_overlay(
-    table: Mapping[str, np.ndarray], channels: Sequence[Channel], simulated: Mapping[str, str]
-) -> TimeOverlay:
+def time_overlay(table: Columns, channels: Sequence[Channel], simulated: Mapping[str, str]) -> TimeOverlay:
     """Overlay of a table of time histories, run by run.
 
     Args:

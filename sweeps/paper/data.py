@@ -8,7 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data import runs
+from calibration.data import Columns, Json, Names, runs
 from calibration.inference import simulation_errors
 from mmrjax.fidelities import outputs
 from mmrjax.fidelities.base import History
@@ -20,8 +20,6 @@ from mmrjax.model.robot import Robot
 from sweeps.pages import history_figures
 from sweeps.pages.history_figures import Start
 
-Columns = dict[str, np.ndarray]
-
 _CHUNK = 256  # one compiled shape for every question that the report asks of `steady`
 #: Surface of Table 5 that stands for "adhesion raised": the first on which all 20 measured rows climb.
 RAISED_SURFACE = "smooth_concrete_floor"
@@ -31,12 +29,12 @@ FIG_23, FIG_24 = "Fig. 23: total current", r"Fig. 24: $V_x$ and $V_{x\,teor}$"  
 MODES = {1: (15.0, 0.0), 2: (33.0, 0.0), 3: (33.0, 5.0), 4: (33.0, 8.0)}
 
 
-def shared_configurations(robot: Robot) -> tuple[str, ...]:
+def shared_configurations(robot: Robot) -> Names:
     """The paper's configurations that a robot has; its runs on the bench can be set against these alone."""
     return tuple(c for c in CONFIGURATIONS if c in robot.configurations)
 
 
-def shown_configurations(robot: Robot) -> tuple[str, ...]:
+def shown_configurations(robot: Robot) -> Names:
     """The configurations that are shown of a robot: the paper's, or where it has none of them its own."""
     return shared_configurations(robot) or robot.configurations.names
 
@@ -115,7 +113,7 @@ def simulate_measured_rows(robot: Robot) -> Rows | None:
         for table in map(runs.read_runs, ("measured", "simulated_by_paper"))
     )
     kind = table["configuration"]
-    asked: dict[str, Any] = {
+    asked: Json = {
         "configuration": kind,
         "voltage": table["supply_voltage_V"],
         "payload": table["payload_kg"],
@@ -340,7 +338,7 @@ def paper_rows_table(rows: Rows) -> Columns:
     return columns | {"status": rows.plain["status"]}
 
 
-def bench_error_summary(rows: Rows) -> dict[str, dict[str, Any]]:
+def bench_error_summary(rows: Rows) -> dict[str, Json]:
     """Errors (35) of every channel against the bench: of the robot three ways, and of the paper's simulation."""
     ways = {
         name: channel_percent_errors(getattr(rows, name), rows.measured) for name in ("plain", "raised", "weighed")

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data import runs
+from calibration.data import Columns, Json, runs
 from calibration.inference import simulation_errors
 from mmrjax.model.channels import find_channel
 from mmrjax.model.paper_tables import CONFIGURATIONS, TRACKED, WHEELED
@@ -17,7 +15,7 @@ from sweeps.paper import data
 from sweeps.report.run_tables import reading_text
 
 
-def variant_errors(variants: dict[str, np.ndarray], rows: data.Rows) -> list[dict[str, Any]]:
+def variant_errors(variants: Columns, rows: data.Rows) -> list[Json]:
     """Rms and worst error (35) of each variant (errors of shape (rows, channels)), all rows and by group."""
     kind = rows.conditions["configuration"]
     answer = []
@@ -31,7 +29,7 @@ def variant_errors(variants: dict[str, np.ndarray], rows: data.Rows) -> list[dic
     return answer
 
 
-def error_answer(every: list[dict[str, Any]]) -> str:
+def error_answer(every: list[Json]) -> str:
     """Sentence on the rms errors (35) over all rows, from `variant_errors`: the robot's and the paper's."""
     own, _, raised, *_, paper = (e for e in every if e["group"] == "all")
     labels = [c.label for c in data.channels_of_paper()]
@@ -53,7 +51,7 @@ def implied_resistance(robot: Robot, table: runs.Runs) -> np.ndarray:
     return robot.sides * (table["supply_voltage_V"] - back) / current
 
 
-def row_by_row(nominal: Robot, rows: data.Rows) -> list[dict[str, Any]]:
+def row_by_row(nominal: Robot, rows: data.Rows) -> list[Json]:
     """The 20 rows: bench, the paper's simulation, the nominal robot three ways, and letters that say why."""
     table = rows.conditions
     own, raised, weighed = (data.stack_channels(t) for t in (rows.plain, rows.raised, rows.weighed))
@@ -75,7 +73,10 @@ def row_by_row(nominal: Robot, rows: data.Rows) -> list[dict[str, Any]]:
             reasons.append("E")
         if raised[k, 1] > 1.03 * rows.measured[k, 1]:
             reasons.append("B")
-        following = (table["slope_deg"] == table["slope_deg"][k] + 5) & _same_mode(table, k)
+        following = (table["slope_deg"] == table["slope_deg"][k] + 5) & (
+            (table["configuration"] == table["configuration"][k])
+            & (table["supply_voltage_V"] == table["supply_voltage_V"][k])
+        )
         if following.any() and rows.paper[following, 1][0] > rows.paper[k, 1]:
             reasons.append("N")
         creep = rows.raised["theoretical_speed_mm_s"][k] * rows.raised["slip"][k]
@@ -103,13 +104,7 @@ def row_by_row(nominal: Robot, rows: data.Rows) -> list[dict[str, Any]]:
     return answer
 
 
-def _same_mode(table: runs.Runs, k: int) -> np.ndarray:
-    return (table["configuration"] == table["configuration"][k]) & (
-        table["supply_voltage_V"] == table["supply_voltage_V"][k]
-    )
-
-
-def _cells(channel: str, measured: float, paper: float, own: float, raised: float, weighed: float) -> dict[str, Any]:
+def _cells(channel: str, measured: float, paper: float, own: float, raised: float, weighed: float) -> Json:
     """Texts of one channel in a row; differences by (35) of the nominal (raised, own mass) from paper and bench."""
     return {
         "measured": reading_text(measured, find_channel(channel)),
@@ -124,7 +119,7 @@ def _cells(channel: str, measured: float, paper: float, own: float, raised: floa
     }
 
 
-def row_by_row_facts(nominal: Robot, rows: data.Rows) -> dict[str, Any]:
+def row_by_row_facts(nominal: Robot, rows: data.Rows) -> Json:
     """The numbers behind the letters of `row_by_row`, for the page to put into words."""
     measured = rows.conditions
     of_paper = implied_resistance(nominal, runs.read_runs("simulated_by_paper"))

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from calibration.data import Columns, Json
 from calibration.data.robot_file import RobotFile
 from calibration.inference import simulation_errors
 from mmrjax.model.paper_robots import ROBOTS
@@ -33,7 +33,7 @@ def write_paper_page(folder: Path, file: RobotFile, *, model: str, gear: bool) -
     name = file.name if shown["robot"] == words_shown(file.name) else shown["robot"]
     robots = {name: robot} | {n: make() for n, make in ROBOTS.items() if n != name}
     album = page.Album(folder)
-    known: dict[str, Any] = {"gear": None, "errors": [], "sliding": [], "measured": 0, "raised": ""}
+    known: Json = {"gear": None, "errors": [], "sliding": [], "measured": 0, "raised": ""}
     rows = {
         n: r for n, r in ((n, data.simulate_measured_rows(member)) for n, member in robots.items()) if r is not None
     }
@@ -65,9 +65,7 @@ def write_paper_page(folder: Path, file: RobotFile, *, model: str, gear: bool) -
     return page.render_page(folder, "paper.html.j2", album, title=title, model=model, **shown, **known), mine
 
 
-def _against_the_bench(
-    album: page.Album, robots: dict[str, Robot], rows: dict[str, data.Rows], name: str
-) -> dict[str, Any]:
+def _against_the_bench(album: page.Album, robots: dict[str, Robot], rows: dict[str, data.Rows], name: str) -> Json:
     mine, robot = rows[name], robots[name]
     album.add("rows", lambda: run_figures.row_parity(mine, name))
     certainty = album.add("fig28_current_over_slope", lambda: run_figures.current_over_slope(robot, mine))
@@ -84,7 +82,7 @@ def _against_the_bench(
     }
 
 
-def _variants(name: str, rows: dict[str, data.Rows]) -> dict[str, np.ndarray]:
+def _variants(name: str, rows: dict[str, data.Rows]) -> Columns:
     """Errors of the rows under the names that the table of errors shows."""
     mine = rows[name]
     error = data.channel_percent_errors

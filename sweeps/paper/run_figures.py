@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from matplotlib.figure import Figure
 
+from calibration.data import Columns, Json
 from calibration.inference import simulation_errors
 from mmrjax.model.paper_tables import TRACKED, WHEELED
 from mmrjax.model.robot import Robot
@@ -32,7 +31,7 @@ from sweeps.paper.look import CONFIGURATION, MODEL
 _MODES = {1: (BLUE, "o"), 2: (SKY, "v"), 3: (GREEN, "^"), 4: (VERMILION, "s")}
 
 
-def current_over_slope(robot: Robot, rows: data.Rows) -> tuple[Figure, list[dict[str, Any]]]:
+def current_over_slope(robot: Robot, rows: data.Rows) -> tuple[Figure, list[Json]]:
     """Fig. 28: total current over slope in four loading modes, with the measured points and R² (A1)."""
     slopes = np.linspace(0, 20, 81)
     lines = data.current_over_slope(robot, rows.ratio, slopes)
@@ -84,11 +83,11 @@ def current_over_slope(robot: Robot, rows: data.Rows) -> tuple[Figure, list[dict
     return fig, certainty
 
 
-def model_errors(robots: dict[str, Robot], rows: dict[str, data.Rows]) -> tuple[Figure, dict[str, Any]]:
+def model_errors(robots: dict[str, Robot], rows: dict[str, data.Rows]) -> tuple[Figure, Json]:
     """Fig. 29: errors (35) in current and speed over slope, 6T2A, modes 1 and 2, adhesion raised."""
     fig, grid = new_figure(2, 2, 6.2, sharex=True)
     slopes = np.array([0.0, 5.0, 10.0, 15.0, 20.0])
-    errors: dict[str, Any] = {}
+    errors: Json = {}
     for name, robot in robots.items():
         ratio = rows[name].ratio[TRACKED]
         colour = MODEL.get(name, PURPLE)
@@ -146,12 +145,12 @@ _SPLIT_COLOURS = {
 }
 
 
-def draw_energy(robot: Robot, ratio: dict[str, float]) -> tuple[Figure, list[dict[str, Any]]]:
+def draw_energy(robot: Robot, ratio: dict[str, float]) -> tuple[Figure, list[Json]]:
     """Use of the supply's power at twelve operating points, in percent, with watts at the end."""
     asked = [(c, u, p, s) for c in ratio for u, p in ((15.0, 0.0), (33.0, 8.0)) for s in (0.0, 10.0, 20.0)]
     kind, voltage, payload, slope = (np.array(v) for v in zip(*asked, strict=True))
 
-    def at(adhesion: np.ndarray) -> tuple[data.Columns, data.Columns]:
+    def at(adhesion: np.ndarray) -> tuple[Columns, Columns]:
         return data.energy_split(
             robot,
             data.batch_conditions(robot, kind, voltage=voltage, payload=payload, slope_deg=slope, adhesion=adhesion),

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
+from calibration.data import Json
 from mmrjax.fidelities.track import STEP, Trajectory, track_batch
 from mmrjax.model.paper_tables import TRACKED
 from mmrjax.model.robot import Robot
@@ -32,7 +32,7 @@ def simulate_gear_runs(robot: Robot) -> Trajectory:
     return jax.device_get(track_batch(robot, conditions, duration=SECONDS, sample=SAMPLE, step=step))
 
 
-def draw_running_gear(album: Album, robot: Robot) -> dict[str, Any]:
+def draw_running_gear(album: Album, robot: Robot) -> Json:
     """Draw the figures.
 
     Returns:

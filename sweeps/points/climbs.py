@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data import terrains
+from calibration.data import Columns, Json, terrains
 from calibration.data.input_errors import BadConfiguration
 from mmrjax.climbing import terrain
 from mmrjax.climbing.climb_simulation import (
@@ -63,12 +63,10 @@ def obstacle_axis(obstacle: Obstacle) -> Axis:
     return Axis(SIZE, "mm", meaning[obstacle.kind], (1.0, 5000.0), None)
 
 
-def climb_attributes(obstacle: Obstacle) -> dict[str, dict[str, Any]]:
+def climb_attributes(obstacle: Obstacle) -> dict[str, Json]:
     """Outputs that a point has, by name, with their attributes in a store."""
     names = (VERDICT, LARGEST) if obstacle.find else tuple(name for name in OUTPUTS if name != LARGEST)
-    found: dict[str, dict[str, Any]] = {
-        name: {"units": OUTPUTS[name][0], "long_name": OUTPUTS[name][1]} for name in names
-    }
+    found: dict[str, Json] = {name: {"units": OUTPUTS[name][0], "long_name": OUTPUTS[name][1]} for name in names}
     del found[VERDICT]["units"]
     found[VERDICT] |= {"flag_values": [*range(len(NAMES))], "flag_meanings": " ".join(NAMES)}
     return found
@@ -85,9 +83,7 @@ def terrains_of(obstacle: Obstacle, sizes: np.ndarray) -> Terrain:
     return jax.vmap(make[obstacle.kind])(jnp.asarray(sizes) / 1000)
 
 
-def further_variation(
-    obstacle: Obstacle, varied: Mapping[str, np.ndarray], robot: Robot, where: str
-) -> dict[str, float]:
+def further_variation(obstacle: Obstacle, varied: Columns, robot: Robot, where: str) -> dict[str, float]:
     """Further conditions: a low voltage, if a sweep of climbs states none.
 
     Args:
@@ -138,7 +134,7 @@ def compute_climbs(
     values: np.ndarray | jax.Array,
     sizes: np.ndarray | None,
     told: Callable[[float], None],
-) -> dict[str, np.ndarray]:
+) -> Columns:
     """Outputs and status of points, by name.
 
     Args:
@@ -188,7 +184,7 @@ def _sequences(obstacle: Obstacle, robot: Robot, conditions: Conditions, points:
     return dataclasses.replace(found, supply=jnp.full(points, obstacle.levers_voltage_V))
 
 
-def _numbers(found: Climb) -> dict[str, np.ndarray]:
+def _numbers(found: Climb) -> Columns:
     """Numbers of runs until their verdicts."""
     r, during = found.record, found.during
 
@@ -209,9 +205,7 @@ def _numbers(found: Climb) -> dict[str, np.ndarray]:
     }
 
 
-def _searched(
-    obstacle: Obstacle, points: int, run: Callable[..., Climb], told: Callable[[float], None]
-) -> dict[str, np.ndarray]:
+def _searched(obstacle: Obstacle, points: int, run: Callable[..., Climb], told: Callable[[float], None]) -> Columns:
     """The largest sizes that are got over, by bisection of all points side by side, and how the next one ends."""
     low, high = SOUGHT[obstacle.kind]
     rounds = 1 + int(np.ceil(np.log2((high - low) / NEAR)))

@@ -17,8 +17,7 @@ import threading
 from collections.abc import Iterable, Iterator
 from typing import Any
 
-import numpy as np
-
+from calibration.data import Columns, Json
 from calibration.data.input_errors import BadConfiguration, InputError
 from sweeps.points.identity import identity_differences, installed_versions, module_hashes
 from sweeps.points.scale import Job, Produced
@@ -250,7 +249,7 @@ def _quiet() -> Iterator[None]:
 # --- on the workers -------------------------------------------------------------------------------------------------
 
 _lock = threading.Lock()
-_compiled: dict[str, Any] = {}
+_compiled: Json = {}
 
 
 def program_identity() -> dict[str, dict[str, str]]:
@@ -274,7 +273,7 @@ def introduce_worker() -> tuple[dict[str, dict[str, str]], str]:
     return program_identity(), device_kind()
 
 
-def compute_on_worker(work: bytes, name: str, chunk: int, expected: dict[str, Any]) -> dict[str, np.ndarray]:
+def compute_on_worker(work: bytes, name: str, chunk: int, expected: Json) -> Columns:
     """A chunk on this worker's devices; a job is unpacked and compiled once.
 
     Args:

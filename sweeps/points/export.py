@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from calibration.data import Json
 from mmrjax.fidelities import outputs
 from mmrjax.fidelities.variation import STATUS
 from mmrjax.model import channels, quantities
@@ -51,7 +52,7 @@ def chunk_tables(store: Path, layout: Layout) -> Iterator[Any]:
     for chunk in range(len(blocks)):
         box = blocks.box(chunk)
         shape = tuple(b.stop - b.start for b in box)
-        found: dict[str, Any] = {}
+        found: Json = {}
         for k, (name, values) in enumerate(design.axes.items()):
             along = values[box[k]][(slice(None),) + (None,) * (len(shape) - k - 1)]
             flat = np.broadcast_to(along, shape).ravel()

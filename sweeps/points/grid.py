@@ -8,6 +8,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from calibration.data import Names
 from calibration.data.columns import LOAD, Layout
 from calibration.data.input_errors import BadConfiguration, allowed_words
 from calibration.data.runs import Runs
@@ -118,7 +119,7 @@ def grid_conditions(config: GridPart, robot: Robot, battery: bool = False) -> Ru
     return Runs(source="the grid", columns=columns, layout=Layout.of(robot))
 
 
-def grid_configurations(config: GridPart, robot: Robot) -> tuple[str, ...]:
+def grid_configurations(config: GridPart, robot: Robot) -> Names:
     """Configurations of a grid: the stated ones, or all of the robot's.
 
     Raises:

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Collection
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data import profiles
+from calibration.data import Json, profiles
 from calibration.data.input_errors import BadConfiguration, allowed_words
 from mmrjax import __version__, fidelities
 from mmrjax.fidelities import outputs
@@ -130,6 +129,6 @@ def laid_out(config: Campaign, job: scale.Job) -> Layout:
     return Layout(job.plan.design, job.blocks, tuple(variables), coordinates, labels, about, config.compression)
 
 
-def _in_store(about: dict[str, Any]) -> dict[str, Any]:
+def _in_store(about: Json) -> Json:
     """Attributes in the form of a store, with the unit 1 for a quantity without unit."""
     return {**about, "units": "1"} if about.get("units") in ("-", "") else about

@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from calibration.data import robot_file
+from calibration.data import Columns, Json, robot_file
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.runs import Runs
 from calibration.inference import observers
@@ -38,7 +38,10 @@ from sweeps.points.tasks import of_fidelity
 from sweeps.skeleton import Page
 from sweeps.store import RunFolder
 
-Table = dict[str, np.ndarray]
+Table = Columns
+
+#: Steps of `compare` in place of each step of a fit.
+PARTS = 4
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,20 +58,20 @@ class SimulationResult:
     model: str
     robot: Robot
     runs: Runs
-    table: dict[str, np.ndarray]
-    further: dict[str, Any] = dataclasses.field(default_factory=dict)
+    table: Columns
+    further: Json = dataclasses.field(default_factory=dict)
 
     @property
     def statuses(self) -> dict[str, int]:
         """Number of runs by status; every status is included."""
-        return runs_by_status(self.table)
+        return {status: int(np.sum(self.table["status"] == status)) for status in STATUSES}
 
     @property
     def flags(self) -> dict[str, int]:
         """Number of runs that exceed each limit."""
         return {name: int(np.sum(np.char.find(self.table["flags"], name) >= 0)) for name in FLAGS}
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Json:
         """`result.json`."""
         return {
             "schema": f"mmrjax.{self.command}/1",
@@ -80,7 +83,7 @@ class SimulationResult:
         }
 
 
-def ending_columns(robot: Robot, batch: Run) -> dict[str, np.ndarray]:
+def ending_columns(robot: Robot, batch: Run) -> Columns:
     """The columns of how a batch of runs ended, with those of its fidelity alone."""
     result, further = jax.device_get((batch.result, batch.columns))
     return outputs.output_columns(result, robot.channels, further)
@@ -157,7 +160,7 @@ def evaluate_runs(
     config: FidelityPart,
     folder: RunFolder | None,
     advance: Callable[[float], None] | None = None,
-) -> dict[str, np.ndarray]:
+) -> Columns:
     """Simulate every run and return the table of conditions and outcomes.
 
     Chunks already in the folder (of an interrupted run of the same configuration) are not simulated again.
@@ -183,6 +186,8 @@ def evaluate_runs(
 def follow_histories(robot: Robot, runs: Runs, model: str | None) -> Table:
     """Conditions and simulated outputs at every row of a table of time histories.
 
+    Its steps are finer than those of fits, which use the grid up to thousands of times.
+
     Args:
         robot: prepared for the table; model: requested fidelity; None: the fidelity for histories.
 
@@ -190,7 +195,7 @@ def follow_histories(robot: Robot, runs: Runs, model: str | None) -> Table:
         BadConfiguration: a fidelity that cannot follow them.
     """
     seen = jax.device_get(
-        _observed(observers.observer_kind(runs).of(runs, robot, model), params.without_weak_types(robot))
+        _observed(observers.Histories.of(runs, robot, model, PARTS), params.without_weak_types(robot))
     )
     columns = {c.column: seen.reading[:, k] / c.factor for k, c in enumerate(robot.channels)}
     return {**condition_table(robot, runs), **columns, **outputs.status_words(seen.status, seen.flags)}
@@ -201,7 +206,7 @@ def _observed(observe: observers.Observer, robot: Robot) -> Observation:
     return observe(robot)
 
 
-def condition_table(robot: Robot, runs: Runs) -> dict[str, np.ndarray]:
+def condition_table(robot: Robot, runs: Runs) -> Columns:
     """The condition columns of a table, with the robot's total mass if the table has none."""
     columns = dict(runs.columns)
     if "total_mass_kg" in runs.layout.axes and "total_mass_kg" not in columns:
@@ -209,11 +214,6 @@ def condition_table(robot: Robot, runs: Runs) -> dict[str, np.ndarray]:
         columns["total_mass_kg"] = own[runs.configurations(robot)] + runs["payload_kg"]
     shown = ("configuration", *dict.fromkeys((*runs.layout.axes, *runs.axes)), "surface", "run_id")
     return {key: columns[key] for key in shown if key in columns}
-
-
-def runs_by_status(table: dict[str, np.ndarray]) -> dict[str, int]:
-    """Number of runs by status; every status is included."""
-    return {status: int(np.sum(table["status"] == status)) for status in STATUSES}
 
 
 def write_run_folder(

@@ -17,6 +17,8 @@ from typing import Any, Protocol
 import numpy as np
 from jaxtyping import Float, Int, UInt64
 
+from calibration.data import Columns, Names
+
 #: Dimension of the sampled points in a store.
 SAMPLE = "sample"
 #: The axis along which the runs of a table are counted.
@@ -27,7 +29,7 @@ class Joint(Protocol):
     """Several names that are sampled together, from as many independent normal scores as it has coordinates."""
 
     @property
-    def names(self) -> tuple[str, ...]:
+    def names(self) -> Names:
         """Names of its columns."""
         ...
 
@@ -64,7 +66,7 @@ class Samples:
     joint: Joint | None = None
 
     @property
-    def names(self) -> tuple[str, ...]:
+    def names(self) -> Names:
         """Sampled names, in order."""
         return (*self.marginals, *(self.joint.names if self.joint is not None else ()))
 
@@ -98,7 +100,7 @@ class Drawn:
         names: what is sampled; table: its values, a row a name.
     """
 
-    names: tuple[str, ...]
+    names: Names
     table: Float[np.ndarray, "names points"]
 
     @property
@@ -135,16 +137,16 @@ class Design:
         samples: None for a plain grid.
     """
 
-    axes: dict[str, np.ndarray]
+    axes: Columns
     samples: Samples | Drawn | None = None
 
     @property
-    def names(self) -> tuple[str, ...]:
+    def names(self) -> Names:
         """Varied names: axes, then samples."""
         return (*self.axes, *(self.samples.names if self.samples is not None else ()))
 
     @property
-    def dimensions(self) -> tuple[str, ...]:
+    def dimensions(self) -> Names:
         """Names of the dimensions of every output."""
         return (*self.axes, *((SAMPLE,) if self.samples is not None else ()))
 

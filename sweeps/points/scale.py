@@ -23,6 +23,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float
 
+from calibration.data import Columns, Json, Names
 from mmrjax import WORKER, fidelities
 from mmrjax.compile.compiling import compiled
 from mmrjax.compile.precision import Threads
@@ -59,7 +60,7 @@ class Job:
     robot: Robot
     task: Task
     plan: Plan
-    outputs: tuple[str, ...]
+    outputs: Names
     storage: str
     blocks: Blocks
     profile: Profile | None = None
@@ -104,7 +105,9 @@ class Compiled:
         each = each if each < SHARED else -(-each // SHARED) * SHARED
         self.size = each * len(devices)
         everywhere = NamedSharding(self.mesh, PartitionSpec())
-        self._variation, self._fixed = _placed((job.plan.varied(job.robot), job.plan.fixed()), everywhere)
+        tree = (job.plan.varied(job.robot), job.plan.fixed())
+        arrays, rest = eqx.partition(tree, eqx.is_array)
+        self._variation, self._fixed = eqx.combine(jax.device_put(arrays, everywhere), rest)
         self._split = NamedSharding(self.mesh, PartitionSpec(POINTS))
         factors = {row.name: row.factor for row in outputs.output_table(job.robot.channels)}
         surface = None if job.plan.surface is None else adhesion_ratios(job.robot, job.plan.surface)
@@ -167,11 +170,6 @@ class _Asked(NamedTuple):
     factors: tuple[tuple[str, float], ...]
     storage: str
     surface: tuple[float, ...] | None
-
-
-def _placed(tree: Any, sharding: NamedSharding) -> Any:
-    arrays, rest = eqx.partition(tree, eqx.is_array)
-    return eqx.combine(jax.device_put(arrays, sharding), rest)
 
 
 def _wide(conditions: Conditions, points: int) -> Conditions:
@@ -246,7 +244,7 @@ class Piece:
     """
 
     chunk: int
-    arrays: Mapping[str, Any]
+    arrays: Json
     values: Float[np.ndarray, "points names"] | None = None
     told: float = 0.0
 
@@ -254,7 +252,7 @@ class Piece:
 Produced = Iterator[Piece]
 Advance = Callable[[float], None]
 #: Keeps a chunk by its number: values of its points by variable, and of its samples as `drawn_samples` gives them.
-Keep = Callable[[int, dict[str, np.ndarray], np.ndarray | None], Any]
+Keep = Callable[[int, Columns, np.ndarray | None], Any]
 
 
 def produce_chunks(
@@ -305,7 +303,7 @@ def share_counter(advance: Advance, count: int) -> Callable[[float], None]:
     return told
 
 
-def fetch_values(arrays: Mapping[str, Any], count: int) -> dict[str, np.ndarray]:
+def fetch_values(arrays: Json, count: int) -> Columns:
     """The first `count` values of each array, on this machine."""
     return {name: np.asarray(values)[:count] for name, values in jax.device_get(dict(arrays)).items()}
 

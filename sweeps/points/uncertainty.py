@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 
+from calibration.data import Columns
 from calibration.data.posterior_file import Posterior
 from calibration.data.runs import Runs
 from mmrjax import fidelities
@@ -38,7 +39,7 @@ class Intervals:
         draws: their number; channels: of the robot.
     """
 
-    columns: dict[str, np.ndarray]
+    columns: Columns
     draws: int
     channels: tuple[Channel, ...]
 
@@ -75,10 +76,10 @@ def simulate_draws(
     return Intervals(found if whole else summary(found), draws, robot.channels)
 
 
-def _summary(columns: dict[str, np.ndarray], counts: np.ndarray) -> dict[str, np.ndarray]:
+def _summary(columns: Columns, counts: np.ndarray) -> Columns:
     """Spread of each column over draws; arrays of shape (runs, draws), `counts`: where a draw converges."""
     enough = counts.sum(1) >= 2
-    found: dict[str, np.ndarray] = {}
+    found: Columns = {}
     for column, values in columns.items():
         x = np.where(enough[:, None], np.where(counts, values, np.nan), 0.0)
         with np.errstate(invalid="ignore"):  # of windings that settle at no temperature
@@ -91,7 +92,7 @@ def _summary(columns: dict[str, np.ndarray], counts: np.ndarray) -> dict[str, np
     return {**found, SHARE: counts.mean(1)}
 
 
-def interval_ranges(table: dict[str, np.ndarray], found: Intervals) -> list[str]:
+def interval_ranges(table: Columns, found: Intervals) -> list[str]:
     """Range of every channel over the runs, each end with its sd; and how many draws do not converge."""
     first = found.channels[0].column
     finite = np.isfinite(found.sd(first)) & np.isfinite(table[first])

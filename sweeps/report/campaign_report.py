@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from calibration.data import Columns, Json
 from calibration.data.robot_file import RobotFile
 from mmrjax.climbing.climb_simulation import OVER
 from mmrjax.errors import count_noun
@@ -25,7 +26,7 @@ from sweeps.results.climb_results import VERDICTS
 THINNED, CHUNKS, DRAWN = 200_000, 100, 6
 
 
-def campaign_document(file: RobotFile, layout: Layout, result: dict[str, Any], store: Path) -> Document:
+def campaign_document(file: RobotFile, layout: Layout, result: Json, store: Path) -> Document:
     """The report of a store whose every chunk is done.
 
     Args:
@@ -45,7 +46,7 @@ def campaign_document(file: RobotFile, layout: Layout, result: dict[str, Any], s
     )
 
 
-def _sections(store: Path, layout: Layout, extremes: dict[str, Any]) -> Iterable[Section]:
+def _sections(store: Path, layout: Layout, extremes: Json) -> Iterable[Section]:
     values, found = sample_points(store, layout)
     yield Section("What varies", (_varied(layout, values),), "varied")
     if VERDICT in found:
@@ -53,9 +54,7 @@ def _sections(store: Path, layout: Layout, extremes: dict[str, Any]) -> Iterable
     yield Section("What came out", tuple(_outputs(values, found, layout, extremes)), "outputs")
 
 
-def _outputs(
-    values: np.ndarray, found: dict[str, np.ndarray], layout: Layout, extremes: dict[str, Any]
-) -> Iterable[Block]:
+def _outputs(values: np.ndarray, found: Columns, layout: Layout, extremes: Json) -> Iterable[Block]:
     """Outputs with their extremes and quantiles; the first of them are drawn."""
     settled = np.isin(found[STATUS], signals.DONE)
     rows, figures = list[tuple[Any, ...]](), list[Figure]()
@@ -78,7 +77,7 @@ def _outputs(
     yield from figures
 
 
-def _verdicts(values: np.ndarray, found: dict[str, np.ndarray], layout: Layout) -> tuple[Block, ...]:
+def _verdicts(values: np.ndarray, found: Columns, layout: Layout) -> tuple[Block, ...]:
     """The largest obstacle, the number of climbs by outcome, and these over size and the first other axis."""
     codes, design = found[VERDICT].astype(int), layout.design
     meanings = next(v.attributes for v in layout.variables if v.name == VERDICT)["flag_meanings"].split()
@@ -93,7 +92,7 @@ def _verdicts(values: np.ndarray, found: dict[str, np.ndarray], layout: Layout) 
     )
 
 
-def _largest(values: np.ndarray, found: dict[str, np.ndarray], layout: Layout) -> str:
+def _largest(values: np.ndarray, found: Columns, layout: Layout) -> str:
     """Largest obstacle climbed and its first point, in words."""
     names = layout.design.names
     sizes = found[LARGEST] if LARGEST in found else values[:, names.index(SIZE)] * (found[VERDICT] == OVER)
@@ -108,7 +107,7 @@ def _largest(values: np.ndarray, found: dict[str, np.ndarray], layout: Layout) -
     return f"The largest obstacle that is got over: {sizes[k]:.4g} mm{', at ' if rest else ''}{rest}."
 
 
-def sample_points(store: Path, layout: Layout) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+def sample_points(store: Path, layout: Layout) -> tuple[np.ndarray, Columns]:
     """Some of the points, at random and always the same ones.
 
     Returns:

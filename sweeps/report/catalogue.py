@@ -8,20 +8,21 @@ from collections.abc import Sequence
 from importlib import resources
 from typing import Any
 
+from calibration.data import Json
 from calibration.data.input_files import toml_content
 from sweeps.report.document import Column, Figure, Note, Table, columns
 
 
 @functools.cache
-def _content() -> dict[str, Any]:
+def _content() -> Json:
     words = (resources.files("sweeps.pages") / "templates" / "catalogue.toml").read_text("utf-8")
     return toml_content(words, "catalogue.toml")
 
 
-def _entry(name: str) -> dict[str, Any]:
+def _entry(name: str) -> Json:
     """Words of a figure, table or note, `report.name` of the catalogue."""
     room, _, key = name.partition(".")
-    found: dict[str, Any] = _content()[room][key]
+    found: Json = _content()[room][key]
     return found
 
 

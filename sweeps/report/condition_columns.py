@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-import numpy as np
-
+from calibration.data import Columns
 from mmrjax.model import channels
 from mmrjax.model.quantities import SET, Condition
 
@@ -27,7 +26,7 @@ def _column(condition: Condition) -> str:
 CONDITIONS = {_column(c): (c.heading, c.shown) for c in SET if c.heading}
 
 
-def condition_formats(table: dict[str, np.ndarray], *, mass: bool = False) -> dict[str, tuple[str, str]]:
+def condition_formats(table: Columns, *, mass: bool = False) -> dict[str, tuple[str, str]]:
     """Heading and format of each condition of a table, by column, without columns that are readings.
 
     Args:

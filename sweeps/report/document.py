@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from calibration.data import Names
 from calibration.data.writing import cell_text
 
 #: Most rows of a table on a page, and on a terminal.
@@ -35,7 +36,7 @@ class Note:
         name: of the element on the page; terminal: True if the terminal prints it too.
     """
 
-    text: str | tuple[str, ...]
+    text: str | Names
     kind: str = ""
     name: str = ""
     terminal: bool = False

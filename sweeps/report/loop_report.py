@@ -8,13 +8,14 @@ from typing import Any
 
 import numpy as np
 
+from calibration.data import Columns, Names
 from calibration.data.columns import Layout
 from calibration.described import describe
 from calibration.discovery.result import DiscoveryResult
 from calibration.discovery.settings import WITHOUT_NAME
 from calibration.inference import blocks
 from calibration.inference.details import EquationDefects, TimeStatistics
-from calibration.inference.fit_notes import Copied, Determination, FarFromPrior, Repeats
+from calibration.inference.fit_notes import Determination, with_codes
 from calibration.inference.simulation_errors import OF_SIZE
 from calibration.words import loop_words
 from mmrjax.effects import BY_NAME
@@ -64,7 +65,7 @@ def loop_answer(found: DiscoveryResult) -> str:
     return f"{'Perhaps' if first.level == 'open' else 'No'}. {claim}"
 
 
-def rows_of(found: DiscoveryResult) -> dict[str, np.ndarray]:
+def rows_of(found: DiscoveryResult) -> Columns:
     """Rows of the result as figures and page show them: of a rig each surface is a configuration of its own."""
     table = found.rows_table()
     if Layout.of(found.robot).crosses_zero:
@@ -143,7 +144,7 @@ def held_out_table(found: DiscoveryResult) -> Table:
 
 def check_first(found: DiscoveryResult) -> list[str]:
     """Points to check before use: the reading with the largest weight, parameters that moved far, contradictions."""
-    far = [describe(note) for note in found.remarks if isinstance(note, FarFromPrior | Repeats | Copied)]
+    far = [describe(note) for note in with_codes(found.remarks, "far_from_prior", "repeats", "copied")]
     against = [note for note in found.remarks if isinstance(note, str)]
     said = [loop_words.largest_share(found), *far, *against[:1]]
     # a sentence begins with a capital, a parameter's name does not
@@ -289,7 +290,7 @@ def _sections(found: DiscoveryResult, changes: Mapping[str, Change], missing: bo
     yield Section("Words", (catalogue.table("loop.words", list(words.GLOSSARY.items())),))
 
 
-def _run_by_run(found: DiscoveryResult, table: dict[str, np.ndarray]) -> Iterable[Block]:
+def _run_by_run(found: DiscoveryResult, table: Columns) -> Iterable[Block]:
     verdict = "none" if found.refit_alone else found.verdict
     if isinstance(found.detail, EquationDefects):
         yield catalogue.figure("loop.before_after", table, found.channels, verdict, words=("",))
@@ -302,9 +303,7 @@ def _run_by_run(found: DiscoveryResult, table: dict[str, np.ndarray]) -> Iterabl
     yield catalogue.figure("loop.over_time", found.runs, table, found.channels, verdict, words=(some,))
 
 
-def _where_missing(
-    found: DiscoveryResult, table: dict[str, np.ndarray], changes: Mapping[str, Change]
-) -> Iterable[Block]:
+def _where_missing(found: DiscoveryResult, table: Columns, changes: Mapping[str, Change]) -> Iterable[Block]:
     verdict, sized = "none" if found.refit_alone else found.verdict, Layout.of(found.robot).crosses_zero
     if changes:
         yield catalogue.figure("loop.laws", found, table, changes)
@@ -327,7 +326,7 @@ def _where_missing(
         yield Note(loop_words.proposed_formula(curve), name="proposal")
 
 
-def _closed(found: DiscoveryResult, table: dict[str, np.ndarray]) -> str:
+def _closed(found: DiscoveryResult, table: Columns) -> str:
     """Equations that the channels close."""
     from sweeps.pages import loop_figures
 
@@ -363,7 +362,7 @@ def _candidates(found: DiscoveryResult) -> Iterable[Block]:
     kinds = (
         [] if not held else [f"by {blocks.kind_in_words(k)} | .2f" for k in found.alternatives_held_out[0].by_kind]
     )
-    tables: dict[str, tuple[str, Sequence[Any], Sequence[str], tuple[str, ...]]] = {
+    tables: dict[str, tuple[str, Sequence[Any], Sequence[str], Names]] = {
         "alternatives": ("alternatives", several, (), (curves if found.verdict in WITHOUT_NAME else "",)),
         "hidden": ("hidden", hidden, (), ()),
         "held": ("alternatives_held_out", held, kinds, ()),

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Any
 
+from calibration.data import Json
 from calibration.data.robot_file import RobotFile
 from sweeps.pages.page import Album, render_page, robot_section
 from sweeps.report.document import Document, Figure
@@ -22,5 +22,5 @@ def write_report_page(folder: Path, document: Document, file: RobotFile | None =
     for block in document.every_block:
         if isinstance(block, Figure):
             album.add(block.name, block.draw)
-    about: dict[str, Any] = {"warnings": (), "about_robot": None} if file is None else robot_section(file)
+    about: Json = {"warnings": (), "about_robot": None} if file is None else robot_section(file)
     return render_page(folder, "document.html.j2", album, title=document.title, document=document, **about)

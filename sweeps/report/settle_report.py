@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+from calibration.data import Names
 from calibration.data.settling import Settled, Stretch
 from calibration.words import settle_words as words
 from sweeps.report import catalogue
@@ -18,7 +19,7 @@ IMPOSED = {
 }
 
 
-def settle_document(found: Settled, few: str = "", notes: tuple[str, ...] = ()) -> Document:
+def settle_document(found: Settled, few: str = "", notes: Names = ()) -> Document:
     """The report; `few`: sentence of `words.too_few`; notes: further sentences on the settled runs."""
     next_step = Note("Next: `mmrjax loop settled.csv` with the same `--robot`.", "lead")
     next_step = Note(few, "lead", "few", terminal=True) if few else next_step

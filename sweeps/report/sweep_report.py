@@ -8,6 +8,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
+from calibration.data import Columns
 from calibration.data.robot_file import RobotFile
 from mmrjax.errors import count_noun
 from sweeps import capabilities
@@ -17,10 +18,8 @@ from sweeps.report.condition_columns import imposed_column
 from sweeps.report.document import Document, Section, Table, remarks
 from sweeps.report.run_tables import quantity_column
 
-Runs = dict[str, np.ndarray]
 
-
-def sweep_document(file: RobotFile, model: str, runs: Runs, notes: Sequence[str] = ()) -> Document:
+def sweep_document(file: RobotFile, model: str, runs: Columns, notes: Sequence[str] = ()) -> Document:
     """The report of a finished sweep of any grid."""
     shown = capabilities.without_idle(file.robot, runs)
     statuses = Counter(map(str, runs["status"]))
@@ -48,7 +47,7 @@ def sweep_document(file: RobotFile, model: str, runs: Runs, notes: Sequence[str]
     )
 
 
-def sweep_answer(runs: Runs) -> str:
+def sweep_answer(runs: Columns) -> str:
     """One sentence: runs that have an operating point, and how many of them stay within every limit."""
     total = len(runs["status"])
     settled = np.isin(runs["status"], words.SETTLED)
@@ -65,7 +64,7 @@ def sweep_answer(runs: Runs) -> str:
     )
 
 
-def _limits(runs: Runs) -> Table:
+def _limits(runs: Columns) -> Table:
     """Limits that some runs exceed, with the number of runs and their places."""
     kinds, which = np.unique(runs["flags"], return_inverse=True)
     rows = []
@@ -76,13 +75,13 @@ def _limits(runs: Runs) -> Table:
     return catalogue.table("sweep.limits", rows)
 
 
-def _axes(runs: Runs) -> list[str]:
+def _axes(runs: Columns) -> list[str]:
     """Columns of the axes that runs have: on the battery no voltage, and no readings."""
     axes = ("configuration", imposed_column(runs), "payload_kg", "slope_deg", "load_torque_Nm")
     return [c for c in axes if c in runs and (runs[c].dtype.kind not in "fiu" or not np.isnan(runs[c]).all())]
 
 
-def _levels(runs: Runs, name: str, pick: np.ndarray | slice = slice(None), most: int = 8) -> str:
+def _levels(runs: Columns, name: str, pick: np.ndarray | slice = slice(None), most: int = 8) -> str:
     """Levels of an axis at the picked runs, in words: `slope 0, 10°`."""
     values, column = runs[name][pick], quantity_column(name)
     levels = np.unique(values)
@@ -94,7 +93,7 @@ def _levels(runs: Runs, name: str, pick: np.ndarray | slice = slice(None), most:
     return f"{column.heading} {', '.join(f'{v:.4g}' for v in levels)}{unit}"
 
 
-def _where(runs: Runs, pick: np.ndarray) -> str:
+def _where(runs: Columns, pick: np.ndarray) -> str:
     """Ranges of slope and imposed quantity of the picked runs, by configuration, in words."""
     parts = []
     for kind in dict.fromkeys(map(str, runs["configuration"][pick])):
@@ -105,7 +104,7 @@ def _where(runs: Runs, pick: np.ndarray) -> str:
     return ", ".join(parts)
 
 
-def _extremes(runs: Runs, names: Iterable[str]) -> Table:
+def _extremes(runs: Columns, names: Iterable[str]) -> Table:
     """The settled runs with the largest readings, slip and winding temperature."""
     settled = np.nonzero(np.isin(runs["status"], words.SETTLED))[0]
     reached = [c for c in names if c in runs and not np.isnan(runs[c][settled]).all()]

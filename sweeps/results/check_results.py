@@ -5,10 +5,10 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
+from calibration.data import Json
 from calibration.data.input_errors import three_digits
 from calibration.data.requirements_file import Requirements
 from calibration.sizing import sheet
@@ -52,7 +52,7 @@ class CheckResult:
         worst = "" if len(missed) <= NAMED else "the worst "
         return f"{len(missed)} of {number} requirements {verb} missed: {worst}{listed}{more}."
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Json:
         """`result.json`."""
         return {
             "schema": "mmrjax.check/1",

@@ -6,7 +6,7 @@ import csv
 import dataclasses
 import functools
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from calibration.data import robot_file
+from calibration.data import Columns, Json, Names, robot_file
 from calibration.data.input_errors import BadConfiguration
 from mmrjax.climbing.climb_derivatives import OUTPUTS, ClimbInputs, Derivatives, outputs_of_run
 from mmrjax.climbing.climb_simulation import LOSSES, NAMES, OVER, SOURCES, Climb
@@ -39,7 +39,7 @@ COORDINATES = ("x_mm", "z_mm", "pitch_deg", "shaft_deg", "front_deg", "rear_deg"
 SHOWN = ("time_s", "traction_current_A")
 
 
-def footing_coordinates(table: Mapping[str, np.ndarray]) -> np.ndarray:
+def footing_coordinates(table: Columns) -> np.ndarray:
     """Coordinates of `mmrjax.climbing.footing` at every sample of a history, (samples, 6)."""
     x, z, pitch, shaft, front, rear = (table[name] for name in COORDINATES)
     turned = np.radians([-pitch, shaft, front, 180 - rear])
@@ -54,8 +54,8 @@ class Along:
         names, units: of the values; values, widths: in these units; given: the run that such values make.
     """
 
-    names: tuple[str, ...]
-    units: tuple[str, ...]
+    names: Names
+    units: Names
     values: Array
     widths: Array
     given: Callable[[Array], ClimbInputs]
@@ -74,7 +74,7 @@ class Seen:
     configuration: str
     obstacle: str
     terrain: Terrain
-    table: dict[str, np.ndarray]
+    table: Columns
 
     @staticmethod
     def read(folder: Path) -> Seen:
@@ -133,7 +133,7 @@ class ClimbResult:
         return int(self.climb.verdict[0]) == OVER
 
     @functools.cached_property
-    def table(self) -> dict[str, np.ndarray]:
+    def table(self) -> Columns:
         """The run over time."""
         r: Any = self.climb.run(0)
         q, v = r.motion.q, r.motion.v
@@ -176,7 +176,7 @@ class ClimbResult:
         return {name: float(value) for name, value in found.items() if name.startswith("margin_")}
 
     @property
-    def slopes(self) -> list[dict[str, Any]] | None:
+    def slopes(self) -> list[Json] | None:
         """Derivatives, a row an output and value that it is derived by; None: not asked for."""
         along, found = self.along, self.derivatives
         if along is None or found is None:
@@ -224,7 +224,7 @@ class ClimbResult:
             "energy_J": tracks + levers,
         }
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Json:
         """`result.json`."""
         return {
             "schema": "mmrjax.climb/1",

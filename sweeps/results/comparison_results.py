@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
+from calibration.data import Columns, Json, Names
 from calibration.data.runs import Runs
 from calibration.inference import simulation_errors as residual
 from mmrjax.model.channels import Channel
 from mmrjax.model.robot import Robot
 
 #: Group → channel → rows, rms_percent, max_percent, rms, unit (of the rms), r2, missing.
-Summary = dict[str, dict[str, dict[str, Any]]]
+Summary = dict[str, dict[str, Json]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Comparison:
         against: name of a second robot, "" for none; its readings are the columns `against_<column>` of the table.
     """
 
-    table: dict[str, np.ndarray]
+    table: Columns
     summary: Summary
     channels: tuple[Channel, ...]
     source: str
@@ -39,7 +39,7 @@ class Comparison:
     robot_name: str
     fit: str = ""
     over: Mapping[str, str] | None = None
-    notes: tuple[str, ...] = ()
+    notes: Names = ()
     against: str = ""
 
     @property
@@ -55,16 +55,12 @@ class Comparison:
         return answer
 
 
-def add_second_robot(
-    table: dict[str, np.ndarray], channels: Sequence[Channel], simulated: Mapping[str, np.ndarray]
-) -> dict[str, np.ndarray]:
+def add_second_robot(table: Columns, channels: Sequence[Channel], simulated: Columns) -> Columns:
     """A table of `compare_readings` with the readings that a second robot gives on its rows."""
     return table | {f"against_{c.column}": simulated[c.column] for c in channels}
 
 
-def compare_readings(
-    measured: Runs, simulated: dict[str, np.ndarray], robot: Robot | None = None
-) -> tuple[dict[str, np.ndarray], Summary]:
+def compare_readings(measured: Runs, simulated: Columns, robot: Robot | None = None) -> tuple[Columns, Summary]:
     """Measured and simulated readings with their errors, and their summary by group.
 
     Groups are configurations, or surfaces of `robot`. A missing reading is NaN and counts as `missing`.
@@ -93,7 +89,7 @@ def compare_readings(
     return table, summary
 
 
-def _summary(channel: Channel, table: dict[str, np.ndarray]) -> dict[str, Any]:
+def _summary(channel: Channel, table: Columns) -> Json:
     measured, simulated = table[channel.column], table[f"simulated_{channel.column}"]
     return {
         **residual.error_summary(table[f"error_{channel.name}_percent"]),

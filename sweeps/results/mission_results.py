@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
-import numpy as np
-
-from calibration.data import profiles
+from calibration.data import Columns, Json, profiles
 from calibration.data.profiles import ProfileTable
 from mmrjax.missions import mission_batch
 from mmrjax.model.energy import SINKS
@@ -24,13 +21,13 @@ class Missions:
         whole: whether the course of every run reaches its end.
     """
 
-    table: dict[str, np.ndarray]
-    segments: dict[str, np.ndarray]
-    course: dict[str, np.ndarray]
+    table: Columns
+    segments: Columns
+    course: Columns
     source: ProfileTable
     whole: bool
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Json:
         """Content of `result.json`: for one run its numbers by name, for several a list of them."""
         each = [self._one(k) for k in range(len(self.table["status"]))]
         about = {
@@ -40,7 +37,7 @@ class Missions:
         }  # fmt: skip
         return {"profile": about, **(each[0] if len(each) == 1 else {"missions": each})}
 
-    def _one(self, row: int) -> dict[str, Any]:
+    def _one(self, row: int) -> Json:
         to = {name: f"energy_to_{name}_Wh" for name in SINKS}
         numbers = {
             c: float(self.table[c][row])

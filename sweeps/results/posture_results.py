@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import jax
 import numpy as np
 
+from calibration.data import Columns
 from calibration.data.columns import LEVERS
 from calibration.data.table import Runs
 from calibration.sizing.sheet import Outcome
@@ -63,7 +64,7 @@ class Postures:
         table: by column; rest, step: the first run's, drawn, at rest and on its highest step; over: of the first run.
     """
 
-    table: dict[str, np.ndarray]
+    table: Columns
     rest: Drawn
     step: Drawn
     over: StepMap

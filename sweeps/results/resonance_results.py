@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from calibration.data import Columns, Json
 from mmrjax.model.quantities import MM
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import STATUSES
@@ -45,7 +46,7 @@ class ResonanceResult:
     surface: str
     passing: Passing
     robot: Robot
-    table: dict[str, np.ndarray]
+    table: Columns
     modes: dict[float, list[Mode]]
     peaks: list[Peak]
     crossings: list[Crossing]
@@ -204,7 +205,7 @@ class ResonanceResult:
         within = any(low <= speed <= high for low, high, _ in self.avoid)
         return "yes" if self.shaken(row) else "at other payloads" if within else "no"
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Json:
         """`result.json`."""
         return {
             "schema": "mmrjax.resonance/1",

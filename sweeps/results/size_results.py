@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
+from calibration.data import Json, Names
 from calibration.data.requirements_file import Requirements
 from calibration.sizing.chart import Chart
 from calibration.sizing.design import OBJECTIVES
@@ -28,7 +28,7 @@ class SizeResult:
     asked: Requirements
     robot: Robot
     sizing: Sizing
-    objectives: tuple[str, ...]
+    objectives: Names
     outcomes: tuple[Outcome, ...]
     charts: tuple[Chart, ...] = ()
 
@@ -49,7 +49,7 @@ class SizeResult:
         binds += f" It misses {', '.join(missing)}." if missing else ""
         return f"{describe_design(s.best)}: {objective_text(s.best, s.objective)}.{binds}{left_out}"
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Json:
         """`result.json`."""
         s = self.sizing
         return {
@@ -69,7 +69,7 @@ class SizeResult:
         }
 
 
-def design_verdict(found: SizedDesign, unmeetable: tuple[str, ...]) -> str:
+def design_verdict(found: SizedDesign, unmeetable: Names) -> str:
     """Verdict on a design; `unmeetable`: requirements that no choice of parts meets, which were dropped."""
     return "misses" if not found.feasible else "meets the others" if unmeetable else "meets"
 
