@@ -35,6 +35,8 @@ FURTHER = 3
 FAR = 1.5
 #: Least gain by a set that needs another program, as a share of the largest gain of any set.
 ANOTHER = 0.05
+#: Most steps of all runs for which a base fit in the program with effects costs less than a program of its own.
+BRIEF = 10_000
 #: Number of effects in the first program of a log's fits, and of those among them that are similar to the first.
 ROOM, NEAR = 8, 5
 
@@ -189,7 +191,7 @@ class Beforehand:
     Attributes:
         base: the fit without effects, by regression. None if the load may slide on its ground, which the
             equations do not show, so that a search should not begin there.
-        room: effects in the program of all fits, if the equations show that one is missing.
+        room: effects in the program of all fits, if the equations show that one is missing and the log is `BRIEF`.
         scores: of every instance; windows: number of equations.
         null: root of the strongest score of tables under the null hypothesis [σ], shape (replicates,).
     """
@@ -230,7 +232,8 @@ def screen_by_weak_form(space: CandidateSpace, settings: Settings) -> Beforehand
     base = dataclasses.replace(candidate_of_fit(space, empty_slots(settings), at, settings), simulated=False)
     slides = problem.base.has_ground and problem.base.rig.imposed == "voltage"
     missing = np.mean(null >= np.max(np.abs(single))) < settings.family_wise_error
-    room = _program_room(space, base, found, scores, settings) if missing else ()
+    brief = problem.observe.times.size <= BRIEF  # type: ignore[attr-defined]  # of histories
+    room = _program_room(space, base, found, scores, settings) if missing and brief else ()
     return Beforehand(None if slides else base, room, scores, found.windows, null)
 
 
