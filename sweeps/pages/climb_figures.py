@@ -15,8 +15,8 @@ from mmrjax.climbing.footing import PITCH, SHAFT
 from mmrjax.model.paper_tables import BODY_HEIGHT
 from mmrjax.undercarriage import rendering
 from sweeps.pages.figure_style import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, VERMILION, figure_settings, new_figure
-from sweeps.results.climb_results import SHOWN as IN_TITLE
-from sweeps.results.climb_results import ClimbResult, Seen, footing_coordinates
+from sweeps.report.climb_report import FILMED as IN_TITLE
+from sweeps.report.climb_report import ClimbResult, Seen, footing_coordinates
 
 #: What can be drawn.
 Drawable = ClimbResult | Seen

@@ -12,7 +12,7 @@ from mmrjax.model.quantities import MM
 from mmrjax.undercarriage.ripple_peaks import MATTERS, SIGNALS, strongest_resonances
 from sweeps.pages import words
 from sweeps.pages.figure_style import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, SKY, VERMILION, new_figure
-from sweeps.results.resonance_results import ResonanceResult, ripple_percent
+from sweeps.report.resonance_report import ResonanceResult, ripple_percent
 
 ORDERS = 8  # lines of the Campbell diagram
 MAPS = ("reaction", "current", "speed")
