@@ -13,7 +13,7 @@ from calibration.inference.identifiability import Z95
 from calibration.inference.residual_clusters import ResidualCluster
 from calibration.inference.result import CalibrationResult
 from mmrjax.model import channels
-from sweeps.pages.figure_style import BLUE, FAINT, INK, ORANGE, VERMILION, new_figure
+from sweeps.pages.figure_style import BLUE, FAINT, INK, ORANGE, VERMILION, colour_bar, new_figure
 from sweeps.pages.words import short_name
 
 #: Clusters shown, panels in a row, width of a strip.
@@ -109,7 +109,7 @@ def draw_correlations(found: CalibrationResult) -> Figure:
             if abs(c[i, j]) > 0.3:
                 left.text(j, i, f"{c[i, j]:.2f}".replace("0.", "."), ha="center", va="center", fontsize=7.5,
                           color="white" if abs(c[i, j]) > 0.7 else INK)  # fmt: skip
-    fig.colorbar(image, ax=left, shrink=0.8, label="correlation")
+    colour_bar(fig, image, left, shrink=0.8, label="correlation")
     s = np.maximum(found.identifiability.singular_values, 1e-6)
     right.semilogy(np.arange(1, len(s) + 1), s, "o-", color=BLUE)
     right.axhline(1.0, color=ORANGE, lw=1)
