@@ -79,7 +79,8 @@ class TimeSide:
     def to_json(self) -> dict[str, Any]:
         """Entries of `result.json`."""
         orders = [{"order": w, "a_turn": n, **dataclasses.asdict(s)} for (w, n), s in self.orders.items()]
-        return {"memory": dataclasses.asdict(self.memory), "orders": orders, "drift": self.drift and dataclasses.asdict(self.drift)}
+        drift = self.drift and dataclasses.asdict(self.drift)
+        return {"memory": dataclasses.asdict(self.memory), "orders": orders, "drift": drift}
 
 
 @dataclasses.dataclass(frozen=True)
