@@ -119,6 +119,12 @@ SINKS = {
     "lift": "lift (net of what comes back)",
 }  # fmt: skip
 
+
+def sink_labels(on_ground: bool) -> dict[str, str]:
+    """Labels of the uses of energy; a shaft has no tracks."""
+    return SINKS if on_ground else SINKS | {"track": "friction of the load"}
+
+
 #: Words of the pages, for docs/reference/glossary.md.
 GLOSSARY = {
     "balance": "one of the model's equations, such as volts along the motor's circuit or torque at the "
