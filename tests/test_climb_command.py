@@ -185,6 +185,6 @@ def test_one_climb_leaves_a_folder_whose_energy_adds_up(mmrjax, tmp_path):
     code, out, _ = mmrjax("render", "c.png", "--climb", "c")
     assert code == 0 and (tmp_path / "c.png").stat().st_size > 5000
     code, _, err = mmrjax("render", "d.gif", "--climb", "c", "--voltage", "12")
-    assert code == 2 and "expected one of the two" in err
+    assert code == 2 and "--climb: not allowed with options of a run of the track model" in err
     code, _, err = mmrjax("render", "d.gif", "--climb", "tests")
     assert code == 2 and "tests cannot be read; expected a folder of mmrjax climb" in err

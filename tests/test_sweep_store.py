@@ -875,7 +875,7 @@ def test_grid_too_large_for_the_disk_is_refused_with_figures(sweep, monkeypatch,
     many = CONFIG.replace("number = 50", "number = 20000000").replace("chunk = 40", "chunk = 100000")
     for dry in ([], ["--dry-run"]):
         code, _, err = sweep("s", *dry, config=many)
-        assert code == 2 and "the results would take 3.39 GB (uncompressed)" in err and "has 1 GB free" in err
+        assert code == 2 and "the results would take 3.4 GB (uncompressed)" in err and "has 1 GB free" in err
     assert [p.name for p in tmp_path.iterdir()] == ["plan.toml"]
 
 
