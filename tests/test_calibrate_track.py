@@ -6,13 +6,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from calibration.data import runs as records
 from calibration.inference import noise as noise_room
 from calibration.inference import observers, priors
 from calibration.inference import optimizers as fit
 from calibration.inference.calibration import calibrate
-from calibration.inference.fit_notes import BesideSteady, PriorOfProduct
+from calibration.inference.fit_notes import with_codes
 from calibration.inference.priors import GUIDED
 from calibration.words import table_words
 from mmrjax import fidelities
@@ -53,7 +54,7 @@ def made(seen):
 
 @pytest.mark.slow
 def test_the_share_of_the_guides_is_what_the_track_model_puts_out(seen):
-    np.testing.assert_allclose(seen[1].steady.guide_share, GUIDED, atol=0.01)
+    assert_allclose(seen[1].steady.guide_share, GUIDED, atol=0.01)
 
 
 def test_in_track_the_guide_friction_stands_for_the_product(base):
@@ -95,7 +96,7 @@ def test_jacobian_through_the_rollout_is_the_central_difference(posed):
     assert (np.asarray(seen.status) == CONVERGED).all()
     moved = [[fit.linearise(posed, at + s * e, posed.data)[0] for s in (step, -step)] for e in np.eye(2)]
     central = np.stack([(up - down) / (2 * step) for up, down in moved], 1)
-    np.testing.assert_allclose(jacobian, central, rtol=0.01, atol=1e-4 * np.abs(central).max())
+    assert_allclose(jacobian, central, rtol=0.01, atol=1e-4 * np.abs(central).max())
     assert (np.abs(jacobian[:6]).max(0) > 0.1).all()  # both move the readings
 
 
@@ -110,15 +111,15 @@ def test_track_calibration_recovers_the_guide_friction(found, made, told):
     assert answer.prior.source == "product"
     assert not found.profiled and not found.held_out  # minutes each, so only when asked for
     assert any("round 1" in t for t in told) and any("start 2 of 2" in t for t in told)
-    (product,) = [n for n in found.remarks if isinstance(n, PriorOfProduct)]
-    (beside,) = [n for n in found.remarks if isinstance(n, BesideSteady)]
-    assert f"{product.share:.0%}" == "98%" and (beside.inside, beside.of) == (2, 2)
+    (product,) = with_codes(found.remarks, "prior_of_product")
+    (beside,) = with_codes(found.remarks, "beside_steady")
+    assert f"{product.share:.0%}" == "98%" and (beside.inside, beside.total) == (2, 2)
 
 
 @pytest.mark.slow
 def test_the_robot_says_the_same_in_the_other_fidelities(found, made):
     current = steady_batch(found.robot, made.conditions(found.robot)).total_current
-    np.testing.assert_allclose(current, made["total_current_A"], rtol=5e-3)
+    assert_allclose(current, made["total_current_A"], rtol=5e-3)
 
 
 @pytest.mark.slow

@@ -5,13 +5,14 @@ import re
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from calibration.data import input_files, robot_file
 from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration, BadData, InputError
 from calibration.discovery.discover import without_copies
 from calibration.inference.checks import _check_stuck_channels
-from calibration.inference.fit_notes import StiffSupply
+from calibration.inference.fit_notes import Remark
 from mmrjax.errors import count_noun
 from sweeps.pages import comparison_figures
 
@@ -105,8 +106,8 @@ def test_words_for_no_reading_are_empty_cells(tmp_path, word):
     text = "supply_voltage_V,motor_current_A,output_speed_rpm,room_C\n4,0.3,700,20\n6,{},1100,{}\n8,0.5,1500,22\n"
     named, empty = (table(tmp_path, text.format(x, x), robot) for x in (word, ""))
     assert named.notes == empty.notes and "1 of 3 cells of motor_current_A are empty" in named.notes[0]
-    np.testing.assert_array_equal(named.measured(), empty.measured())
-    np.testing.assert_array_equal(named.extras["room_C"], empty.extras["room_C"])
+    assert_array_equal(named.measured(), empty.measured())
+    assert_array_equal(named.extras["room_C"], empty.extras["room_C"])
     with pytest.raises(BadData, match=f"row 1, supply_voltage_V: got {word}; expected "):
         table(tmp_path, f"supply_voltage_V,output_speed_rpm\n{word},700\n", robot)
 
@@ -153,7 +154,7 @@ def test_a_stiff_supply_is_no_stuck_instrument(tmp_path):
     robot = robot_file.read_robot(tmp_path / "rig.toml")
     rows = "".join(f"{speed},{0.01 * k},24\n" for k, speed in enumerate((4500, 4400, 4300, 4200)))
     found = table(tmp_path, f"motor_speed_rpm,motor_current_A,motor_voltage_V\n{rows}", robot)
-    assert _check_stuck_channels(found) == [StiffSupply("motor_voltage_V", 24.0)]
+    assert _check_stuck_channels(found) == [Remark("stiff_supply", column="motor_voltage_V", value=24.0)]
 
 
 @pytest.mark.parametrize("count", [1, np.int64(1), np.int32(2), np.uint8(0)])

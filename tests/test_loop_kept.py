@@ -19,13 +19,13 @@ from calibration.data.input_errors import BadConfiguration
 from calibration.discovery import discover as room
 from calibration.discovery import kept
 from calibration.discovery.kept import OutOfTime
-from calibration.discovery.loop_notes import Outstanding
 from mmrjax.compile import programs
 from mmrjax.model import paper_robots
 from sweeps import config
 from sweeps import stage_files as kept_stages
 from sweeps.commands import loop as command
 from sweeps.store import RunFolder, open_folder
+from tests.commands import ends
 
 
 def refuse():
@@ -46,12 +46,12 @@ def test_a_stage_is_made_once_and_read_after_an_interrupt(tmp_path):
 
 def test_a_stage_of_another_version_is_made_again(tmp_path, monkeypatch):
     """What is named by a hash of the source: the release's number does not change with a mended line."""
-    told = SimpleNamespace(model_dump=lambda **_: {}, effects=())
+    told, beside = SimpleNamespace(model_dump=lambda **_: {}, effects=()), config.FolderPart(out=tmp_path / "x")
 
     def stage(make, force=False):
         with (
             pytest.raises(KeyboardInterrupt),
-            open_folder("loop", told, paper_robots.nominal(), tmp_path / "x", force) as folder,
+            open_folder("loop", told, paper_robots.nominal(), beside.model_copy(update={"force": force})) as folder,
         ):
             found.append(folder.stage("base", make))
             raise KeyboardInterrupt
@@ -61,7 +61,7 @@ def test_a_stage_of_another_version_is_made_again(tmp_path, monkeypatch):
     stage(refuse)
     monkeypatch.setattr(programs, "source_hash", lambda: "mended")
     with pytest.raises(BadConfiguration, match="another configuration, table or version"):
-        open_folder("loop", told, paper_robots.nominal(), tmp_path / "x", False)
+        open_folder("loop", told, paper_robots.nominal(), beside)
     stage(lambda: 2, force=True)
     assert found == [1, 1, 2]
 
@@ -91,8 +91,8 @@ def rig(tmp_path):
     return ["loop", "table.csv", "--robot", "rig.toml", "--no-report", "--out", "found"]
 
 
-@pytest.mark.parametrize(("end", "ends"), [(KeyboardInterrupt, 130), (OutOfTime, 3)])
-def test_an_interrupted_loop_goes_on_after_its_last_stage(rig, mmrjax, monkeypatch, tmp_path, end, ends):
+@pytest.mark.parametrize(("end", "code"), [(KeyboardInterrupt, 130), (OutOfTime, 3)])
+def test_an_interrupted_loop_goes_on_after_its_last_stage(rig, mmrjax, monkeypatch, tmp_path, end, code):
     def first(*_, keep, **__):
         keep("verdict", lambda: room.LoopStages("class", None, None, None))
         raise end
@@ -108,10 +108,13 @@ def test_an_interrupted_loop_goes_on_after_its_last_stage(rig, mmrjax, monkeypat
     monkeypatch.setattr(
         command.loop_words, "verdict_line", lambda found: f"verdict: {found.verdict}, iron_loss or windage"
     )
-    code, _, err = mmrjax(*rig, "--within", "5min")
-    assert at_once == [ends]
+    _, _, err = ends(
+        mmrjax(*rig, "--within", "5min"),
+        "kept: verdict; to continue, run the same command with --out found",
+        code=code,
+    )
+    assert at_once == [code]
     assert ("no verdict within 300 s\n" in err) == (end is OutOfTime)
-    assert code == ends and "kept: verdict; to continue, run the same command with --out found" in err
     assert "s  verdict: class, iron_loss or windage; next, errors held out and other noises\n" in err  # at once
     assert "verdict: class, iron_loss or windage; errors held out and other noises are outstanding" in err
     assert not (tmp_path / "found").exists()
@@ -121,8 +124,7 @@ def test_an_interrupted_loop_goes_on_after_its_last_stage(rig, mmrjax, monkeypat
         raise BadConfiguration("as far as this test goes")
 
     monkeypatch.setattr(command, "discover", again)
-    code, _, err = mmrjax(*rig, "--within", "5min")  # which is no other command
-    assert code == 2 and "as far as this test goes" in err
+    ends(mmrjax(*rig, "--within", "5min"), "as far as this test goes")
 
 
 def test_what_cannot_be_kept_is_not_said_to_be(rig, mmrjax, monkeypatch, tmp_path):
@@ -132,8 +134,7 @@ def test_what_cannot_be_kept_is_not_said_to_be(rig, mmrjax, monkeypatch, tmp_pat
 
     monkeypatch.setattr(command, "discover", first)
     monkeypatch.setattr(command.loop_words, "verdict_line", lambda found: found.verdict)
-    code, _, err = mmrjax(*rig)
-    assert code == 130 and "nothing could be kept of verdict; the same command begins anew" in err
+    _, _, err = ends(mmrjax(*rig), "nothing could be kept of verdict; the same command begins anew", code=130)
     assert "kept: verdict" not in err and not (tmp_path / "found.partial").exists()
 
 
@@ -213,7 +214,7 @@ def test_a_loop_of_kept_stages_finds_what_it_found(tmp_path):
 
     ended = room.discover(runs, robot, replicates=250, keep=slow, left=lambda: 0.0)
     assert ended.verdict == found.verdict and not ended.sensitivity
-    assert [n.factors for n in ended.remarks if isinstance(n, Outstanding)] == [tuple(sorted(factors))]
+    assert [n.factors for n in ended.remarks if n.code == "outstanding"] == [tuple(sorted(factors))]
 
 
 def test_nothing_is_kept_where_nobody_asks():

@@ -8,25 +8,19 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration
 from calibration.inference import identifiability, multistart, noise, observers, population, priors
 from calibration.inference.calibration import calibrate
-from calibration.inference.fit_notes import (
-    Edge,
-    EndedAtEdge,
-    FarFromPrior,
-    Generations,
-    LostRows,
-    MembersJump,
-    ReadFromMembers,
-)
+from calibration.inference.fit_notes import Edge, Remark, with_codes
 from calibration.inference.observers.settled import SettledRuns
 from calibration.inference.population import Members, Rows
 from calibration.inference.problem import Observation
 from mmrjax.model import channels, paper_robots
 from mmrjax.model.signals import FAILED, FLAGS, SLIDES, TIPS
+from tests.commands import ends
 
 NAMES = ("motor.resistance", "6T2A.track.loss_coulomb", "6T2A.track.loss_viscous", "6T2A.ground.rolling_resistance")
 SIZE = 48
@@ -95,8 +89,8 @@ def test_generations_come_down_to_the_truth(found, truth):
 @pytest.mark.slow
 def test_same_seed_same_members_and_another_seed_others(posed, known, found):
     again = evolve(posed, known)
-    np.testing.assert_array_equal(again.z, found.z)
-    np.testing.assert_array_equal(again.cost, found.cost)
+    assert_array_equal(again.z, found.z)
+    assert_array_equal(again.cost, found.cost)
     assert not np.array_equal(evolve(posed, known, 1, seed=4).z, found.z[:SIZE])
 
 
@@ -160,8 +154,8 @@ def test_kept_members_are_not_run_again_and_an_ended_search_goes_on(posed, known
     true = population._observed
     monkeypatch.setattr(population, "_observed", lambda *a: run.append(1) or true(*a))
     whole = evolve(posed, known, len(found.generations), file)
-    np.testing.assert_array_equal(whole.z, found.z)
-    np.testing.assert_array_equal(whole.cost, found.cost)
+    assert_array_equal(whole.z, found.z)
+    assert_array_equal(whole.cost, found.cost)
     together = population.TOGETHER[0]
     assert len(run) == (len(found.generations) - 2) * -(-SIZE // together)
     run.clear()
@@ -206,8 +200,10 @@ def test_damaged_members_are_refused_before_the_first_search(tmp_path, monkeypat
             members=tmp_path / "kept.npz",
         )
     monkeypatch.setattr("sweeps.commands.loop.discover", never)
-    code, _, err = mmrjax("loop", "measured", "--resolve", "--members", "kept.npz", "--out", "x")
-    assert code == 2 and "--members kept.npz: not a readable file of members" in err
+    ends(
+        mmrjax("loop", "measured", "--resolve", "--members", "kept.npz", "--out", "x"),
+        "--members kept.npz: not a readable file of members",
+    )
     assert [p.name for p in tmp_path.iterdir()] == ["kept.npz"]
 
 
@@ -254,9 +250,11 @@ def test_parameter_across_whose_threshold_differences_lead_is_named(posed, found
 def test_statements_say_whether_it_settled_and_what_derivatives_are_worth(found):
     at = int(found.order[0])
     calm = population.Searched(found, at, (), None, np.nan)
-    assert calm.remarks()[0] == Generations(len(found.z), len(found.generations), found.settled)
+    assert calm.remarks()[0] == Remark(
+        "generations", members=len(found.z), generations=len(found.generations), settled=found.settled
+    )
     torn = population.Searched(dataclasses.replace(found, generations=found.generations[:2]), at, ("a",), None, 0.4)
-    assert not torn.remarks()[0].settled and torn.remarks()[-1] == ReadFromMembers(("a",), 0.4)
+    assert not torn.remarks()[0].settled and torn.remarks()[-1] == Remark("read_from_members", names=("a",), left=0.4)
     assert calm.to_json()["regression_rms_sd"] is None and torn.to_json()["derivatives_apart"] == ["a"]
 
 
@@ -282,7 +280,7 @@ def test_what_members_did_is_counted_and_said(found):
     assert told.to_json()["outcomes"] == {"tips": 3, "failed": 1, "slides": 2, "jumps": 2}
     assert told.to_json()["at_edge"] == {"a": "at its upper bound"}
     assert told.remarks()[1:] == [
-        LostRows({"slides": 2, "tips": 3, "failed": 1}), MembersJump(2, (2,)), EndedAtEdge({"a": Edge("upper", 9.0)})
+        Remark("lost_rows", members={"slides": 2, "tips": 3, "failed": 1}), Remark("members_jump", members=2, best=(2,)), Remark("ended_at_edge", edge={"a": Edge("upper", 9.0)})
     ]  # fmt: skip
 
 
@@ -299,9 +297,9 @@ def test_search_that_ends_at_the_edge_of_a_prior_says_so_in_the_result(runs):
     assert abs(best[0]) > population.EDGE and abs(found.parameters[name].shift) > population.EDGE
     assert list(found.searched.edge) == [name]
     assert list(found.to_json()["optimizer"]["population"]["at_edge"]) == [name]
-    (ended,) = [n for n in found.remarks if isinstance(n, EndedAtEdge)]
+    (ended,) = with_codes(found.remarks, "ended_at_edge")
     assert list(ended.edge) == [name] and ended.edge[name].sds > 0
-    assert any(isinstance(n, FarFromPrior) and n.name == name for n in found.remarks)
+    assert any(n.code == "far_from_prior" and n.name == name for n in found.remarks)
     assert np.isfinite(found.posterior.covariance).all()
 
 

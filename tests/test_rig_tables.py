@@ -5,13 +5,14 @@ import re
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from calibration.data import instruments, rig_facts, robot_file, surfaces
 from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration, BadData, three_digits
 from calibration.inference import bases, blocks, checks, noise, observers, priors
 from calibration.inference.calibration import calibrate
-from calibration.inference.fit_notes import Constant
+from calibration.inference.fit_notes import Remark
 from calibration.inference.ranges import check_ranges
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import paper_robots, params, quantities
@@ -26,6 +27,7 @@ from mmrjax.model.signals import STALLED
 from mmrjax.model.track_friction import Track
 from sweeps import config as configuration
 from sweeps.points import run
+from tests.commands import ends
 
 DRIVE = {
     "motor.resistance": 2.0,
@@ -461,7 +463,9 @@ def test_what_is_said_of_constant_conditions_is_of_the_rig(tmp_path):
     runs = read(tmp_path, f"{BENCH}900,0.4\n900,0.41\n900,0.4\n900,0.41\n", robot)
     known = noise.noise_from_table(runs, observers.observer_kind(runs).sizes(runs), "current=5%")
     said = checks.check_data(runs, robot, (), known)
-    assert [note for note in said if isinstance(note, Constant)] == [Constant("motor_speed_rpm", 900.0, "speed")]
+    assert [note for note in said if note.code == "constant"] == [
+        Remark("constant", column="motor_speed_rpm", value=900.0, alike="speed")
+    ]
 
 
 @pytest.mark.slow
@@ -541,7 +545,7 @@ def test_curves_of_runs_both_ways_count_along_the_travel(tmp_path):
     over = set()
     for basis in observe.bases(seen, np.ones(2 * n, bool), robot):
         for (place, variable), shapes in zip(basis.names, np.asarray(basis.columns), strict=True):
-            np.testing.assert_allclose(shapes[:n], -shapes[n:], atol=1e-9, err_msg=f"{place} over {variable}")
+            assert_allclose(shapes[:n], -shapes[n:], atol=1e-9, err_msg=f"{place} over {variable}")
             over.add((bases.window_from_name(variable) and "window") or variable)
     assert {"voltage", "slope", "speed_motor", bases.CONDITIONS, "window"} <= over
 
@@ -619,10 +623,8 @@ def test_a_bench_is_compared_and_calibrated_from_two_files(mmrjax, tmp_path):
     rows = "".join(f"{n},{0.16 + n * 2.4e-5 + 1e-3 * (k % 3)}\n" for k, n in enumerate(range(500, 4500, 500)))
     (tmp_path / "runs.csv").write_text(BENCH + rows, encoding="utf-8")
     both = ("runs.csv", "--robot", "rig.toml", "--out")
-    code, _, said = mmrjax("compare", *both, "a")
-    assert code == 0, said
-    code, _, said = mmrjax("calibrate", *both, "b", "--starts", "2", "--no-profiles", "--noise", "current=2%")
-    assert code == 0, said
+    ends(mmrjax("compare", *both, "a"), code=0)
+    ends(mmrjax("calibrate", *both, "b", "--starts", "2", "--no-profiles", "--noise", "current=2%"), code=0)
     for page in (tmp_path / "a" / "report.html", tmp_path / "b" / "report.html"):
         text = page.read_text(encoding="utf-8")
         assert "n [rpm]" in text and "slope [°]" not in text and "6T2A" not in text
@@ -663,8 +665,8 @@ def test_an_instrument_left_free_is_what_its_table_shows(tmp_path):
     assert instruments.with_inferred_instruments(stated, runs) is stated
     size = np.ones((8, 1))
     sds = [noise.noise_from_table(records.read_runs(path, robot=r), size).sd for r in (free, stated)]
-    np.testing.assert_allclose(sds[0], sds[1], rtol=1e-9)
-    np.testing.assert_allclose(sds[0], np.hypot(0.01, 0.03 / np.sqrt(12)), rtol=1e-9)
+    assert_allclose(sds[0], sds[1], rtol=1e-9)
+    assert_allclose(sds[0], np.hypot(0.01, 0.03 / np.sqrt(12)), rtol=1e-9)
     with pytest.raises(BadData, match="negative backward; or signed = false"):
         records.read_runs(path, robot=bench())
     signed = re.sub(r"(-\d+),0", r"\1,-0", path.read_text(encoding="utf-8"))

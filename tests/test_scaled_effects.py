@@ -21,6 +21,7 @@ from mmrjax.effects.scaled import amplitude_of, scaled_effect, shape_of
 from mmrjax.model import params
 from mmrjax.model.quantities import RPM
 from sweeps.commands import rig_new
+from tests.commands import ends
 
 #: Of rigs: kind and what is imposed; the largest and the smallest that a few draws give.
 RIGS = [("bench", "voltage"), ("linear", "motor_speed"), ("wheeled", "voltage")]
@@ -52,6 +53,21 @@ def test_a_size_is_a_size_however_small():
     """The square of a term that fades with speed may be zero, the term is not: no rig divides by that."""
     assert scales._size([1e-200, 2e-200, 0.0, np.nan]) == pytest.approx(np.sqrt(2.5) * 1e-200, rel=1e-12, abs=0)
     assert np.isnan(scales._size([0.0, np.nan]))
+
+
+def test_offset_of_an_ammeter_follows_its_range_and_not_a_motor_without_load(tmp_path):
+    """A motor of 57 A at standstill draws 0.2 A without load: a meter for it may be off by 0.4 A, but not by 2 A."""
+    file = tmp_path / "rig.toml"
+    file.write_text(
+        'base = "none"\nchannels = ["motor_speed", "motor_current"]\n'
+        "[motor]\nresistance = 0.42\ntorque_constant = 0.051\nfriction_coulomb = 0.009\n"
+        '[gearbox]\nratio = 1.0\nefficiency_load = 1.0\n[brake]\nload = "shaft"\nloss_coulomb = 0.0\ninertia = 1e-4\n'
+    )
+    robot = robot_file.read_robot(file)
+    size = mm.Conditions(0, voltage=[6.0, 12.0, 24.0])
+    library = scales.library_of_size(robot, size, effects.BY_NAME | effects.OF_CHANNELS)
+    spec = amplitude_of(library["motor_current_offset"]()).spec
+    assert 0.4 < spec.bounds[1] < 1.5 and spec.sd * 4 > 0.4
 
 
 @pytest.mark.slow
@@ -106,8 +122,7 @@ def test_a_robot_with_effects_of_its_size_is_compared_and_swept(tmp_path, mmrjax
     robot_file.write_robot(with_all(robot, some, 0.01), tmp_path / "robot.toml")
     options = ("--robot", tmp_path / "robot.toml", "--no-report")
     for command in (("compare", tmp_path / "table.csv"), ("sweep", "--voltages", 12)):
-        code, _, err = mmrjax(*command, *options, "--out", tmp_path / command[0])
-        assert code == 0, err
+        ends(mmrjax(*command, *options, "--out", tmp_path / command[0]), code=0)
     assert eqx.tree_equal(
         robot_file.read_robot(tmp_path / "compare" / "robot.toml").effects,
         robot_file.read_robot(tmp_path / "robot.toml").effects,

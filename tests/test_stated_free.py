@@ -13,7 +13,7 @@ from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration
 from calibration.inference import foresight, priors, remarks
 from calibration.inference.calibration import calibrate
-from calibration.inference.fit_notes import FarFromPrior, HeldByPrior
+from tests.commands import ends
 
 RIG = """
 base = "none"
@@ -104,8 +104,7 @@ def test_nothing_to_fit_is_not_put_down_to_an_option_that_nobody_gave(tmp_path):
 
 def test_a_width_of_the_programs_is_said(tmp_path, mmrjax):
     bench(tmp_path, lambda text: text.replace('"1.2 ± 5 %"', "1.2"))
-    code, out, err = mmrjax("rig", "check", "rig.toml")
-    assert code == 0, err
+    _, out, _ = ends(mmrjax("rig", "check", "rig.toml"), code=0)
     assert "without ±, so with the program's: motor.resistance (±5 %)" in " ".join(out.split())
     assert "bench.loss_coulomb (±50 %)" in " ".join(out.split())
 
@@ -117,5 +116,5 @@ def test_what_lies_far_from_its_prior_is_not_said_to_be_held_by_it():
         together=(), undetermined=("near", "far"),
     )  # fmt: skip
     said = list(remarks._parameters(found))
-    assert [n.names for n in said if isinstance(n, HeldByPrior)] == [("near",)]
-    assert [(n.name, n.sds) for n in said if isinstance(n, FarFromPrior)] == [("far", 6.5)]
+    assert [n.names for n in said if n.code == "held_by_prior"] == [("near",)]
+    assert [(n.name, n.sds) for n in said if n.code == "far_from_prior"] == [("far", 6.5)]

@@ -474,6 +474,7 @@ def _lines_of_parameters(robot: Robot, nothing: Robot) -> Iterator[tuple[str, st
         was = start.get(parameter.name, 0.0 if table.startswith("effects.") else None)
         same = value == was and not parameter.name.startswith(always) and parameter.name not in needed
         same &= parameter.name not in nothing.rig.unknown or parameter.name in robot.rig.unknown
+        same &= whole or parameter.name not in robot.rig.stated
         if same and (not whole or table == "rig"):
             continue
         origin = f"; nominal {was:g}: {spec.source}" if was is not None and value != was else ""

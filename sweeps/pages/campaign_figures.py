@@ -13,7 +13,19 @@ from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 
 from calibration.data import Names
-from sweeps.pages.figure_style import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, SKY, VERMILION, corner_note, new_figure
+from sweeps.pages.figure_style import (
+    BLUE,
+    FAINT,
+    GREEN,
+    INK,
+    ORANGE,
+    PURPLE,
+    SKY,
+    VERMILION,
+    colour_bar,
+    corner_note,
+    new_figure,
+)
 from sweeps.pages.words import short_name
 from sweeps.points.climbs import SIZE
 from sweeps.points.zarr_store import Layout
@@ -59,7 +71,14 @@ def draw_output_spread(output: np.ndarray, label: str, varied: Mapping[str, Vari
     histogram.hist(output, bins=_number(output, BARS), color=BLUE)
     histogram.set(xlabel=label, ylabel="points", title="how often")
     for axes, name in zip(others, names, strict=False):
-        _band(axes, varied[name].values, output)
+        values = varied[name].values
+        which, middles = bin_values(values)
+        quantiles = np.array([np.quantile(output[which == k], (0.05, 0.5, 0.95)) for k in range(len(middles))])
+        axes.fill_between(middles, quantiles[:, 0], quantiles[:, 2], color=BLUE, alpha=0.2, linewidth=0)
+        axes.plot(middles, quantiles[:, 1], color=BLUE)
+        found = variance_share(values, output)
+        if found > by_chance(values):
+            corner_note(axes, f"{100 * found:.0f} % of the variance")
         axes.set(xlabel=varied[name].label, ylabel=label, title=f"over {short_name(name)}")
         _ticks(axes.xaxis, varied[name])
     if len(names) == 2:
@@ -134,16 +153,6 @@ def by_chance(values: np.ndarray) -> float:
     return float(scipy.stats.beta.ppf(0.99, between / 2, within / 2)) if within and between else float(within == 0)
 
 
-def _band(axes: Axes, values: np.ndarray, output: np.ndarray) -> None:
-    which, middles = bin_values(values)
-    quantiles = np.array([np.quantile(output[which == k], (0.05, 0.5, 0.95)) for k in range(len(middles))])
-    axes.fill_between(middles, quantiles[:, 0], quantiles[:, 2], color=BLUE, alpha=0.2, linewidth=0)
-    axes.plot(middles, quantiles[:, 1], color=BLUE)
-    found = variance_share(values, output)
-    if found > by_chance(values):
-        corner_note(axes, f"{100 * found:.0f} % of the variance")
-
-
 def _ticks(axis: Axis, varied: Varied) -> None:
     if varied.words:
         axis.set_ticks(range(len(varied.words)), labels=list(varied.words))
@@ -165,7 +174,7 @@ def _map(
     for number, values in zip(numbers, np.split(output[order], first[1:]), strict=True):
         cells.flat[number] = np.median(values)
     drawn = axes.pcolormesh(across, along, cells, shading="nearest", cmap="viridis", rasterized=True)
-    fig.colorbar(drawn, ax=axes, label=f"median {label}")
+    colour_bar(fig, drawn, axes, label=f"median {label}")
     axes.set(xlabel=one.label, ylabel=other.label, title="over both")
     _ticks(axes.xaxis, one)
     _ticks(axes.yaxis, other)

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from calibration.sensitivity.replicates import Estimate
 from calibration.sensitivity.result import NEGLIGIBLE, NextRuns, OutputStudy, SensitivityResult
 from mmrjax.errors import count_noun
-from sweeps.pages.figure_style import BLUE, GREEN, INK, ORANGE, VERMILION, corner_note, new_figure
+from sweeps.pages.figure_style import BLUE, GREEN, INK, ORANGE, VERMILION, corner_note, legend_columns, new_figure
 from sweeps.pages.words import short_name
 
 #: Inputs that a figure shows at most, and operating points of a tornado.
@@ -54,8 +54,9 @@ def _cells(ax: Axes, shares: np.ndarray, labelled: int) -> None:
                 ax.text(j, i, f"{100 * x:.0f}", ha="center", va="center", fontsize=8.5, color=ink)
 
 
-def tornado_points(study: OutputStudy, found: SensitivityResult) -> list[int]:
-    """Operating points of a tornado: of each configuration the gentlest and the hardest that it runs, or between."""
+def draw_tornado(study: OutputStudy, found: SensitivityResult) -> Figure:
+    """The output with each input alone at the ends of its 95 % interval, at a few operating points."""
+    # Operating points of a tornado: of each configuration the gentlest and the hardest that it runs, or between
     points = found.points
     kinds = list(dict.fromkeys(map(str, points.configuration)))
     each = max(PANELS // len(kinds), 1)
@@ -65,12 +66,7 @@ def tornado_points(study: OutputStudy, found: SensitivityResult) -> list[int]:
         order = mine[np.lexsort((points.payload[mine], points.slope_deg[mine], points.imposed[1][mine]))]
         if order.size:
             chosen += [int(order[k]) for k in np.unique(np.linspace(0, order.size - 1, each).astype(int))]
-    return chosen[:PANELS]
-
-
-def draw_tornado(study: OutputStudy, found: SensitivityResult) -> Figure:
-    """The output with each input alone at the ends of its 95 % interval, at a few operating points."""
-    where = tornado_points(study, found)
+    where = chosen[:PANELS]
     unit, factor = study.row.unit_shown, study.row.factor
     swing, value = study.swing[:, where] / factor, study.value[where] / factor
     reach = np.nanmax(np.abs(swing - value[:, None]), 0, initial=0.0, where=np.isfinite(swing))
@@ -141,7 +137,8 @@ def _bars(ax: Axes, study: OutputStudy, found: SensitivityResult, top: np.ndarra
         f"effect over the 95 % range{unit}" if "mean_absolute_effect" in shown else "share of the variance [-]"
     )
     ax.grid(axis="y", visible=False)
-    ax.legend(loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=2, fontsize=7.5)  # beside no bar
+    columns = legend_columns(ax.get_legend_handles_labels()[1], 2)
+    ax.legend(loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=columns, fontsize=7.5)  # beside no bar
 
 
 def _over_points(ax: Axes, study: OutputStudy, found: SensitivityResult, top: np.ndarray) -> None:

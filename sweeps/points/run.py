@@ -40,6 +40,9 @@ from sweeps.store import RunFolder
 
 Table = Columns
 
+#: Steps of `compare` in place of each step of a fit.
+PARTS = 4
+
 
 @dataclasses.dataclass(frozen=True)
 class SimulationResult:
@@ -61,7 +64,7 @@ class SimulationResult:
     @property
     def statuses(self) -> dict[str, int]:
         """Number of runs by status; every status is included."""
-        return runs_by_status(self.table)
+        return {status: int(np.sum(self.table["status"] == status)) for status in STATUSES}
 
     @property
     def flags(self) -> dict[str, int]:
@@ -183,6 +186,8 @@ def evaluate_runs(
 def follow_histories(robot: Robot, runs: Runs, model: str | None) -> Table:
     """Conditions and simulated outputs at every row of a table of time histories.
 
+    Its steps are finer than those of fits, which use the grid up to thousands of times.
+
     Args:
         robot: prepared for the table; model: requested fidelity; None: the fidelity for histories.
 
@@ -190,7 +195,7 @@ def follow_histories(robot: Robot, runs: Runs, model: str | None) -> Table:
         BadConfiguration: a fidelity that cannot follow them.
     """
     seen = jax.device_get(
-        _observed(observers.observer_kind(runs).of(runs, robot, model), params.without_weak_types(robot))
+        _observed(observers.Histories.of(runs, robot, model, PARTS), params.without_weak_types(robot))
     )
     columns = {c.column: seen.reading[:, k] / c.factor for k, c in enumerate(robot.channels)}
     return {**condition_table(robot, runs), **columns, **outputs.status_words(seen.status, seen.flags)}
@@ -209,11 +214,6 @@ def condition_table(robot: Robot, runs: Runs) -> Columns:
         columns["total_mass_kg"] = own[runs.configurations(robot)] + runs["payload_kg"]
     shown = ("configuration", *dict.fromkeys((*runs.layout.axes, *runs.axes)), "surface", "run_id")
     return {key: columns[key] for key in shown if key in columns}
-
-
-def runs_by_status(table: Columns) -> dict[str, int]:
-    """Number of runs by status; every status is included."""
-    return {status: int(np.sum(table["status"] == status)) for status in STATUSES}
 
 
 def write_run_folder(
