@@ -37,9 +37,7 @@ def words_of_others(*texts):
     found = []
     for text in texts:
         bare = re.sub(r"data:image/[^\"]*", "", text)
-        bare = re.sub(
-            r'"(sweeps/paper/|mmrjax/model/paper_robots)[^"]*"', "", bare
-        )  # a file of the code, in a store's digests
+        bare = re.sub(r'"(mmrjax|calibration|sweeps)/[^"]*"', "", bare)  # a file of the code, in a store's digests
         bare = re.sub(r"<style>.*?</style>", "", bare, flags=re.DOTALL)
         bare = re.sub(r"\dT\d\d:\d\d:\d\d", "", bare)  # a time of day, which may read as a ratio of gears
         for word in FORBIDDEN:
