@@ -335,7 +335,9 @@ def solve_states(robot: Robot, conditions: Conditions, times: Float[Array, " tim
     """
     steps, constant = run_steps(conditions, times)
     of_first, first_state = first_instant(robot, conditions)
-    along = _with_motor(robot, of_first)
+    # change of the unknowns with motor speed when shafts and robot move as one, in their units
+    size, per_speed = drive_units(robot), robot.chassis(of_first.configuration).radius / robot.gearbox.ratio
+    along = jnp.zeros(len(size)).at[MOTOR].set(1.0).at[GROUND].set(per_speed * size[MOTOR] / size[GROUND])
 
     def taken(y: Array, step: RunStep) -> tuple[Array, RunStates]:
         held, lag = step.held(constant), _lag_of(robot, constant, step, y)
@@ -516,12 +518,6 @@ def _in_blocks(of_steps: T) -> T:
 def _of_steps(blocks: T, count: int) -> T:
     """Inverse of `_in_blocks` for this number of steps."""
     return jax.tree.map(lambda x: x.reshape(x.shape[0] * BLOCK, *x.shape[2:])[:count], blocks)
-
-
-def _with_motor(robot: Robot, conditions: Conditions) -> Array:
-    """Change of the unknowns with motor speed when shafts and robot move as one, in their units."""
-    size, per_speed = drive_units(robot), robot.chassis(conditions.configuration).radius / robot.gearbox.ratio
-    return jnp.zeros(len(size)).at[MOTOR].set(1.0).at[GROUND].set(per_speed * size[MOTOR] / size[GROUND])
 
 
 def _jump(
