@@ -109,20 +109,6 @@ def test_windows_end_before_what_they_may_not_hold():
     assert not any(12 in rows or {24, 25} <= rows for rows in found)
 
 
-def test_white_noise_is_that_of_differences_whatever_jumps():
-    rng, time = np.random.default_rng(2), np.arange(4000) * 0.01
-    smooth = np.sin(time) + 5 * (time % 7 > 3)
-    assert shown_states.white_noise([smooth + 0.01 * rng.standard_normal(4000)]) == pytest.approx(0.01, rel=0.05)
-    assert shown_states.white_noise([smooth[:5]]) == np.inf
-
-
-def test_sds_that_nobody_stated_do_not_hide_what_a_fine_instrument_shows(space, before):
-    """Sds a hundred times the noise left the prior where the readings determine the parameters."""
-    coarse = posed(Runs("synthetic", motor()).of(space.bare.base), space.bare.base, 100 * np.asarray(SD))
-    found = weak_form.weak_form(coarse.bare)
-    np.testing.assert_allclose(found.z, before.base.z[: space.free], atol=0.3)
-
-
 def test_base_parameters_are_those_of_the_log(space, before):
     value = space.coordinates.base.value(before.base.z[: space.free])
     names = space.coordinates.base.names

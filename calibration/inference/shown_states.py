@@ -27,8 +27,6 @@ from mmrjax.model.params import Scalar
 from mmrjax.model.quantities import CURRENT, VOLTAGE
 from mmrjax.model.signals import State
 
-#: Share of the sds of readings below which their white noise weights the windows, and the least share.
-FINER, TINY = 0.5, 1e-4
 #: Length of a window in correlation times of the motion and in rows, at least; its points, about; its fewest rows;
 #: distance between the starts of windows, as a share of their length.
 CORRELATED, LONG, POINTS, FEWEST, APART = 0.35, 16, 32, 9, 0.25
@@ -298,17 +296,6 @@ def slope_rows(time: np.ndarray, angle: np.ndarray, sd: float) -> tuple[int, flo
     return rows, sd * (75 / rows**3) ** 0.5 / step  # of a cubic
 
 
-def white_noise(runs: list[np.ndarray]) -> float:
-    """Sd of the white noise of readings, from their third differences; infinite for too few.
-
-    The largest tenth is left out, because readings jump with what is imposed.
-    """
-    apart = np.abs(np.concatenate([np.diff(x, 3) for x in runs if len(x) > FEWEST] or [np.zeros(0)]))
-    usual = np.sort(apart)[: int(0.9 * len(apart))]
-    # Without its largest tenth, a normal deviate has 0.623 of its variance.
-    return float(np.sqrt(np.mean(usual**2) / 0.623 / 20)) if len(usual) > FEWEST else np.inf
-
-
 class _Log:
     """Arrays of a log, by table row."""
 
@@ -316,14 +303,11 @@ class _Log:
         observe: Any = problem.observe
         self.problem, self.plan, self.observe = problem, plan, observe
         self.time, self.of_rows = np.asarray(observe.time, float), observe.of_rows
-        self.measured, sd = (np.asarray(x, float) for x in (problem.data.measured, problem.data.sd))
+        self.measured, self.sd = (np.asarray(x, float) for x in (problem.data.measured, problem.data.sd))
         states = [k for k in (plan.current, plan.motion if plan.mechanical else -1, *plan.others) if k >= 0]
         weight = np.asarray(problem.data.weight)
         self.every = [rows[rows >= 0] for rows in np.asarray(observe.rows_of)]
         self.each = [rows[np.all(weight[rows][:, states] > 0, 1)] for rows in self.every]
-        white = np.array([white_noise([self.measured[rows, k] for rows in self.each]) for k in range(sd.shape[1])])
-        # Sds that nobody states are shares of the readings, and may be many times the noise of a fine instrument.
-        self.sd = np.where(white < FINER * np.median(sd, 0), np.maximum(white, TINY * sd), sd)
         long = [np.diff(self.time[rows]) for rows in self.each if len(rows) > 1]
         self.step = float(np.median(np.concatenate(long))) if long else 1.0
 
