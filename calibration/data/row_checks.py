@@ -1,4 +1,4 @@
-"""Checks of rows: values of columns that contradict each other, and missing columns with a default."""
+"""Checks of rows: contradictions between columns, missing columns with a default, and repeated readings."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from calibration.data import surfaces
+from calibration.data import Columns, Names, surfaces
 from calibration.data.columns import (
     DEFAULTS,
     DRIVEN,
@@ -26,6 +26,75 @@ from mmrjax.model import channels
 from mmrjax.model.channels import Channel
 from mmrjax.model.rig import Instrument
 
+#: Least rows between two readings of a slow sensor, and least number of its readings.
+APART, FEWEST = 2, 12
+#: Share of changes that may come sooner than a period, and least share that comes after a whole number of periods.
+SOONER, REGULAR = 0.02, 0.8
+#: Least share of rows that repeat the row before, and least ratio of the periods of recordings.
+LEAST, ALIKE = 0.3, 0.8
+#: Least share of changes by one smallest step for which a channel's repeats are attributed to its display.
+STEPS = 0.5
+
+
+def reading_period(values: np.ndarray) -> float:
+    """Rows of a log between two readings of a slow sensor; 0 for a channel that is read in every row.
+
+    A slow sensor changes at even distances of two rows or more, and rarely sooner. An instrument of coarse steps
+    repeats numbers too, but changes by its smallest step, or at any distance.
+
+    Args:
+        values: readings of a channel in one recording, in the order of time; NaN if missing.
+    """
+    values = values[np.isfinite(values)]
+    changed = np.flatnonzero(np.diff(values) != 0)
+    gaps = np.diff(changed)
+    if len(gaps) < FEWEST:
+        return 0.0
+    size = np.abs(np.diff(values)[changed])
+    smallest = size.min()
+    if (size <= 1.5 * smallest).mean() > STEPS:
+        return 0.0
+    usual = float(np.median(gaps))
+    near = gaps[gaps <= 1.5 * usual]
+    rows = usual if abs(near.mean() - usual) < 0.25 and (near == usual).mean() > 0.5 else float(near.mean())
+    if usual < APART or (gaps < usual - 1.5).mean() > SOONER or (usual < 3 and (gaps < APART).mean() > SOONER):
+        return 0.0
+    off = np.abs(gaps - rows * np.maximum(np.round(gaps / rows), 1))
+    return rows if (off <= np.maximum(1.0, 0.1 * gaps)).mean() >= REGULAR and len(near) >= 0.5 * len(gaps) else 0.0
+
+
+def used_once(values: np.ndarray, time: np.ndarray, run: np.ndarray | None = None) -> tuple[np.ndarray, float]:
+    """Returns a channel's values with one row for each reading of a slow sensor, NaN in the rows that repeat it, and
+    the rows between readings; the unchanged values and 0 if no reading is repeated.
+
+    Args:
+        values: NaN for a missing reading, shape (rows,); time: of the rows; run: name of the recording of each row;
+            None: all are of one.
+    """
+    if (np.diff(values) == 0).sum() < LEAST * len(values):
+        return values, 0.0
+    names = np.zeros(len(values), int) if run is None else np.unique(run, return_inverse=True)[1]
+    order = np.lexsort((time, names))
+    recordings = np.split(order, np.flatnonzero(np.diff(names[order])) + 1)
+    periods = [reading_period(values[rows]) for rows in recordings]
+    of_period = sum(len(rows) for rows, p in zip(recordings, periods, strict=True) if p)
+    found = [p for p in periods if p]
+    if not found or min(found) < ALIKE * max(found) or of_period < 0.5 * len(values):
+        return values, 0.0
+    rows_apart = float(np.median(found))
+    kept = np.full(len(values), np.nan)
+    for rows in recordings:
+        shown = rows[np.isfinite(values[rows])]
+        begins = np.flatnonzero(np.concatenate([[True], np.diff(values[shown]) != 0]))[: len(shown)]
+        lengths = np.diff(np.append(begins, len(shown)))
+        times = np.maximum(np.floor(lengths / rows_apart + 0.5), 1).astype(int)  # a reading may be the same again
+        first = np.repeat(begins, times)
+        again = np.arange(len(first)) - np.repeat(np.cumsum(times) - times, times)
+        at = shown[np.minimum(first + np.round(again * rows_apart).astype(int), len(shown) - 1)]
+        kept[at] = values[at]
+    return kept, rows_apart
+
+
 #: Excess of a reading beyond zero by its noise, in stated sds, and as a share of the channel's rms.
 SIGN_SDS, SIGN_SHARE = 4.0, 0.05
 #: Fewest levels of the drive that show whether readings have signs.
@@ -34,7 +103,7 @@ LEVELS_OF_SIGN = 3
 STILL = 0.02
 
 
-def complete_columns(name: str, columns: dict[str, np.ndarray], rows: int, layout: Layout) -> None:
+def complete_columns(name: str, columns: Columns, rows: int, layout: Layout) -> None:
     """Fills columns that a table may leave out, and refuses values that contradict each other."""
     _fill(name, columns, rows, layout)
     _check_driving(name, columns)
@@ -44,7 +113,7 @@ def complete_columns(name: str, columns: dict[str, np.ndarray], rows: int, layou
     _check_deviations(name, columns, layout.channels)
 
 
-def without_copies(name: str, columns: dict[str, np.ndarray]) -> tuple[np.ndarray, tuple[str, ...]]:
+def without_copies(name: str, columns: Columns) -> tuple[np.ndarray, Names]:
     """Returns False for rows of a log that are the row before once more, shape (rows,), and a sentence on them."""
     rows = len(next(iter(columns.values()), []))
     kept = np.full(rows, True)
@@ -71,7 +140,7 @@ def without_copies(name: str, columns: dict[str, np.ndarray]) -> tuple[np.ndarra
     return kept, (said,) if again.size else ()
 
 
-def _fill(name: str, columns: dict[str, np.ndarray], rows: int, layout: Layout) -> None:
+def _fill(name: str, columns: Columns, rows: int, layout: Layout) -> None:
     """Adds columns that a table of a rig may leave out: its only configuration, and conditions with a usual value."""
     if layout.complete:
         return
@@ -83,7 +152,7 @@ def _fill(name: str, columns: dict[str, np.ndarray], rows: int, layout: Layout) 
         columns.setdefault(column, np.full(rows, value))
 
 
-def _only(name: str, columns: dict[str, np.ndarray], layout: Layout) -> str:
+def _only(name: str, columns: Columns, layout: Layout) -> str:
     """Returns the configuration of a table without that column: the only one, or the only one with its surfaces."""
     labels = np.unique(columns.get("surface", np.zeros(0, str)))
     found = surfaces.common_configuration(layout.configurations, labels)
@@ -94,7 +163,7 @@ def _only(name: str, columns: dict[str, np.ndarray], layout: Layout) -> str:
     return found
 
 
-def _check_driving(name: str, columns: dict[str, np.ndarray]) -> None:
+def _check_driving(name: str, columns: Columns) -> None:
     if "mode" in columns and not set(TIME) <= set(columns):  # settled runs are driven
         raise BadData(f"{name}: column mode is for time histories; add {', '.join(TIME)}, or remove it")
     if "duty" not in columns:
@@ -112,7 +181,7 @@ def _check_driving(name: str, columns: dict[str, np.ndarray]) -> None:
     columns["duty"] = np.nan_to_num(duty)
 
 
-def _check_sides(name: str, columns: dict[str, np.ndarray], layout: Layout) -> None:
+def _check_sides(name: str, columns: Columns, layout: Layout) -> None:
     stated = [c for c in layout.sides if c in columns]
     if len(stated) == 1:
         (other,) = set(layout.sides) - set(stated)
@@ -124,7 +193,7 @@ def _check_sides(name: str, columns: dict[str, np.ndarray], layout: Layout) -> N
         )
 
 
-def _check_held(name: str, columns: dict[str, np.ndarray]) -> None:
+def _check_held(name: str, columns: Columns) -> None:
     """Refuses a clamp in a log, and a load torque beside it: what the clamp carries is a reading."""
     held = columns.get("held", np.zeros(1)) > 0.5
     if held.any() and set(TIME) <= set(columns):
@@ -136,7 +205,7 @@ def _check_held(name: str, columns: dict[str, np.ndarray]) -> None:
         )
 
 
-def _check_mass(name: str, columns: dict[str, np.ndarray]) -> None:
+def _check_mass(name: str, columns: Columns) -> None:
     if "total_mass_kg" not in columns:
         return
     total, payload = columns["total_mass_kg"], columns["payload_kg"]
@@ -149,7 +218,7 @@ def too_light(where: str, total: float, payload: float) -> str:
     return f"{where}, total_mass_kg: got {bound_text(total)}; expected {included}"
 
 
-def _check_deviations(name: str, columns: dict[str, np.ndarray], shown: tuple[Channel, ...]) -> None:
+def _check_deviations(name: str, columns: Columns, shown: tuple[Channel, ...]) -> None:
     for channel in shown:
         if channel.column in columns and channel.sd_column in columns:
             lost = np.isfinite(columns[channel.column]) & ~np.isfinite(columns[channel.sd_column])
@@ -160,9 +229,7 @@ def _check_deviations(name: str, columns: dict[str, np.ndarray], shown: tuple[Ch
                 )
 
 
-def driven_rows(
-    name: str, columns: dict[str, np.ndarray], layout: Layout
-) -> tuple[dict[str, np.ndarray], np.ndarray, tuple[str, ...]]:
+def driven_rows(name: str, columns: Columns, layout: Layout) -> tuple[Columns, np.ndarray, Names]:
     """Returns the columns of settled runs in rows where something drives the motors, True for these rows, and a note
     on the other ones.
 
@@ -179,7 +246,7 @@ def driven_rows(
     return columns, driven, (note,) if note else ()
 
 
-def _driven(name: str, columns: dict[str, np.ndarray], layout: Layout) -> tuple[np.ndarray, str]:
+def _driven(name: str, columns: Columns, layout: Layout) -> tuple[np.ndarray, str]:
     """True for rows of settled runs in which something drives the motors; a sentence on the other rows.
 
     Raises:
@@ -217,7 +284,7 @@ def _driven(name: str, columns: dict[str, np.ndarray], layout: Layout) -> tuple[
     )
 
 
-def _check_level(name: str, columns: dict[str, np.ndarray]) -> None:
+def _check_level(name: str, columns: Columns) -> None:
     """Refuses readings of turns on a slope, since no turn is settled there."""
     slope = columns["slope_deg"]
     if slope.any():
@@ -230,7 +297,7 @@ def _check_level(name: str, columns: dict[str, np.ndarray]) -> None:
         )
 
 
-def _check_signs(name: str, columns: dict[str, np.ndarray], layout: Layout) -> None:
+def _check_signs(name: str, columns: Columns, layout: Layout) -> None:
     """Refuses readings without a sign in rows that drive the robot backward."""
     column = layout.imposed_column
     imposed, unit = columns[column], column.split("_")[-1]
@@ -292,14 +359,14 @@ def _rises_through_zero(imposed: np.ndarray, readings: np.ndarray, backward: np.
     return bool(slope * np.ptp(levels) > 2 * scatter)
 
 
-def _doubt(columns: dict[str, np.ndarray], channel: Channel) -> np.ndarray | float:
+def _doubt(columns: Columns, channel: Channel) -> np.ndarray | float:
     """Largest excess of a reading beyond zero by noise: SIGN_SDS of its sd, or a share of the channel's rms."""
     readings = columns[channel.column]
     share = SIGN_SHARE * float(np.sqrt(np.nanmean(readings**2))) if np.isfinite(readings).any() else 0.0
     return np.fmax(share, SIGN_SDS * np.nan_to_num(columns.get(channel.sd_column, np.zeros(len(readings)))))
 
 
-def missing_data_notes(name: str, columns: dict[str, np.ndarray], layout: Layout) -> Iterator[str]:
+def missing_data_notes(name: str, columns: Columns, layout: Layout) -> Iterator[str]:
     """Yields notes on missing channels and readings, on copies of rows, and on runs with several rows."""
     for channel in layout.channels:
         if channel.column not in columns:
@@ -338,7 +405,7 @@ def missing_data_notes(name: str, columns: dict[str, np.ndarray], layout: Layout
             )
 
 
-def driven_backward_notes(name: str, columns: dict[str, np.ndarray], layout: Layout) -> Iterator[str]:
+def driven_backward_notes(name: str, columns: Columns, layout: Layout) -> Iterator[str]:
     """Yields a note on settled rows in which a load torque without a sign drives a shaft that runs backward."""
     on = np.flatnonzero(driven_on(columns, layout))
     if on.size and not set(TIME) & set(columns) and columns[LOAD].min() >= 0:
