@@ -67,16 +67,20 @@ class Strongest:
 
 @dataclasses.dataclass(frozen=True)
 class TimeSide:
-    """Statistics of one fit over time: memory; order (word, waves a turn of the driving shaft) → score; drift."""
+    """Statistics of one fit over time: memory; order (word, waves a turn of the driving shaft) → score; drift.
+
+    Without drift if the other conditions determine the time (see `bases.COLLINEAR`).
+    """
 
     memory: Memory
     orders: dict[tuple[str, float], Strongest]
-    drift: Strongest
+    drift: Strongest | None
 
     def to_json(self) -> dict[str, Any]:
         """Entries of `result.json`."""
         orders = [{"order": w, "a_turn": n, **dataclasses.asdict(s)} for (w, n), s in self.orders.items()]
-        return {"memory": dataclasses.asdict(self.memory), "orders": orders, "drift": dataclasses.asdict(self.drift)}
+        drift = self.drift and dataclasses.asdict(self.drift)
+        return {"memory": dataclasses.asdict(self.memory), "orders": orders, "drift": drift}
 
 
 @dataclasses.dataclass(frozen=True)
