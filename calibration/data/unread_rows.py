@@ -7,8 +7,7 @@ import dataclasses
 import numpy as np
 
 from calibration.data.columns import LOAD, SUPPLY
-from calibration.data.courses import applied_drive
-from calibration.data.runs import Runs
+from calibration.data.table import Runs
 from mmrjax.model.robot import Robot
 
 #: Share of the current at standstill below which a motor turns, if it drives more than its friction by this factor.
@@ -24,7 +23,7 @@ def without_unread(runs: Runs, robot: Robot) -> Runs:
     if runs.sampled or runs.turns or runs.layout.imposed_column != SUPPLY or runs.has("held"):
         return runs
     columns, notes = dict(runs.columns), list(runs.notes)
-    drive = applied_drive(runs)
+    drive = runs[SUPPLY] * (runs["duty"] if runs.has("duty") else 1.0)
     beyond = _beyond_limit(runs, np.abs(drive))
     unread = _turning(runs, robot, drive) & ~beyond
     for channel in (c for c in runs.channels if runs.has(c.column)):
