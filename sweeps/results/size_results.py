@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from calibration.data import Json, Names
+from calibration.data import Json, Names, writing
 from calibration.data.requirements_file import Requirements
 from calibration.sizing.chart import Chart
 from calibration.sizing.design import OBJECTIVES
@@ -63,7 +63,7 @@ class SizeResult:
             "alternatives": [f.to_json() for f in s.alternatives],
             "motors": [{"motor": name, **f.to_json()} for name, f in s.motors.items()],
             "pareto": [f.to_json() for f in s.front],
-            "requirements": [o.to_json() for o in self.outcomes],
+            "requirements": writing.json_value(self.outcomes),
             "starts": s.starts,
             "evaluated": s.evaluated,
         }
