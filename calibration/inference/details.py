@@ -67,11 +67,14 @@ class Strongest:
 
 @dataclasses.dataclass(frozen=True)
 class TimeSide:
-    """Statistics of one fit over time: memory; order (word, waves a turn of the driving shaft) → score; drift."""
+    """Statistics of one fit over time: memory; order (word, waves a turn of the driving shaft) → score; drift.
+
+    Without drift if the other conditions determine the time (see `bases.COLLINEAR`).
+    """
 
     memory: Memory
     orders: dict[tuple[str, float], Strongest]
-    drift: Strongest
+    drift: Strongest | None
 
     def to_json(self) -> dict[str, Any]:
         """Entries of `result.json`."""
