@@ -15,7 +15,7 @@ from calibration.data.input_errors import BadConfiguration, BadData
 from mmrjax.climbing.climb_simulation import LOSSES
 from mmrjax.model.paper_robots import nominal
 from sweeps.commands import climb as room
-from sweeps.results.climb_results import Seen, footing_coordinates
+from sweeps.report.climb_report import Seen, footing_coordinates
 from tests.commands import ends
 
 SCHEMA = json.loads((Path(__file__).parents[1] / "docs" / "schemas" / "climb.schema.json").read_text("utf-8"))

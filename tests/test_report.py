@@ -29,7 +29,7 @@ from sweeps.commands import compare
 from sweeps.pages import power_figures, sweep_figures, words
 from sweeps.points import run
 from sweeps.report import comparison_report, page_renderer, runs_report, sweep_report
-from sweeps.results.comparison_results import Comparison
+from sweeps.report.comparison_report import Comparison
 
 SWEEP_FIGURES = {f"sweep_{name}" for name in channels.USUAL}
 

@@ -242,7 +242,7 @@ def json_value(value: Any) -> Any:
         listed = [field.name for field in dataclasses.fields(value)]
     if listed is not None:
         pairs = (entry.partition("=") for entry in listed)
-        return {key: json_value(operator.attrgetter(of or key)(value)) for key, _, of in pairs}
+        return {key: json_value(operator.attrgetter(attribute or key)(value)) for key, _, attribute in pairs}
     if isinstance(value, Mapping):
         return {key: json_value(v) for key, v in value.items()}
     if isinstance(value, list | tuple):
