@@ -31,8 +31,8 @@ from sweeps.pages.figure_style import (
     new_figure,
 )
 from sweeps.pages.words import short_name
-from sweeps.report.condition_columns import UNITS, imposed_column
 from sweeps.report.fit_tables import Change
+from sweeps.report.run_tables import UNITS, imposed_column
 
 #: Effects on the ladder and on the map of look-alikes.
 RUNGS, ALIKE = 20, 14
