@@ -18,7 +18,7 @@ from test_loop_command import commanded
 from test_stated_values import traced as leads
 from worlds import settled, tables
 
-from calibration.data.writing import finite_or_null
+from calibration.data.writing import json_value
 from calibration.discovery.clusters import Cluster
 from calibration.discovery.discover import FAR
 from calibration.discovery.loop_notes import Asked, NameSupport, NameTest, RuledOut
@@ -95,7 +95,7 @@ def shown(tmp_path_factory):
             found = MADE[name]()
             folder = tmp_path_factory.mktemp(name)
             text = page_of(folder, found)
-            document = finite_or_null(found.to_json())
+            document = json_value(found.to_json())
             known[name] = SimpleNamespace(found=found, document=document, text=text, page=Tables(text))
         capsys.readouterr()
         print_document(documented(known[name].found))
@@ -298,7 +298,7 @@ def lines_of(found, capsys):
     """Lines of the whole document, of what a terminal shows of it, and of parts of result.json."""
     capsys.readouterr()
     print_document(documented(found))
-    written = finite_or_null(found.to_json())
+    written = json_value(found.to_json())
     jsonschema.validate(written, SCHEMA)
     parts = json.dumps({part: written[part] for part in PARTS}, indent=1, ensure_ascii=False)
     text = f"{as_text(documented(found))}# TERMINAL\n{capsys.readouterr().out}# JSON\n{parts}"
