@@ -78,9 +78,8 @@ class TimeSide:
 
     def to_json(self) -> dict[str, Any]:
         """Entries of `result.json`."""
-        orders = [{"order": w, "a_turn": n, **dataclasses.asdict(s)} for (w, n), s in self.orders.items()]
-        drift = self.drift and dataclasses.asdict(self.drift)
-        return {"memory": dataclasses.asdict(self.memory), "orders": orders, "drift": drift}
+        orders = [{"order": w, "a_turn": n, **vars(s)} for (w, n), s in self.orders.items()]
+        return {"memory": self.memory, "orders": orders, "drift": self.drift}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,12 +98,4 @@ class TimeStatistics(Detail):
     after: TimeSide
 
     def to_json(self) -> dict[str, Any]:
-        return {
-            "series": {
-                "runs": self.runs,
-                "samples": self.samples,
-                "orders_unresolved": list(self.orders_unresolved),
-                "before": self.before.to_json(),
-                "after": self.after.to_json(),
-            }
-        }
+        return {"series": vars(self)}

@@ -142,7 +142,8 @@ def over_time(robot: Robot, batch: Run) -> Columns:
     last = np.where(finite.any(-1), finite.shape[-1] - 1 - np.argmax(finite[..., ::-1], -1), 0)
     rows = np.arange(len(last))
     motors = float(robot.sides) * np.asarray(history.signals.current)
-    columns[PEAK] = np.maximum(_peaks(jnp.asarray(time), jnp.asarray(np.abs(motors))), 0.0)
+    limit = float(robot.sides) * float(robot.driver.current_limit)
+    columns[PEAK] = np.maximum(_peaks(jnp.asarray(time), jnp.asarray(np.abs(motors)), jnp.asarray(limit)), 0.0)
     columns["displacement_m"], columns["time_end_s"] = np.array(history.distance)[rows, last], time[rows, last]
     empty = (status == BATTERY_EMPTY) & ~finite[rows, -1]
     if empty.any():
@@ -172,8 +173,10 @@ def permissible_durations(robot: Robot, table: Columns) -> np.ndarray:
 
 
 @functools.partial(compiled, options=SELDOM)
-def _peaks(time: Float[Array, "runs samples"], values: Float[Array, "runs samples"]) -> Float[Array, " runs"]:
-    return jax.vmap(curve_peak)(time, values)
+def _peaks(
+    time: Float[Array, "runs samples"], values: Float[Array, "runs samples"], kink: Array
+) -> Float[Array, " runs"]:
+    return jax.vmap(curve_peak, in_axes=(0, 0, None))(time, values, kink)
 
 
 @functools.partial(compiled, options=SELDOM)

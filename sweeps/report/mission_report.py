@@ -88,6 +88,7 @@ def missions_document(file: RobotFile, found: Missions) -> Document:
     table, source = found.table, found.source
     shown = capabilities.without_idle(file.robot, table)
     first, names = {key: value[0] for key, value in table.items()}, _names(table)
+    answer = mission_answer({key: value[0] for key, value in shown.items()}, file.robot.has_ground)
     fed = "battery" if np.isfinite(first["state_of_charge"]) else "supply"
     cycles, each = (f", {source.cycles} cycles", " each") if source.cycles > 1 else ("", "")
     between = "linear" if source.linear else "held"
@@ -103,7 +104,7 @@ def missions_document(file: RobotFile, found: Missions) -> Document:
     whole = len(names) == 1 and first["status"] == "converged"
     return Document(
         f"Mission {source.source}" + ("" if len(names) > 1 else f" of {names[0]}"),
-        mission_answer(first),
+        answer,
         (
             run_tables.lead_note(file, more=detail),
             Note(lead, terminal=True),
@@ -112,11 +113,11 @@ def missions_document(file: RobotFile, found: Missions) -> Document:
             *([] if whole else [endings]),
             *remarks(_charge_left(table)),
         ),
-        page_sections=lambda: _sections(file.robot, found, first),
+        page_sections=lambda: _sections(file.robot, found, first, answer),
     )
 
 
-def _sections(robot: Robot, found: Missions, first: Json) -> Iterable[Section]:
+def _sections(robot: Robot, found: Missions, first: Json, answer: str) -> Iterable[Section]:
     """The first run over time, from above, its energy and its segments."""
     source, name, limit = found.source, found.segments["run_id"][0], float(robot.motor.temperature_limit)
     mine = found.course["run_id"] == name
@@ -135,7 +136,9 @@ def _sections(robot: Robot, found: Missions, first: Json) -> Iterable[Section]:
         f"{_NO_RETURN}; what driven motors give feeds the other consumers first." if on_battery else f"{_NO_RETURN}."
     )  # fmt: skip
     asked = "battery's charge" if on_battery else "supply", returned, abs(first["unaccounted_share"])
-    energy = catalogue.figure("mission.energy", first, on_battery, finding=mission_answer(first), words=asked)
+    energy = catalogue.figure(
+        "mission.energy", first, on_battery, robot.has_ground, finding=answer, words=asked
+    )  # fmt: skip
     yield Section("Where the energy goes", (energy,), "energy-section")
     yield Section(
         "Segments", (_segments(found, name, capabilities.idle_columns(robot)), catalogue.note("mission.settles")),
@@ -160,14 +163,15 @@ def _names(runs: Columns) -> list[str]:
     return [", ".join([head, *(p for p in rest if not p.startswith("nan"))]) for head, *rest in parts]
 
 
-def mission_answer(run: Json) -> str:
+def mission_answer(run: Json, on_ground: bool = True) -> str:
     """One sentence: energy of the mission, its largest shares, and how long the battery lasts."""
     drawn = float(run["energy_drawn_Wh"])
     text = f"The mission takes {float(run['energy_Wh']):.3g} Wh"
     if np.isfinite(run.get("distance_m", np.nan)) and run["distance_m"] > 0:
         text += f" over {run['distance_m']:.0f} m"
     if drawn > 0:
-        shares = {words.SINKS[name]: float(run[f"energy_to_{name}_Wh"]) / drawn for name in SINKS}
+        labels = words.sink_labels(on_ground)
+        shares = {labels[name]: float(run[f"energy_to_{name}_Wh"]) / drawn for name in SINKS}
         largest = sorted(shares, key=lambda label: -shares[label])[:2]
         parts = [f"{label} {100 * shares[label]:.0f} %" for label in largest if shares[label] > 0]
         text += f" ({', '.join(parts)})"

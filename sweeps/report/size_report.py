@@ -8,7 +8,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from calibration.data import Json, Names
+from calibration.data import Json, Names, writing
 from calibration.data.requirements_file import Requirements
 from calibration.sizing.chart import LIMITS, Chart
 from calibration.sizing.design import OBJECTIVES
@@ -69,7 +69,7 @@ class SizeResult:
             "alternatives": [f.to_json() for f in s.alternatives],
             "motors": [{"motor": name, **f.to_json()} for name, f in s.motors.items()],
             "pareto": [f.to_json() for f in s.front],
-            "requirements": [o.to_json() for o in self.outcomes],
+            "requirements": writing.json_value(self.outcomes),
             "starts": s.starts,
             "evaluated": s.evaluated,
         }
