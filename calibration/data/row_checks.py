@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -20,16 +21,21 @@ from calibration.data.columns import (
     WHEN,
     Layout,
 )
-from calibration.data.input_errors import BadData, bound_text
+from calibration.data.input_errors import BadData, bound_text, three_digits
 from calibration.data.table import driven_on
 from mmrjax.model import channels
 from mmrjax.model.channels import Channel
+from mmrjax.model.quantities import VOLTAGE
 from mmrjax.model.rig import Instrument
+from mmrjax.model.robot import Robot
+from mmrjax.model.shaft import Shaft
 
 #: Excess of a reading beyond zero by its noise, in stated sds, and as a share of the channel's rms.
 SIGN_SDS, SIGN_SHARE = 4.0, 0.05
 #: Fewest levels of the drive that show whether readings have signs.
 LEVELS_OF_SIGN = 3
+#: Least time between settled points [s], and in time constants of the motors with their load.
+APART, SETTLED = 0.5, 5.0
 #: Share of the largest reading of a speed below which an undriven motor counts as at rest.
 STILL = 0.02
 
@@ -158,6 +164,66 @@ def _check_deviations(name: str, columns: dict[str, np.ndarray], shown: tuple[Ch
                     f"{name} row {int(np.flatnonzero(lost)[0]) + 1}, {channel.sd_column}: got an empty cell next "
                     f"to a reading; expected its sd, more than 0 {channel.unit}"
                 )
+
+
+def settled_points(
+    name: str, columns: Mapping[str, np.ndarray], layout: Layout, robot: Robot
+) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
+    """Returns columns without the time if each row is a settled run, and a note that says so.
+
+    Rows are `APART` and `SETTLED` time constants of the motors after one another, and half of them have another
+    setting than the row before. Readings follow the setting of their own row as well as that of the row before, as
+    they do not if a setting begins at its row.
+    """
+    kept, time = dict(columns), columns.get("time_s")
+    if time is None or len(time) < 3 or layout.imposed != "voltage" or "held" in columns:
+        return kept, ()
+    shown = [c for c in layout.channels if c.column in columns]
+    constant, step = time_constant(robot), np.diff(time)
+    apart = float(step[step > 0].min(initial=math.inf))
+    if not all(c.settled for c in shown) or not math.inf > apart >= max(APART, SETTLED * constant):
+        return kept, ()
+    settings = [c for c in (SUPPLY, "duty", LOAD, "slope_deg", "payload_kg") if c in columns]
+    changed = np.any([np.diff(columns[c]) != 0 for c in settings], 0) if settings else np.zeros(1, bool)
+    if changed.mean() < 0.5:
+        return kept, ()
+    drive = columns[SUPPLY] * columns.get("duty", 1.0)
+    others = [columns[c] for c in settings if c not in (SUPPLY, "duty")]
+    for channel in shown:
+        own, before = (
+            _unexplained(columns[channel.column][1:], [x[k : len(x) - 1 + k] for x in (drive, *others)])
+            for k in (1, 0)
+        )
+        if own > 2 * before:
+            return kept, ()
+    kept = {column: values for column, values in kept.items() if column not in ("time_s", "run_id")}
+    said = f"rows are {three_digits(apart)} s apart or more, most at another setting"
+    settle = f", and the motors settle in about {three_digits(SETTLED * constant)} s" if constant > 0 else ""
+    return kept, (f"{name}: {said}{settle}: each row is read as a settled run, without its time",)
+
+
+def _unexplained(readings: np.ndarray, settings: Sequence[np.ndarray]) -> float:
+    """Sum of squares of readings that no linear function of the settings explains."""
+    a = np.stack([np.ones(len(readings)), *settings], 1)
+    sound = np.isfinite(readings)
+    if sound.sum() < 3:
+        return 0.0
+    a, readings = a[sound], readings[sound]
+    return float(np.sum((readings - a @ np.linalg.lstsq(a, readings, rcond=None)[0]) ** 2))
+
+
+def time_constant(robot: Robot) -> float:
+    """Time constant J R/k² of the motors' speed with the slowest load [s]; infinite if it is unknown."""
+    motor, sides, found = robot.motor, float(robot.sides), 0.0
+    if not robot.knows(VOLTAGE):
+        return math.inf
+    for load in robot.configurations.members:
+        if float(load.torque_gravity if isinstance(load, Shaft) else 0.0) > 0:
+            return math.inf
+        moved = 0.0 if isinstance(load, Shaft) else float(load.mass) * float(load.radius) ** 2 / sides
+        carried = (float(load.inertia) + moved) / float(robot.gearbox.ratio) ** 2
+        found = max(found, float(motor.inertia) + carried)
+    return found * float(motor.resistance) / float(motor.torque_constant) ** 2
 
 
 def driven_rows(
