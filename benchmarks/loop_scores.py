@@ -18,7 +18,7 @@ WITHOUT_NAME = ("mechanism", "place", "unnamed")
 CHANNELS = ("total_current", "motor_speed", "speed")
 #: Groups of balances that act on the same of the three equations of current, motor speed and speed.
 EQUATION = {
-    **dict.fromkeys(("supply", "electrical", "inductance"), "electrical"),
+    **dict.fromkeys(("duty", "supply", "electrical", "inductance"), "electrical"),
     **dict.fromkeys(("motor", "gearbox", "track", "ground", "mass", "inertia"), "torque"),
     "slip": "slip",
     **dict.fromkeys(("sensor", *CHANNELS), "sensor"),

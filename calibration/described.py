@@ -25,13 +25,16 @@ def describe(found: Any, part: str = "", *about: str) -> str:
         return found
     # results and notes are described by methods of their own, so their module cannot be imported above
     tables = importlib.import_module("calibration.words.note_words")
-    said = tables.PARTS.get((type(found), part)) if part else (tables.NOTES | tables.RESULTS).get(type(found))
+    if isinstance(found, tables.Remark) and not part:
+        said = tables.NOTES[found.code]
+        if isinstance(said, str):
+            listed = {name: ", ".join(x) if isinstance(x, tuple) else x for name, x in found.values.items()}
+            return said.format(**listed)
+        return said(**found.values)
+    said = tables.PARTS.get((type(found), part)) if part else tables.RESULTS.get(type(found))
     if said is None:
         kind = type(found).__name__ + (f", {part}" if part else "")
         raise TypeError(f"describe: got {kind}; expected a note or a result of calibrate, discover or sensitivity")
-    if isinstance(said, str):
-        listed = {name: ", ".join(x) if isinstance(x, tuple) else x for name, x in vars(found).items()}
-        return said.format(**listed)
     return said(found, *about)
 
 

@@ -103,7 +103,7 @@ def glossary() -> str:
     from sweeps.pages.words import GLOSSARY
 
     lines = [f"**{word}**\n: {meaning}\n" for word, meaning in GLOSSARY.items()]
-    opening = "Words of the reports and the terminal. `mmrjax explain NAME` explains every other name."
+    opening = "Words of the reports and the terminal. `mmrjax explain NAME` prints these and every other name."
     return "\n\n".join(["# Glossary", opening, MADE, "\n".join(lines)])
 
 

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import importlib
 import inspect
 import os
 import re
 import signal
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import typer
 
@@ -22,7 +23,6 @@ from mmrjax import SOUND_AT_LEVEL_0, WORKER, __version__, fidelities
 from mmrjax.errors import printable, shorten
 from sweeps import config, config_campaign
 from sweeps import options as made
-from sweeps.flags import options_of_fields as flags_of
 
 INTERRUPTED = 130
 
@@ -35,8 +35,6 @@ app = typer.Typer(
 )  # fmt: skip
 
 
-_Out = Annotated[Path | None, typer.Option("--out", help="The run folder.  \\[default: runs/COMMAND-TIME]")]
-_Force = Annotated[bool, typer.Option("--force", help="Replace an existing run folder.")]
 _NoCache = Annotated[
     bool,
     typer.Option("--no-cache", help="Compile again: neither read nor keep compiled programs."),
@@ -55,81 +53,63 @@ _Columns = Annotated[
 ]
 
 
-class Told(NamedTuple):
-    """Input of a command: its configuration, options that change no number, and the file of both, if any."""
-
-    config: Any
-    beside: Any
-    file: Path | None
-
-    @property
-    def where(self) -> str:
-        """Origin of the configuration, for messages."""
-        return "options" if self.file is None else self.file.name
-
-
 def _command(
     kind: type[config.Part],
+    beside: type[config.Part],
     *,
     group: str,
     example: str,
+    room: str = "",
     failure: str = "the solver failed at some runs (status failed). Runs that stall or slide are answers: 0",
-    beside: type[config.Part] | None = None,
-    arguments: Names = (),
     resolve: Callable[..., config.Part] | None = None,
-) -> Callable[[Callable[..., int]], Callable[..., int]]:
-    """Decorator for a command whose options are the fields of a configuration, in addition to its function's own.
+) -> Callable[[Callable[[], None]], None]:
+    """Decorator for the name and help of a command whose options are the fields of two configurations.
 
-    Its function is called with `Told`, once jax is ready, and with its own options and arguments by name.
+    The command is the function `execute` of its module in `commands`, called with both once jax is ready.
 
     Args:
-        kind: of the configuration; group: heading in `--help`; failure: meaning of exit code 3.
-        beside: configuration of options that change no number; a file may state its `[solver]` only.
-        arguments: fields that are arguments; a `plan` of the function's own is the file, as --config is.
+        kind: the configuration; beside: that of options that change no number; a file may state its `[solver]` only.
+        group: heading in `--help`; room: the module, if it has another name; failure: meaning of exit code 3.
         resolve: in place of `config.resolve_configuration`.
     """
 
-    def of(function: Callable[..., int]) -> Callable[..., int]:
-        kinds = (kind,) if beside is None else (kind, beside)
+    def of(described: Callable[[], None]) -> None:
+        name = described.__name__
 
-        @functools.wraps(function)
         def run(**given: Any) -> int:
             from sweeps.console import report_working
 
-            no_cache, file, trust = given.pop("no_cache"), given.pop("config_file"), given.pop("trust")
-            given.pop("help_all", None)
-            plan = given.pop("plan", None)
+            file, plan, trust = given["config_file"], given.get("plan"), given["trust"]
             if plan is not None and file is not None:
                 raise InputError(f"--config: got {file} beside {plan}; expected one of them")
             file = plan if file is None else file
-            stated = made.take_options(kind, given)
-            further = None
-            if beside is not None:
-                further = config.resolve_beside(beside, file, made.take_options(beside, given), trust)
-            resolved = (
-                functools.partial(config.resolve_configuration, kind, beside=beside) if resolve is None else resolve
-            )
-            found = resolved(file, stated, trust=trust)
-            with report_working(function.__name__.replace("_", " ")):
-                return function(Told(_prepared(found, no_cache), further, file), **given)
+            if "plan" in given:
+                given["plan"] = file
+            stated, others = made.take_options(kind, given), made.take_options(beside, given)
+            aside = config.resolve_beside(beside, file, others, trust)
+            if resolve is None:
+                found = config.resolve_configuration(kind, file, stated, beside, trust)
+            else:
+                found = resolve(file, stated, trust)
+            with report_working(name):
+                _prepare(found, given["no_cache"])
+                code: int = importlib.import_module(f"sweeps.commands.{room or name}").execute(found, aside)
+                return code
 
-        own = list(inspect.signature(function, eval_str=True).parameters.values())[1:]
-        own = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in own]
-        first, last = [p for p in own if p.name not in _LAST], [p for p in own if p.name in _LAST]
         keyword = functools.partial(inspect.Parameter, kind=inspect.Parameter.KEYWORD_ONLY)
-        last += [
+        fields = [p for each in (beside, kind) for p in made.option_parameters(each)]
+        everything = [
+            *(p for p in fields if p.name not in _LAST),
+            *(p for p in fields if p.name in _LAST),
             keyword("config_file", annotation=_Config, default=None),
             keyword("trust", annotation=_Trust, default=False),
             keyword("no_cache", annotation=_NoCache, default=False),
-            *made.help_all(kinds),
+            *made.help_all((kind, beside)),
         ]
-        fields = [p for k in kinds[::-1] for p in made.option_parameters(k, arguments)]
-        everything = [*first, *fields, *last]
+        run.__name__, run.__doc__ = name, described.__doc__
         run.__signature__ = inspect.Signature(everything)  # type: ignore[attr-defined]
         run.__annotations__ = {p.name: p.annotation for p in everything}
-        del run.__wrapped__  # whose annotations are not these
         app.command(epilog=f"Example: {example}\n\nExit code 3: {failure}.", rich_help_panel=group)(run)
-        return function
 
     return of
 
@@ -137,7 +117,7 @@ def _command(
 #: Headings of commands in `--help`, in their order there.
 MODEL, DATA, DESIGN, ELSEWHERE = "Model", "Data", "Design", "Export and reference"
 _AT_CORNER = "the solver failed at the worst corner"
-#: Parameters of commands that stand after those of their configurations.
+#: Options that stand at the end of each command.
 _LAST = ("out", "force")
 
 
@@ -174,19 +154,12 @@ def _root(
 
 @_command(
     config.Simulate,
+    config.GivenRuns,
     group=MODEL,
-    beside=config.OneRun,
     example="mmrjax simulate --configuration 4W2T --voltage 24 --slope 10 --payload 5 --model drive; "
     "mmrjax simulate --profile patrol --battery --payload 5; mmrjax simulate --left 33 --right 15",
 )
-def simulate(
-    told: Told,
-    runs: Annotated[
-        Path | None, typer.Option(help="CSV of runs to simulate instead; the condition columns are enough.")
-    ] = None,
-    out: _Out = None,
-    force: _Force = False,
-) -> int:
+def simulate() -> None:
     """Simulate operating points, a start, a mission or a turn.
 
     One operating point is stated by options, several by --runs FILE.csv. With --model drive or track the run starts
@@ -195,62 +168,17 @@ def simulate(
     distance, peaks, temperatures and charge of each segment. With --left and --right the two sides have different
     voltages, and the robot turns (docs/howto/turn.md).
     """
-    cells = told.beside.model_dump()
-    stated = {column for column, value in cells.items() if value is not None}
-    if runs is not None and stated:
-        options = flags_of(config.OneRun)
-        raise InputError(
-            f"{', '.join(options[column] for column in cells if column in stated)}: not allowed with --runs, whose "
-            f"columns state the conditions of each run; state it there, or leave out --runs"
-        )
-    given = cells if runs is None else str(runs)
-    if told.config.profile is not None:
-        from sweeps.commands import missions
-
-        return missions.simulate_missions(told.config, given, stated, out, force)
-    if told.config.turns:
-        from sweeps.commands import turn
-
-        return turn.simulate_turn(told.config, given, out, force)
-    from sweeps.commands import simulate as room
-
-    return room.simulate_to_folder(told.config, given, out, force)
 
 
 @_command(
     config.Sweep,
+    config_campaign.StoreOptions,
     group=MODEL,
-    beside=config_campaign.SharePart,
     resolve=config_campaign.resolve_campaign,
     example="mmrjax sweep --slopes 0:20:0.5 --payloads 0,4,8 --voltages 24 --configurations 6T2A "
     "--set 6T2A.ground.friction.static=0.6",
 )
-def sweep(
-    told: Told,
-    plan: Annotated[
-        Path | None,
-        typer.Argument(
-            metavar="[CONFIG.toml]", help="TOML file with \\[axes] or \\[samples] (docs/reference/plans.md)."
-        ),
-    ] = None,
-    zarr: Annotated[
-        bool, typer.Option("--zarr", help="Write a Zarr store, also of a small grid of options.")
-    ] = False,
-    outputs: Annotated[
-        str | None,
-        typer.Option(
-            help="Comma-separated, what a store holds of each point.  \\[default: what its instruments show]"
-        ),
-    ] = None,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Say points, chunks, bytes and time; write nothing.")
-    ] = False,
-    export: Annotated[
-        list[str] | None, typer.Option(help="Write the store as csv or parquet too, repeatable.")
-    ] = None,
-    out: _Out = None,
-    force: _Force = False,
-) -> int:
+def sweep() -> None:
     """Simulate every combination of a grid in one batch.
 
     The default grid is the paper's Table 8. An axis is a list, 0,5,10, or a range, first:last:step, such as
@@ -258,99 +186,59 @@ def sweep(
     runs.csv too. In a CONFIG.toml any parameter or condition can vary, on a grid or by sampling
     (docs/reference/plans.md). An interrupted sweep continues with the same command and the same --out.
     """
-    how = config_campaign.sweep_options(told.beside.shard, told.beside.scheduler, export, dry_run, zarr, outputs)
-    from sweeps.commands import sweep as room
-
-    return room.sweep_to_folder(told.config, told.where, out, force, how)
 
 
-@_command(config.Compare, group=DATA, example="mmrjax compare measured --robot found/robot.toml --against nominal")
-def compare(
-    told: Told,
-    data: Annotated[
-        str, typer.Argument(help="Measured runs in any format, or measured, or simulated_by_paper.")
-    ] = "measured",
-    own_mass: Annotated[
-        bool, typer.Option("--own-mass", help="Take the robot's mass and the payload, not the stated total mass.")
-    ] = False,
-    out: _Out = None,
-    force: _Force = False,
-) -> int:
+@_command(
+    config.Compare,
+    config.ComparedRuns,
+    group=DATA,
+    example="mmrjax compare measured --robot found/robot.toml --against nominal",
+)
+def compare() -> None:
     """Simulate measured runs and report the errors.
 
     Errors are given by row and channel, with rms, worst and R². --against compares two robots on the same rows.
     """
-    from sweeps.commands import compare as room
-
-    return room.compare_with_table(told.config, data, own_mass, out, force)
 
 
-@_command(config.Reproduce, group=MODEL, example="mmrjax reproduce --robot found/robot.toml --model track")
-def reproduce(told: Told, out: _Out = None, force: _Force = False) -> int:
+@_command(
+    config.Reproduce,
+    config.FolderPart,
+    group=MODEL,
+    example="mmrjax reproduce --robot found/robot.toml --model track",
+)
+def reproduce() -> None:
     """Reproduce the paper's tables and figures with a robot.
 
     The bench's rows and Figs. 5a-29 are compared row by row. With --model track the running gear is resolved (Figs.
     23-27).
     """
-    from sweeps.commands import reproduce as room
-
-    return room.reproduce_paper(told.config, out, force)
 
 
 @_command(
     config.Render,
+    config.Picture,
     group=MODEL,
-    beside=config.OneRun,
     example="mmrjax render start.mp4 --slope 10 --payload 5 --begin 0 --end 0.2 --slow 20",
 )
-def render(
-    told: Told,
-    file: Annotated[Path, typer.Argument(help="What to write: its suffix is .png, .gif or .mp4.")],
-    begin: Annotated[
-        float | None,
-        typer.Option(help="Instant of a picture, first one of a film (s).  \\[default: 0; of a picture 0.8]"),
-    ] = None,
-    end: Annotated[float | None, typer.Option(help="Last instant of a film (s).  \\[default: begin + 0.1]")] = None,
-    slow: Annotated[
-        float | None, typer.Option(help="Slow-motion factor of a film.  \\[default: 20]", min=0.01)
-    ] = None,
-    climb: Annotated[
-        Path | None,
-        typer.Option(help="A folder of mmrjax climb to draw in its place, by default whole and at half speed."),
-    ] = None,
-    force: _Force = False,
-) -> int:
+def render() -> None:
     """Draw a picture or film of the track model.
 
     It shows the robot on its slope, its track and the contact forces. The run starts from standstill. With --left
     and --right the robot turns and is shown from above. --climb draws a climb that has been computed. No display is
     needed.
     """
-    from sweeps.commands import render as room
-
-    if climb is not None:
-        stated = told.config != config.Render() or any(v is not None for v in told.beside.model_dump().values())
-        return room.render_climb(climb, stated, file, begin, end, slow, force)
-    slow = 20.0 if slow is None else slow
-    begin = (0.8 if file.suffix == ".png" else 0.0) if begin is None else begin
-    end = begin + 0.1 if end is None and file.suffix != ".png" else end
-    return room.render_run(told.config, told.beside.model_dump(), file, begin, end, slow, force)
 
 
 @_command(
     config.Calibrate,
+    config.FittedRuns,
     group=DATA,
-    beside=config.MembersPart,
     example="mmrjax calibrate measured --noise current=2%,motor_speed=0.5%,speed=1% --out fitted",
     failure="the search, or one without a block, did not converge, or the solver failed at a row. A fit that is not "
     "adequate and rows that slide are answers: 0",
 )
-def calibrate(
-    told: Told,
-    data: Annotated[str, typer.Argument(help="Measured runs or histories in any format, or measured.")] = "measured",
-    out: _Out = None,
-    force: _Force = False,
-) -> int:
+def calibrate() -> None:
     """Fit parameters to measured runs, with intervals.
 
     The search follows gradients through the simulation. By default it frees friction, slip and data-sheet values.
@@ -359,87 +247,64 @@ def calibrate(
     of steady, and intervals are linear unless --profiles is given. track takes minutes. If the running gear is free
     (--model track --free running_gear.guide_recess,...), a population is searched first.
     """
-    from sweeps.commands import calibrate as room
-
-    return room.calibrate_robot(told.config, data, out, force, told.beside.members)
 
 
 @_command(
     config.Settle,
+    config.SettledLog,
     group=DATA,
     example="mmrjax settle log.csv --robot rig.toml --out settled, then "
     "mmrjax loop settled/settled.csv --robot rig.toml",
     failure="does not occur: nothing is solved",
 )
-def settle(
-    told: Told,
-    log: Annotated[
-        str, typer.Argument(metavar="LOG", help="A log over time in any format: time_s, what is imposed, channels.")
-    ],
-    out: _Out = None,
-    force: _Force = False,
-) -> int:
+def settle() -> None:
     """Extract the settled runs of a log as a table.
 
     The table is input for loop and calibrate. The page reports what was left out and why. Writes settled.csv (means
     and their sds), stretches.csv (every stretch and what still changes) and report.html.
     """
-    from sweeps.commands import settle as room
-
-    return room.settle_to_folder(told.config, log, out, force)
 
 
 @_command(
     config.Loop,
+    config.LoopBeside,
     group=DATA,
-    beside=config.LoopBeside,
     example="mmrjax loop measured --out found, then mmrjax sweep --robot found/robot.toml",
     failure="the fit that is proposed did not converge, or --within was out before a verdict (the same command with "
     "more goes on). Every verdict is an answer: 0",
 )
-def loop(
-    told: Told,
-    data: Annotated[
-        str,
-        typer.Argument(help="Measured runs in any format, or with time_s histories from rest; or measured."),
-    ] = "measured",
-    out: _Out = None,
-    force: _Force = False,
-) -> int:
+def loop() -> None:
     """Find the effect that the model lacks, and add it.
 
     The model is fitted, the residual is traced to an effect, and errors are reported before and after. The answer
     may be that nothing is missing, or that no effect of the library explains the residual. Writes result.json,
     report.html, and robot.toml, which every command accepts as --robot.
     """
-    from sweeps.commands import loop as room
-
-    return room.run_loop(told.config, data, out, force, told.beside.members, told.beside.seconds)
 
 
 @_command(
     config.Sensitivity,
+    config.FolderPart,
     group=DESIGN,
     example="mmrjax sensitivity --outputs speed,peak_current --slopes 0,5 --evaluations 200000",
 )
-def sensitivity(told: Told, out: _Out = None, force: _Force = False) -> int:
+def sensitivity() -> None:
     """Rank parameters by influence, and propose the next runs.
 
-    Every method includes local derivatives and elasticities at every operating point. Writes result.json,
+    Every method includes local derivatives and elasticities at every operating point. Methods that draw a sample take
+    the corners and middle of axes that are not stated. Writes result.json,
     report.html, points.csv and indices.csv.
     """
-    from sweeps.commands import sensitivity as room
-
-    return room.study_sensitivity(told.config, out, force)
 
 
 @_command(
     config.Resonance,
+    config.FolderPart,
     group=MODEL,
     example="mmrjax resonance --configuration 6T2A --voltages 10:40:0.5 --payloads 0,4,8 "
     "--set running_gear.guide_recess=1e-4",
 )
-def resonance(told: Told, out: _Out = None, force: _Force = False) -> int:
+def resonance() -> None:
     """Find speeds at which the tracks excite the chassis.
 
     The track model gives the ripple of reaction, current and speed over speed and payload. A Campbell diagram
@@ -447,18 +312,16 @@ def resonance(told: Told, out: _Out = None, force: _Force = False) -> int:
     contacts. An axis is 0,5,10 or first:last:step. Writes result.json, report.html, points.csv, modes.csv and
     peaks.csv. The points of Table 8 are included. Takes about a minute on two cores.
     """
-    from sweeps.commands import resonance as room
-
-    return room.map_resonance(told.config, out, force)
 
 
 @_command(
     config.Climb,
+    config.FolderPart,
     group=MODEL,
     example="mmrjax climb --step 120 --levers-front 45 --levers-rear -8.5 --voltage 6; mmrjax climb --find step",
     failure="numbers of the run went wrong (verdict failed). That a robot does not get over is an answer: 0",
 )
-def climb(told: Told, out: _Out = None, force: _Force = False) -> int:
+def climb() -> None:
     """Simulate a climb over a step, stairs, a gap or a terrain.
 
     Reports what stops the robot. The robot starts on level ground and meets the obstacle squarely. Levers keep
@@ -466,64 +329,53 @@ def climb(told: Told, out: _Out = None, force: _Force = False) -> int:
     report.html and history.csv with posture, currents of all four drives, tipping margin and energy over time
     (docs/howto/climb.md).
     """
-    from sweeps.commands import climb as room
-
-    return room.climb_obstacle(told.config, out, force)
 
 
 @_command(
     config.Check,
+    config.FolderPart,
     group=DESIGN,
-    arguments=("requirements",),
     example="mmrjax check requirements.toml --robot found/robot.toml --set gearbox.ratio=40",
     failure=f"{_AT_CORNER}. A requirement that is missed is an answer: 0; result.json counts them",
 )
-def check(told: Told, out: _Out = None, force: _Force = False) -> int:
+def check() -> None:
     """Check a robot against requirements.
 
     Each requirement passes or fails with a margin, at the worst corner of its envelope. For each missed requirement
     it reports the change of one parameter that would meet it.
     """
-    from sweeps.commands import check as room
-
-    return room.check_robot(told.config, out, force)
 
 
 @_command(
     config.Size,
+    config.FolderPart,
     group=DESIGN,
-    arguments=("requirements",),
     example="mmrjax size requirements.toml --pareto mass,energy",
     failure=f"{_AT_CORNER} of the best. That no design meets all is an answer: 0",
 )
-def size(told: Told, out: _Out = None, force: _Force = False) -> int:
+def size() -> None:
     """Choose motor, gearbox and cells that meet requirements.
 
     The search covers makers' motors and gearboxes, ratio, wheel radius and number of cells. Writes the best design
     as robot.toml, the alternatives, and the requirement that limits each motor.
     """
-    from sweeps.commands import size as room
-
-    return room.size_to_folder(told.config, out, force)
 
 
 @_command(
     config.Export,
+    config.FolderPart,
     group=ELSEWHERE,
-    arguments=("robot",),
     example="mmrjax export found/robot.toml --to mujoco --data runs.csv --out exported",
     failure="does not occur: runs that do not settle are left out of the comparison",
+    room="export_drive",
 )
-def export(told: Told, out: _Out = None, force: _Force = False) -> int:
+def export() -> None:
     """Write the drive for MuJoCo, JAX, ONNX and others.
 
     A page reports what the format cannot represent. The format's parameters are refitted to this model over the
     runs of --data. LAW.md documents the law on its own: equations, constants with intervals, conditions covered by
     the data, and what was not tested.
     """
-    from sweeps.commands import export_drive as room
-
-    return room.export_to_folder(told.config, out, force)
 
 
 rig = typer.Typer(
@@ -638,7 +490,8 @@ def inspect_file(
 @app.command(rich_help_panel=ELSEWHERE, epilog="Example: mmrjax explain series_resistance")
 def explain(
     name: Annotated[
-        str | None, typer.Argument(help="An effect, status, flag, output, channel or parameter; none lists them.")
+        list[str] | None,
+        typer.Argument(help="Effect, status, flag, output, channel, parameter or word of a report. None lists them."),
     ] = None,
     effects: _Effects = None,
     no_cache: _NoCache = False,
@@ -650,11 +503,11 @@ def explain(
     _start_jax(no_cache)
     from sweeps.commands import explain as room
 
-    return room.explain_name(name, tuple(effects or ()))
+    return room.explain_name(" ".join(name) if name else None, tuple(effects or ()))
 
 
-def _prepared(resolved: Any, no_cache: bool = False) -> Any:
-    """A command's configuration, once the environment is ready for the jax that the command will import.
+def _prepare(resolved: Any, no_cache: bool = False) -> None:
+    """Make the environment ready for the jax that a command of this configuration will import.
 
     Runs of the track model have hung for good, one sweep in seven on two cores, with every thread asleep in
     XLA's CPU executor (jax 0.10.2); with one thread none of twelve did (docs/lab/figures.md). Whoever sets
@@ -664,7 +517,6 @@ def _prepared(resolved: Any, no_cache: bool = False) -> Any:
     one_thread = model is not None and fidelities.fidelity_facts(model).one_thread
     options = (f"xla_cpu_small_while_loop_byte_threshold={WHOLE}",) * isinstance(resolved, config.Loop)
     _start_jax(no_cache, ("--xla_cpu_multi_thread_eigen=false",) * one_thread, options)
-    return resolved
 
 
 #: Up to how many bytes a loop within a program of `loop` is compiled as one function [bytes]. In another one each
@@ -710,18 +562,6 @@ def _refuse_little_memory() -> None:
         )
 
 
-def _check_arguments(arguments: Sequence[str]) -> None:
-    """Refuse names that are not UTF-8: neither pages nor JSON could show them.
-
-    Raises:
-        BadConfiguration: an argument with other bytes.
-    """
-    for argument in arguments:
-        if not argument.isprintable() and any("\ud800" <= c <= "\udfff" for c in argument):
-            shown = argument.encode("utf-8", "replace").decode()
-            raise BadConfiguration(f"{shown}: is not in UTF-8; rename the file or folder")
-
-
 def main() -> None:
     """Run the command line; every failure is one sentence on stderr and a documented exit code."""
     for number in (signal.SIGTERM, signal.SIGALRM):  # ended or interrupted: both can be taken up again
@@ -729,7 +569,11 @@ def main() -> None:
     unraised, sys.unraisablehook = sys.unraisablehook, _obey_interrupt
     _replace_closed_streams()
     try:
-        _check_arguments(sys.argv[1:])
+        # Refuse names that are not UTF-8: neither pages nor JSON could show them
+        for argument in sys.argv[1:]:
+            if not argument.isprintable() and any("\ud800" <= c <= "\udfff" for c in argument):
+                shown = argument.encode("utf-8", "replace").decode()
+                raise BadConfiguration(f"{shown}: is not in UTF-8; rename the file or folder")
         code = app(standalone_mode=False)
         if code == INTERRUPTED:  # the option parser has caught the interrupt
             raise KeyboardInterrupt

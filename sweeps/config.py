@@ -13,25 +13,36 @@ from pydantic_core import PydanticCustomError
 
 from calibration.data import Json, Names, presets_file
 from calibration.data.columns import ROWS
-from calibration.data.input_errors import SEEDS, BadConfiguration, allowed_words, parse_number
+from calibration.data.input_errors import SEEDS, BadConfiguration, allowed_words
 from calibration.data.input_files import toml_content, toml_text
 from calibration.inference import solvers
 from mmrjax import fidelities
 from mmrjax.model import channels
 from mmrjax.model.paper_tables import BENCH, PAYLOADS_KG, SLOPES_DEG, SURFACES, VOLTAGES_V
 from mmrjax.model.quantities import CONDITIONS
-from sweeps.flags import options_of_fields
+from sweeps.options import options_of_fields, schema_facts
 
-_VOLTAGE, _PAYLOAD, _SLOPE = (CONDITIONS[c].range for c in ("voltage", "payload", "slope_deg"))
-Slope = Annotated[float, Field(ge=_SLOPE[0], le=_SLOPE[1], allow_inf_nan=False)]
-Payload = Annotated[float, Field(ge=_PAYLOAD[0], le=_PAYLOAD[1], allow_inf_nan=False)]
-_SPEED = channels.find_channel("motor_speed").range
-_CURRENT = channels.find_channel("motor_current").range
-MotorCurrent = Annotated[float, Field(ge=_CURRENT[0], le=_CURRENT[1], allow_inf_nan=False)]
-_TORQUE = CONDITIONS["load_torque"].range
-LoadTorque = Annotated[float, Field(ge=_TORQUE[0], le=_TORQUE[1], allow_inf_nan=False)]
-MotorSpeed = Annotated[float, Field(ge=_SPEED[0], le=_SPEED[1], allow_inf_nan=False)]
-Voltage = Annotated[float, Field(ge=_VOLTAGE[0], le=_VOLTAGE[1], allow_inf_nan=False)]
+
+def between(low: float, high: float) -> Any:
+    """Bounds of a finite number."""
+    return Field(ge=low, le=high, allow_inf_nan=False)
+
+
+def positive(most: float) -> Any:
+    """Bounds of a finite number above 0."""
+    return Field(gt=0, le=most, allow_inf_nan=False)
+
+
+T = TypeVar("T")
+Several = Annotated[tuple[T, ...], Field(min_length=1)]
+Slope = Annotated[float, between(*CONDITIONS["slope_deg"].range)]
+Payload = Annotated[float, between(*CONDITIONS["payload"].range)]
+LoadTorque = Annotated[float, between(*CONDITIONS["load_torque"].range)]
+Voltage = Annotated[float, between(*CONDITIONS["voltage"].range)]
+Duty = Annotated[float, between(*CONDITIONS["duty_left"].range)]
+Heading = Annotated[float, between(*CONDITIONS["heading_deg"].range)]
+MotorCurrent = Annotated[float, between(*channels.find_channel("motor_current").range)]
+MotorSpeed = Annotated[float, between(*channels.find_channel("motor_speed").range)]
 #: The fidelity that follows profiles.
 PROFILED = "drive"
 #: Longest run of `simulate` where none is stated [s]: short enough that the start is seen.
@@ -48,7 +59,7 @@ def option_field(default: Any, description: str, **extra: Any) -> Any:
             `solver`, how its command solves, which few need: hidden in `--help`, and a key of `[solver]`;
             `verbatim`, a list each of whose texts may have commas; `metavar` of an argument; `format`, such as path;
             `minimum`, where the command asks for more than the field; `executes`, whose value is code that is run,
-            or leads to such: a file may state it with `--trust` only.
+            or leads to such: a file may state it with `--trust` only; `argument`, if it is no option.
     """
     return Field(default=default, description=description, json_schema_extra=extra or None)
 
@@ -68,6 +79,36 @@ class RobotPart(Part):
     )
     effects: Names = option_field(
         (), "A Python file with effects of your own, repeatable; its code is run", verbatim=True, executes=True
+    )
+
+
+class FolderPart(Part):
+    """Run folder of a command; it changes no number."""
+
+    out: Path | None = option_field(None, "The run folder", usual="runs/COMMAND-TIME")
+    force: bool = option_field(False, "Replace an existing run folder")
+
+
+class Measured(FolderPart):
+    """Measured data of a command."""
+
+    data: str = option_field("measured", "Measured runs or histories in any format, or measured", argument=True)
+
+
+class ComparedRuns(Measured):
+    """Data of `compare`."""
+
+    data: str = option_field(
+        "measured", "Measured runs in any format, or measured, or simulated_by_paper", argument=True
+    )
+    own_mass: bool = option_field(False, "Take the robot's mass and the payload, not the stated total mass")
+
+
+class SettledLog(FolderPart):
+    """Data of `settle`."""
+
+    data: str = option_field(
+        ..., "A log over time in any format: time_s, what is imposed, channels", argument=True, metavar="LOG"
     )
 
 
@@ -129,14 +170,14 @@ def _usual(option: str, shown: float = math.inf) -> str:
     return "; ".join([f"{name} {text}" for name, text in capped.items()] if len(found) > 1 else capped.values())
 
 
-Duration = Annotated[float, Field(gt=0, le=_most("duration"), allow_inf_nan=False)]
+Duration = Annotated[float, positive(_most("duration"))]
 
 
 class FidelityPart(ModelPart):
     """Fidelity of the simulation and its options; None takes the fidelity's default."""
 
     duration_s: Duration | None = option_field(None, "Length of a run", usual=_usual("duration", SHOWN))
-    step_s: Annotated[float, Field(gt=0, le=_most("step"), allow_inf_nan=False)] | None = option_field(
+    step_s: Annotated[float, positive(_most("step"))] | None = option_field(
         None, "Integration step", usual=_usual("step")
     )
 
@@ -191,8 +232,6 @@ class SupplyPart(Part):
         return self
 
 
-Voltages = Annotated[tuple[Voltage, ...], Field(min_length=1)]
-Payloads = Annotated[tuple[Payload, ...], Field(min_length=1)]
 SURFACE = (
     "Surface of Table 5; scales the adhesion, which a robot states for lacquered_wood. Of a rig a label of its own"
 )
@@ -221,9 +260,7 @@ class OneRun(Part):
         None, "Motor speed (rpm), negative backward, of a rig on whose motors it is imposed"
     )
     motor_current_A: float | None = option_field(
-        None,
-        "Current of each motor (A), negative backward, of a rig on whose motors it is imposed",
-        flag="--motor-current",
+        None, "Current of each motor (A), negative backward, of a rig on whose motors it is imposed"
     )
     payload_kg: float | None = option_field(None, "Additional load mass", usual="0")
     slope_deg: float | None = option_field(None, "Slope, positive uphill", usual="0")
@@ -237,39 +274,78 @@ class OneRun(Part):
     levers_rear_deg: float | None = option_field(None, "The same of the rear levers", usual="the robot's")
     load_torque_Nm: float | None = option_field(
         None, "Torque of a brake on the output of each drive (N·m), against forward rotation, of a load on a shaft",
-        usual="none", flag="--load-torque",
+        usual="none"
     )  # fmt: skip
 
+    @property
+    def stated(self) -> Json:
+        """Conditions that options state, by column."""
+        return {name: value for name in OneRun.model_fields if (value := getattr(self, name)) is not None}
 
-class GridPart(Part):
-    """The axes of a grid; None leaves them to `sweeps.points.grid.resolve_grid`: Table 8 for the packaged robot.
+
+class GivenRuns(OneRun, FolderPart):
+    """Runs of `simulate`: one of options, or those of a file."""
+
+    runs: Path | None = option_field(None, "CSV of runs to simulate instead; the condition columns are enough")
+
+    @model_validator(mode="after")
+    def _once(self) -> Self:
+        if self.runs is not None and self.stated:
+            raise PydanticCustomError(
+                "idle", f"{', '.join(f'`{name}`' for name in self.stated)}: not allowed with `runs`, whose columns "
+                "state the conditions of each run; state it there, or leave out `runs`",
+            )  # fmt: skip
+        return self
+
+
+class Picture(OneRun):
+    """File of `render`, and the run that it shows."""
+
+    file: Path = option_field(..., "What to write: its suffix is .png, .gif or .mp4", argument=True)
+    begin: float | None = option_field(
+        None, "Instant of a picture, first one of a film (s)", usual="0; of a picture 0.8"
+    )
+    end: float | None = option_field(None, "Last instant of a film (s)", usual="begin + 0.1")
+    slow: Annotated[float, Field(ge=0.01)] | None = option_field(None, "Slow-motion factor of a film", usual="20")
+    climb: Path | None = option_field(
+        None, "A folder of mmrjax climb to draw in its place, by default whole and at half speed"
+    )
+    force: bool = option_field(False, "Replace an existing file")
+
+
+class AxesPart(Part):
+    """Axes of a grid; None leaves them to `sweeps.points.grid.resolve_grid`: Table 8 for the packaged robot.
 
     A robot has voltages or motor speeds, on the battery neither; payloads, slopes and surface are of a vehicle.
     """
 
-    configurations: Annotated[Names, Field(min_length=1)] | None = option_field(
+    configurations: Several[str] | None = option_field(
         None, "Comma-separated, of the robot's", usual="all that it has"
     )
-    voltages_V: Voltages | None = option_field(
+    voltages_V: Several[Voltage] | None = option_field(
         None, "Supply voltages (V), of a rig thirds of its voltage_limit", usual=_shown(VOLTAGES_V)
     )
-    motor_speeds_rpm: Annotated[tuple[MotorSpeed, ...], Field(min_length=1)] | None = option_field(
+    motor_speeds_rpm: Several[MotorSpeed] | None = option_field(
         None, "Motor speeds (rpm) of a rig on whose motors they are imposed", usual="thirds of speed_limit"
     )
-    motor_currents_A: Annotated[tuple[MotorCurrent, ...], Field(min_length=1)] | None = option_field(
-        None, "Currents of each motor (A) of a rig on whose motors they are imposed", flag="--motor-currents"
-    )
-    payloads_kg: Payloads | None = option_field(
+    payloads_kg: Several[Payload] | None = option_field(
         None, "Additional load masses (kg), of a rig 0", usual=_shown(PAYLOADS_KG)
     )
-    slopes_deg: Annotated[tuple[Slope, ...], Field(min_length=1)] | None = option_field(
+    slopes_deg: Several[Slope] | None = option_field(
         None, "Slopes, positive uphill (deg), of a rig 0", usual=_shown(SLOPES_DEG)
     )
     surface: str | None = option_field(None, SURFACE, usual=f"{BENCH}; of a rig none")
-    load_torques_Nm: Annotated[tuple[LoadTorque, ...], Field(min_length=1)] | None = option_field(
-        None, "Torques of a brake on the output of each drive (N·m), of a load on a shaft", usual="none",
-        flag="--load-torques",
-    )  # fmt: skip
+
+
+class GridPart(AxesPart):
+    """Axes of a grid, those of shafts and imposed currents among them."""
+
+    motor_currents_A: Several[MotorCurrent] | None = option_field(
+        None, "Currents of each motor (A) of a rig on whose motors they are imposed"
+    )
+    load_torques_Nm: Several[LoadTorque] | None = option_field(
+        None, "Torques of a brake on the output of each drive (N·m), of a load on a shaft", usual="none"
+    )
 
 
 class InferencePart(Part):
@@ -298,7 +374,11 @@ class MembersPart(Part):
     )
 
 
-class LoopBeside(MembersPart):
+class FittedRuns(MembersPart, Measured):
+    """Options of `calibrate` that change no number."""
+
+
+class LoopBeside(FittedRuns):
     """Options of the loop that change no number."""
 
     within: Annotated[str, Field(pattern=r"^\d+(\.\d+)?(s|min|h)?$")] | None = option_field(
@@ -314,10 +394,6 @@ class LoopBeside(MembersPart):
         return float(number) * {"min": 60.0, "h": 3600.0}.get(self.within.removeprefix(number), 1.0)
 
 
-_DUTY, _HEADING = CONDITIONS["duty_left"].range, CONDITIONS["heading_deg"].range
-Duty = Annotated[float, Field(ge=_DUTY[0], le=_DUTY[1], allow_inf_nan=False)]
-
-
 class TurnPart(Part):
     """Different drive of the two sides of one run; None: the same."""
 
@@ -327,15 +403,13 @@ class TurnPart(Part):
     right_V: Voltage | None = option_field(None, "Voltage of the right motor (V)")
     duty_left: Duty | None = option_field(None, "Share of the supply's voltage at the left motor, in place of --left")
     duty_right: Duty | None = option_field(None, "Share of the supply's voltage at the right motor")
-    speed_m_s: Annotated[float, Field(ge=-100, le=100, allow_inf_nan=False)] | None = option_field(
+    speed_m_s: Annotated[float, between(-100, 100)] | None = option_field(
         None, "Speed of the settled turn (m/s), in place of --left and --right, which are found; with --yaw-rate"
     )
-    yaw_rate_rad_s: Annotated[float, Field(ge=-100, le=100, allow_inf_nan=False)] | None = option_field(
+    yaw_rate_rad_s: Annotated[float, between(-100, 100)] | None = option_field(
         None, "Yaw rate of the settled turn (rad/s), positive to the left; with --speed"
     )
-    heading_deg: Annotated[float, Field(ge=_HEADING[0], le=_HEADING[1], allow_inf_nan=False)] | None = option_field(
-        None, "Heading at the start, from uphill, positive to the left"
-    )
+    heading_deg: Heading | None = option_field(None, "Heading at the start, from uphill, positive to the left")
 
     @property
     def demands(self) -> bool:
@@ -479,21 +553,21 @@ class Resonance(RobotPart, FidelityPart, OutputPart):
         None, "Length of a run (s); ripple is read in its second half", usual="1.5", minimum=0.5
     )
     configuration: str | None = option_field(None, "One of the robot's", usual="its first")
-    voltages_V: Voltages = option_field(
+    voltages_V: Several[Voltage] = option_field(
         tuple(10.0 + k for k in range(31)),
         "Supply voltages (V) that set the speed, at least 5 of them",
         usual="10:40:1, that is 31",
         minimum=0,
     )
-    payloads_kg: Payloads = option_field(PAYLOADS_KG, "Additional load masses")
+    payloads_kg: Several[Payload] = option_field(PAYLOADS_KG, "Additional load masses")
     slope_deg: Slope = option_field(0.0, "Slope, positive uphill")
     surface: Literal[tuple(SURFACES)] = option_field(  # type: ignore[valid-type]  # names of a table
         BENCH, "Surface of Table 5, which scales the adhesion"
     )
 
 
-Angle = Annotated[float, Field(ge=-360, le=360, allow_inf_nan=False)]
-Height = Annotated[float, Field(gt=0, le=5000, allow_inf_nan=False)]
+Angle = Annotated[float, between(-360, 360)]
+Height = Annotated[float, positive(5000)]
 
 
 class Climb(RobotPart, SupplyPart, OutputPart):
@@ -506,9 +580,7 @@ class Climb(RobotPart, SupplyPart, OutputPart):
     terrain: Path | None = option_field(
         None, "CSV of a polyline with columns x_m and z_m, or x_mm and z_mm", format="path"
     )
-    nose_mm: Annotated[float, Field(ge=0, le=500, allow_inf_nan=False)] = option_field(
-        0.0, "Radius of the noses of step or stairs"
-    )
+    nose_mm: Annotated[float, between(0, 500)] = option_field(0.0, "Radius of the noses of step or stairs")
     levers_front_deg: Angle | None = option_field(
         None, "Front levers, 0 along the wheelbase outward, positive up, 180 folded", usual="as the robot states them"
     )
@@ -518,8 +590,8 @@ class Climb(RobotPart, SupplyPart, OutputPart):
         "voltages of their motors, front_V, rear_V, beginning at the stated angles",
         format="path",
     )  # fmt: skip
-    levers_voltage_V: Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False)] | None = option_field(
-        None, "Highest voltage of the levers' motors (V)", usual="that of the supply", flag="--levers-voltage"
+    levers_voltage_V: Annotated[float, positive(1e6)] | None = option_field(
+        None, "Highest voltage of the levers' motors (V)", usual="that of the supply"
     )
     supply_voltage_V: Voltage | None = option_field(None, "Supply voltage (V)", usual="12", flag="--voltage")
     payload_kg: Payload = option_field(0.0, "Additional load mass")
@@ -535,10 +607,8 @@ class Climb(RobotPart, SupplyPart, OutputPart):
         "voltage, levers_front_deg, levers_rear_deg, obstacle_mm",
     )
     film: bool = option_field(False, "Write climb.gif")
-    duration_s: Annotated[float, Field(gt=0, le=600, allow_inf_nan=False)] = option_field(20.0, "Longest run")
-    time_step_s: Annotated[float, Field(gt=0, le=1e-3, allow_inf_nan=False)] = option_field(
-        1e-4, "Integration step", solver=True
-    )
+    duration_s: Annotated[float, positive(600)] = option_field(20.0, "Longest run")
+    time_step_s: Annotated[float, positive(1e-3)] = option_field(1e-4, "Integration step", solver=True)
 
     @model_validator(mode="after")
     def _one_obstacle(self) -> Self:
@@ -603,7 +673,7 @@ class Calibrate(RobotPart, DataPart, InferencePart, OutputPart):
 class Settle(RobotPart, DataPart, OutputPart):
     """Options for extracting settled runs from a log over time."""
 
-    shortest_s: Annotated[float, Field(gt=0, le=3600, allow_inf_nan=False)] | None = option_field(
+    shortest_s: Annotated[float, positive(3600)] | None = option_field(
         None, "Shortest stretch that is taken for settled", usual="0.3, and at least 20 samples"
     )
     drift: Annotated[float, Field(gt=0, le=0.5)] = option_field(
@@ -615,7 +685,11 @@ class Export(RobotPart, OutputPart):
     """A drive in the format of another simulator."""
 
     robot: str = option_field(
-        "nominal", "nominal, sm1, sm2, or a robot's TOML file", metavar="[ROBOT.toml]", format="path"
+        "nominal",
+        "nominal, sm1, sm2, or a robot's TOML file",
+        metavar="[ROBOT.toml]",
+        format="path",
+        argument=True,
     )
     to: Literal["mujoco", "jax", "onnx", "mjlab", "table", "randomization"] = option_field(
         "mujoco", "Format (docs/howto/export.md)"
@@ -665,6 +739,7 @@ class RequirementsPart(Part):
         usual="the paper's aims",
         metavar="[REQUIREMENTS.toml]",
         format="path",
+        argument=True,
     )
 
 
@@ -684,32 +759,14 @@ class Size(RequirementsPart, RobotPart, OutputPart):
     seed: Seed = option_field(0, "Of the starts")
 
 
-class Sensitivity(RobotPart, DataPart, FidelityPart, SupplyPart, OutputPart):
-    """A sensitivity study.
-
-    Operating points are those of a grid; None leaves them to the method: Table 8 where gradients do, its corners and
-    middle where a sample is drawn; of a rig see `sweeps.points.grid.resolve_grid`.
-    """
+class Sensitivity(RobotPart, DataPart, FidelityPart, SupplyPart, AxesPart, OutputPart):
+    """A sensitivity study; methods that draw a sample take corners and middle of the axes that are not stated."""
 
     method: str = option_field(
         "sobol",
         "local, sobol, morris or derivative",
         usual="sobol; with --posterior local",
     )
-    configurations: Annotated[Names, Field(min_length=1)] | None = option_field(
-        None, "Comma-separated, of the robot's", usual="all that it has"
-    )
-    voltages_V: Voltages | None = option_field(
-        None, "Supply voltages", usual="of Table 8; of a rig thirds of its voltage_limit"
-    )
-    motor_speeds_rpm: Annotated[tuple[MotorSpeed, ...], Field(min_length=1)] | None = option_field(
-        None, "Motor speeds (rpm) of a rig on whose motors they are imposed", usual="thirds of speed_limit"
-    )
-    payloads_kg: Payloads | None = option_field(None, "Additional load masses", usual="of Table 8; of a rig 0")
-    slopes_deg: Annotated[tuple[Slope, ...], Field(min_length=1)] | None = option_field(
-        None, "Slopes, positive uphill", usual="of Table 8; of a rig 0"
-    )
-    surface: str | None = option_field(None, SURFACE, usual=f"{BENCH}; of a rig none")
     parameters: Names = option_field(
         (), "Uncertain parameters, comma-separated, motor.* a group", usual="all that have a prior"
     )
@@ -754,15 +811,9 @@ def read_toml(file: Path) -> Json:
     return toml_content(toml_text(file, file), file)
 
 
-def solver_keys(kind: type[Part]) -> list[str]:
-    """The fields of a configuration that say how its command solves, keys of `[solver]` of a file."""
-    return fields_with(kind, "solver")
-
-
 def fields_with(kind: type[Part], fact: str) -> list[str]:
-    """Names of the fields whose `option_field` states a fact."""
-    extra = {name: f.json_schema_extra for name, f in kind.model_fields.items()}
-    return [name for name, said in extra.items() if isinstance(said, dict) and said.get(fact)]
+    """Names of the fields whose `option_field` states a fact: `solver`, the keys of `[solver]` of a file, for one."""
+    return [name for name, facts in schema_facts(kind).items() if facts.get(fact)]
 
 
 def _keys(kind: type[Part], file: Path, beside: type[Part] | None) -> Json:
@@ -771,7 +822,7 @@ def _keys(kind: type[Part], file: Path, beside: type[Part] | None) -> Json:
     table = values.pop("solver", {})
     if not isinstance(table, dict):
         raise BadConfiguration(f"{file.name}, solver: got {table!r}; expected a table, [solver]")
-    own, others = solver_keys(kind), [] if beside is None else solver_keys(beside)
+    own, others = fields_with(kind, "solver"), [] if beside is None else fields_with(beside, "solver")
     for key in table:
         if key not in own + others:
             known = allowed_words(key, own + others) if own + others else "this command has none"
@@ -791,7 +842,7 @@ def resolve_beside(kind: type[C], file: Path | None, options: Json, trust: bool 
         BadConfiguration: as `resolve_configuration`.
     """
     table = {} if file is None else read_toml(file).get("solver", {})
-    stated = {key: table[key] for key in solver_keys(kind) if key in table}
+    stated = {key: table[key] for key in fields_with(kind, "solver") if key in table}
     return _checked(kind, file, stated, options, trust)
 
 
@@ -848,82 +899,14 @@ def _sentence(kind: type[Part], error: ValidationError, file: Path | None, given
     where = f"{file.name}, {place}" if file is not None and key not in given else called(key)
     if first["type"] == "extra_forbidden":
         return f"{where}: no such key; {allowed_words(key, kind.model_fields)}"
-    limits = {
-        name: first["ctx"][name] for name in ("gt", "ge", "lt", "le", "expected") if name in first.get("ctx", {})
-    }
     wanted = first["msg"][0].lower() + first["msg"][1:]
-    ranges = {
-        "slopes_deg": _SLOPE,
-        "slope_deg": _SLOPE,
-        "payloads_kg": _PAYLOAD,
-        "voltages_V": _VOLTAGE,
-        "motor_speeds_rpm": _SPEED,
-        "motor_currents_A": _CURRENT,
-        "load_torques_Nm": _TORQUE,
-    }
-    allowed = ranges.get(key)
-    if allowed is not None and limits:
-        wanted = f"expected {allowed[0]:g} to {allowed[1]:g}"
+    fact = schema_facts(kind).get(key, {})
+    limits = {**fact.get("items", {}), **fact}
+    if first["type"] == "literal_error":
+        wanted = f"expected {first['ctx']['expected']}"
+    if {"minimum", "maximum"} <= limits.keys() and {"ge", "le"} & first.get("ctx", {}).keys():
+        wanted = f"expected {limits['minimum']:.10g} to {limits['maximum']:.10g}"
     return f"{where}: got {first['input']!r}; {wanted}"
-
-
-def parse_settings(options: list[str] | None) -> dict[str, bool | float] | None:
-    """The `--set NAME=VALUE` options as a table.
-
-    Raises:
-        BadConfiguration: no equals sign, or a value that is neither a number nor true or false.
-    """
-    if not options:
-        return None
-    table: dict[str, bool | float] = {}
-    for option in options:
-        name, equals, value = option.partition("=")
-        try:
-            word = value.strip()
-            table[name.strip()] = word == "true" if word in ("true", "false") else parse_number(word)
-        except ValueError:
-            raise BadConfiguration(
-                f"--set: got {option}; expected NAME=VALUE with a number, such as motor.resistance=0.9"
-            ) from None
-        if not equals:
-            raise BadConfiguration(f"--set: got {option}; expected NAME=VALUE, such as motor.resistance=0.9")
-    return table
-
-
-def split_words(options: list[str] | None) -> Names | None:
-    """Repeated, comma-separated options as one tuple."""
-    return tuple(w.strip() for o in options for w in o.split(",") if w.strip()) if options else None
-
-
-def parse_axis(option: str, text: str | None) -> tuple[float, ...] | None:
-    """An axis of a grid: `0,5,10`, or `0:20:0.5` for first, last and step, or both mixed.
-
-    Raises:
-        BadConfiguration: something that is neither.
-    """
-    if text is None:
-        return None
-    values: list[float] = []
-    for part in text.split(","):
-        try:
-            numbers = [parse_number(n) for n in part.split(":")]
-            if len(numbers) == 1:
-                values += numbers
-                continue
-            first, last, step = numbers
-            if (last - first) * step < 0:
-                raise BadConfiguration(
-                    f"{option}: got {part}, which ends before it begins; expected first:last:step as 0:20:0.5"
-                )
-            count = (last - first) / step
-            if not 0 <= count < 1e6:
-                raise ValueError
-            values += [first + k * step for k in range(round(count - 0.5 + 1e-9) + 1)]
-        except (ValueError, ZeroDivisionError, OverflowError):
-            raise BadConfiguration(
-                f"{option}: got {part or 'nothing'}; expected numbers as 0,5,10 or first:last:step as 0:20:0.5"
-            ) from None
-    return tuple(values)
 
 
 def as_toml(config: Part) -> str:

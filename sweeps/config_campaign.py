@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
 import re
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, Self
 
@@ -12,11 +10,12 @@ from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from calibration.data import Json, Names
-from calibration.data.input_errors import BadConfiguration, allowed_words
+from calibration.data.input_errors import BadConfiguration
 from mmrjax.model.paper_tables import COULOMB_PER_MAH
 from mmrjax.model.quantities import RPM
 from sweeps.config import (
     BatchPart,
+    FolderPart,
     OutputPart,
     Part,
     ProfilePart,
@@ -26,7 +25,7 @@ from sweeps.config import (
     read_toml,
     resolve_configuration,
 )
-from sweeps.flags import options_of_fields
+from sweeps.options import options_of_fields
 
 #: Keys that only a sweep into a store has.
 KEYS = ("axes", "samples", "conditions", "outputs", "storage", "compression", "profile", "obstacle")
@@ -36,7 +35,6 @@ GRID = (
     "battery",
     "discharge_mAh",
 )  # fmt: skip
-EXPORTS = ("csv", "parquet")
 
 
 #: Axis of the size of what is climbed.
@@ -88,9 +86,20 @@ class Campaign(RobotPart, ProfilePart, BatchPart, OutputPart):
     obstacle: Obstacle | None = None
 
 
-class SharePart(Part):
-    """Who simulates a sweep, which changes no number."""
+class StoreOptions(FolderPart):
+    """Execution and storage options of a sweep; they do not affect results."""
 
+    plan: Path | None = option_field(
+        None, "TOML file with [axes] or [samples] (docs/reference/plans.md)", argument=True, metavar="[CONFIG.toml]"
+    )
+    zarr: bool = option_field(False, "Write a Zarr store, also of a small grid of options")
+    outputs: Names = option_field(
+        (), "Comma-separated, what a store holds of each point", usual="what its instruments show"
+    )
+    dry_run: bool = option_field(False, "Say points, chunks, bytes and time; write nothing")
+    export: tuple[Literal["csv", "parquet"], ...] = option_field(
+        (), "Write the store as csv or parquet too, repeatable"
+    )
     shard: str | None = option_field(
         None, "Simulate the i-th of n shares, as 3/8: a process of a job array each", solver=True
     )
@@ -98,60 +107,35 @@ class SharePart(Part):
         None, "Address of a dask scheduler whose workers simulate, as tcp://host:8786", solver=True, executes=True
     )
 
+    @model_validator(mode="after")
+    def _shared(self) -> Self:
+        if self.shard is not None and not (
+            re.fullmatch(r"\d+/\d+", self.shard) and 1 <= self.share[0] <= self.share[1]
+        ):
+            raise PydanticCustomError(
+                "idle", f"`shard`: got {self.shard}; expected i/n with i from 1 to n, such as 3/8"
+            )
+        if self.shard is not None and self.scheduler is not None:
+            raise PydanticCustomError(
+                "idle", "`shard`: not allowed with `scheduler`, which shares out the chunks; give one of them"
+            )
+        return self
 
-@dataclasses.dataclass(frozen=True)
-class How:
-    """Execution and storage options of a sweep; they do not affect results.
+    @property
+    def where(self) -> str:
+        """Origin of the configuration, for messages."""
+        return "options" if self.plan is None else self.plan.name
 
-    Attributes:
-        shard: this process's share of the chunks, k of n; scheduler: address of a dask scheduler.
-        export: further files, of `EXPORTS`; dry_run: say what would be done, and write nothing.
-        zarr: write a store, also of a small grid; outputs: of it, in place of those of the configuration.
-    """
+    @property
+    def share(self) -> tuple[int, int]:
+        """This process's share of the chunks, k of n."""
+        k, n = (self.shard or "1/1").split("/")
+        return int(k), int(n)
 
-    shard: tuple[int, int] | None = None
-    scheduler: str | None = None
-    export: Names = ()
-    dry_run: bool = False
-    zarr: bool = False
-    outputs: Names = ()
-
-
-def sweep_options(
-    shard: str | None,
-    scheduler: str | None,
-    export: Sequence[str] | None,
-    dry_run: bool,
-    zarr: bool,
-    outputs: str | None,
-) -> How:
-    """The options of a sweep, checked.
-
-    Raises:
-        BadConfiguration: an invalid share, an unknown kind of file.
-    """
-    share = None
-    if shard is not None:
-        match = re.fullmatch(r"(\d+)/(\d+)", shard)
-        share = (int(match[1]), int(match[2])) if match else (0, 0)
-        if not 1 <= share[0] <= share[1]:
-            raise BadConfiguration(f"--shard: got {shard}; expected i/n with i from 1 to n, such as 3/8")
-    for kind in export or ():
-        if kind not in EXPORTS:
-            raise BadConfiguration(f"--export: got {kind}; {allowed_words(kind, EXPORTS)}")
-    if share is not None and scheduler is not None:
-        raise BadConfiguration("--shard: not allowed with --scheduler, which shares out the chunks; give one of them")
-    wanted = () if outputs is None else tuple(name.strip() for name in outputs.split(","))
-    return How(share, scheduler, tuple(dict.fromkeys(export or ())), dry_run, zarr, wanted)
-
-
-def is_campaign(file: Path | None) -> bool:
-    """True if a file states its own axes or samples, or anything else that only a store has.
-
-    Raises:
-        BadConfiguration: the file cannot be read.
-    """
-    return file is not None and not set(KEYS).isdisjoint(read_toml(file))
+    @property
+    def of_store(self) -> bool:
+        """True if only a store has what is stated."""
+        return any((self.zarr, self.outputs, self.dry_run, self.export, self.shard, self.scheduler))
 
 
 def resolve_campaign(file: Path | None, options: Json, trust: bool = False) -> Campaign | Sweep:
@@ -162,7 +146,7 @@ def resolve_campaign(file: Path | None, options: Json, trust: bool = False) -> C
     Raises:
         BadConfiguration: as `resolve`; an option of the grid with a file that has its own axes.
     """
-    if is_campaign(file):
+    if file is not None and not set(KEYS).isdisjoint(read_toml(file)):
         assert file is not None
         for name in GRID:
             if options.get(name) is not None:
@@ -172,9 +156,9 @@ def resolve_campaign(file: Path | None, options: Json, trust: bool = False) -> C
                     "axes or conditions"
                 )
         return resolve_configuration(
-            Campaign, file, {k: v for k, v in options.items() if k not in GRID}, SharePart, trust
+            Campaign, file, {k: v for k, v in options.items() if k not in GRID}, StoreOptions, trust
         )
-    return resolve_configuration(Sweep, file, options, SharePart, trust)
+    return resolve_configuration(Sweep, file, options, StoreOptions, trust)
 
 
 def of_grid(grid: Sweep) -> Campaign:

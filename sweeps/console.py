@@ -8,7 +8,7 @@ import sys
 import textwrap
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import IO, Any, cast
 
@@ -26,6 +26,7 @@ from rich.progress import (
 from rich.segment import Segment
 from rich.text import Text
 
+from calibration.data import Json
 from calibration.data.writing import json_text, naming_file
 from mmrjax.errors import printable
 
@@ -79,7 +80,7 @@ def print_output(what: Any) -> None:
         _out.print(wrap_for_terminal(what) if isinstance(what, str) and sys.stdout.isatty() else what)
 
 
-def print_json(content: Mapping[str, Any]) -> None:
+def print_json(content: Json) -> None:
     """Print JSON to stdout."""
     with naming_file(OUTPUT):
         print(json_text(content))

@@ -19,9 +19,9 @@ from mmrjax.model.paper_tables import BENCH, SURFACES
 from mmrjax.model.quantities import RPM
 from mmrjax.model.robot import Robot, turn_error
 from sweeps import capabilities, store
-from sweeps.config import FidelityPart, OneRun, RobotPart
+from sweeps.config import FidelityPart, GivenRuns, OneRun, RobotPart, Simulate
 from sweeps.console import print_message
-from sweeps.flags import options_of_fields
+from sweeps.options import options_of_fields
 from sweeps.points import imposed
 from sweeps.report.words import turn_words
 
@@ -160,6 +160,13 @@ def read_runs(
     if runs.unknown:
         print_message(f"{runs.source}: not used: {', '.join(runs.unknown)}")
     return runs
+
+
+def given_runs(robot: Robot, beside: GivenRuns, config: Simulate, elsewhere: Collection[str] = ()) -> records.Runs:
+    """Runs of a file, or one of options; `elsewhere`: columns that a profile states."""
+    if beside.runs is None:
+        return one_run(robot, beside.stated, config.battery, elsewhere)
+    return read_runs(str(beside.runs), robot, columns=config.columns, measured=False, battery=config.battery)
 
 
 def one_run(robot: Robot, cells: Json, battery: bool = False, elsewhere: Collection[str] = ()) -> records.Runs:

@@ -4,22 +4,69 @@ from __future__ import annotations
 
 import copy
 import inspect
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from pydantic import BaseModel
 
-from calibration.data import Json, Names
-from sweeps import config
-from sweeps.config import Part
-from sweeps.flags import of_unit, option_of_field, schema_facts
+from calibration.data import Json
+from calibration.data.input_errors import BadConfiguration, parse_number
+
+#: Units that names of fields end with, the longest first, and as they are written.
+UNITS = {
+    "rad_s": "rad/s",
+    "m_s": "m/s",
+    "s": "s",
+    "V": "V",
+    "A": "A",
+    "Nm": "N·m",
+    "rpm": "rpm",
+    "kg": "kg",
+    "deg": "deg",
+    "mm": "mm",
+    "mAh": "mAh",
+}
+
+
+def schema_facts(kind: type[BaseModel]) -> dict[str, Json]:
+    """Schema of each field of a configuration, in the order of its parts, its own first."""
+    schema = kind.model_json_schema()["properties"]
+    own = [
+        name for part in kind.__mro__ if issubclass(part, BaseModel) for name in vars(part).get("__annotations__", {})
+    ]
+    found = {}
+    for name in dict.fromkeys(n for n in own if n in schema):
+        stated = schema[name]
+        given: Json = next((a for a in stated.get("anyOf", ()) if a.get("type") != "null"), {})
+        found[name] = {**given, **stated}
+    return found
+
+
+def option_of_field(name: str, fact: Json) -> str:
+    """The option of a field: `--discharge` of `discharge_mAh`."""
+    stem, _ = of_unit(name)
+    return str(fact.get("flag") or "--" + stem.replace("_", "-"))
+
+
+def of_unit(name: str) -> tuple[str, str]:
+    """A field's name without its unit, and that, empty where it has none."""
+    return next(
+        ((name.removesuffix(f"_{end}"), unit) for end, unit in UNITS.items() if name.endswith(f"_{end}")), (name, "")
+    )
+
+
+def options_of_fields(kind: type[BaseModel]) -> dict[str, str]:
+    """The option of each field."""
+    return {name: option_of_field(name, fact) for name, fact in schema_facts(kind).items()}
+
 
 _TYPES = {"boolean": bool, "integer": int, "number": float, "string": str, "object": list[str]}
 _LISTS = {"number": str, "string": list[str]}  # an axis is one text
 
 
-def option_help(name: str, fact: Mapping[str, Any]) -> str:
+def option_help(name: str, fact: Json) -> str:
     """Meaning, unit, choices, bounds and default of a field, as a help text has them."""
     _, unit = of_unit(name)
     texts = [str(fact.get("description", name)).rstrip(".")]
@@ -32,7 +79,7 @@ def option_help(name: str, fact: Mapping[str, Any]) -> str:
     return "  ".join(texts).replace("[", "\\[")  # a word in brackets would be markup
 
 
-def _bounds(fact: Mapping[str, Any]) -> str:
+def _bounds(fact: Json) -> str:
     limits = {**fact.get("items", {}), **fact}
     ends = [f"{limits[key]:.10g}" if key in limits else "" for key in ("minimum", "maximum")]
     if all(ends):
@@ -41,7 +88,7 @@ def _bounds(fact: Mapping[str, Any]) -> str:
     return ", ".join(f"{word} {limits[key]:.10g}" for key, word in words.items() if key in limits)
 
 
-def _default(name: str, fact: Mapping[str, Any]) -> str:
+def _default(name: str, fact: Json) -> str:
     value = fact.get("usual", fact.get("default"))
     if isinstance(value, bool):
         return "default: " + option_of_field(name, fact).removeprefix("--") if value else ""
@@ -52,34 +99,32 @@ def _default(name: str, fact: Mapping[str, Any]) -> str:
     )
 
 
-def option_parameters(kind: type[Part], arguments: Names = ()) -> Iterator[inspect.Parameter]:
-    """A parameter of a command's function for each field that can be chosen, None where it is not given.
-
-    Args:
-        arguments: fields that are arguments and not options.
-    """
+def option_parameters(kind: type[BaseModel]) -> Iterator[inspect.Parameter]:
+    """A parameter of a command's function for each field that can be chosen, None where it is not given."""
     for name, fact in schema_facts(kind).items():
         if "const" in fact:  # one choice is none
             continue
-        if name in arguments:
-            told: Any = typer.Argument(metavar=fact["metavar"], help=option_help(name, fact))
+        default, annotation = None, _type(fact) | None
+        if fact.get("argument"):
+            told: Any = typer.Argument(metavar=fact.get("metavar"), help=option_help(name, fact))
+            if "default" not in fact:
+                default, annotation = inspect.Parameter.empty, _type(fact)
         else:
             word = option_of_field(name, fact)
             pair = fact.get("type") == "boolean" and fact.get("default") is not False
             names = f"{word}/--no-{word.removeprefix('--')}" if pair else word
             told = typer.Option(names, help=option_help(name, fact), hidden=bool(fact.get("solver")))
-        yield inspect.Parameter(
-            name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=Annotated[_type(fact) | None, told]
-        )
+        keyword = inspect.Parameter.KEYWORD_ONLY
+        yield inspect.Parameter(name, keyword, default=default, annotation=Annotated[annotation, told])
 
 
-def _type(fact: Mapping[str, Any]) -> Any:
+def _type(fact: Json) -> Any:
     if fact.get("format") == "path":
         return Path
     return _LISTS[fact["items"]["type"]] if fact["type"] == "array" else _TYPES[fact["type"]]
 
 
-def take_options(kind: type[Part], values: Json) -> Json:
+def take_options(kind: type[BaseModel], values: Json) -> Json:
     """Takes what was given for the fields of a configuration out of the values of a command, and reads their texts.
 
     Raises:
@@ -88,19 +133,23 @@ def take_options(kind: type[Part], values: Json) -> Json:
     return {name: _read(name, fact, values.pop(name, None)) for name, fact in schema_facts(kind).items()}
 
 
-def _read(name: str, fact: Mapping[str, Any], value: Any) -> Any:
-    if value is None:
+def _read(name: str, fact: Json, value: Any) -> Any:
+    if value is None or value == []:
         return None
     if fact["type"] == "object":
-        return config.parse_settings(value)
+        return parse_settings(value)
     if fact["type"] == "array" and fact["items"]["type"] == "number":
-        return config.parse_axis(option_of_field(name, fact), value)
+        return parse_axis(option_of_field(name, fact), value)
     if fact["type"] == "array":
-        return (tuple(value) or None) if fact.get("verbatim") else config.split_words(value)
+        return (
+            tuple(value)
+            if fact.get("verbatim")
+            else tuple(w.strip() for o in value for w in o.split(",") if w.strip())
+        )
     return str(value) if isinstance(value, Path) else value
 
 
-def help_all(kinds: tuple[type[Part], ...]) -> Iterator[inspect.Parameter]:
+def help_all(kinds: tuple[type[BaseModel], ...]) -> Iterator[inspect.Parameter]:
     """The option that shows those of solvers too, where a command has any."""
     hidden = [
         option_of_field(name, fact)
@@ -125,3 +174,53 @@ def _show_all(context: typer.Context, wanted: bool) -> None:
             p.hidden = False  # type: ignore[attr-defined]  # of an option
         typer.echo(shown.get_help(context))
         raise typer.Exit
+
+
+def parse_settings(options: list[str]) -> dict[str, bool | float]:
+    """The `--set NAME=VALUE` options as a table.
+
+    Raises:
+        BadConfiguration: no equals sign, or a value that is neither a number nor true or false.
+    """
+    table: dict[str, bool | float] = {}
+    for option in options:
+        name, equals, value = option.partition("=")
+        try:
+            word = value.strip()
+            table[name.strip()] = word == "true" if word in ("true", "false") else parse_number(word)
+        except ValueError:
+            raise BadConfiguration(
+                f"--set: got {option}; expected NAME=VALUE with a number, such as motor.resistance=0.9"
+            ) from None
+        if not equals:
+            raise BadConfiguration(f"--set: got {option}; expected NAME=VALUE, such as motor.resistance=0.9")
+    return table
+
+
+def parse_axis(option: str, text: str) -> tuple[float, ...]:
+    """An axis of a grid: `0,5,10`, or `0:20:0.5` for first, last and step, or both mixed.
+
+    Raises:
+        BadConfiguration: something that is neither.
+    """
+    values: list[float] = []
+    for part in text.split(","):
+        try:
+            numbers = [parse_number(n) for n in part.split(":")]
+            if len(numbers) == 1:
+                values += numbers
+                continue
+            first, last, step = numbers
+            if (last - first) * step < 0:
+                raise BadConfiguration(
+                    f"{option}: got {part}, which ends before it begins; expected first:last:step as 0:20:0.5"
+                )
+            count = (last - first) / step
+            if not 0 <= count < 1e6:
+                raise ValueError
+            values += [first + k * step for k in range(round(count - 0.5 + 1e-9) + 1)]
+        except (ValueError, ZeroDivisionError, OverflowError):
+            raise BadConfiguration(
+                f"{option}: got {part or 'nothing'}; expected numbers as 0,5,10 or first:last:step as 0:20:0.5"
+            ) from None
+    return tuple(values)

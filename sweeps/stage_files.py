@@ -174,7 +174,15 @@ class _Reader:
         if kind == "array":
             return self._array(*rest)
         if kind == "jax":
-            return _on_device(self._array(*rest[1:]), weak=rest[0])
+            x = self._array(*rest[1:])
+            weak = rest[0]
+            import jax.numpy as jnp
+
+            if not weak or not 0 < x.size <= FEW:
+                return jnp.asarray(x)
+            # Scalars of Python are of the weak kind, for which another program would be compiled.
+            scalars = [jnp.asarray(value) for value in x.ravel().tolist()]
+            return scalars[0] if x.shape == () else jnp.stack(scalars).reshape(x.shape)
         if kind == "type":
             return _class(*rest)
         if kind == "function":
@@ -211,16 +219,6 @@ def _holds(kind: type, name: str) -> bool:
     kept = inspect.getattr_static(kind, name, None)
     fields: Json = getattr(kind, "__dataclass_fields__", {})
     return name in fields or isinstance(kept, functools.cached_property)
-
-
-def _on_device(x: np.ndarray, weak: bool) -> Any:
-    import jax.numpy as jnp
-
-    if not weak or not 0 < x.size <= FEW:
-        return jnp.asarray(x)
-    # Scalars of Python are of the weak kind, for which another program would be compiled, and so is what they make.
-    scalars = [jnp.asarray(value) for value in x.ravel().tolist()]
-    return scalars[0] if x.shape == () else jnp.stack(scalars).reshape(x.shape)
 
 
 def _named_class(kind: type) -> tuple[str, str, list[float] | None]:

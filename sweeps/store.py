@@ -27,7 +27,7 @@ from calibration.discovery.kept import REFIT_FILE
 from mmrjax import __version__
 from mmrjax.model import params
 from mmrjax.model.robot import Robot
-from sweeps.config import RobotPart
+from sweeps.config import FolderPart, RobotPart
 from sweeps.console import print_message
 
 T = TypeVar("T")
@@ -455,7 +455,7 @@ class RunFolder(Folder):
 
 
 def open_folder(
-    command: str, config: RobotPart, robot: Robot, out: Path | None, force: bool, runs: Runs | None = None
+    command: str, config: RobotPart, robot: Robot, beside: FolderPart, runs: Runs | None = None
 ) -> RunFolder:
     """Run folder of a command. Its identity is the configuration and the program's source.
 
@@ -463,7 +463,7 @@ def open_folder(
 
     Args:
         command: its name; config: its configuration; robot: of the configuration, with its changes.
-        out: where the folder is to appear; None: a new one below `runs/`; force: replace an existing run folder.
+        beside: says where the folder is to appear, and if it replaces an existing one.
         runs: the table that it was given, if any.
     """
     import jax
@@ -478,7 +478,7 @@ def open_folder(
         "runs": None if runs is None else {key: value.tolist() for key, value in runs.columns.items()},
         "effects": [sha256_hex(Path(file).read_bytes()) for file in config.effects],
     }
-    folder = RunFolder(out or default_path(command), identity, force=force)
+    folder = RunFolder(beside.out or default_path(command), identity, force=beside.force)
     folder.tables = getattr(config, "table", folder.tables)
     return folder
 

@@ -13,7 +13,7 @@ from calibration.data.runs import Runs
 from calibration.inference import checks
 from calibration.inference.calibration import calibrate
 from calibration.inference.conduct import conduct_notes
-from calibration.inference.fit_notes import EndsEarly, Fact, NeverGrips, NoiseOff, Shown
+from calibration.inference.fit_notes import Remark, Shown, with_codes
 from mmrjax.model import paper_robots, params
 
 CLIMBING = params.replace(paper_robots.nominal(), settled.CLIMBING)
@@ -62,27 +62,31 @@ def test_histories_that_grip_have_nothing_said(histories):
 @pytest.mark.slow
 def test_histories_that_never_grip_are_said(sliding, histories):
     which, none = conduct_notes(sliding, CLIMBING)
-    assert which == NeverGrips(RUNS, which.share) and 0 <= which.share < 0.7 and none == Fact("no grip")
+    assert (
+        which == Remark("never_grips", runs=RUNS, share=which.share)
+        and 0 <= which.share < 0.7
+        and none == Remark("no_grip")
+    )
     half = {c: np.concatenate([sliding[c][sliding["run_id"] == "start0"], histories[c][histories["run_id"] != "start0"]])
             for c in histories.columns}  # fmt: skip
     (said,) = conduct_notes(Runs("runs.csv", half), CLIMBING)
-    assert said == NeverGrips(("start0",), said.share)
+    assert said == Remark("never_grips", runs=("start0",), share=said.share)
 
 
 def test_runs_of_ten_milliseconds_are_said(short):
     (said,) = conduct_notes(short, CLIMBING)
-    assert isinstance(said, EndsEarly) and said.runs == RUNS
+    assert said.code == "ends_early" and said.runs == RUNS
     assert said.lasts == pytest.approx(0.01, rel=0.1) and 0 < said.share < 0.7
     bare = Runs("runs.csv", {c: x for c, x in short.columns.items() if not c.startswith("speed")})
     (said,) = conduct_notes(bare, CLIMBING)
-    assert isinstance(said, EndsEarly) and said.runs == RUNS and np.isnan(said.share)
+    assert said.code == "ends_early" and said.runs == RUNS and np.isnan(said.share)
 
 
 @pytest.mark.slow
 def test_loop_and_calibrate_say_both(sliding, short):
     """Both ask `checks.check_data` before they fit, and keep what it says."""
-    for runs, kind in ((sliding, NeverGrips), (short, EndsEarly)):
-        assert any(isinstance(note, kind) for note in checks.check_data(runs, CLIMBING, (), known(runs)))
+    for runs, code in ((sliding, "never_grips"), (short, "ends_early")):
+        assert with_codes(checks.check_data(runs, CLIMBING, (), known(runs)), code)
 
 
 #: A table or histories, and what is said of it by every command that fits.
@@ -130,7 +134,7 @@ def tenth(case):
 def test_calibrate_says_that_sds_are_ten_times_too_small():
     runs = tenth(tables.narrow(seed=3, free=settled.FRICTION))
     found = calibrate(runs, CLIMBING, starts=2, profiles=False, blocks=())
-    (off,) = [n for n in found.remarks if isinstance(n, NoiseOff)]
+    (off,) = with_codes(found.remarks, "noise_off")
     assert 9.0 < off.factor < 11.0 and off.channel == "" and off.source == "stated"
     assert found.adequacy.adequate is False and found.adequacy.shown_by == Shown(what="stated")
 
@@ -139,5 +143,5 @@ def test_calibrate_says_that_sds_are_ten_times_too_small():
 def test_loop_says_that_sds_are_ten_times_too_small():
     found = SETTLED.discover(tenth(tables.narrow(seed=3)))
     off = found.remarks[0]
-    assert off == NoiseOff("", off.factor, "stated") and 9.0 < off.factor < 11.0
-    assert not any(isinstance(n, NoiseOff) for n in SETTLED.discover(table(tables.narrow(seed=3))).remarks)
+    assert off == Remark("noise_off", channel="", factor=off.factor, source="stated") and 9.0 < off.factor < 11.0
+    assert not with_codes(SETTLED.discover(table(tables.narrow(seed=3))).remarks, "noise_off")

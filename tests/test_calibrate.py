@@ -25,7 +25,7 @@ from calibration.discovery.result import DiscoveryResult
 from calibration.inference import noise, observers, priors
 from calibration.inference import optimizers as fit
 from calibration.inference.calibration import calibrate
-from calibration.inference.fit_notes import Constant, Repeats, SamePredictions, Unmeasured
+from calibration.inference.fit_notes import Remark
 from calibration.inference.observers import SettledRuns
 from calibration.inference.remarks import calibration_remarks
 from calibration.inference.result import CalibrationResult, ChannelErrors, HeldOut
@@ -158,7 +158,9 @@ def test_blocks_that_tell_nothing_of_their_own_are_said_and_not_shown(found, cap
     kinds = ("voltage_configuration", "slope", "voltage", "payload")
     found = dataclasses.replace(found, held_out=dict(zip(kinds, held, strict=True)))
     assert found.held_out_alike == {"voltage_configuration": ("voltage", "payload"), "slope": ()}
-    assert SamePredictions("voltage_configuration", ("voltage", "payload")) in calibration_remarks(found)
+    assert Remark(
+        "same_predictions", kind="voltage_configuration", others=("voltage", "payload")
+    ) in calibration_remarks(found)
     print_document(calibration_report.calibration_document(found, "nominal"))
     shown = capsys.readouterr().out
     table = [line for line in shown.splitlines() if line.startswith("after, held out")]
@@ -246,7 +248,7 @@ def test_a_constant_condition_is_said(measured):
     flat = measured.where((measured["slope_deg"] == 10) | (measured["slope_deg"] == 5))
     level = changed(flat, slope_deg=np.full(8, 5.0), supply_voltage_V=flat["supply_voltage_V"])
     notes = quick(level.where(np.arange(8) % 2 == 0), noise="current=30%,motor_speed=9%,speed=9%").remarks
-    assert Constant("slope_deg", 5.0, "guides") in notes
+    assert Remark("constant", column="slope_deg", value=5.0, alike="guides") in notes
 
 
 def test_repeats_that_differ_are_said_and_no_error(measured):
@@ -257,7 +259,17 @@ def test_repeats_that_differ_are_said_and_no_error(measured):
     for stated, apart in ((None, "40%"), ("current=2%,motor_speed=1%,speed=1%", "14 sd")):
         known = noise.noise_from_table(other, SettledRuns.sizes(other), stated)
         assert SettledRuns.check(other, known) == [
-            Repeats(other.source, (4, 21), "total_current_A", (3.45, 5.2), apart)
+            Remark(
+                "repeats",
+                source=other.source,
+                rows=(4, 21),
+                column="total_current_A",
+                values=(3.45, 5.2),
+                apart=apart,
+                unused=(),
+                more=0,
+                near="",
+            )
         ]
 
 
@@ -327,8 +339,8 @@ def test_what_a_fidelity_does_not_read_is_not_freed(measured):
 @pytest.mark.slow
 def test_a_parameter_that_nothing_measures_is_said_with_what_would(measured):
     made = quick(measured, free=["default", "motor.inductance", "6T2A.mass"])
-    assert {Unmeasured("motor.inductance"), Unmeasured("6T2A.mass")} <= {
-        n for n in made.remarks if isinstance(n, Unmeasured)
+    assert {Remark("unmeasured", name="motor.inductance"), Remark("unmeasured", name="6T2A.mass")} <= {
+        n for n in made.remarks if n.code == "unmeasured"
     }
     entry = made.parameters["motor.inductance"]
     assert entry.held_by_prior and not entry.measured_by_data

@@ -16,7 +16,7 @@ import typer
 
 from calibration.data.input_errors import BadConfiguration
 from mmrjax import SOUND_AT_LEVEL_0, errors, fidelities
-from sweeps import cli, config
+from sweeps import cli, config, options
 from sweeps.points import scale
 from tests.commands import rows as table
 
@@ -533,7 +533,7 @@ def test_track_model_runs_xla_on_one_thread_unless_told_otherwise(monkeypatch, g
     if given is None:
         monkeypatch.delenv("XLA_FLAGS")
     resolved = config.resolve_configuration(config.Sweep, None, {"model": model})
-    assert cli._prepared(resolved) is resolved
+    cli._prepare(resolved)
     ours = "--xla_cpu_multi_thread_eigen=false" if model == "track" else None
     assert os.environ.get("XLA_FLAGS") == (ours if given is None else given)
 
@@ -629,10 +629,10 @@ def test_every_command_that_compiles_can_do_without_the_cache(monkeypatch, capsy
 
 
 def test_axis_takes_values_and_ranges():
-    assert config.parse_axis("--slopes", "0,5,10") == (0.0, 5.0, 10.0)
-    assert config.parse_axis("--slopes", "0:1:0.25") == (0.0, 0.25, 0.5, 0.75, 1.0)
-    assert config.parse_axis("--slopes", "0:1:0.3,9") == (0.0, 0.3, 0.6, pytest.approx(0.9), 9.0)
-    assert len(config.parse_axis("--slopes", "0:20:0.1")) == 201
+    assert options.parse_axis("--slopes", "0,5,10") == (0.0, 5.0, 10.0)
+    assert options.parse_axis("--slopes", "0:1:0.25") == (0.0, 0.25, 0.5, 0.75, 1.0)
+    assert options.parse_axis("--slopes", "0:1:0.3,9") == (0.0, 0.3, 0.6, pytest.approx(0.9), 9.0)
+    assert len(options.parse_axis("--slopes", "0:20:0.1")) == 201
 
 
 def test_configuration_has_what_applies_to_its_command_alone():

@@ -146,6 +146,7 @@ def random_states(n=400):
     return dataclasses.replace(
         straight,
         pause=rng.uniform(0, 1, n),
+        duty=np.random.default_rng(13).uniform(-1, 1, n),
         side=rng.choice((-1.0, 1.0), n),
         yaw_rate=turn,
         direction_turn=np.sign(turn),
@@ -259,7 +260,7 @@ DRIVERS = {
     "demand": ("demand", "traction", "resistance"),
     "weight": ("normal", "mass"),
     "slope": ("slope",),
-    "duty": ("pause",),
+    "duty": ("pause", "duty"),
     "configuration": ("configuration", "on_tracks"),
     "direction": ("direction",),
     "the side": ("side",),
@@ -753,7 +754,7 @@ thermal_drift coast_decay armature_inductance windage stribeck_motor iron_loss t
 gear_quadratic_loss stribeck_gear backdriving_loss bristle_load_loss bristle_backdriving_loss churning stribeck_track tension_friction centrifugal_tension
 bending_loss stick_slip directional_friction stribeck_exponent directional_viscous torque_offset presliding
 angle_friction position_friction directional_stribeck speed_rolling adhesive_drag weight_transfer sinkage slope_bias grouser_polygon rolling_radius belt_creep nonlinear_slip speed_slip load_slip pulley_eccentricity
-vibration_slip ammeter_gain ammeter_offset encoder_scale speed_gain
+vibration_slip ammeter_gain ammeter_offset encoder_scale speed_gain duty_exponent duty_dead_band duty_saturation
 """.split()  # noqa: SIM905
 MODULES = [m.name for m in pkgutil.iter_modules(effects.__path__, "mmrjax.effects.")]
 
@@ -1222,7 +1223,12 @@ def test_library_declares_what_the_loop_asks_for():
         "thermal_drift": "winding_heating", "torque_offset": "directional_friction",
         "bristle_load_loss": "gear_load_loss", "bristle_backdriving_loss": "backdriving_loss",
     }  # fmt: skip
-    assert [e.name for e in ALL if e.needs_duty] == ["coast_decay"]
+    assert [e.name for e in ALL if e.needs_duty] == [
+        "coast_decay",
+        "duty_exponent",
+        "duty_dead_band",
+        "duty_saturation",
+    ]
     assert [e.name for e in ALL if e.odd_in_travel] == [*both_ways, "slope_bias"]
     assert {e.name: e.movers for e in ALL if e.movers} == {
         "mass_offset": "wheels", "grouser_polygon": "tracks", "vibration_slip": "tracks",

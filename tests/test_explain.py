@@ -24,7 +24,8 @@ def unsimulated(monkeypatch):
 
 def test_every_name_has_an_explanation_of_its_kind(unsimulated):
     kinds = {"effects": "effect", "statuses": "status", "flags": "flag", "channels": "channel", "conditions": "condition", "outputs": "output",
-             "parameters": "parameter", "verdicts of the loop": "verdict of the loop", "verdicts of a climb": "verdict of a climb"}  # fmt: skip
+             "parameters": "parameter", "verdicts of the loop": "verdict of the loop", "verdicts of a climb": "verdict of a climb",
+             "words of the reports": "word of the reports"}  # fmt: skip
     for kind, those in explain.explainable_names(EVERY).items():
         for name in those:
             lines = said(kinds[kind], name)
@@ -75,6 +76,8 @@ def test_the_command_prints_80_columns_and_every_meaning_of_a_name(mmrjax):
     assert code == 0 and "cut_off: status" in out and "cut_off: flag" in out
     assert words.FLAGS["cut_off"] in " ".join(out.split())
     assert max(map(len, out.splitlines())) <= 80
+    code, out, _ = mmrjax("explain", "held", "out")
+    assert code == 0 and words.GLOSSARY["held out"] in " ".join(out.split())
     code, out, _ = mmrjax("explain")
     assert code == 0 and "series_resistance" in out and "motor.resistance" in out and "converged" in out
 

@@ -11,7 +11,7 @@ from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration, BadData, InputError
 from calibration.discovery.discover import without_copies
 from calibration.inference.checks import _check_stuck_channels
-from calibration.inference.fit_notes import StiffSupply
+from calibration.inference.fit_notes import Remark
 from mmrjax.errors import count_noun
 from sweeps.pages import comparison_figures
 
@@ -153,7 +153,7 @@ def test_a_stiff_supply_is_no_stuck_instrument(tmp_path):
     robot = robot_file.read_robot(tmp_path / "rig.toml")
     rows = "".join(f"{speed},{0.01 * k},24\n" for k, speed in enumerate((4500, 4400, 4300, 4200)))
     found = table(tmp_path, f"motor_speed_rpm,motor_current_A,motor_voltage_V\n{rows}", robot)
-    assert _check_stuck_channels(found) == [StiffSupply("motor_voltage_V", 24.0)]
+    assert _check_stuck_channels(found) == [Remark("stiff_supply", column="motor_voltage_V", value=24.0)]
 
 
 @pytest.mark.parametrize("count", [1, np.int64(1), np.int32(2), np.uint8(0)])

@@ -19,7 +19,6 @@ from calibration.data.input_errors import BadConfiguration
 from calibration.discovery import discover as room
 from calibration.discovery import kept
 from calibration.discovery.kept import OutOfTime
-from calibration.discovery.loop_notes import Outstanding
 from mmrjax.compile import programs
 from mmrjax.model import paper_robots
 from sweeps import config
@@ -46,12 +45,12 @@ def test_a_stage_is_made_once_and_read_after_an_interrupt(tmp_path):
 
 def test_a_stage_of_another_version_is_made_again(tmp_path, monkeypatch):
     """What is named by a hash of the source: the release's number does not change with a mended line."""
-    told = SimpleNamespace(model_dump=lambda **_: {}, effects=())
+    told, beside = SimpleNamespace(model_dump=lambda **_: {}, effects=()), config.FolderPart(out=tmp_path / "x")
 
     def stage(make, force=False):
         with (
             pytest.raises(KeyboardInterrupt),
-            open_folder("loop", told, paper_robots.nominal(), tmp_path / "x", force) as folder,
+            open_folder("loop", told, paper_robots.nominal(), beside.model_copy(update={"force": force})) as folder,
         ):
             found.append(folder.stage("base", make))
             raise KeyboardInterrupt
@@ -61,7 +60,7 @@ def test_a_stage_of_another_version_is_made_again(tmp_path, monkeypatch):
     stage(refuse)
     monkeypatch.setattr(programs, "source_hash", lambda: "mended")
     with pytest.raises(BadConfiguration, match="another configuration, table or version"):
-        open_folder("loop", told, paper_robots.nominal(), tmp_path / "x", False)
+        open_folder("loop", told, paper_robots.nominal(), beside)
     stage(lambda: 2, force=True)
     assert found == [1, 1, 2]
 
@@ -213,7 +212,7 @@ def test_a_loop_of_kept_stages_finds_what_it_found(tmp_path):
 
     ended = room.discover(runs, robot, replicates=250, keep=slow, left=lambda: 0.0)
     assert ended.verdict == found.verdict and not ended.sensitivity
-    assert [n.factors for n in ended.remarks if isinstance(n, Outstanding)] == [tuple(sorted(factors))]
+    assert [n.factors for n in ended.remarks if n.code == "outstanding"] == [tuple(sorted(factors))]
 
 
 def test_nothing_is_kept_where_nobody_asks():

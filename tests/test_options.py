@@ -10,12 +10,12 @@ import pytest
 import typer
 
 from calibration.data.input_errors import BadConfiguration
-from sweeps import cli, config, config_campaign, flags, options
+from sweeps import cli, config, config_campaign, options
 
 KINDS = {
     "simulate": (config.Simulate, config.OneRun),
-    "sweep": (config.Sweep, config_campaign.SharePart),
-    "compare": (config.Compare,),
+    "sweep": (config.Sweep, config_campaign.StoreOptions),
+    "compare": (config.Compare, config.ComparedRuns),
     "reproduce": (config.Reproduce,),
     "render": (config.Render, config.OneRun),
     "calibrate": (config.Calibrate, config.MembersPart),
@@ -65,8 +65,8 @@ def test_every_field_that_can_be_chosen_is_an_option_that_says_what_the_schema_s
                 assert name not in parameters[command]
                 continue
             shown = parameters[command][name]
-            assert fact["description"].rstrip(".").partition(" (")[0] in shown.help, name
-            _, unit = flags.of_unit(name)
+            assert fact["description"].rstrip(".").partition(" (")[0] in shown.help.replace("\\", ""), name
+            _, unit = options.of_unit(name)
             assert not unit or f"({unit})" in shown.help, name
             assert all(choice in shown.help for choice in fact.get("enum", ()))
             assert shown.default is None, name  # what is not given is the configuration's affair
@@ -75,7 +75,7 @@ def test_every_field_that_can_be_chosen_is_an_option_that_says_what_the_schema_s
 
 def test_units_bounds_choices_and_defaults_are_read_off_the_field():
     def text(kind, name):
-        return options.option_help(name, flags.schema_facts(kind)[name]).replace("\\", "")
+        return options.option_help(name, options.schema_facts(kind)[name]).replace("\\", "")
 
     assert text(config.Sweep, "slopes_deg").endswith("  [-45 to 45]  [default: 0,5,10,15,20]")
     assert text(config.Sweep, "discharge_mAh") == (
@@ -126,7 +126,7 @@ def test_solver_table_of_a_file_is_read_and_options_win(tmp_path):
         (config.Check, "[solver]\nmembers = 3\n", r"c.toml, solver.members: no such key; this command has none"),
         (config.Loop, "solver = 3\n", r"c.toml, solver: got 3; expected a table, \[solver\]"),
         (config.Loop, "replicates = 400\n[solver]\nreplicates = 300\n", r"solver.replicates: the file states replicates"),
-        (config.Loop, "[solver]\nreplicates = 3\n", r"c.toml, replicates: got 3; input should be greater"),
+        (config.Loop, "[solver]\nreplicates = 3\n", r"c.toml, replicates: got 3; expected 250 to 100000"),
     ],
 )  # fmt: skip
 def test_solver_tables_that_cannot_be_are_refused_in_a_sentence(kind, text, message, tmp_path):
@@ -137,11 +137,11 @@ def test_solver_tables_that_cannot_be_are_refused_in_a_sentence(kind, text, mess
 def test_command_takes_its_solver_table(tmp_path, monkeypatch, said):
     monkeypatch.chdir(tmp_path)
     _file(tmp_path, '[solver]\nshard = "0/3"\n')
-    assert said("sweep", "--config", "c.toml").startswith("mmrjax: --shard: got 0/3; expected i/n")
+    assert said("sweep", "--config", "c.toml").startswith("mmrjax: c.toml: shard: got 0/3; expected i/n")
     _file(tmp_path, "[solver]\nshards = 3\n")
     assert said("sweep", "c.toml").startswith("mmrjax: c.toml, solver.shards: no such key; did you mean shard?")
     _file(tmp_path, "[solver]\npopulation = 3\n")
-    assert said("loop", "--config", "c.toml").startswith("mmrjax: c.toml, population: got 3; input should be")
+    assert said("loop", "--config", "c.toml").startswith("mmrjax: c.toml, population: got 3; expected 4 to 1000000")
     assert [p.name for p in tmp_path.iterdir()] == ["c.toml"]
 
 
@@ -157,7 +157,7 @@ def test_no_message_of_what_was_stated_by_options_names_a_field(tmp_path):
     option are called by it; from a file by their key."""
     source = Path(config.__file__).read_text(encoding="utf-8")
     rules = [m for m in re.findall(r'"idle",\s*(f?"(?:[^"]|"\s*f?")*")', source)]
-    fields = {n for kinds in KINDS.values() for k in kinds for n in flags.options_of_fields(k) if "_" in n}
+    fields = {n for kinds in KINDS.values() for k in kinds for n in options.options_of_fields(k) if "_" in n}
     assert len(rules) > 15 and [r for r in rules for n in fields if re.search(rf"(?<![`\w]){n}(?![`\w])", r)] == []
     given = {"left_V": 5.0, "battery": True}
     with pytest.raises(BadConfiguration, match=r"^--left acts with --right only; state both$"):

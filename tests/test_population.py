@@ -13,15 +13,7 @@ from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration
 from calibration.inference import identifiability, multistart, noise, observers, population, priors
 from calibration.inference.calibration import calibrate
-from calibration.inference.fit_notes import (
-    Edge,
-    EndedAtEdge,
-    FarFromPrior,
-    Generations,
-    LostRows,
-    MembersJump,
-    ReadFromMembers,
-)
+from calibration.inference.fit_notes import Edge, Remark, with_codes
 from calibration.inference.observers.settled import SettledRuns
 from calibration.inference.population import Members, Rows
 from calibration.inference.problem import Observation
@@ -254,9 +246,11 @@ def test_parameter_across_whose_threshold_differences_lead_is_named(posed, found
 def test_statements_say_whether_it_settled_and_what_derivatives_are_worth(found):
     at = int(found.order[0])
     calm = population.Searched(found, at, (), None, np.nan)
-    assert calm.remarks()[0] == Generations(len(found.z), len(found.generations), found.settled)
+    assert calm.remarks()[0] == Remark(
+        "generations", members=len(found.z), generations=len(found.generations), settled=found.settled
+    )
     torn = population.Searched(dataclasses.replace(found, generations=found.generations[:2]), at, ("a",), None, 0.4)
-    assert not torn.remarks()[0].settled and torn.remarks()[-1] == ReadFromMembers(("a",), 0.4)
+    assert not torn.remarks()[0].settled and torn.remarks()[-1] == Remark("read_from_members", names=("a",), left=0.4)
     assert calm.to_json()["regression_rms_sd"] is None and torn.to_json()["derivatives_apart"] == ["a"]
 
 
@@ -282,7 +276,7 @@ def test_what_members_did_is_counted_and_said(found):
     assert told.to_json()["outcomes"] == {"tips": 3, "failed": 1, "slides": 2, "jumps": 2}
     assert told.to_json()["at_edge"] == {"a": "at its upper bound"}
     assert told.remarks()[1:] == [
-        LostRows({"slides": 2, "tips": 3, "failed": 1}), MembersJump(2, (2,)), EndedAtEdge({"a": Edge("upper", 9.0)})
+        Remark("lost_rows", members={"slides": 2, "tips": 3, "failed": 1}), Remark("members_jump", members=2, best=(2,)), Remark("ended_at_edge", edge={"a": Edge("upper", 9.0)})
     ]  # fmt: skip
 
 
@@ -299,9 +293,9 @@ def test_search_that_ends_at_the_edge_of_a_prior_says_so_in_the_result(runs):
     assert abs(best[0]) > population.EDGE and abs(found.parameters[name].shift) > population.EDGE
     assert list(found.searched.edge) == [name]
     assert list(found.to_json()["optimizer"]["population"]["at_edge"]) == [name]
-    (ended,) = [n for n in found.remarks if isinstance(n, EndedAtEdge)]
+    (ended,) = with_codes(found.remarks, "ended_at_edge")
     assert list(ended.edge) == [name] and ended.edge[name].sds > 0
-    assert any(isinstance(n, FarFromPrior) and n.name == name for n in found.remarks)
+    assert any(n.code == "far_from_prior" and n.name == name for n in found.remarks)
     assert np.isfinite(found.posterior.covariance).all()
 
 

@@ -14,9 +14,10 @@ from worlds import tables
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.writing import finite_or_null
 from calibration.discovery import discover, preference
-from calibration.discovery.loop_notes import DRAW, Led
+from calibration.discovery.loop_notes import DRAW
 from calibration.discovery.result import HeldOutAlternative, Worse
 from calibration.discovery.settings import HELD_OUT, settings_for
+from calibration.inference.fit_notes import Remark
 from calibration.inference.observers import SettledRuns
 from mmrjax.model import channels, paper_robots
 from sweeps.report import loop_report, page_renderer
@@ -83,10 +84,32 @@ def test_it_is_said_by_what_the_leader_was_chosen():
     best, other = alternative("series_resistance", 3.0, leads=True), alternative("supply_sag", 2.0, rise=1.4)
     names = ("series_resistance", "supply_sag")
     (note,) = preference.leader_remarks((best, other), "fit")
-    assert note == Led(names, (3.0, 2.0), 0, 0, 1, "fit", "fit", preference.TOLD, 0.0)
+    assert note == Remark(
+        "led",
+        names=names,
+        rms_sigma=(3.0, 2.0),
+        leader=0,
+        closest=0,
+        best=1,
+        by="fit",
+        prefer="fit",
+        told=preference.TOLD,
+        rise_chi2=0.0,
+    )
     led = (dataclasses.replace(best, leads=False), dataclasses.replace(other, leads=True))
     (note,) = preference.leader_remarks(led, HELD_OUT)
-    assert note == Led(names, (3.0, 2.0), 1, 0, 1, HELD_OUT, HELD_OUT, preference.TOLD, 1.4)
+    assert note == Remark(
+        "led",
+        names=names,
+        rms_sigma=(3.0, 2.0),
+        leader=1,
+        closest=0,
+        best=1,
+        by=HELD_OUT,
+        prefer=HELD_OUT,
+        told=preference.TOLD,
+        rise_chi2=1.4,
+    )
     (note,) = preference.leader_remarks((best, dataclasses.replace(other, rms_sigma=2.99)), HELD_OUT)
     assert (note.leader, note.best, note.by) == (0, 0, DRAW)
     (note,) = preference.leader_remarks((best, other), HELD_OUT)

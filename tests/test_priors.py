@@ -10,7 +10,7 @@ import pytest
 from calibration.data import robot_file
 from calibration.data.input_errors import BadConfiguration
 from calibration.inference import priors
-from calibration.inference.fit_notes import InheritedPriors
+from calibration.inference.fit_notes import Remark
 from calibration.inference.foreign import inherited_priors
 from mmrjax.effects import ALL
 from mmrjax.model import paper_robots, params
@@ -183,8 +183,11 @@ def read(tmp_path, text):
 def test_friction_left_in_from_another_robot_is_said(tmp_path):
     text = 'configurations = ["rover"]\n[rover]\nlike = "4W2T"\nmass = 3.0\n[motor]\ntorque_constant = 0.012\n'
     motor, rover = inherited_priors(read(tmp_path, text))
-    assert motor == InheritedPriors(
-        "motor", (("torque_constant", 0.012, 0.0259),), ("motor.friction_coulomb", "motor.friction_viscous")
+    assert motor == Remark(
+        "inherited_priors",
+        part="motor",
+        changed=(("torque_constant", 0.012, 0.0259),),
+        kept=("motor.friction_coulomb", "motor.friction_viscous"),
     )
     assert (rover.part, rover.changed) == ("rover", (("mass", 3.0, 11.5),))
     assert rover.kept[0] == "rover.track.loss_coulomb" and not any("guide" in name for name in rover.kept)

@@ -11,7 +11,7 @@ from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration, BadData, three_digits
 from calibration.inference import bases, blocks, checks, noise, observers, priors
 from calibration.inference.calibration import calibrate
-from calibration.inference.fit_notes import Constant
+from calibration.inference.fit_notes import Remark
 from calibration.inference.ranges import check_ranges
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import paper_robots, params, quantities
@@ -461,7 +461,9 @@ def test_what_is_said_of_constant_conditions_is_of_the_rig(tmp_path):
     runs = read(tmp_path, f"{BENCH}900,0.4\n900,0.41\n900,0.4\n900,0.41\n", robot)
     known = noise.noise_from_table(runs, observers.observer_kind(runs).sizes(runs), "current=5%")
     said = checks.check_data(runs, robot, (), known)
-    assert [note for note in said if isinstance(note, Constant)] == [Constant("motor_speed_rpm", 900.0, "speed")]
+    assert [note for note in said if note.code == "constant"] == [
+        Remark("constant", column="motor_speed_rpm", value=900.0, alike="speed")
+    ]
 
 
 @pytest.mark.slow

@@ -54,6 +54,21 @@ def test_a_size_is_a_size_however_small():
     assert np.isnan(scales._size([0.0, np.nan]))
 
 
+def test_offset_of_an_ammeter_follows_its_range_and_not_a_motor_without_load(tmp_path):
+    """A motor of 57 A at standstill draws 0.2 A without load: a meter for it may be off by 0.4 A, but not by 2 A."""
+    file = tmp_path / "rig.toml"
+    file.write_text(
+        'base = "none"\nchannels = ["motor_speed", "motor_current"]\n'
+        "[motor]\nresistance = 0.42\ntorque_constant = 0.051\nfriction_coulomb = 0.009\n"
+        '[gearbox]\nratio = 1.0\nefficiency_load = 1.0\n[brake]\nload = "shaft"\nloss_coulomb = 0.0\ninertia = 1e-4\n'
+    )
+    robot = robot_file.read_robot(file)
+    size = mm.Conditions(0, voltage=[6.0, 12.0, 24.0])
+    library = scales.library_of_size(robot, size, effects.BY_NAME | effects.OF_CHANNELS)
+    spec = amplitude_of(library["motor_current_offset"]()).spec
+    assert 0.4 < spec.bounds[1] < 1.5 and spec.sd * 4 > 0.4
+
+
 @pytest.mark.slow
 def test_a_mass_that_was_weighed_is_off_by_no_more_than_that_of_the_packaged_robot(tmp_path):
     """Of a rig, as a share of its mass: a table of turns had been explained by -18 of its robot's 34 kg."""

@@ -13,7 +13,6 @@ from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration
 from calibration.inference import foresight, priors, remarks
 from calibration.inference.calibration import calibrate
-from calibration.inference.fit_notes import FarFromPrior, HeldByPrior
 
 RIG = """
 base = "none"
@@ -117,5 +116,5 @@ def test_what_lies_far_from_its_prior_is_not_said_to_be_held_by_it():
         together=(), undetermined=("near", "far"),
     )  # fmt: skip
     said = list(remarks._parameters(found))
-    assert [n.names for n in said if isinstance(n, HeldByPrior)] == [("near",)]
-    assert [(n.name, n.sds) for n in said if isinstance(n, FarFromPrior)] == [("far", 6.5)]
+    assert [n.names for n in said if n.code == "held_by_prior"] == [("near",)]
+    assert [(n.name, n.sds) for n in said if n.code == "far_from_prior"] == [("far", 6.5)]

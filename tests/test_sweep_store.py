@@ -913,7 +913,7 @@ REFUSED = {
     "share zero": (CONFIG, ["--shard", "0/3"], "--shard: got 0/3; expected i/n"),
     "share in words": (CONFIG, ["--shard", "first"], "--shard: got first; expected i/n"),
     "shares of a cluster": (CONFIG, ["--shard", "1/2", "--scheduler", "tcp://x:1"], "--shard: not allowed with --scheduler"),
-    "unknown export": (CONFIG, ["--export", "xls"], "--export: got xls; allowed: csv, parquet"),
+    "unknown export": (CONFIG, ["--export", "xls"], "--export: got 'xls'; expected 'csv' or 'parquet'"),
     "option of a grid": (CONFIG, ["--slopes", "3"], "--slopes: acts with a grid of options only"),
     "two configurations": (CONFIG, ["--config", "plan.toml"], "--config: got plan.toml beside plan.toml"),
     "not a scheduler": (CONFIG, ["--scheduler", "nonsense"], "--scheduler: got nonsense; no scheduler answers there"),

@@ -15,11 +15,12 @@ from calibration.described import describe
 from calibration.discovery import discover
 from calibration.inference import calibration as calibrate
 from calibration.inference import foresight
-from calibration.inference.fit_notes import Thinned, ThinnedTable
+from calibration.inference.fit_notes import Remark
 from calibration.inference.noise import infer_noise
 from calibration.inference.observers import Histories, SettledRuns
 from mmrjax.model import paper_robots
 from sweeps.commands import rig_check
+from sweeps.report.terminal_renderer import print_document
 
 EVERY, ROWS = 0.01, 300
 
@@ -70,9 +71,9 @@ def test_rows_of_a_table_are_taken_evenly_over_its_conditions():
     kept = np.flatnonzero(np.isin(table["supply_voltage_V"], some["supply_voltage_V"]))
     np.testing.assert_array_equal(table["supply_voltage_V"][kept], some["supply_voltage_V"])  # in the file's order
     notes = [
-        n for n in SettledRuns.check(some, infer_noise(some, SettledRuns.sizes(some))) if isinstance(n, ThinnedTable)
+        n for n in SettledRuns.check(some, infer_noise(some, SettledRuns.sizes(some))) if n.code == "thinned_table"
     ]
-    assert notes == [ThinnedTable("log.csv", 3000, len(some))]
+    assert notes == [Remark("thinned_table", source="log.csv", rows=3000, kept=len(some))]
     assert f"{len(some)} of 3000 rows" in describe(notes[0])
 
 
@@ -173,9 +174,9 @@ def test_that_a_log_is_thinned_is_said():
     runs = log()
     some = thin_rows(runs, 100)
     said = [
-        n for x in (some, runs) for n in Histories.check(x, infer_noise(x, Histories.sizes(x))) if type(n) is Thinned
+        n for x in (some, runs) for n in Histories.check(x, infer_noise(x, Histories.sizes(x))) if n.code == "thinned"
     ]
-    assert said == [Thinned("log.csv", len(runs), len(some))]
+    assert said == [Remark("thinned", source="log.csv", rows=len(runs), kept=len(some))]
     assert f"{len(some)} of {len(runs)} rows" in describe(said[0])
 
 
@@ -193,7 +194,7 @@ def test_rig_check_says_how_many_rows_are_used(tmp_path, monkeypatch, capsys):
     found = rig_check.examine_rig_file(tmp_path / "rig.toml", str(tmp_path / "log.csv"))
     used = len(found.foresight.status)
     assert 0.9 * 4000 < used < 4200 < len(found.runs)
-    rig_check.print_check(found)
+    print_document(rig_check.check_document(found))
     assert f"readings of {used} of them" in " ".join(capsys.readouterr().out.split())
 
 

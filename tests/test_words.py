@@ -1,8 +1,11 @@
 """What is said of data, in words: one sentence for each kind of note, and no kind without one."""
 
 import ast
+import copy
 import dataclasses
+import inspect
 import re
+import string
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -23,11 +26,10 @@ from calibration.discovery.loop_notes import (
 )
 from calibration.discovery.result import Formula, Sensitivity, Worse
 from calibration.inference import fit_notes as of_fit
-from calibration.inference.fit_notes import Note, Shown, Step
+from calibration.inference.fit_notes import Remark, Shown, next_step
 from calibration.inference.lack_of_fit import Adequacy
 from calibration.inference.residual_clusters import LevelMean, ResidualCluster
 from calibration.inference.series_noise import SeriesNoise
-from calibration.sensitivity import sensitivity_notes as of_study
 from calibration.words import fit_words, loop_words, step_words, table_words
 from calibration.words.note_words import NOTES
 from mmrjax.model import channels
@@ -37,111 +39,232 @@ from sweeps.pages.words import FILES
 ROOT = Path(__file__).resolve().parents[1]
 #: Notes of every kind; their sentences are in `tests/record/pages/notes.txt`, which `python tests/test_words.py` writes.
 SAMPLES = [
-    of_fit.HeldByPrior(("a",)),
-    of_fit.OnlyTogether((of_fit.Pair("a", "b", 0.99, "ratio", -1.0), of_fit.Pair("a", "c", -1.0, "linear", 0.031))),
-    of_fit.HeldByPrior(("a", "b")),
-    of_fit.FarFromPrior("m", 3.2, "loop"),
-    of_fit.FarFromPrior("m", 3.2, "calibration"),
-    of_fit.FarFromPrior("m", 2.7, "edge"),
-    of_fit.NoiseOff("", 10.04, "stated"),
-    of_fit.NoiseOff("speed", 3.0, "assumed"),
-    of_fit.Fact("no grip"),
-    of_fit.Unmeasured("6T2A.mass"),
-    of_fit.LargerNoise("total_current", 8.3, 12, "stated"),
-    of_fit.Repeats("r.csv", (1, 2), "motor_speed_rpm", (4564.6, 4373.6), "6 sd", ("torque",), 2),
-    of_fit.Repeats("r.csv", (1, 2), "motor_speed_rpm", (4500.0, 4300.0), "5%", (), 3),
-    of_fit.Repeats("r.csv", (1, 2), "motor_speed_rpm", (4500.0, 4300.0), "5%"),
-    of_fit.Repeats("r.csv", (1, 2), "motor_speed_rpm", (45.0, 43.0), "5%", ("M_b_mNm",), near="load_torque_mNm"),
-    of_fit.Unused("r.csv", (("M_b_Nm", "load_torque_Nm"), ("room", ""))),
-    of_fit.Unused("r.csv", (("room", ""),)),
-    of_fit.NoLoadGives("r.csv", "output_torque_Nm", "M", 0.974),
-    of_fit.NothingVaries("r.csv", 20, "supply_voltage_V"),
-    of_fit.NothingVaries("r.csv", 20, "supply_voltage_V", ("a", "b")),
-    of_fit.Copied("r.csv", "output_torque_Nm", "motor_current_A", 0.2, -0.5, False),
-    of_fit.Copied("r.csv", "output_speed_rpm", "motor_speed_rpm", 0.0, 0.05, True),
-    of_fit.Turned("r.csv", "motor_current_A", "Iq", 8.04, 0.31),
-    of_fit.StiffSupply("motor_voltage_V", 24.0),
-    of_fit.Constant("slope_deg", 5.0, "guides"),
-    of_fit.Constant("motor_speed_rpm", 900.0, "speed"),
-    of_fit.EndsEarly(("a", "b"), 0.01, 0.4),
-    of_fit.EndsEarly(("a",), 0.01, float("nan")),
-    of_fit.Thinned("log.csv", 25000, 3600),
-    of_fit.ThinnedTable("runs.csv", 50000, 3847),
-    of_fit.NeverGrips(("a",), 0.31),
-    of_fit.CoarseSteps(90.0, 0.03),
-    of_fit.StopsOnSlope(("a", "b")),
-    of_fit.InheritedPriors("motor", (("torque_constant", 0.012, 0.0259),), ("motor.a", "motor.b")),
-    of_fit.InheritedPriors("motor", (("torque_constant", 0.012, 0.0259),), ("motor.a",)),
-    of_fit.OffBy("speed_mm_s", "mm/s", 1 / 3, (), (), "supply_voltage_V"),
-    of_fit.OffBy("speed_mm_s", "mm/s", 1000.0, ("um/s", "nm/s"), ("motor_speed_rpm",), "supply_voltage_V"),
-    of_fit.SlopesIn("radians", 57.3),
-    of_fit.EstimatedNoise((("motor_speed", 1.23), ("speed", 4.0))),
-    of_fit.BesideSteady(2, 3, "a", 2.345),
-    of_fit.OfRows((1, 2), "limited", 0.01),
-    of_fit.OfRows((3,), "jumps"),
-    of_fit.OfRows((3,), "slides"),
-    of_fit.AtBound("a", "upper"),
-    of_fit.ProductAlone("f", "s", True),
-    of_fit.ProductAlone("f", "s", False),
-    of_fit.PriorOfProduct("f", 0.06, 0.02, 0.98),
-    of_fit.NoPrediction("voltage_configuration", 2, 20),
-    of_fit.SamePredictions("voltage_configuration", ("voltage", "payload")),
-    of_fit.BlockNotConverged("slope"),
-    of_fit.Agreement(1, 1, 0, 0.0, 0),
-    of_fit.Agreement(1, 0, 0, 0.0, 1),
-    of_fit.Agreement(4, 4, 0, 0.0, 0),
-    of_fit.Agreement(4, 1, 2, 3.2, 1),
-    of_fit.Unsettled(("a", "b")),
-    of_fit.Unsettled(()),
-    of_fit.Elsewhere(1, 3, ("a", "b")),
-    of_fit.InPieces("rig.delay", 2),
-    of_fit.Generations(96, 8, True),
-    of_fit.Generations(96, 8, False),
-    of_fit.LostRows({"tips": 3, "slides": 2, "failed": 1}),
-    of_fit.MembersJump(2, (2, 5)),
-    of_fit.EndedAtEdge({"a": of_fit.Edge("upper", 9.0), "b": of_fit.Edge("", -2.64)}),
-    of_fit.ReadFromMembers(("a", "b"), 0.4),
-    of_loop.AssumedNoise(("speed",), "speed=2%"),
-    of_loop.NoiseFromSeries(
-        (
+    Remark("held_by_prior", names=("a",)),
+    Remark(
+        "only_together",
+        pairs=(of_fit.Pair("a", "b", 0.99, "ratio", -1.0), of_fit.Pair("a", "c", -1.0, "linear", 0.031)),
+    ),
+    Remark("held_by_prior", names=("a", "b")),
+    Remark("far_from_prior", name="m", sds=3.2, kind="loop"),
+    Remark("far_from_prior", name="m", sds=3.2, kind="calibration"),
+    Remark("far_from_prior", name="m", sds=2.7, kind="edge"),
+    Remark("noise_off", channel="", factor=10.04, source="stated"),
+    Remark("noise_off", channel="speed", factor=3.0, source="assumed"),
+    Remark("no_grip"),
+    Remark("no_covariance"),
+    Remark("not_profiled"),
+    Remark(
+        "residual_cluster",
+        cluster=ResidualCluster(
+            "wheel",
+            "speed",
+            "mm/s",
+            "",
+            False,
+            (LevelMean("1", "", -14.42, 9), LevelMean("2", "", 3.6, 9)),
+            None,
+            2e-7,
+            (),
+            (),
+            np.zeros(2),
+            np.zeros(2),
+        ),
+    ),
+    Remark("unmeasured", name="6T2A.mass"),
+    Remark("larger_noise", channel="total_current", factor=8.3, pairs=12, source="stated"),
+    Remark(
+        "repeats",
+        source="r.csv",
+        rows=(1, 2),
+        column="motor_speed_rpm",
+        values=(4564.6, 4373.6),
+        apart="6 sd",
+        unused=("torque",),
+        more=2,
+    ),
+    Remark(
+        "repeats",
+        source="r.csv",
+        rows=(1, 2),
+        column="motor_speed_rpm",
+        values=(4500.0, 4300.0),
+        apart="5%",
+        unused=(),
+        more=3,
+    ),
+    Remark("repeats", source="r.csv", rows=(1, 2), column="motor_speed_rpm", values=(4500.0, 4300.0), apart="5%"),
+    Remark(
+        "repeats",
+        source="r.csv",
+        rows=(1, 2),
+        column="motor_speed_rpm",
+        values=(45.0, 43.0),
+        apart="5%",
+        unused=("M_b_mNm",),
+        near="load_torque_mNm",
+    ),
+    Remark("unused", source="r.csv", columns=(("M_b_Nm", "load_torque_Nm"), ("room", ""))),
+    Remark("unused", source="r.csv", columns=(("room", ""),)),
+    Remark("no_load_gives", source="r.csv", column="output_torque_Nm", theirs="M", share=0.974),
+    Remark("nothing_varies", source="r.csv", rows=20, column="supply_voltage_V"),
+    Remark("nothing_varies", source="r.csv", rows=20, column="supply_voltage_V", unused=("a", "b")),
+    Remark(
+        "copied",
+        source="r.csv",
+        column="output_torque_Nm",
+        other="motor_current_A",
+        intercept=0.2,
+        slope=-0.5,
+        tied=False,
+    ),
+    Remark(
+        "copied",
+        source="r.csv",
+        column="output_speed_rpm",
+        other="motor_speed_rpm",
+        intercept=0.0,
+        slope=0.05,
+        tied=True,
+    ),
+    Remark("turned", source="r.csv", column="motor_current_A", theirs="Iq", off=8.04, turned=0.31),
+    Remark("stiff_supply", column="motor_voltage_V", value=24.0),
+    Remark("constant", column="slope_deg", value=5.0, alike="guides"),
+    Remark("constant", column="motor_speed_rpm", value=900.0, alike="speed"),
+    Remark("ends_early", runs=("a", "b"), lasts=0.01, share=0.4),
+    Remark("ends_early", runs=("a",), lasts=0.01, share=float("nan")),
+    Remark("thinned", source="log.csv", rows=25000, kept=3600),
+    Remark("thinned_table", source="runs.csv", rows=50000, kept=3847),
+    Remark("never_grips", runs=("a",), share=0.31),
+    Remark("coarse_steps", lasts=90.0, step=0.03),
+    Remark("stops_on_slope", runs=("a", "b")),
+    Remark(
+        "inherited_priors", part="motor", changed=(("torque_constant", 0.012, 0.0259),), kept=("motor.a", "motor.b")
+    ),
+    Remark("inherited_priors", part="motor", changed=(("torque_constant", 0.012, 0.0259),), kept=("motor.a",)),
+    Remark("off_by", column="speed_mm_s", unit="mm/s", factor=1 / 3, units=(), others=(), imposed="supply_voltage_V"),
+    Remark(
+        "off_by",
+        column="speed_mm_s",
+        unit="mm/s",
+        factor=1000.0,
+        units=("um/s", "nm/s"),
+        others=("motor_speed_rpm",),
+        imposed="supply_voltage_V",
+    ),
+    Remark("slopes_in", unit="radians", rise=57.3),
+    Remark("estimated_noise", percent=(("motor_speed", 1.23), ("speed", 4.0))),
+    Remark("beside_steady", inside=2, total=3, furthest="a", sds=2.345),
+    Remark("of_rows", rows=(1, 2), what="limited", share=0.01),
+    Remark("of_rows", rows=(3,), what="jumps"),
+    Remark("of_rows", rows=(3,), what="slides"),
+    Remark("at_bound", name="a", side="upper"),
+    Remark("product_alone", friction="f", share="s", free=True),
+    Remark("product_alone", friction="f", share="s", free=False),
+    Remark("prior_of_product", name="f", mean=0.06, sd=0.02, share=0.98),
+    Remark("no_prediction", kind="voltage_configuration", rows=2, total=20),
+    Remark("same_predictions", kind="voltage_configuration", others=("voltage", "payload")),
+    Remark("block_not_converged", kind="slope"),
+    Remark("agreement", starts=1, agree=1, elsewhere=0, more=0.0, open=0),
+    Remark("agreement", starts=1, agree=0, elsewhere=0, more=0.0, open=1),
+    Remark("agreement", starts=4, agree=4, elsewhere=0, more=0.0, open=0),
+    Remark("agreement", starts=4, agree=1, elsewhere=2, more=3.2, open=1),
+    Remark("unsettled", names=("a", "b")),
+    Remark("unsettled", names=()),
+    Remark("elsewhere", searches=1, total=3, names=("a", "b")),
+    Remark("in_pieces", name="rig.delay", pieces=2),
+    Remark("generations", members=96, generations=8, settled=True),
+    Remark("generations", members=96, generations=8, settled=False),
+    Remark("lost_rows", members={"tips": 3, "slides": 2, "failed": 1}),
+    Remark("members_jump", members=2, best=(2, 5)),
+    Remark("ended_at_edge", edge={"a": of_fit.Edge("upper", 9.0), "b": of_fit.Edge("", -2.64)}),
+    Remark("read_from_members", names=("a", "b"), left=0.4),
+    Remark("assumed_noise", channels=("speed",), usual="speed=2%"),
+    Remark(
+        "noise_from_series",
+        noise=(
             SeriesNoise(channels.find_channel("total_current"), 0.0546, 0.0133, 7.45, "slope_deg", 4),
             SeriesNoise(channels.find_channel("speed"), 0.0, 0.0124, 7.44, "slope_deg", 4, 0.004),
-        )
+        ),
     ),
-    of_loop.RefitWorse("total_current", 0.44, 0.54, "estimated"),
-    of_loop.Copies((3,)),
-    of_loop.Copies((3, 4)),
-    of_loop.KeptOut((1, 2), "unusable"),
-    of_loop.KeptOut((7,), "outliers"),
-    of_loop.PhasesDiffer(80.4, 12.0),
-    of_loop.StillLacks("motor_speed", "speed_motor"),
-    of_loop.Late(0.0312, 0.0004),
-    of_loop.Led(("a", "b"), (3.0, 2.0), 0, 0, 1, "fit", "fit", 0.01, 0.0),
-    of_loop.Led(("a", "b"), (3.0, 2.0), 1, 0, 1, "held-out", "held-out", 0.01, 1.4),
-    of_loop.Led(("a", "b"), (3.0, 2.99), 0, 0, 0, of_loop.DRAW, "held-out", 0.01, 0.0),
-    of_loop.Led(("a", "b"), (3.0, 2.0), 0, 0, 1, "held-out", "held-out", 0.01, 0.0),
-    of_loop.Outstanding((0.5, 2.0), "assumed"),
-    of_loop.NotPredictable(("configuration",)),
-    of_loop.LostReplicates(400, 500),
-    of_loop.RestsOn(NameTest("slip", 10.57, 3.3, (), 0.0, 2, 2.9, what="run")),
-    of_loop.RestsOn(
-        NameTest("slip", 10.57, 3.3, (), 0.0, 10, 4.3),
-        {"configuration": "6T2A", "supply_voltage_V": 33.0, "slope_deg": 20.0},
-        "slope_deg",
-        (17.5, 22.5),
+    Remark("refit_worse", channel="total_current", stated=0.44, refit=0.54, word="estimated"),
+    Remark("copies", rows=(3,)),
+    Remark("copies", rows=(3, 4)),
+    Remark("kept_out", rows=(1, 2), why="unusable"),
+    Remark("kept_out", rows=(7,), why="outliers"),
+    Remark("phases_differ", free=80.4, held=12.0),
+    Remark("still_lacks", place="motor_speed", variable="speed_motor"),
+    Remark("late", delay=0.0312, sd=0.0004),
+    Remark(
+        "led",
+        names=("a", "b"),
+        rms_sigma=(3.0, 2.0),
+        leader=0,
+        closest=0,
+        best=1,
+        by="fit",
+        prefer="fit",
+        told=0.01,
+        rise_chi2=0.0,
     ),
-    of_loop.Unwritten(True, 0.13, 0.42),
-    of_loop.Unwritten(False, -0.2, 0.05),
-    of_loop.TooFewReplicates(100),
-    of_study.Sampling("morris", 8),
-    of_study.PointsLeftOut(2, 8, False, ("speed", "current")),
-    of_study.PointsLeftOut(2, 8, True, ("speed",)),
-    of_study.SampleLeftOut(3, 0.0123, ("speed",)),
-    of_study.Inert(("a", "b")),
-    of_study.Tied(("a", "b")),
-    Step("evaluations", (12345, 1234.6)),
-    Step("alike", (("a", "b"),)),
-    Step("round", (2, 3.25, 7, 1.26)),
+    Remark(
+        "led",
+        names=("a", "b"),
+        rms_sigma=(3.0, 2.0),
+        leader=1,
+        closest=0,
+        best=1,
+        by="held-out",
+        prefer="held-out",
+        told=0.01,
+        rise_chi2=1.4,
+    ),
+    Remark(
+        "led",
+        names=("a", "b"),
+        rms_sigma=(3.0, 2.99),
+        leader=0,
+        closest=0,
+        best=0,
+        by=of_loop.DRAW,
+        prefer="held-out",
+        told=0.01,
+        rise_chi2=0.0,
+    ),
+    Remark(
+        "led",
+        names=("a", "b"),
+        rms_sigma=(3.0, 2.0),
+        leader=0,
+        closest=0,
+        best=1,
+        by="held-out",
+        prefer="held-out",
+        told=0.01,
+        rise_chi2=0.0,
+    ),
+    Remark("outstanding", factors=(0.5, 2.0), word="assumed"),
+    Remark("not_predictable", kinds=("configuration",)),
+    Remark("lost_replicates", settled=400, asked=500),
+    Remark("rests_on", test=NameTest("slip", 10.57, 3.3, (), 0.0, 2, 2.9, what="run")),
+    Remark(
+        "rests_on",
+        test=NameTest("slip", 10.57, 3.3, (), 0.0, 10, 4.3),
+        conditions={"configuration": "6T2A", "supply_voltage_V": 33.0, "slope_deg": 20.0},
+        axis="slope_deg",
+        beside=(17.5, 22.5),
+    ),
+    Remark("unwritten", curve=True, gain=0.13, se=0.42),
+    Remark("unwritten", curve=False, gain=-0.2, se=0.05),
+    Remark("too_few_replicates", settled=100),
+    Remark("sampling", method="morris", points=8),
+    Remark("points_left_out", points=2, total=8, sampled=False, outputs=("speed", "current")),
+    Remark("points_left_out", points=2, total=8, sampled=True, outputs=("speed",)),
+    Remark("sample_left_out", points=3, share=0.0123, outputs=("speed",)),
+    Remark("inert", inputs=("a", "b")),
+    Remark("tied", inputs=("a", "b")),
+    next_step("evaluations", 12345, 1234.6),
+    next_step("alike", ("a", "b")),
+    next_step("round", 2, 3.25, 7, 1.26),
 ]
 
 
@@ -150,10 +273,10 @@ RECORD = ROOT / "tests" / "record" / "pages" / "notes.txt"
 
 def as_text() -> str:
     """The sentence of each sample, a line each."""
-    return "".join(f"{type(note).__name__}: {describe(note)}\n" for note in SAMPLES)
+    return "".join(f"{note.code}: {describe(note)}\n" for note in SAMPLES)
 
 
-@pytest.mark.parametrize("kind", sorted({type(note).__name__ for note in SAMPLES}))
+@pytest.mark.parametrize("kind", sorted({note.code for note in SAMPLES}))
 def test_notes_of_a_kind_read_as_recorded(kind):
     recorded, now = (
         [line for line in text.splitlines() if line.startswith(f"{kind}: ")]
@@ -168,32 +291,46 @@ def test_a_callback_for_notes_passes_their_sentences_on():
     assert told == [describe(SAMPLES[0])]
 
 
-def kinds():
-    """Every kind of note that the rooms have."""
-    return {
-        kind
-        for room in (of_fit, of_loop, of_study)
-        for kind in vars(room).values()
-        if isinstance(kind, type) and issubclass(kind, Note) and kind is not Note
-    }
+def made_in_code():
+    """Code of each remark that the code makes, with the names of its values."""
+    for file in (ROOT / "calibration").rglob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            if (
+                isinstance(node, ast.Call)
+                and ast.unparse(node.func) == "Remark"
+                and isinstance(node.args[0], ast.Constant)
+            ):
+                yield node.args[0].value, {keyword.arg for keyword in node.keywords}
 
 
-def test_every_kind_of_note_has_a_sentence_and_a_sample():
-    assert kinds() == set(NOTES) == {type(note) for note in SAMPLES}
-    assert all(dataclasses.is_dataclass(kind) for kind in kinds())
+def test_each_remark_of_the_code_has_a_sample_and_a_sentence_with_its_values():
+    made = list(made_in_code())
+    assert {code for code, _ in made} == set(NOTES) == {note.code for note in SAMPLES}
+    for code, names in made:
+        if isinstance(NOTES[code], str):
+            assert names >= {field for _, field, _, _ in string.Formatter().parse(NOTES[code]) if field}, code
+        else:
+            inspect.signature(NOTES[code]).bind(**dict.fromkeys(names))
+
+
+def test_a_remark_is_a_value_and_its_values_are_attributes():
+    note = Remark("in_pieces", name="a", pieces=2)
+    assert note.pieces == 2 and note == copy.deepcopy(note) and note != Remark("in_pieces", name="a", pieces=3)
+    with pytest.raises(AttributeError, match="remark in_pieces: no value parts"):
+        note.parts  # noqa: B018
 
 
 def test_a_sentence_is_its_own_words_and_what_is_no_note_says_so():
     assert describe("as it is") == "as it is"
-    with pytest.raises(TypeError, match="got Note; expected a note or a result"):
-        describe(Note())
-    with pytest.raises(TypeError, match="got HeldByPrior, header; expected"):
-        describe(of_fit.HeldByPrior(("a",)), "header")
+    with pytest.raises(TypeError, match="got int; expected a note or a result"):
+        describe(3)
+    with pytest.raises(TypeError, match="got Remark, header; expected"):
+        describe(Remark("held_by_prior", names=("a",)), "header")
 
 
 @pytest.mark.parametrize(
     ("kind", "rows"),
-    [("Step", step_words.STEPS), ("Fact", fit_words.FACTS), ("RuledOut", loop_words.RULED_OUT)],
+    [("next_step", step_words.STEPS), ("RuledOut", loop_words.RULED_OUT)],
 )
 def test_names_of_rows_are_those_of_the_code(kind, rows):
     """A name without a row would fail only where it is said, and a row without a name is never said."""
@@ -202,7 +339,7 @@ def test_names_of_rows_are_those_of_the_code(kind, rows):
         for file in (ROOT / "calibration" / room).rglob("*.py"):
             for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
                 if isinstance(node, ast.Call) and ast.unparse(node.func) == kind and node.args:
-                    at = 0 if kind in ("Step", "Fact") else 1
+                    at = 0 if kind == "next_step" else 1
                     used |= {node.args[at].value} if len(node.args) > at else {""}
     assert used | ({""} & set(rows)) == set(rows)
 
@@ -281,7 +418,7 @@ def test_why_names_stand_or_not(support, said):
 
 
 def test_verdict_of_a_complete_model():
-    off = of_fit.NoiseOff("", 2.0, "stated")
+    off = Remark("noise_off", channel="", factor=2.0, source="stated")
     said = "Nothing is missing: the residuals are consistent with noise (family-wise p = 0.4)."
     assert loop_words.verdict_sentences(Summary("none", 0.4, None)) == said
     assert loop_words.verdict_sentences(Summary("none", 0.4, None, noise=(off,))) == f"{said} But {describe(off)}"

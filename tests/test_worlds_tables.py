@@ -94,6 +94,9 @@ def test_library_is_of_every_effect_that_steady_runs_show():
     other = {e.name for e in ALL if e.memory_size is not None} | {
         "battery_sag",
         "coast_decay",
+        "duty_exponent",
+        "duty_dead_band",
+        "duty_saturation",
         "backdriving_loss",
         *forward,
     }

@@ -34,29 +34,7 @@ from calibration.discovery.experiments import Proposal, propose_denser_runs, pro
 from calibration.discovery.hidden import find_hidden_effects
 from calibration.discovery.kept import Keep
 from calibration.discovery.location import DiscrepancyLocation, varied_by_duty
-from calibration.discovery.loop_notes import (
-    AssumedNoise,
-    Copies,
-    FreedValue,
-    KeptOut,
-    Late,
-    LostReplicates,
-    Mechanism,
-    Missed,
-    Missing,
-    NameSupport,
-    NameTest,
-    NoiseFromSeries,
-    NotPredictable,
-    Outstanding,
-    PhasesDiffer,
-    RefitWorse,
-    RestsOn,
-    StillLacks,
-    Summary,
-    TooFewReplicates,
-    Unwritten,
-)
+from calibration.discovery.loop_notes import FreedValue, Mechanism, Missed, Missing, NameSupport, NameTest, Summary
 from calibration.discovery.loop_posterior import posterior_of_curve, posterior_of_fit
 from calibration.discovery.mechanism import find_mechanism, scored_once
 from calibration.discovery.outliers import (
@@ -89,17 +67,7 @@ from calibration.inference import blocks as blocks_room
 from calibration.inference import noise as noise_room
 from calibration.inference import observers, preparation, priors, series_noise
 from calibration.inference.bases import Bases
-from calibration.inference.fit_notes import (
-    Copied,
-    FarFromPrior,
-    HeldByPrior,
-    NoiseOff,
-    Note,
-    Notes,
-    NothingVaries,
-    OnlyTogether,
-    Step,
-)
+from calibration.inference.fit_notes import Notes, Remark, next_step, with_codes
 from calibration.inference.fit_posterior import undetermined_names
 from calibration.inference.lack_of_fit import Residuals
 from calibration.inference.linearization import Linearization
@@ -134,7 +102,7 @@ LIKELY = 4.0
 FAR = 3.0
 #: Callback for progress notes.
 #: Is told what the loop does next.
-Tell = Callable[[Note | str], None]
+Tell = Callable[[Remark | str], None]
 
 
 @in_double
@@ -195,7 +163,7 @@ def discover(
     sensitivity, outstanding = list[Sensitivity](), list[float]()
     try:
         if factors:
-            tell(Step("factors", (tuple(f"{f:g}" for f in factors), known.word)))
+            tell(next_step("factors", tuple(f"{f:g}" for f in factors), known.word))
 
         def other(factor: float) -> LoopStages:
             noise = known.scaled(dict.fromkeys(silent, factor))
@@ -207,7 +175,7 @@ def discover(
             lambda: assemble_result(traced, distinct, ready.numbers, ready.settings, ready.library, tell),
         )
         if not all(verdict.done() for verdict in verdicts.values()):
-            tell(Step("others"))
+            tell(next_step("others"))
         for f, verdict in verdicts.items():
             try:
                 sensitivity.append(brief_verdict(f, verdict.result(left()), ready.numbers))
@@ -216,12 +184,17 @@ def discover(
     finally:  # an interruption or the time limit waits for none of them
         others.shutdown(wait=False, cancel_futures=True)
     if outstanding:
-        notes = (Outstanding(tuple(outstanding), known.word), *notes)
+        notes = (Remark("outstanding", factors=tuple(outstanding), word=known.word), *notes)
     assumed = [c for c in known.silent if c not in {s.channel for s in known.along_series}]
     if assumed:
-        notes = (*notes, AssumedNoise(channels.channel_names(assumed), noise_room.default_noise(assumed)))
+        notes = (
+            *notes,
+            Remark(
+                "assumed_noise", channels=channels.channel_names(assumed), usual=noise_room.default_noise(assumed)
+            ),
+        )
     if known.along_series:
-        notes = (*notes, NoiseFromSeries(known.along_series))
+        notes = (*notes, Remark("noise_from_series", noise=known.along_series))
     return dataclasses.replace(found, remarks=(*notes, *found.remarks), sensitivity=tuple(sensitivity))
 
 
@@ -289,8 +262,8 @@ def prepare_loop(
         )
     with scales.nominal_ahead(robot):
         ready = preparation.prepare(distinct, robot, noise, stated)
-    for note in ready.checked:
-        if isinstance(note, NothingVaries) or (isinstance(note, Copied) and not note.tied):
+    for note in with_codes(ready.checked, "nothing_varies", "copied"):
+        if note.code == "nothing_varies" or not note.tied:
             raise BadData(describe(note))
     at_first = (*ready.foreign, *ready.doubted)
     said: Notes = (*notes, *ready.checked, *ready.begins, *ready.weighed, *at_first)
@@ -313,7 +286,7 @@ class Sds:
 
     noise: Noise
     factors: dict[str, float] = dataclasses.field(default_factory=dict)
-    remarks: tuple[NoiseOff, ...] = ()
+    remarks: tuple[Remark, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -476,12 +449,12 @@ class _Task:
         known, at = self.known, functools.partial(bases_at_fit, self.runs)
         if known is not None and space.bare.observe.long:  # the same rows are included here
             space = dataclasses.replace(space.without(np.array(known.screened.outliers, int)), near=known.simulated)
-            self.progress(Step("base"))
+            self.progress(next_step("base"))
             base = fit_base(space, self.settings, self.runs.source, near)
             return screen_known_rows(base, at, known.screened, self.settings)
         if near is None:
             near = self.windows(space, ranked)
-        self.progress(Step("base"))
+        self.progress(next_step("base"))
         return screen_outliers(fit_base(space, self.settings, self.runs.source, near), at, self.runs, self.settings)
 
     def windows(self, space: CandidateSpace, ranked: list[Ranking]) -> Candidate | None:
@@ -503,7 +476,7 @@ def _fit_base_and_noise(task: _Task, ranked: list[Ranking]) -> tuple[Screening, 
     factors = {} if screened.cluster is not None else common_factors(residuals)
     sds = Sds(noise, factors, tuple(noise_remarks(residuals, noise.word)))
     if factors:
-        task.progress(Step("sds"))
+        task.progress(next_step("sds"))
         sds = dataclasses.replace(sds, noise=noise.scaled(factors))
         screened = task.screen(sds.noise, screened.base.candidate, ranked)
     return screened, sds
@@ -538,13 +511,13 @@ def _search_until_clean(
     """Search, repeated while it leaves outliers; None if the base leaves no discrepancy."""
     settings, keep, progress = task.settings, task.keep, task.progress
     for k in range(SCREENINGS):
-        progress(Step("bootstrap", (settings.replicates,)))
+        progress(next_step("bootstrap", settings.replicates))
         screened, left = keep(f"bootstrap {k}", functools.partial(_test_base, task, sds, screened))
         if k == 0 and not ranked:
             keep("ranking", functools.partial(findings.rank_library, screened.base.space, left, settings))
         if not left.test.rejected and screened.cluster is None:
             return screened, left, None
-        progress(Step("effects"))
+        progress(next_step("effects"))
         screened, left, searched = keep(f"search {k}", functools.partial(_search_effects, task, screened, left))
         after = searched.diagnosis
         if after is None or not after.test.rejected_with_margin or screened.base.space.near:
@@ -554,7 +527,7 @@ def _search_until_clean(
         )
         if more is None:
             break
-        progress(Step("alone"))
+        progress(next_step("alone"))
         screened = more
     return screened, left, searched
 
@@ -569,7 +542,7 @@ def _verdict(task: _Task, screened: Screening, left: Diagnosis, sds: Sds, search
     stages = functools.partial(LoopStages, beside=beside, predicted=predicted)
     leaves: tuple[Missed, ...] = ()
     if missed := missed_channels(space, runs, sds.noise, left.linear):
-        progress(Step("held out"))
+        progress(next_step("held out"))
         refit = scored_once(space, runs, base, predicted)
         fits = {c.key: c for c in (model[0] if model else None, searched.best, *best_of_each_size(searched)) if c}
         for fit in fits.values():
@@ -582,7 +555,7 @@ def _verdict(task: _Task, screened: Screening, left: Diagnosis, sds: Sds, search
     named = [] if model is None else [stood.established(e) for e in model[0].effects]
     level, found = "", None
     if not any(named):
-        progress(Step("mechanism"))
+        progress(next_step("mechanism"))
         ladder = [c for c in (*searched.ladder, *([] if model is None else model[:1]))]
         found = find_mechanism(space, runs, base, left, ladder, bases, beside, predicted, settings)
         level = "place" if found is None or found.fails else "mechanism"
@@ -591,13 +564,13 @@ def _verdict(task: _Task, screened: Screening, left: Diagnosis, sds: Sds, search
 
     searched = dataclasses.replace(searched, best=model[0], diagnosis=model[1])
     best, after = model
-    progress(Step("alike", (best.effects,)))
+    progress(next_step("alike", best.effects))
     alike = find_classes(space, base, best, searched.ladder, left, after, settings)
     if not any(named):
         return stages(level, screened, left, sds, searched, alike, where, standing=stood, mechanism=found)
     compared: tuple[HeldOutAlternative, ...] = ()
     if settings.prefer == HELD_OUT:
-        progress(Step("held out"))
+        progress(next_step("held out"))
         searched, alike, compared = preference.prefer_by_held_out(space, runs, searched, alike, bases, settings)
         after = searched.diagnosis or after
         stood = stood.renamed(dict(zip(best.active, (searched.best or best).active, strict=True)))
@@ -640,7 +613,7 @@ def choose_effects(
         return (best, after), searched, stood
     few = None
     if not (long and stood is not None and stood.stands):  # refits of histories take long
-        progress(Step("held out"))
+        progress(next_step("held out"))
         few = prediction.smallest_predictive_set(space, runs, base, best_of_each_size(searched), predicted)
     if stood is None:
         judged = best if few is None else few
@@ -780,7 +753,7 @@ def _rows_until_repeat(columns: Sequence[np.ndarray]) -> int:
     return next(n for n in range(1, len(rows) + 1) if len(rows) % n == 0 and rows[:-n] == rows[n:])
 
 
-def without_copies(runs: Runs) -> tuple[Runs, np.ndarray, list[Note]]:
+def without_copies(runs: Runs) -> tuple[Runs, np.ndarray, list[Remark]]:
     """Runs without exact copies of each other, their row numbers, and notes on the copies.
 
     Equal rows that a file does not distinguish by name, order or time are repeats, perhaps read from a coarse
@@ -800,7 +773,7 @@ def without_copies(runs: Runs) -> tuple[Runs, np.ndarray, list[Note]]:
         keep, copies = list(range(once)), list(range(once, len(runs)))
     if not copies:
         return runs, np.arange(1, len(runs) + 1), []
-    return runs.where(np.asarray(keep)), np.asarray(keep) + 1, [Copies(tuple(k + 1 for k in copies))]
+    return runs.where(np.asarray(keep)), np.asarray(keep) + 1, [Remark("copies", rows=tuple(k + 1 for k in copies))]
 
 
 def brief_verdict(factor: float, traced: LoopStages, numbers: np.ndarray) -> Sensitivity:
@@ -893,7 +866,7 @@ def _fit_of_verdict(traced: LoopStages, progress: Tell) -> _FitOfVerdict:
     space, base, best, ends = traced.screened.base.space, traced.screened.base.candidate, traced.best, traced.ends
     curve = beside = None
     if traced.verdict in WITHOUT_NAME and traced.beside is not None:
-        progress(Step("shape"))
+        progress(next_step("shape"))
         curve, beside = traced.beside.curve, traced.beside.diagnosis
     before = findings.Fitted(*space.fit_of(base.active, base.z))
     if best is base and curve is not None and beside is not None:
@@ -953,7 +926,7 @@ def assemble_result(
     included = space.included[: len(runs)]
     numbers = np.arange(1, len(runs) + 1) if numbers is None else numbers
     written = _fit_of_verdict(traced, progress)
-    progress(Step("errors"))
+    progress(next_step("errors"))
     known = [traced.predicted.get(prediction.candidate_key(c)) for c in (base, best)]
     seen = findings.readings_of_rows(
         runs, noise.sd, written.before, written.after, known[0], None if best is base else known[1]
@@ -965,7 +938,7 @@ def assemble_result(
     gain = _gain(space, runs, seen)
     kept = _predicts_well(traced, written, gain)
     written = written.or_refit(traced, kept)
-    progress(Step("next"))
+    progress(next_step("next"))
     remaining = _residuals(space, runs, written.ends.linear, seen.after, written.z)
     found = _ResultInput(traced, written, seen, compared, gain, kept, remaining)
     result = _result(found, runs, numbers, settings, library)
@@ -1074,7 +1047,7 @@ def _result(
     )
 
 
-def refit_worse(seen: ReadingsOfRows, noise: Noise, included: np.ndarray) -> list[RefitWorse]:
+def refit_worse(seen: ReadingsOfRows, noise: Noise, included: np.ndarray) -> list[Remark]:
     """Channels with unstated sds and a refit that is worse than the robot as stated, beyond their noise.
 
     The estimated sds then give some readings too much weight.
@@ -1092,7 +1065,15 @@ def refit_worse(seen: ReadingsOfRows, noise: Noise, included: np.ndarray) -> lis
             for x in (seen.as_stated - seen.measured, seen.before - seen.measured, seen.measured, noise.sd)
         )
         if refit > WORSE * stated and refit - stated > sd:
-            found.append(RefitWorse(channel.name, stated / size, refit / size, noise_room.UNSTATED[noise.source[k]]))
+            found.append(
+                Remark(
+                    "refit_worse",
+                    channel=channel.name,
+                    stated=stated / size,
+                    refit=refit / size,
+                    word=noise_room.UNSTATED[noise.source[k]],
+                )
+            )
     return found
 
 
@@ -1104,7 +1085,7 @@ def on_same_rows(
     return error(np.where(both, before, np.nan)), error(np.where(both, after, np.nan))
 
 
-def noise_remarks_before_verdict(sds: Sds, remaining: Residuals) -> tuple[NoiseOff, ...]:
+def noise_remarks_before_verdict(sds: Sds, remaining: Residuals) -> tuple[Remark, ...]:
     """Remarks on sds that are reported before the verdict: from the residuals of the final fit, or that the sds were
     changed if those residuals agree with them."""
     off = tuple(noise_remarks(remaining, sds.noise.word)) if sds.remarks else ()
@@ -1184,46 +1165,46 @@ def _noise(runs: Runs, noise: Noise, kind: type[observers.Observer]) -> dict[str
 
 def loop_remarks(found: DiscoveryResult) -> Notes:
     """Remarks of a careful engineer on a result."""
-    said: list[Note] = []
+    said: list[Remark] = []
     for rows, why in ((found.unusable, "unusable"), (found.outliers, "outliers")):
         if rows:
-            said.append(KeptOut(rows, why))
+            said.append(Remark("kept_out", rows=rows, why=why))
     far = {name: abs(p.shift_after) for name, p in found.base_shift.items() if abs(p.shift_after) > FAR}
-    said += [FarFromPrior(name, x, "loop") for name, x in far.items()]
+    said += [Remark("far_from_prior", name=name, sds=x, kind="loop") for name, x in far.items()]
     held = tuple(name for name in undetermined_names(found.held_by_prior, found.together) if name not in far)
-    said += [HeldByPrior(held)] * bool(held)
-    said += [OnlyTogether(found.together)] * bool(found.together)
-    said += [NotPredictable(found.held_out_unpredictable)] * bool(found.held_out_unpredictable)
-    said += found.residual_clusters
+    said += [Remark("held_by_prior", names=held)] * bool(held)
+    said += [Remark("only_together", pairs=found.together)] * bool(found.together)
+    said += [Remark("not_predictable", kinds=found.held_out_unpredictable)] * bool(found.held_out_unpredictable)
+    said += [Remark("residual_cluster", cluster=c) for c in found.residual_clusters]
     wave = found.unnamed
     if wave is not None and wave.score_free_in_each_run and wave.score < 0.5 * wave.score_free_in_each_run:
-        said.append(PhasesDiffer(wave.score_free_in_each_run, wave.score))
+        said.append(Remark("phases_differ", free=wave.score_free_in_each_run, held=wave.score))
     delay = found.base_shift.get(priors.DELAY)
     if delay is not None and priors.DELAY not in found.robot.rig.stated and abs(delay.after) > LATE * delay.sd_after:
-        said.append(Late(delay.after, delay.sd_after))
+        said.append(Remark("late", delay=delay.after, sd=delay.sd_after))
     if found.remains is not None:
-        said.append(StillLacks(found.remains.place, found.remains.variable))
+        said.append(Remark("still_lacks", place=found.remains.place, variable=found.remains.variable))
     names = [e.name for e in found.effects]
     for t in () if found.support is None else found.support.tests:
         if t.rests_on is not None and t.effect in names:
             said.append(_rests_on(found, t))
     if not found.written and found.gain is not None:
-        said.append(Unwritten(not found.effects, found.gain.mean, found.gain.se))
+        said.append(Remark("unwritten", curve=not found.effects, gain=found.gain.mean, se=found.gain.se))
     said += preference.leader_remarks(found.alternatives_held_out, found.settings.prefer)
     settled, asked = found.replicates, found.settings.replicates
     if settled < 0.9 * asked:
-        said.append(LostReplicates(settled, asked))
+        said.append(Remark("lost_replicates", settled=settled, asked=asked))
     if 1 / (1 + settled) > min(found.settings.shares.values()):
-        said.append(TooFewReplicates(settled))
+        said.append(Remark("too_few_replicates", settled=settled))
     return tuple(said)
 
 
-def _rests_on(found: DiscoveryResult, test: NameTest) -> RestsOn:
+def _rests_on(found: DiscoveryResult, test: NameTest) -> Remark:
     """Experiment to test the run that an effect depends on: a repeat, and half steps to either side along a series
     of that run."""
     runs = found.runs
     if test.what == "run":
-        return RestsOn(test)
+        return Remark("rests_on", test=test)
     row = int(np.flatnonzero(found.numbers == test.row)[0])
     columns = [c for c in ("configuration", *runs.axes) if runs.has(c)]
     at = {c: str(runs[c][row]) if runs[c].dtype.kind == "U" else float(runs[c][row]) for c in columns}
@@ -1232,8 +1213,8 @@ def _rests_on(found: DiscoveryResult, test: NameTest) -> RestsOn:
         x, here = runs[axis][row if series is None else series], float(runs[axis][row])
         beside = neighbouring_levels(np.asarray(x, float), here)
         if beside:
-            return RestsOn(test, at, axis, beside)
-    return RestsOn(test, at)
+            return Remark("rests_on", test=test, conditions=at, axis=axis, beside=beside)
+    return Remark("rests_on", test=test, conditions=at)
 
 
 def neighbouring_levels(x: np.ndarray, here: float) -> tuple[float, ...]:

@@ -11,8 +11,7 @@ import numpy as np
 
 from calibration.discovery.clusters import Cluster
 from calibration.discovery.location import DiscrepancyLocation
-from calibration.inference.fit_notes import NoiseOff, Note
-from calibration.inference.series_noise import SeriesNoise
+from calibration.inference.fit_notes import Remark
 
 # --- the verdict ----------------------------------------------------------------------------------------
 
@@ -265,7 +264,7 @@ class Summary:
     support: NameSupport | None = None
     aside: int = 0
     of: int = 0
-    noise: tuple[NoiseOff, ...] = ()
+    noise: tuple[Remark, ...] = ()
     cluster: Cluster | None = None
     mechanism: Mechanism | None = None
     missed: tuple[Missed, ...] = ()
@@ -325,115 +324,6 @@ class Asked:
 DRAW = "draw"
 
 
-# --- remarks --------------------------------------------------------------------------------------------
-
-
-class AssumedNoise(Note):
-    """Channels with unstated sds, and the usual values, in the form of the option."""
-
-    channels: tuple[str, ...]
-    usual: str
-
-
-class NoiseFromSeries(Note):
-    """Channels with unstated sds, and estimates from the scatter along series."""
-
-    noise: tuple[SeriesNoise, ...]
-
-
-class RefitWorse(Note):
-    """A channel with a refit that is worse than the robot as stated: errors over its measured rms [-], and `assumed`
-    or `estimated` for its noise."""
-
-    channel: str
-    stated: float
-    refit: float
-    word: str
-
-
-class Copies(Note):
-    """Numbers of rows that duplicate earlier ones."""
-
-    rows: tuple[int, ...]
-
-
-class KeptOut(Note):
-    """Numbers of excluded rows: `unusable` ones, or `outliers`."""
-
-    rows: tuple[int, ...]
-    why: str
-
-
-class PhasesDiffer(Note):
-    """A wave with a different phase in each run: decrease of χ² with a phase for each run, and with one [σ²]."""
-
-    free: float
-    held: float
-
-
-class StillLacks(Note):
-    """A place with a remaining discrepancy over a variable."""
-
-    place: str
-    variable: str
-
-
-class Late(Note):
-    """A delay of an imposed quantity that the rig's file does not state, with its sd [s]."""
-
-    delay: float
-    sd: float
-
-
-class Led(Note):
-    """Choice of the leader of a class.
-
-    Attributes:
-        names, rms_sigma: of the alternatives, and their hold-out errors [σ].
-        leader: index of the leader; closest: of the best fit to all rows; best: of the best hold-out error among
-            adequate ones.
-        by: `settings.PREFERENCES`, or `DRAW`; prefer: the requested criterion.
-        told: least relative difference of errors that counts [-].
-        rise_chi2: of the leader above the closest [σ²].
-    """
-
-    names: tuple[str, ...]
-    rms_sigma: tuple[float, ...]
-    leader: int
-    closest: int
-    best: int
-    by: str
-    prefer: str
-    told: float
-    rise_chi2: float
-
-
-class NotPredictable(Note):
-    """Kinds of blocks that the others cannot predict, because single blocks determine some parameters."""
-
-    kinds: tuple[str, ...]
-
-
-class LostReplicates(Note):
-    """Number of bootstrap tables with successful refits, and of all."""
-
-    settled: int
-    asked: int
-
-
-class Outstanding(Note):
-    """Verdicts at other noises that were not finished in time: factors of the sds, and `assumed` or `estimated`."""
-
-    factors: tuple[float, ...]
-    word: str
-
-
-class TooFewReplicates(Note):
-    """Too few bootstrap tables for every kind of evidence."""
-
-    settled: int
-
-
 # --- what to do next ------------------------------------------------------------------------------------
 
 
@@ -471,32 +361,3 @@ class Overvoltage:
 
 
 Watch = Heat | Overspeed | Overvoltage
-
-
-class RestsOn(Note):
-    """An effect that depends on a single run, which should be repeated together with neighbouring ones.
-
-    Attributes:
-        test: of the effect.
-        conditions: column → value of that run; axis: column along which other runs share its other conditions,
-            "" for none; beside: values along it that would be most informative.
-    """
-
-    test: NameTest
-    conditions: dict[str, str | float] = dataclasses.field(default_factory=dict)
-    axis: str = ""
-    beside: tuple[float, ...] = ()
-
-
-class Unwritten(Note):
-    """A proposal that is not written to the robot, because its hold-out predictions are worse than the refit's.
-
-    A curve is also omitted if they are no better.
-
-    Attributes:
-        curve: True for a curve, False for effects; gain, se: of its predictions [nat a reading].
-    """
-
-    curve: bool
-    gain: float
-    se: float

@@ -12,12 +12,13 @@ from calibration.discovery import experiments
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.candidates import Candidate, fit_candidates, start_of_fit
 from calibration.discovery.classes import Classes, families_of_members
-from calibration.discovery.loop_notes import DRAW, Led
+from calibration.discovery.loop_notes import DRAW
 from calibration.discovery.result import Errors, HeldOutAlternative, Worse
 from calibration.discovery.search import Search, diagnose_candidate
 from calibration.discovery.settings import HELD_OUT, Settings
 from calibration.inference import blocks as blocks_room
 from calibration.inference.bases import Bases
+from calibration.inference.fit_notes import Remark
 from calibration.inference.held_out import predict_unseen
 
 #: Least relative difference of hold-out errors that counts; less is invisible in two digits.
@@ -164,7 +165,7 @@ def _classes_of_leader(
     )
 
 
-def leader_remarks(table: Sequence[HeldOutAlternative], prefer: str) -> list[Led]:
+def leader_remarks(table: Sequence[HeldOutAlternative], prefer: str) -> list[Remark]:
     """Notes on the choice of the leader, and whether the other criterion would have chosen another."""
     if not table:
         return []
@@ -173,10 +174,11 @@ def leader_remarks(table: Sequence[HeldOutAlternative], prefer: str) -> list[Led
     wins = _order(table)[0]
     alike = any(_is_draw(table[k], table[0]) for k in _full_predictors(table)[1:])
     return [
-        Led(
-            tuple(" and ".join(n for n in a.effects if n not in shared) for a in table),
-            tuple(a.rms_sigma for a in table),
-            leader,
+        Remark(
+            "led",
+            names=tuple(" and ".join(n for n in a.effects if n not in shared) for a in table),
+            rms_sigma=tuple(a.rms_sigma for a in table),
+            leader=leader,
             closest=min(range(len(table)), key=lambda k: table[k].rise_chi2),
             best=wins,
             by=DRAW if prefer == HELD_OUT and leader == wins == 0 and alike else prefer,

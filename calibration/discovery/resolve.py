@@ -20,7 +20,7 @@ from calibration.discovery.result import PLAUSIBLE, DiscoveryResult, Estimate, R
 from calibration.inference import noise as noise_room
 from calibration.inference import observers
 from calibration.inference.calibration import calibrate
-from calibration.inference.fit_notes import Note, Step
+from calibration.inference.fit_notes import Remark, next_step
 from calibration.inference.population import saved_members
 from calibration.inference.result import CalibrationResult
 from mmrjax.effects import UNNAMED
@@ -77,7 +77,7 @@ def resolve(
     generations: int | None = None,
     members: Path | None = None,
     seed: int = 0,
-    tell: Callable[[Note | str], None] = lambda note: None,
+    tell: Callable[[Remark | str], None] = lambda note: None,
 ) -> Resolved | None:
     """Fit the track model to the rows of a verdict.
 
@@ -115,9 +115,9 @@ def resolve(
             seed=seed, profiles=False, blocks=False, tell=tell,
         )  # fmt: skip
 
-    tell(Step("gear stated"))
+    tell(next_step("gear stated"))
     stated = fit(friction)
-    tell(Step("gear free"))
+    tell(next_step("gear free"))
     free = fit((*friction, *gear), members)
     fall = 2 * (stated.objective - free.objective)
     return Resolved(

@@ -24,7 +24,7 @@ from calibration.discovery.loop_notes import Asked, Headline, Mechanism, NameSup
 from calibration.discovery.prediction import Gain
 from calibration.discovery.settings import Settings
 from calibration.inference.details import Detail
-from calibration.inference.fit_notes import HeldByPrior, Notes, Pair
+from calibration.inference.fit_notes import Notes, Pair, Remark
 from calibration.inference.fit_posterior import determined_together
 from calibration.inference.residual_clusters import ResidualCluster
 from calibration.inference.simulation_errors import OF_SIZE
@@ -739,7 +739,7 @@ class DiscoveryResult:
         folder.mkdir(parents=True, exist_ok=True)
         write_json(folder / "result.json", self.to_json())
         write_table(folder / "rows.csv", self.rows_table(), tables)
-        held = [describe(HeldByPrior(self.held_by_prior))] if self.held_by_prior else []
+        held = [describe(Remark("held_by_prior", names=self.held_by_prior))] if self.held_by_prior else []
         note = "\n".join([describe(self, "header", robot_name), *held])
         robot_file.write_robot(self.robot, folder / "robot.toml", note=note)
         robot_file.write_robot(self.refit, folder / REFIT_FILE, note=describe(self, "refit header", robot_name))

@@ -36,6 +36,7 @@ from mmrjax.model.signals import Signals
 
 #: Reference quantity of each balance; terms are shares of it.
 WHOLE: dict[str, Callable[[Robot, Signals], object]] = {
+    "duty": lambda robot, s: s.duty,
     "supply": lambda robot, s: s.voltage,
     "electrical": lambda robot, s: s.voltage,
     "motor": lambda robot, s: s.torque_electromagnetic,
@@ -70,6 +71,9 @@ UNKNOWN = 4.0
 #: Largest error of an instrument, as a share of the channel's rms reading: a larger one would be noticed (47 A on
 #: readings of 114 A are no ammeter's offset).
 MOST_OFF = 0.25
+#: Least size of an instrument's readings for its errors, as a share of those at rated load and speed. A motor without
+#: load draws little of its ammeter's range: 0.4 A on readings of 0.6 A is an offset of a meter for 20 A.
+LEAST_SHOWN = 0.2
 #: Signals that grow with the motors' current, and signals that grow with their speed.
 LOADS = (
     "current",
@@ -193,21 +197,23 @@ def _scale_effect(kind: type[Effect], mine: tuple[Robot, Signals], theirs: tuple
         if with_ is not None:
             stretch = _ratio(_size(with_(mine[1])), _size(with_(theirs[1])))
     grown = effect if shape is None else params.replace(effect, {shape.name: jnp.asarray(stretch * shape.value)})
-    factor = 1.0
+    factor, share = 1.0, _unit_share(grown, *mine)
+    if kind.balance == "sensor":
+        share = min(share, _unit_share(grown, mine[0], _at_rated_load(*mine)) / LEAST_SHOWN)
     if amplitude.spec.unit == BALANCES[kind.balance][0]:  # by its own size, even if operating points show none
         whole = WHOLE[kind.balance]
         factor = _ratio(_size(whole(*mine)), _size(whole(*theirs)))
     elif amplitude.spec.unit != "-":
-        factor = _ratio(_unit_share(effect, *theirs), _unit_share(grown, *mine))
+        factor = _ratio(_unit_share(effect, *theirs), share)
     slips = kind.balance == "slip" and amplitude.spec.unit == "-"
     factor *= SLIPPERY if slips else 1.0 if kind.balance == "mass" else UNKNOWN
     limits = factor
     if kind.balance != "sensor":
-        own, rated = (_unit_share(grown, mine[0], s) for s in (mine[1], _at_rated_load(*mine)))
-        limits = factor * min(1.0, _ratio(own, rated))
+        rated = _unit_share(grown, mine[0], _at_rated_load(*mine))
+        limits = factor * min(1.0, _ratio(share, rated))
     else:
         low, high = amplitude_of(grown).spec.bounds
-        limits = min(factor, MOST_OFF / (max(-low, high) * _unit_share(grown, *mine)))
+        limits = min(factor, MOST_OFF / (max(-low, high) * share))
     return scaled_effect(kind, (float(factor), float(stretch), float(limits)))
 
 

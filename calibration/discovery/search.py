@@ -16,7 +16,7 @@ from calibration.discovery.score_tests import ScoreTable, Statistics, diagnose_f
 from calibration.discovery.screening import Confirmed, confirm_by_simulation, fit_by_regression
 from calibration.discovery.settings import Settings
 from calibration.inference.bases import Bases
-from calibration.inference.fit_notes import Step
+from calibration.inference.fit_notes import Remark, next_step
 
 #: Largest number of pairs of instances that are examined for pairs of effects.
 PAIRS = 4000
@@ -57,7 +57,7 @@ def search_effects(
     left: Diagnosis,
     bases: Bases,
     settings: Settings,
-    progress: Callable[[Step], None],
+    progress: Callable[[Remark], None],
 ) -> Search:
     """Smallest set of effects that explains the discrepancy of the base to within the test's margin.
 
@@ -76,7 +76,7 @@ def search_effects(
         diagnosis = diagnose_candidate(space, best, bases, left.test.null, settings)
         if not diagnosis.test.rejected_with_margin or len(best.effects) == _largest_set_size(space, settings):
             break
-        progress(Step("more effects", (best.effects,)))
+        progress(next_step("more effects", best.effects))
         rounds.append(_extend(space, best, diagnosis, base, left, settings))
         more, space = list(rounds[-1].candidates), space.with_room(rounds[-1].room)
         best = _accepted(_best(more), ladder, settings)

@@ -31,7 +31,7 @@ from calibration.inference import (
     scans,
     solvers,
 )
-from calibration.inference.fit_notes import Elsewhere, Fact, Note, OfRows, PriorOfProduct, Step
+from calibration.inference.fit_notes import Remark, next_step
 from calibration.inference.fit_posterior import posterior_of_coordinates
 from calibration.inference.multistart import SearchResult
 from calibration.inference.noise import Noise
@@ -135,7 +135,7 @@ def calibrate(
     optimum = _optimum(setting, found)
     if found.problem.observe.long:
         doing = ["the linear analysis", *["profiles"] * plan.profiles, *["blocks held out"] * bool(plan.kinds)]
-        told(Step("optimum", (", ".join(doing),)))
+        told(next_step("optimum", ", ".join(doing)))
     return _result(setting, found, optimum, _analyse(setting, found, optimum), beside, seed)
 
 
@@ -226,10 +226,13 @@ class _Setting:
         )
         return observers.pose_problem(self.runs, self.base, coordinates, self.ready.noise.sd, self.plan.fidelity)
 
-    def remarks(self) -> list[Note | str]:
+    def remarks(self) -> list[Remark | str]:
         """Remarks on the table and the priors."""
         ready = self.ready
-        products = [PriorOfProduct(name, mean, sd, priors.GUIDED) for name, (mean, sd) in self.of_product.items()]
+        products = [
+            Remark("prior_of_product", name=name, mean=mean, sd=sd, share=priors.GUIDED)
+            for name, (mean, sd) in self.of_product.items()
+        ]
         return [*ready.foreign, *ready.doubted, *ready.checked, *ready.weighed, *products, *ready.begins]
 
 
@@ -281,7 +284,7 @@ def _search(
     starts: int,
     evolved: _PopulationOptions,
     seed: int,
-    tell: Callable[[Step], None],
+    tell: Callable[[Remark], None],
     solver: optimizers.Solver | None,
 ) -> tuple[SearchResult, np.ndarray | None]:
     """The searches of a problem, and where they began at the optimum of `steady`, that optimum."""
@@ -296,7 +299,7 @@ def _search(
     if not posed.observe.eased:
         shares = multistart.initial_noise_shares(known)
         return multistart.search_one_by_one(posed, known, points, shares, tell, solver), None
-    tell(Step("steady"))
+    tell(next_step("steady"))
     if evolved.size:
         population.Members(posed, evolved.file)  # refuses another calibration's file before the search of steady
     draws = rng.standard_normal((fidelities.fidelity_facts("steady").effort.starts, size))
@@ -324,7 +327,7 @@ def _search(
             f"in: {said or 'none'}); begin from another robot, or free fewer parameters"
         )
     posed, shares = multistart.reestimate_noise_at(posed, known, everyone, at)
-    tell(Step("derivatives"))
+    tell(next_step("derivatives"))
     about = identifiability.analyse_identifiability(posed, jnp.asarray(everyone.z[at]))
     off = population.unreliable_derivatives(posed, members, everyone.z[at], about.jacobian, about.sd)
     names = tuple(n for n, apart in zip(posed.coordinates.names, off, strict=True) if apart)
@@ -410,13 +413,13 @@ class _Analysis:
     elsewhere: int
     profile: identifiability.Profile | None
     held: dict[str, holdout.HeldOut]
-    notes: list[Note | str]
+    notes: list[Remark | str]
 
 
 def _analyse(setting: _Setting, found: SearchResult, optimum: _Optimum) -> _Analysis:
     """Linear analysis, scans, profiles and held-out blocks at the optimum."""
     posed, z, plan, searched = found.problem, optimum.z, setting.plan, found.searched
-    notes: list[Note | str] = [*posed.observe.cautions(optimum.robot)]
+    notes: list[Remark | str] = [*posed.observe.cautions(optimum.robot)]
     about = identifiability.analyse_identifiability(
         posed, jnp.asarray(z), slope=None if searched is None else searched.slope
     )
@@ -427,11 +430,11 @@ def _analyse(setting: _Setting, found: SearchResult, optimum: _Optimum) -> _Anal
     elsewhere = scans.count_outside(scanned, found.starts.z, found.starts.converged)
     if elsewhere:
         over = tuple(posed.coordinates.names[k] for k in scanned)
-        notes.append(Elsewhere(elsewhere, len(found.starts.cost), over))
+        notes.append(Remark("elsewhere", searches=elsewhere, total=len(found.starts.cost), names=over))
     if not np.isfinite(about.covariance).all():
-        notes.append(Fact("no covariance"))
+        notes.append(Remark("no_covariance"))
     if jumps := row_numbers(np.asarray(optimum.after.flags) >> FLAGS.index("jumps") & 1):
-        notes.append(OfRows(jumps, "jumps"))
+        notes.append(Remark("of_rows", rows=jumps, what="jumps"))
     profile = None
     if plan.profiles:
         profile = identifiability.profile_likelihoods(posed, jnp.asarray(z), float(found.best.cost), about)

@@ -13,7 +13,7 @@ from calibration.data.runs import Runs
 from calibration.described import describe
 from calibration.inference import observers
 from calibration.inference.conduct import conduct_notes
-from calibration.inference.fit_notes import Constant, Note, StiffSupply, Unmeasured
+from calibration.inference.fit_notes import Remark
 from calibration.inference.noise import Noise
 from calibration.inference.ranges import check_ranges
 from calibration.inference.uninformative import computed_load, copied_channels, nothing_varies
@@ -23,7 +23,7 @@ from mmrjax.model.robot import Robot
 from mmrjax.model.signals import SLIDES, STATUSES
 
 
-def check_data(runs: Runs, robot: Robot, names: Sequence[str], noise: Noise) -> list[Note | str]:
+def check_data(runs: Runs, robot: Robot, names: Sequence[str], noise: Noise) -> list[Remark | str]:
     """Refuse data that cannot be fitted; return notes on data that can.
 
     Raises:
@@ -74,7 +74,7 @@ def _check_motion(runs: Runs, noise: Noise) -> None:
     )
 
 
-def _uninformative(runs: Runs, robot: Robot, noise: Noise) -> list[Note]:
+def _uninformative(runs: Runs, robot: Robot, noise: Noise) -> list[Remark]:
     """Notes on settled runs of one condition, and on channels computed from others; a computed load is refused."""
     if runs.sampled or runs.turns:
         return []
@@ -112,12 +112,12 @@ def _check_enough_readings(runs: Runs, names: Sequence[str], noise: Noise) -> No
     raise BadData(f"{runs.source}: {have} {what}; at least {least} are needed{f', or {cure}' if names else ''}")
 
 
-def _check_stuck_channels(runs: Runs) -> list[StiffSupply]:
+def _check_stuck_channels(runs: Runs) -> list[Remark]:
     """Refuses a channel with one value under several conditions; returns notes for a motor voltage with one value."""
     labels = () if runs.layout.complete else ("configuration", "surface")
     columns = [c for c in (*observers.observer_kind(runs).axes_of(runs), *labels) if runs.has(c)]
     varied = [np.unique(runs[c], return_inverse=True)[1] for c in columns]
-    stiff: list[StiffSupply] = []
+    stiff: list[Remark] = []
     if len(np.unique(np.stack(varied, 1), axis=0)) < 2:
         return stiff
     for channel in runs.channels:
@@ -126,7 +126,7 @@ def _check_stuck_channels(runs: Runs) -> list[StiffSupply]:
         )
         if len(readings) > 2 and np.ptp(readings) == 0:
             if channel.name == "motor_voltage":
-                stiff.append(StiffSupply(channel.column, float(readings[0])))
+                stiff.append(Remark("stiff_supply", column=channel.column, value=float(readings[0])))
                 continue
             raise BadData(
                 f"{runs.source}, {channel.column}: {bound_text(readings[0])} in every row although the "
@@ -136,14 +136,14 @@ def _check_stuck_channels(runs: Runs) -> list[StiffSupply]:
     return stiff
 
 
-def _constant_conditions(runs: Runs) -> list[Constant]:
+def _constant_conditions(runs: Runs) -> list[Remark]:
     imposed = runs.layout.imposed_column
     alike = {
         "slope_deg": "guides" if runs.layout.complete else "slope",
         imposed: "voltage" if imposed == SUPPLY else "speed",  # and levels of current identify friction by speed
     }
     return [
-        Constant(column, runs[column][0], losses)
+        Remark("constant", column=column, value=runs[column][0], alike=losses)
         for column, losses in alike.items()
         if column in runs.axes
         and np.ptp(runs[column]) == 0
@@ -151,9 +151,9 @@ def _constant_conditions(runs: Runs) -> list[Constant]:
     ]
 
 
-def unmeasured_notes(names: Sequence[str], sensitivity: np.ndarray) -> list[Unmeasured]:
+def unmeasured_notes(names: Sequence[str], sensitivity: np.ndarray) -> list[Remark]:
     """Notes on free parameters that change no reading."""
-    return [Unmeasured(name) for name, s in zip(names, sensitivity, strict=True) if s < 1e-6]
+    return [Remark("unmeasured", name=name) for name, s in zip(names, sensitivity, strict=True) if s < 1e-6]
 
 
 def infeasible_error(

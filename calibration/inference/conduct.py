@@ -7,7 +7,7 @@ import numpy as np
 from calibration.data.courses import rows_of_varying_runs
 from calibration.data.runs import Runs
 from calibration.inference import observers
-from calibration.inference.fit_notes import EndsEarly, Fact, NeverGrips, Note
+from calibration.inference.fit_notes import Remark
 from calibration.inference.operating import operating_readings
 from calibration.inference.ranges import UNDER_WAY
 from mmrjax.model import channels
@@ -18,7 +18,7 @@ from mmrjax.model.robot import Robot
 SLOW, SLIDING = 0.7, 0.7
 
 
-def conduct_notes(runs: Runs, robot: Robot) -> list[Note]:
+def conduct_notes(runs: Runs, robot: Robot) -> list[Remark]:
     """Notes on runs that end before they reach steady travel, and on runs that never grip."""
     runs = runs.of(robot)
     kind = observers.observer_kind(runs)
@@ -41,16 +41,16 @@ def conduct_notes(runs: Runs, robot: Robot) -> list[Note]:
     early = (lasts < UNDER_WAY) & (slow | ~measured)
     slides = (lasts >= UNDER_WAY) & measured & np.isfinite(movers) & (movers > 0) & (speed < SLIDING * movers)
     slides &= ~np.isin(names, runs.run_names[rows_of_varying_runs(runs)])  # their settled ends are only parts of them
-    said: list[Note] = []
+    said: list[Remark] = []
     if early.any():
         seen = slow & early
         share = float(np.nanmedian(speed[seen] / steady[seen])) if seen.any() else float("nan")
-        said.append(EndsEarly(_run_names(names, early), float(lasts[early].max()), share))
+        said.append(Remark("ends_early", runs=_run_names(names, early), lasts=float(lasts[early].max()), share=share))
     if slides.any():
         share = max(float(np.median(speed[slides] / movers[slides])), 0.0)
-        said.append(NeverGrips(_run_names(names, slides), share))
+        said.append(Remark("never_grips", runs=_run_names(names, slides), share=share))
     if slides.any() and (slides | early).all():
-        said.append(Fact("no grip"))
+        said.append(Remark("no_grip"))
     return said
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
-from calibration.inference.fit_notes import InheritedPriors
+from calibration.inference.fit_notes import Remark
 from calibration.inference.priors import FRICTION, GUIDE_FRICTION, GUIDE_SHARE, parameters_by_name
 from mmrjax.model import paper_robots
 from mmrjax.model.robot import Robot
@@ -19,7 +19,7 @@ CHASSIS, GUIDES = (("mass", "radius"), FRICTION), (GUIDE_SHARE, GUIDE_FRICTION)
 DIFFERS = 0.2
 
 
-def inherited_priors(robot: Robot, stated: Collection[str] = ()) -> list[InheritedPriors]:
+def inherited_priors(robot: Robot, stated: Collection[str] = ()) -> list[Remark]:
     """Parts that differ from the nominal robot's but have the same friction; none for a rig without inheritance.
 
     A configuration is compared with the one of the nominal robot that has the same friction.
@@ -34,7 +34,7 @@ def inherited_priors(robot: Robot, stated: Collection[str] = ()) -> list[Inherit
     )
     pairs = [(part, part, *DRIVE[part]) for part in DRIVE]
     pairs += [(c, other, *CHASSIS) for c in robot.configurations for other in paper_robots.nominal().configurations]
-    inherited: dict[str, InheritedPriors] = {}
+    inherited: dict[str, Remark] = {}
     for part, other, sheet, friction in pairs:
         on_tracks = part in robot.configurations and float(robot.configurations[part].on_tracks) > 0.5
         guides = GUIDES if on_tracks else ()
@@ -49,5 +49,5 @@ def inherited_priors(robot: Robot, stated: Collection[str] = ()) -> list[Inherit
             if abs(mine[f"{part}.{name}"] / nominal[f"{other}.{name}"] - 1) > DIFFERS
         )
         if len(kept) > len(inherited[part].kept if part in inherited else ()):
-            inherited[part] = InheritedPriors(part, changed, kept)
+            inherited[part] = Remark("inherited_priors", part=part, changed=changed, kept=kept)
     return [note for note in inherited.values() if note.changed]

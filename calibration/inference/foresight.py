@@ -12,20 +12,7 @@ from calibration.data.input_errors import BadConfiguration
 from calibration.data.runs import Runs
 from calibration.data.thinning import used_rows
 from calibration.inference import identifiability, observers, optimizers, priors
-from calibration.inference.fit_notes import (
-    Copied,
-    LargerNoise,
-    NoLoadGives,
-    Notes,
-    NothingVaries,
-    OffBy,
-    Pair,
-    Repeats,
-    SlopesIn,
-    StiffSupply,
-    Turned,
-    Unused,
-)
+from calibration.inference.fit_notes import Notes, Pair, with_codes
 from calibration.inference.fit_posterior import determined_together, posterior_of_coordinates
 from calibration.inference.preparation import prepare
 from mmrjax import fidelities
@@ -34,7 +21,8 @@ from mmrjax.model.signals import STATUSES
 
 #: Notes that call for a look at the table before it is used.
 DOUBTS = (
-    Copied, LargerNoise, NoLoadGives, NothingVaries, OffBy, Repeats, SlopesIn, StiffSupply, Turned, Unused,
+    "copied", "larger_noise", "no_load_gives", "nothing_varies", "off_by", "repeats", "slopes_in", "stiff_supply",
+    "turned", "unused",
 )  # fmt: skip
 
 
@@ -115,7 +103,7 @@ def predict_identifiability(runs: Runs, robot: Robot, noise: str | None = None, 
         for k, n in enumerate(names)
     )
     statuses = tuple(STATUSES[int(s)] for s in np.asarray(seen.status))
-    doubts = tuple(note for note in ready.checked if isinstance(note, DOUBTS))
+    doubts = tuple(with_codes(ready.checked, *DOUBTS))
     priors_hold = [p.name for p in found if p.held]
     together = determined_together(
         posterior_of_coordinates(coordinates, np.asarray(z), about.covariance), priors_hold

@@ -15,7 +15,7 @@ import numpy as np
 from calibration.described import describe
 from calibration.inference import identifiability, optimizers, scans, series_noise
 from calibration.inference import noise as noise_room
-from calibration.inference.fit_notes import Agreement, Step
+from calibration.inference.fit_notes import Remark, next_step
 from calibration.inference.noise import Noise
 from calibration.inference.population import Population, Searched, most_probable_noise
 from calibration.inference.problem import Data, Observation, Problem
@@ -58,11 +58,18 @@ class Starts:
         return int(np.sum(self.converged & self._at_best))
 
     @property
-    def agreement(self) -> Agreement:
+    def agreement(self) -> Remark:
         """Agreement of the starts, as a note."""
         other = self.converged & ~self._at_best
         more = float(self.cost[other].min() - self.cost.min()) if other.any() else 0.0
-        return Agreement(len(self.cost), self.agree, int(other.sum()), more, int(np.sum(~self.converged)))
+        return Remark(
+            "agreement",
+            starts=len(self.cost),
+            agree=self.agree,
+            elsewhere=int(other.sum()),
+            more=more,
+            open=int(np.sum(~self.converged)),
+        )
 
     def statement(self) -> str:
         """Whether the starts agree, as a sentence."""
@@ -125,7 +132,7 @@ def search_one_by_one(
     noise: Noise,
     points: np.ndarray,
     shares: np.ndarray,
-    tell: Callable[[Step], None],
+    tell: Callable[[Remark], None],
     solver: optimizers.Solver | None = None,
 ) -> SearchResult:
     """As `search_from_starts`, one search at a time: the noise settles on the first point's optimum, then the others
@@ -145,7 +152,7 @@ def search_one_by_one(
             if solver is not None:
                 return _pick_member(optimizers.search_with_solver(posed, jnp.asarray(z)[None], data, solver), 0)
             return optimizers.search_rollout(
-                posed, jnp.asarray(z), data, tell=lambda *done: tell(Step("search", (*done, minutes())))
+                posed, jnp.asarray(z), data, tell=lambda *done: tell(next_step("search", *done, minutes()))
             )
 
         found, start, end = one(points[0])
@@ -159,7 +166,7 @@ def search_one_by_one(
         for round_ in range(1, ROUNDS + 1):
             posed, found, feasible = _search_until_feasible(posed, z[None], step)
             z = np.asarray(found.z[0])
-            tell(Step("round", (round_, found.cost[0], found.steps[0], minutes())))
+            tell(next_step("round", round_, found.cost[0], found.steps[0], minutes()))
             new = _reestimate_shares(posed, noise, z, shares)
             if new is None:
                 break
@@ -170,7 +177,7 @@ def search_one_by_one(
             end, status, _ = step(posed, point[None], posed.data)
             ends.append(end)
             feasibles.append(~np.any(unreachable_rows(posed, status), axis=1))
-            tell(Step("start", (k, len(points), end.cost[0], end.steps[0], minutes())))
+            tell(next_step("start", k, len(points), end.cost[0], end.steps[0], minutes()))
         found = jax.tree.map(lambda *x: jnp.concatenate(x), *ends)
         k = int(np.nanargmin(found.cost))
         if not found.cost[k] < found.cost[0] - AGREE * (1 + found.cost[0]):
@@ -207,7 +214,7 @@ def optimum_of_population(
     noise: Noise,
     shares: np.ndarray,
     searched: Searched,
-    tell: Callable[[Step], None],
+    tell: Callable[[Remark], None],
     solver: optimizers.Solver | None = None,
 ) -> SearchResult:
     """What a population found, its best member searched on by gradients where those are to be trusted."""

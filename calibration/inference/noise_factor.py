@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import chdtr, chdtrc
 
-from calibration.inference.fit_notes import NoiseOff
+from calibration.inference.fit_notes import Remark
 from calibration.inference.lack_of_fit import LEVEL, Residuals, structure_tests
 
 #: Factor on the sds, in either direction, above which a note reports it; p-value under correct sds below which it
@@ -58,9 +58,13 @@ def _is_common_factor(fit: Residuals, factors: dict[str, float]) -> bool:
     return len(factors) == count > 1 and max(factors.values()) < ALIKE**2 * min(factors.values())
 
 
-def noise_remarks(fit: Residuals, source: str = "stated") -> list[NoiseOff]:
+def noise_remarks(fit: Residuals, source: str = "stated") -> list[Remark]:
     """Notes on sds that are wrong by a factor; `source` is the origin of the sds."""
     factors = noise_factors(fit)
     if _is_common_factor(fit, factors):
-        return [NoiseOff("", float(np.exp(np.mean(np.log(list(factors.values()))))), source)]
-    return [NoiseOff(name, factor, source) for name, factor in factors.items()]
+        return [
+            Remark(
+                "noise_off", channel="", factor=float(np.exp(np.mean(np.log(list(factors.values()))))), source=source
+            )
+        ]
+    return [Remark("noise_off", channel=name, factor=factor, source=source) for name, factor in factors.items()]

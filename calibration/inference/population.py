@@ -27,16 +27,7 @@ from calibration.data.writing import replacing
 from calibration.described import describe
 from calibration.inference import noise as noise_room
 from calibration.inference import series_noise
-from calibration.inference.fit_notes import (
-    Edge,
-    EndedAtEdge,
-    Generations,
-    LostRows,
-    MembersJump,
-    Note,
-    ReadFromMembers,
-    Step,
-)
+from calibration.inference.fit_notes import Edge, Remark, next_step
 from calibration.inference.noise import Noise
 from calibration.inference.priors import Coordinates
 from calibration.inference.problem import MISSING, Observation, Problem
@@ -264,7 +255,7 @@ def evolve(
     seed: int,
     generations: int = GENERATIONS,
     beside: np.ndarray | None = None,
-    tell: Callable[[Step], None] = lambda step: None,
+    tell: Callable[[Remark], None] = lambda step: None,
 ) -> Population:
     """Search by generations.
 
@@ -287,7 +278,7 @@ def evolve(
 
         def advance(done: int) -> None:
             minutes = (time.perf_counter() - begun) / 60
-            tell(Step("members", (number, done, len(asked), minutes)))  # noqa: B023
+            tell(next_step("members", number, done, len(asked), minutes))  # noqa: B023
 
         now = members.run(asked, advance)
         z = asked if seen is None else np.concatenate([z, asked])
@@ -297,7 +288,7 @@ def evolve(
         search.tell([(d, float(c)) for d, c in zip(drawn, np.where(np.isfinite(own), own, MISSING**2), strict=True)])
         failed = int(np.sum(members.lost(now).any(-1)))
         told.append(Generation(len(asked), failed, float(cost.min()), float(np.median(own))))
-        tell(Step("generation", (number, cost.min(), np.median(own), failed)))
+        tell(next_step("generation", number, cost.min(), np.median(own), failed))
         found = Population(z, *seen, cost, tuple(told))
         if found.settled:
             break
@@ -404,15 +395,22 @@ class Searched:
             "regression_rms_sd": self.left if np.isfinite(self.left) else None,
         }
 
-    def remarks(self) -> list[Note]:
+    def remarks(self) -> list[Remark]:
         """Notes on the search."""
-        said: list[Note] = [Generations(len(self.found.z), len(self.found.generations), self.found.settled)]
+        said: list[Remark] = [
+            Remark(
+                "generations",
+                members=len(self.found.z),
+                generations=len(self.found.generations),
+                settled=self.found.settled,
+            )
+        ]
         ended = self.outcomes()
         lost = {status: ended[status] for status in LOST_AS if status in ended}
-        said += [LostRows(lost)] * bool(lost)
+        said += [Remark("lost_rows", members=lost)] * bool(lost)
         if "jumps" in ended:
             rows = np.flatnonzero(self._jumps(self.found.flags[self.at]))
-            said.append(MembersJump(ended["jumps"], tuple(int(k) + 1 for k in rows)))
-        said += [EndedAtEdge(self.edge)] * bool(self.edge)
-        said += [ReadFromMembers(self.apart, self.left)] * bool(self.apart)
+            said.append(Remark("members_jump", members=ended["jumps"], best=tuple(int(k) + 1 for k in rows)))
+        said += [Remark("ended_at_edge", edge=self.edge)] * bool(self.edge)
+        said += [Remark("read_from_members", names=self.apart, left=self.left)] * bool(self.apart)
         return said

@@ -11,7 +11,7 @@ from calibration.data.input_errors import BadData, bound_text
 from calibration.data.runs import Runs
 from calibration.described import describe
 from calibration.inference import observers
-from calibration.inference.fit_notes import Note, OffBy, SlopesIn, Turned
+from calibration.inference.fit_notes import Remark
 from calibration.inference.operating import operating_readings
 from mmrjax.model import channels, params
 from mmrjax.model.channels import Channel
@@ -40,7 +40,7 @@ SLOPES = {"radians": 180 / math.pi, "percent": math.degrees(0.01)}
 FOLLOWS = 0.9
 
 
-def check_ranges(runs: Runs, robot: Robot) -> list[Note]:
+def check_ranges(runs: Runs, robot: Robot) -> list[Remark]:
     """Refuse readings that no robot like this one has under these conditions; return notes on other doubts.
 
     Each channel's readings are compared with steady travel of the robot in its file, and with a tenth and four times
@@ -70,7 +70,7 @@ def check_ranges(runs: Runs, robot: Robot) -> list[Note]:
     if not np.isfinite(possible).any():
         return []
     factors = {c: _factor(measured[:, k], possible[:, :, k]) for k, c in enumerate(robot.channels)}
-    said: list[Note] = []
+    said: list[Remark] = []
     for k, (channel, factor) in enumerate(factors.items()):
         off = max(factor, 1 / factor)
         unknown = not robot.rig.inherits and channel.name in OF_TORQUE
@@ -82,13 +82,14 @@ def check_ranges(runs: Runs, robot: Robot) -> list[Note]:
         ):  # a sliding vehicle may have other speeds
             continue
         typical = _factor(measured[:, k], possible[1:2, :, k])
-        found = OffBy(
-            channel.column,
-            channel.unit,
-            typical if units else factor,
-            tuple(units),
-            tuple(_columns_with_same_factor(channel, factors)),
-            runs.layout.imposed_column,
+        found = Remark(
+            "off_by",
+            column=channel.column,
+            unit=channel.unit,
+            factor=typical if units else factor,
+            units=tuple(units),
+            others=tuple(_columns_with_same_factor(channel, factors)),
+            imposed=runs.layout.imposed_column,
         )
         if off > REFUSED:
             raise BadData(f"{runs.source}, {describe(found)}")
@@ -96,7 +97,7 @@ def check_ranges(runs: Runs, robot: Robot) -> list[Note]:
     return [*said, *_turned(runs, measured, possible), *_slopes(runs, measured, possible[1], robot)]
 
 
-def turned_signs(runs: Runs, robot: Robot) -> list[Turned]:
+def turned_signs(runs: Runs, robot: Robot) -> list[Remark]:
     """Returns the channels of settled runs with readings that are `NEARER` to the file's robot with the other sign.
 
     It needs a robot with a weight. Without a weight signs are checked row by row as a table is read.
@@ -112,16 +113,25 @@ def turned_signs(runs: Runs, robot: Robot) -> list[Turned]:
     )
 
 
-def _turned(runs: Runs, measured: np.ndarray, possible: np.ndarray) -> list[Turned]:
+def _turned(runs: Runs, measured: np.ndarray, possible: np.ndarray) -> list[Remark]:
     """Result of `turned_signs` for readings [SI], shape (runs, channels), and for several robots, (robots, ...)."""
-    found: list[Turned] = []
+    found: list[Remark] = []
     for k, channel in enumerate(runs.channels if runs.layout.weight else ()):
         if not channel.directed or runs.layout.magnitude(channel.name):
             continue
         off, turned = (_rms(sign * measured[:, k] - possible[:, :, k]) for sign in (1.0, -1.0))
         if turned * NEARER < off:
             theirs = runs.headings.get(channel.column, channel.column)
-            found.append(Turned(runs.source, channel.column, theirs, off / channel.factor, turned / channel.factor))
+            found.append(
+                Remark(
+                    "turned",
+                    source=runs.source,
+                    column=channel.column,
+                    theirs=theirs,
+                    off=off / channel.factor,
+                    turned=turned / channel.factor,
+                )
+            )
     return found if len(found) == 1 else []  # with several, the file's values may be wrong instead
 
 
@@ -221,7 +231,7 @@ def _check_masses(runs: Runs, robot: Robot) -> None:
         )
 
 
-def _slopes(runs: Runs, measured: np.ndarray, possible: np.ndarray, robot: Robot) -> Iterator[SlopesIn]:
+def _slopes(runs: Runs, measured: np.ndarray, possible: np.ndarray, robot: Robot) -> Iterator[Remark]:
     """Note if the current rises with the slope as if the slope had another unit.
 
     Among runs that differ only in their slope, the current is nearly linear in it. The regression of measured on
@@ -245,4 +255,4 @@ def _slopes(runs: Runs, measured: np.ndarray, possible: np.ndarray, robot: Robot
     rise = float(x @ y / max(float(x @ x), 1e-300))
     for unit, size in SLOPES.items():
         if follows > FOLLOWS and abs(math.log(max(rise, 1e-9) / size)) < math.log(1.25):
-            yield SlopesIn(unit, rise)
+            yield Remark("slopes_in", unit=unit, rise=rise)

@@ -7,22 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from calibration.inference import priors
-from calibration.inference.fit_notes import (
-    AtBound,
-    BesideSteady,
-    BlockNotConverged,
-    EstimatedNoise,
-    Fact,
-    FarFromPrior,
-    HeldByPrior,
-    NoPrediction,
-    Note,
-    OfRows,
-    OnlyTogether,
-    ProductAlone,
-    SamePredictions,
-    Unsettled,
-)
+from calibration.inference.fit_notes import Remark
 from calibration.inference.identifiability import Z95
 from calibration.inference.population import EDGE
 from calibration.inference.problem import MARGIN
@@ -33,12 +18,12 @@ from mmrjax.model.signals import DONE, STATUSES
 FAR = 3.0
 
 
-def calibration_remarks(found: CalibrationResult) -> list[Note]:
+def calibration_remarks(found: CalibrationResult) -> list[Remark]:
     """All remarks."""
     return [
         *_noise(found),
         *_search(found),
-        *found.residual_clusters,
+        *(Remark("residual_cluster", cluster=c) for c in found.residual_clusters),
         *_statuses(found),
         *_parameters(found),
         *_limits(found),
@@ -46,69 +31,75 @@ def calibration_remarks(found: CalibrationResult) -> list[Note]:
     ]
 
 
-def _noise(found: CalibrationResult) -> Iterator[Note]:
+def _noise(found: CalibrationResult) -> Iterator[Remark]:
     shares = ((c.name, found.noise[c.name].estimated_percent) for c in found.channels)
     if estimated := tuple((name, percent) for name, percent in shares if percent is not None):
-        yield EstimatedNoise(estimated)
+        yield Remark("estimated_noise", percent=estimated)
 
 
-def _search(found: CalibrationResult) -> Iterator[Note]:
+def _search(found: CalibrationResult) -> Iterator[Remark]:
     if not found.converged:
-        yield Unsettled(found.undetermined)
+        yield Remark("unsettled", names=found.undetermined)
     apart = {n: abs(p.with_steady.apart_in_sd) for n, p in found.parameters.items() if p.with_steady is not None}
     if apart:
         worst = max(apart, key=apart.__getitem__)
-        yield BesideSteady(sum(a < Z95 for a in apart.values()), len(apart), worst, apart[worst])
+        yield Remark(
+            "beside_steady",
+            inside=sum(a < Z95 for a in apart.values()),
+            total=len(apart),
+            furthest=worst,
+            sds=apart[worst],
+        )
     if not found.profiled:
-        yield Fact("not profiled")
+        yield Remark("not_profiled")
     if found.starts.agree < len(found.starts.cost):
         yield found.starts.agreement
 
 
-def _statuses(found: CalibrationResult) -> Iterator[Note]:
+def _statuses(found: CalibrationResult) -> Iterator[Remark]:
     for k, word in enumerate(STATUSES):
         if k not in DONE and np.any(found.status == word):
-            yield OfRows(row_numbers(found.status == word), word)
+            yield Remark("of_rows", rows=row_numbers(found.status == word), what=word)
 
 
-def _parameters(found: CalibrationResult) -> Iterator[Note]:
+def _parameters(found: CalibrationResult) -> Iterator[Remark]:
     far = {name for name, p in found.parameters.items() if abs(p.shift) > FAR}  # these get a remark of their own
     if held := tuple(name for name in found.undetermined if name not in far):
-        yield HeldByPrior(held)
+        yield Remark("held_by_prior", names=held)
     if pairs := found.together:
-        yield OnlyTogether(pairs)
+        yield Remark("only_together", pairs=pairs)
     for name, p in found.parameters.items():
         if name in far:
-            yield FarFromPrior(name, abs(p.shift), "calibration")
+            yield Remark("far_from_prior", name=name, sds=abs(p.shift), kind="calibration")
     for name, p in found.parameters.items():
         if p.at_bound:
-            yield AtBound(name, p.at_bound)
+            yield Remark("at_bound", name=name, side=p.at_bound)
     for name, p in found.parameters.items() if found.searched is not None else ():
         if EDGE < abs(p.shift) <= FAR and not p.at_bound:
-            yield FarFromPrior(name, abs(p.shift), "edge")
+            yield Remark("far_from_prior", name=name, sds=abs(p.shift), kind="edge")
 
 
-def _limits(found: CalibrationResult) -> Iterator[Note]:
+def _limits(found: CalibrationResult) -> Iterator[Remark]:
     limited = found.adhesion_used > 1 - MARGIN
     if limited.any():
-        yield OfRows(row_numbers(limited), "limited", MARGIN)
+        yield Remark("of_rows", rows=row_numbers(limited), what="limited", share=MARGIN)
     for configuration in found.robot.configurations:
         friction = f"{configuration}.{priors.GUIDE_FRICTION}"
         share = f"{configuration}.{priors.GUIDE_SHARE}"
         if share in found.parameters:
-            yield ProductAlone(friction, share, free=friction in found.parameters)
+            yield Remark("product_alone", friction=friction, share=share, free=friction in found.parameters)
 
 
-def _blocks(found: CalibrationResult) -> Iterator[Note]:
+def _blocks(found: CalibrationResult) -> Iterator[Remark]:
     for kind, held in found.held_out.items():
         if held.unreachable_rows:
-            yield NoPrediction(kind, len(held.unreachable_rows), len(found))
+            yield Remark("no_prediction", kind=kind, rows=len(held.unreachable_rows), total=len(found))
     for kind, others in found.held_out_alike.items():
         if others:
-            yield SamePredictions(kind, others)
+            yield Remark("same_predictions", kind=kind, others=others)
     for kind, held in found.held_out.items():
         if not all(block.converged for block in held.blocks.values()):
-            yield BlockNotConverged(kind)
+            yield Remark("block_not_converged", kind=kind)
 
 
 def row_numbers(which: np.ndarray) -> tuple[int, ...]:

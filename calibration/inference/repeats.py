@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Int
 
 from calibration.data.runs import Runs
-from calibration.inference.fit_notes import LargerNoise, Note
+from calibration.inference.fit_notes import Remark
 from calibration.inference.noise import UNSTATED, Noise
 
 #: Fewest differences between repeats for an estimate of the noise: of two readings, one may be wrong.
@@ -29,7 +29,7 @@ def rows_of_same_conditions(runs: Runs) -> list[Int[np.ndarray, " rows"]]:
     return [np.array(rows) for rows in alike.values()]
 
 
-def enlarge_noise(noise: Noise, runs: Runs) -> tuple[Noise, list[Note]]:
+def enlarge_noise(noise: Noise, runs: Runs) -> tuple[Noise, list[Remark]]:
     """Noise that is consistent with repeats in a table, and a note for each channel with an enlarged sd.
 
     The median of the differences between neighbouring repeats decides, so that a few wrong readings have no effect.
@@ -42,7 +42,7 @@ def enlarge_noise(noise: Noise, runs: Runs) -> tuple[Noise, list[Note]]:
         return noise, []
     first, second = np.array(pairs).T
     apart = np.abs(runs.measured()[first] - runs.measured()[second]) / np.hypot(noise.sd[first], noise.sd[second])
-    factors, notes = dict[str, float](), list[Note]()
+    factors, notes = dict[str, float](), list[Remark]()
     for k, channel in enumerate(noise.channels):
         told = apart[np.isfinite(apart[:, k]), k]
         if len(told) < FEWEST or noise.source[k] in ("series", "estimated", "no readings"):
@@ -51,7 +51,13 @@ def enlarge_noise(noise: Noise, runs: Runs) -> tuple[Noise, list[Note]]:
         if _median_tail(median, len(told)) < IMPROBABLE:
             factors[channel.name] = median / MEDIAN
             notes.append(
-                LargerNoise(channel.name, factors[channel.name], len(told), UNSTATED.get(noise.source[k], "stated"))
+                Remark(
+                    "larger_noise",
+                    channel=channel.name,
+                    factor=factors[channel.name],
+                    pairs=len(told),
+                    source=UNSTATED.get(noise.source[k], "stated"),
+                )
             )
     return noise.scaled(factors), notes
 

@@ -22,7 +22,6 @@ from scipy.special import fdtrc
 
 from calibration.data.runs import CONDITIONS, WHEN, Runs
 from calibration.described import describe
-from calibration.inference.fit_notes import Note
 from calibration.inference.lack_of_fit import CLEAR, Residuals
 
 #: Family-wise probability of reporting a cluster if there is none.
@@ -63,7 +62,8 @@ class LevelMean:
         return f"{self.level} at {self.within}" if self.within else self.level
 
 
-class ResidualCluster(Note):
+@dataclasses.dataclass(frozen=True)
+class ResidualCluster:
     """Residuals of a channel that are associated with a column without a role.
 
     Attributes:

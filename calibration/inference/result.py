@@ -13,7 +13,7 @@ from calibration.data import posterior_file as posterior
 from calibration.data import writing
 from calibration.data.posterior_file import Posterior
 from calibration.described import describe, sentences
-from calibration.inference.fit_notes import Determination, HeldByPrior, Notes, Pair
+from calibration.inference.fit_notes import Determination, Notes, Pair, Remark
 from calibration.inference.fit_posterior import determined_together, undetermined_names
 from calibration.inference.identifiability import Identifiability
 from calibration.inference.lack_of_fit import Adequacy
@@ -463,7 +463,7 @@ class CalibrationResult:
 
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        held = [describe(HeldByPrior(self.undetermined))] if self.undetermined else []
+        held = [describe(Remark("held_by_prior", names=self.undetermined))] if self.undetermined else []
         note = "\n".join([describe(self, "header", robot_name), *held])
         robot_file.write_robot(self.robot, folder / "robot.toml", note=note)
         writing.write_json(folder / "result.json", self.to_json())

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from calibration.inference.fit_notes import InPieces, Step
+from calibration.inference.fit_notes import Remark, next_step
 from calibration.inference.identifiability import Z95, Identifiability
 from calibration.inference.optimizers import Optimum, evaluate_residuals
 from calibration.inference.priors import parameters_by_name
@@ -138,7 +138,7 @@ Found = tuple[Optimum, Observation]
 
 
 def search_lower_basins(
-    problem: Problem, found: Found, data: Data, search: Callable[[np.ndarray], Found], tell: Callable[[Step], None]
+    problem: Problem, found: Found, data: Data, search: Callable[[np.ndarray], Found], tell: Callable[[Remark], None]
 ) -> Found:
     """Optimum of a search that is scanned afterwards, and repeated from lower basins.
 
@@ -168,7 +168,7 @@ def search_lower_basins(
             break
         found = lower
         over = " or ".join(problem.coordinates.names[k] for k in every)
-        tell(Step("basin", (over, float(found[0].cost))))
+        tell(next_step("basin", over, float(found[0].cost)))
     else:
         return dataclasses.replace(found[0], converged=jnp.asarray(False)), found[1]
     # A kink has a slope on either side, so an optimum there is a point with no lower point nearby.
@@ -207,6 +207,10 @@ def count_outside(scans: dict[int, Scan], z: np.ndarray | None, converged: np.nd
     return int(np.sum(np.any(outside, 0) & converged)) if outside else 0
 
 
-def scan_remarks(problem: Problem, scans: dict[int, Scan]) -> list[InPieces]:
+def scan_remarks(problem: Problem, scans: dict[int, Scan]) -> list[Remark]:
     """Notes on parameters with a 95 % region in several pieces."""
-    return [InPieces(problem.coordinates.names[k], parts) for k, seen in scans.items() if (parts := seen.parts()) > 1]
+    return [
+        Remark("in_pieces", name=problem.coordinates.names[k], pieces=parts)
+        for k, seen in scans.items()
+        if (parts := seen.parts()) > 1
+    ]

@@ -10,7 +10,7 @@ from calibration.data.columns import LOAD
 from calibration.data.contradictions import CURRENTS
 from calibration.data.instruments import FEWEST, step_of
 from calibration.data.runs import Runs
-from calibration.inference.fit_notes import Copied, NothingVaries
+from calibration.inference.fit_notes import Remark
 from calibration.inference.noise import Noise
 from calibration.inference.operating import operating_readings
 from calibration.inference.unused import unused_columns
@@ -26,7 +26,7 @@ ROUNDED, STEPS = 2e-6, 40.0
 RANGE = 8.0
 
 
-def nothing_varies(runs: Runs, robot: Robot, noise: Noise) -> NothingVaries | None:
+def nothing_varies(runs: Runs, robot: Robot, noise: Noise) -> Remark | None:
     """Note that readings and predictions are the same in all rows within the noise.
 
     None if a channel differs by more, or if the file's robot does not reach a row.
@@ -40,12 +40,18 @@ def nothing_varies(runs: Runs, robot: Robot, noise: Noise) -> NothingVaries | No
     sd = np.median(noise.sd, 0)
     if (np.ptp(foreseen, 0) >= sd).any() or (np.ptp(runs.measured(), 0) >= RANGE * sd).any():
         return None
-    return NothingVaries(runs.source, len(runs), runs.layout.imposed_column, unused_columns(runs))
+    return Remark(
+        "nothing_varies",
+        source=runs.source,
+        rows=len(runs),
+        column=runs.layout.imposed_column,
+        unused=unused_columns(runs),
+    )
 
 
-def copied_channels(runs: Runs, robot: Robot) -> list[Copied]:
+def copied_channels(runs: Runs, robot: Robot) -> list[Remark]:
     """Channels that are a linear function of another channel in all rows, to the digits of the file."""
-    copied, copies = list[Copied](), set[str]()
+    copied, copies = list[Remark](), set[str]()
     names = [c for c in runs.channels if runs.has(c.column)]
     for one, other in itertools.combinations(names, 2):
         if {one.name, other.name} & copies:
@@ -54,11 +60,21 @@ def copied_channels(runs: Runs, robot: Robot) -> list[Copied]:
         both = np.isfinite(x) & np.isfinite(y)
         if (line := _line(x[both], y[both])) is not None:
             copies.add(other.name)
-            copied.append(Copied(runs.source, other.column, one.column, *line, _tied(one, other, robot)))
+            copied.append(
+                Remark(
+                    "copied",
+                    source=runs.source,
+                    column=other.column,
+                    other=one.column,
+                    intercept=line[0],
+                    slope=line[1],
+                    tied=_tied(one, other, robot),
+                )
+            )
     return copied
 
 
-def computed_load(runs: Runs) -> Copied | None:
+def computed_load(runs: Runs) -> Remark | None:
     """Note that a load torque is a multiple of a current in all rows, to the digits of the file.
 
     A motor's friction would leave an offset between the two, so a torque that was set or read is no multiple.
@@ -69,7 +85,9 @@ def computed_load(runs: Runs) -> Copied | None:
         both = np.isfinite(runs[column])
         line = _line(runs[column][both], runs[LOAD][both])
         if line is not None and line[0] == 0.0:
-            return Copied(runs.source, LOAD, column, *line, tied=False)
+            return Remark(
+                "copied", source=runs.source, column=LOAD, other=column, intercept=line[0], slope=line[1], tied=False
+            )
     return None
 
 

@@ -8,7 +8,7 @@ from scipy.optimize import nnls
 from calibration.data.columns import LOAD, SPEED
 from calibration.data.courses import applied_drive
 from calibration.data.runs import Runs
-from calibration.inference.fit_notes import NoLoadGives, Unused
+from calibration.inference.fit_notes import Remark
 from calibration.inference.residual_clusters import TIMES
 from mmrjax.model import channels
 
@@ -19,10 +19,10 @@ BRAKED, VARIES = 0.5, 0.2
 TORQUE = channels.find_channel("output_torque")
 
 
-def unused_notes(runs: Runs) -> tuple[Unused, ...]:
+def unused_notes(runs: Runs) -> tuple[Remark, ...]:
     """A note on the columns of numbers that vary and have no role, without row numbers and times."""
     columns = tuple((name, runs.layout.nearest(name, runs.columns)) for name in unused_columns(runs))
-    return (Unused(runs.source, columns),) if columns else ()
+    return (Remark("unused", source=runs.source, columns=columns),) if columns else ()
 
 
 def unused_columns(runs: Runs) -> tuple[str, ...]:
@@ -39,7 +39,7 @@ def _varies(name: str, cells: np.ndarray) -> bool:
     return len(levels) > 1 and not counts
 
 
-def unexplained_torque_notes(runs: Runs) -> tuple[NoLoadGives, ...]:
+def unexplained_torque_notes(runs: Runs) -> tuple[Remark, ...]:
     """A note on a measured output torque with a variation that no load on a shaft causes.
 
     A load takes M_0 sign ω + K ω + M_c with M_0 and K of at least 0. If the best such load in each configuration
@@ -67,7 +67,15 @@ def unexplained_torque_notes(runs: Runs) -> tuple[NoLoadGives, ...]:
             total += float(np.sum((y - y.mean()) ** 2))
     if left <= BRAKED * total or total < VARIES**2 * float(np.sum(torque[read] ** 2)):
         return ()
-    return (NoLoadGives(runs.source, column, runs.headings.get(column, column), left / total),)
+    return (
+        Remark(
+            "no_load_gives",
+            source=runs.source,
+            column=column,
+            theirs=runs.headings.get(column, column),
+            share=left / total,
+        ),
+    )
 
 
 def _unexplained_torque(torque: np.ndarray, speed: np.ndarray, way: np.ndarray) -> float:

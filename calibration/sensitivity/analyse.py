@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from calibration.data.input_errors import BadConfiguration
-from calibration.inference.fit_notes import Note, Step
+from calibration.inference.fit_notes import Remark, next_step
 from calibration.inference.identifiability import Z95
 from calibration.sensitivity.local import Local, correlated_directions, inert_inputs, local_derivatives
 from calibration.sensitivity.methods import (
@@ -18,7 +18,6 @@ from calibration.sensitivity.methods import (
 )
 from calibration.sensitivity.next_runs import Candidates, next_runs
 from calibration.sensitivity.result import METHODS, Input, OutputStudy, SensitivityResult
-from calibration.sensitivity.sensitivity_notes import Inert, PointsLeftOut, SampleLeftOut, Sampling, Tied
 from calibration.sensitivity.study import Study
 from calibration.sensitivity.uncertain_inputs import Inputs
 from mmrjax import derived, fidelities
@@ -62,7 +61,7 @@ def analyse_sensitivity(
     evaluations = usual if evaluations is None else evaluations
     if evaluations < LEAST:
         raise BadConfiguration(f"--evaluations: got {evaluations}; expected {LEAST} or more")
-    study.tell(Step("points"))
+    study.tell(next_step("points"))
     studies = local_derivatives(study)
     if not any(np.isfinite(x).any() for x in studies.value.values()):
         raise BadConfiguration(_none_converges(study, studies.statuses))
@@ -75,7 +74,7 @@ def analyse_sensitivity(
     comparison: dict[str, dict[str, Any]] = {}
     if method == "derivative":
         spent = study.evaluations, study.seconds, dict(study.sampled)
-        study.tell(Step("sobol"))
+        study.tell(next_step("sobol"))
         comparison = _compared(study, parts, sobol_indices(study, ~idle, evaluations, seed, second=False))
         study.evaluations, study.seconds, study.sampled = spent
     outputs = {o.name: _study_of(o, study, studies, parts.get(o.name)) for o in model.outputs}
@@ -103,7 +102,7 @@ def analyse_sensitivity(
 def _by_method(study: Study, method: str, moving: np.ndarray, evaluations: int, seed: int) -> dict[str, Part]:
     if method == "local":
         return {}
-    study.tell(Sampling(method, len(study.points)))
+    study.tell(Remark("sampling", method=method, points=len(study.points)))
     if method == "sobol":
         return sobol_indices(study, moving, evaluations, seed)
     if method == "morris":
@@ -207,21 +206,31 @@ def _none_converges(study: Study, statuses: dict[str, dict[str, int]]) -> str:
     )
 
 
-def _remarks(study: Study, method: str, outputs: dict[str, OutputStudy], idle: np.ndarray) -> tuple[Note, ...]:
-    said: list[Note] = []
+def _remarks(study: Study, method: str, outputs: dict[str, OutputStudy], idle: np.ndarray) -> tuple[Remark, ...]:
+    said: list[Remark] = []
     alike: dict[tuple[bytes, bytes], list[OutputStudy]] = {}
     for o in outputs.values():
         alike.setdefault((o.studied.tobytes(), o.lost.tobytes()), []).append(o)
     for group in alike.values():
         o, names = group[0], tuple(x.row.label for x in group)
         if not o.studied.all():
-            said.append(PointsLeftOut(int((~o.studied).sum()), len(o.studied), method != "local", names))
+            said.append(
+                Remark(
+                    "points_left_out",
+                    points=int((~o.studied).sum()),
+                    total=len(o.studied),
+                    sampled=method != "local",
+                    outputs=names,
+                )
+            )
         some = o.studied & (o.lost >= 1e-3)
         if some.any():
-            said.append(SampleLeftOut(int(some.sum()), float(o.lost[some].max()), names))
+            said.append(
+                Remark("sample_left_out", points=int(some.sum()), share=float(o.lost[some].max()), outputs=names)
+            )
     names = tuple(n for k, n in enumerate(study.inputs.names) if idle[k])
     if names:
-        said.append(Inert(names))
+        said.append(Remark("inert", inputs=names))
     if study.inputs.parameters.tied:
-        said.append(Tied(tuple(f for f, _, _ in study.inputs.parameters.tied)))
+        said.append(Remark("tied", inputs=tuple(f for f, _, _ in study.inputs.parameters.tied)))
     return tuple(said)

@@ -10,7 +10,7 @@ from scipy import stats
 
 from calibration.data.runs import Runs
 from calibration.described import describe, sentences
-from calibration.inference.fit_notes import Note
+from calibration.inference.fit_notes import Remark
 from calibration.sensitivity.replicates import LEVEL, REPLICATES, Estimate
 from mmrjax.model.quantities import Quantity
 
@@ -227,7 +227,7 @@ class SensitivityResult:
     evaluations: int
     seconds: float
     comparison: dict[str, dict[str, Any]]
-    remarks: tuple[Note, ...]
+    remarks: tuple[Remark, ...]
 
     @property
     def names(self) -> tuple[str, ...]:

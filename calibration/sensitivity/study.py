@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.inference.fit_notes import Note, Step
+from calibration.inference.fit_notes import Remark, next_step
 from calibration.sensitivity.model import Answer, Model, count_statuses
 from calibration.sensitivity.result import Points
 from calibration.sensitivity.uncertain_inputs import Inputs
@@ -20,7 +20,7 @@ from mmrjax.model.quantities import RPM, Quantity
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import STATUSES
 
-Tell = Callable[[Note | str], None]
+Tell = Callable[[Remark | str], None]
 #: Longest time without a progress message [s].
 SILENCE = 10.0
 
@@ -104,7 +104,7 @@ class Study:
             if time.perf_counter() - self.told > SILENCE:
                 self.told = time.perf_counter()
                 rate = self.evaluations / max(self.seconds, 1e-9)
-                self.tell(Step("evaluations", (self.evaluations, rate)))
+                self.tell(next_step("evaluations", self.evaluations, rate))
             yield k, answer.values
 
     def _count(self, answer: Answer, rows: int, began: float) -> None:

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 from calibration.data.input_errors import BadConfiguration, allowed_words
 from calibration.data.parts import CellSheet
 from calibration.data.requirements_file import Requirements
-from calibration.inference.fit_notes import Note, Step
+from calibration.inference.fit_notes import Remark, next_step
 from calibration.sizing import sheet
 from calibration.sizing.design import CONTINUOUS, OBJECTIVES, Design, Task, build_robot, evaluate_design, sizing_task
 from calibration.sizing.part_options import Drive, Options, options_for_robot
@@ -238,7 +238,7 @@ def size_robot(
     starts: int = 256,
     motors: tuple[str, ...] = (),
     seed: int = 0,
-    tell: Callable[[Note], None] = lambda note: None,
+    tell: Callable[[Remark], None] = lambda note: None,
 ) -> Sizing:
     """Search ratio, radius, cells and motor of a robot so that it meets requirements.
 
@@ -258,17 +258,17 @@ def size_robot(
     problem = sizing_task(robot, asked, chosen)
     choice = choice_space(robot, problem, chosen)
     columns = [list(OBJECTIVES).index(name) for name in objectives]
-    tell(Step("designs"))
+    tell(next_step("designs"))
     drawn = _random_designs(problem, choice, "cost" in objectives, np.random.default_rng(seed))
     kept = drawn.g.max(axis=0) >= 0
     unmeetable = tuple(label for label, k in zip(problem.labels, kept, strict=True) if not k)
     search = _Search(problem, choice, kept, columns)
     weights = search.weights(starts)
-    tell(Step("descents", (starts,)))
+    tell(next_step("descents", starts))
     free = search.descended(drawn, weights)
-    tell(Step("whole"))
+    tell(next_step("whole"))
     real = search.real(drawn, free, weights)
-    tell(Step("refined", (REFINED,)))
+    tell(next_step("refined", REFINED))
     # The best of these with any ratio and parts of a cell: no search may have begun from their choice of parts.
     top = np.argsort(search.cost(real))[:REFINED]
     free = free + search.refined(real.rows[top], real.x[top], search.first(len(top)), np.ones(3))

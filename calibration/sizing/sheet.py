@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from calibration.data.contradictions import cannot_stand
 from calibration.data.input_errors import BadConfiguration, allowed_words
 from calibration.data.requirements_file import STAIRS, TREAD, Envelope, Requirement, Requirements
-from calibration.inference.fit_notes import Note, Step
+from calibration.inference.fit_notes import Remark, next_step
 from mmrjax.compile.compiling import compiled
 from mmrjax.derived.requirements import EnvelopePoint, Ratings, evaluate_requirement, ratings
 from mmrjax.model import params
@@ -298,7 +298,7 @@ def check_requirements(
     asked: Requirements,
     *,
     changes: bool = True,
-    tell: Callable[[Note], None] = lambda note: None,
+    tell: Callable[[Remark], None] = lambda note: None,
 ) -> tuple[Outcome, ...]:
     """Compare a robot with requirements.
 
@@ -318,13 +318,13 @@ def check_requirements(
         held.append(_QuantityOfRobot(robot, r, (*changeable_parameters(robot, configuration), *of_levers, CELLS)))
     found = []
     for k, h in enumerate(held, 1):
-        tell(Step("requirement", (k, len(held), h.requirement.quantity.label)))
+        tell(next_step("requirement", k, len(held), h.requirement.quantity.label))
         found.append(_outcome(h))
     if not changes:
         return tuple(found)
     missed, answer = [k for k, o in enumerate(found) if not o.met], list(found)
     for n, k in enumerate(missed, 1):
-        tell(Step("changes", (n, len(missed), held[k].requirement.quantity.label)))
+        tell(next_step("changes", n, len(missed), held[k].requirement.quantity.label))
         answer[k] = _with_changes(held[k], found[k], held, found)
     return tuple(answer)
 

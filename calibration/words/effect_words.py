@@ -11,7 +11,8 @@ from mmrjax.model.channels import find_channel
 
 #: Tests that isolate a balance: rows of `experiments.DOING`, `weigh`, and of a channel of `sensor` rows of `ACTS`.
 ISOLATED_BY = {
-    "mass": ("weigh",), "supply": ("held", "one held"), "electrical": ("held", "alone"), "motor": ("alone",),
+    "mass": ("weigh",), "duty": ("alone",), "supply": ("held", "one held"), "electrical": ("held", "alone"),
+    "motor": ("alone",),
     "gearbox": ("braked", "lifted"), "track": ("lifted",), "ground": ("laden", "about"), "slip": ("laden",),
     "inertia": ("lifted",), "inductance": ("held",),
 }  # fmt: skip

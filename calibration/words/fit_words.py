@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -26,12 +26,6 @@ FAR = {
     "edge": "{}: its posterior mean lies {:.1f} prior sds from its prior, at the edge of where the search looked: "
     "widen the prior and search again, or doubt the model",
 }
-#: Facts without a name or a number.
-FACTS = {
-    "not profiled": "no profiles were made: intervals are linear, and too symmetric where the model is curved",
-    "no covariance": "the posterior has no finite covariance: values stand, intervals do not",
-    "no grip": "no run grips: static friction, and slip below it, are known by their priors alone",
-}
 #: Origin of a prior that is neither from a field nor stated.
 PRIORS = {"product": "its product with the share of the guides, as in the other fidelities"}
 #: Reasons why a member of a population loses a row.
@@ -41,22 +35,22 @@ LOST_AS = {
 }  # fmt: skip
 
 
-def noise_off(note: fit_notes.NoiseOff) -> str:
+def noise_off(channel: str, factor: float, source: str) -> str:
     """Ratio of residuals to their sds."""
-    if not note.channel:
+    if not channel:
         return (
-            f"residuals are {note.factor:.2g} times the {note.source} sds in every channel and under all "
+            f"residuals are {factor:.2g} times the {source} sds in every channel and under all "
             "conditions: are the sds right?"
         )
     return (
-        f"residuals of {channels.find_channel(note.channel).label} are {note.factor:.2g} times the {note.source} "
+        f"residuals of {channels.find_channel(channel).label} are {factor:.2g} times the {source} "
         "sds, under all conditions: are these sds right?"
     )
 
 
-def estimated_noise(note: fit_notes.EstimatedNoise) -> str:
+def estimated_noise(percent: tuple[tuple[str, float], ...]) -> str:
     """Channels whose noise was estimated."""
-    each = ", ".join(f"{channel.replace('_', ' ')} {percent:.1f} %" for channel, percent in note.percent)
+    each = ", ".join(f"{channel.replace('_', ' ')} {share:.1f} %" for channel, share in percent)
     return (
         f"no noise was stated for {each}: estimated from the misfit, so it includes model error and cannot "
         "test whether the model is adequate"
@@ -77,66 +71,65 @@ def is_determined_answer(found: fit_notes.Determination) -> str:
     return "no" if found.held else "yes"
 
 
-def only_together(note: fit_notes.OnlyTogether) -> str:
+def only_together(pairs: tuple[fit_notes.Pair, ...]) -> str:
     """Parameters that are not determined separately, with what is."""
-    each = [f"{determined_combination(p)} (correlation {p.correlation:+.3f})" for p in note.pairs]
+    each = [f"{determined_combination(p)} (correlation {p.correlation:+.3f})" for p in pairs]
     return f"determined only together: {', '.join(each)}"
 
 
-def of_rows(note: fit_notes.OfRows) -> str:
+def of_rows(rows: tuple[int, ...], what: str, share: float = 0.0) -> str:
     """Rows with a property, and its consequence."""
-    rows = f"rows {', '.join(map(str, note.rows))}"
-    if note.what == "limited":
+    listed = f"rows {', '.join(map(str, rows))}"
+    if what == "limited":
         return (
-            f"{rows} are within {note.share:.0%} of the adhesion limit: it bounds their static friction from below, "
+            f"{listed} are within {share:.0%} of the adhesion limit: it bounds their static friction from below, "
             "and does not explain all of their slip"
         )
-    if note.what == "jumps":
-        return f"{rows}: the calibrated robot's running gear jumps; it leaves the ground at times"
-    return f"{rows}: {note.what} with the calibrated robot"
+    if what == "jumps":
+        return f"{listed}: the calibrated robot's running gear jumps; it leaves the ground at times"
+    return f"{listed}: {what} with the calibrated robot"
 
 
-def product_alone(note: fit_notes.ProductAlone) -> str:
+def product_alone(friction: str, share: str, free: bool) -> str:
     """Sentence on two parameters that act only as a product."""
-    if note.free:
-        return f"only the product {note.friction} x {note.share} acts; the priors alone divide it"
-    return f"{note.share} is found with {note.friction} held: only their product acts"
+    if free:
+        return f"only the product {friction} x {share} acts; the priors alone divide it"
+    return f"{share} is found with {friction} held: only their product acts"
 
 
-def no_prediction(note: fit_notes.NoPrediction) -> str:
+def no_prediction(kind: str, rows: int, total: int) -> str:
     """Rows that a fit without their block does not predict."""
     return (
-        f"held out by {blocks.kind_in_words(note.kind)}: {note.rows} of {note.of} rows have no prediction, because "
+        f"held out by {blocks.kind_in_words(kind)}: {rows} of {total} rows have no prediction, because "
         "the robot fitted without them slides there; the errors leave them out"
     )
 
 
-def same_predictions(note: fit_notes.SamePredictions) -> str:
+def same_predictions(kind: str, others: tuple[str, ...]) -> str:
     """Kinds of blocks that give the same predictions."""
     return (
-        f"held out by {' or by '.join(blocks.kind_in_words(k) for k in note.others)}: the same predictions as held "
-        f"out by {blocks.kind_in_words(note.kind)}, shown in their place; these runs do not vary them separately"
+        f"held out by {' or by '.join(blocks.kind_in_words(k) for k in others)}: the same predictions as held "
+        f"out by {blocks.kind_in_words(kind)}, shown in their place; these runs do not vary them separately"
     )
 
 
-def search_agreement(note: fit_notes.Agreement) -> str:
+def search_agreement(starts: int, agree: int, elsewhere: int, more: float, open: int) -> str:
     """Agreement of searches from many starts."""
-    if note.starts == 1:
-        return "one search, which did not converge" if note.open else "one search"
-    if note.agree == note.starts:
-        return f"all {note.starts} starts end at the same optimum"
-    parts = [f"{note.agree} of {note.starts} starts end at the best optimum"]
-    if note.elsewhere:
-        parts.append(f"{note.elsewhere} at others (the next costs {note.more:.3g} more)")
-    if note.open:
-        parts.append(f"{note.open} did not converge")
+    if starts == 1:
+        return "one search, which did not converge" if open else "one search"
+    if agree == starts:
+        return f"all {starts} starts end at the same optimum"
+    parts = [f"{agree} of {starts} starts end at the best optimum"]
+    if elsewhere:
+        parts.append(f"{elsewhere} at others (the next costs {more:.3g} more)")
+    if open:
+        parts.append(f"{open} did not converge")
     return ", ".join(parts)
 
 
-def unsettled_search(note: fit_notes.Unsettled) -> str:
+def unsettled_search(names: tuple[str, ...]) -> str:
     """A search that ended before it converged."""
-    names = ", ".join(note.names)
-    determined = f"these data do not determine {names}" if names else "the data determine them all"
+    determined = f"these data do not determine {', '.join(names)}" if names else "the data determine them all"
     return (
         f"the search ended before it converged: parameters are the best that it found, their intervals are not to be "
         f"trusted, and {determined}"
@@ -151,26 +144,26 @@ def calibrated_header(found: CalibrationResult, robot_name: str) -> str:
 # --- a search by population -----------------------------------------------------------------------------
 
 
-def search_generations(note: fit_notes.Generations) -> str:
+def search_generations(members: int, generations: int, settled: bool) -> str:
     """Progress of a search."""
     end = "the last gained nothing that counts"
-    if not note.settled:
+    if not settled:
         end = "the last still gained: go on with more --generations"
-    return f"{count_noun(note.members, 'member')} in {count_noun(note.generations, 'generation')}; {end}"
+    return f"{count_noun(members, 'member')} in {count_noun(generations, 'generation')}; {end}"
 
 
-def lost_rows(note: fit_notes.LostRows) -> str:
+def lost_rows(members: dict[str, int]) -> str:
     """Members with a row that is lost."""
-    lost = ", ".join(f"{note.members[status]} {how}" for status, how in LOST_AS.items() if status in note.members)
+    lost = ", ".join(f"{members[status]} {how}" for status, how in LOST_AS.items() if status in members)
     return f"of the members, in some row: {lost}; a row that is lost costs a member its rank"
 
 
-def members_jump(note: fit_notes.MembersJump) -> str:
+def members_jump(members: int, best: tuple[int, ...]) -> str:
     """Members whose running gear jumps."""
-    best = f"the best in rows {', '.join(map(str, note.best))}" if note.best else "the best in none"
+    where = f"rows {', '.join(map(str, best))}" if best else "none"
     return (
-        f"{note.members} of the members jump in some row: their running gear drops between guides and pulleys and "
-        f"throws them off the ground at times; {best}"
+        f"{members} of the members jump in some row: their running gear drops between guides and pulleys and "
+        f"throws them off the ground at times; the best in {where}"
     )
 
 
@@ -181,9 +174,9 @@ def prior_edge(at: fit_notes.Edge) -> str:
     return f"{abs(at.sds):.1f} prior sd {'below' if at.sds < 0 else 'above'} the middle of its prior"
 
 
-def ended_at_edge(note: fit_notes.EndedAtEdge) -> str:
+def ended_at_edge(edge: dict[str, fit_notes.Edge]) -> str:
     """A search that ended at the edge of what was allowed."""
-    named = ", ".join(f"{name} {prior_edge(at)}" for name, at in note.edge.items())
+    named = ", ".join(f"{name} {prior_edge(at)}" for name, at in edge.items())
     return f"the search ended at the edge of what was allowed: its best member has {named}"
 
 
@@ -307,36 +300,38 @@ def residual_cluster(c: ResidualCluster) -> str:
     )
 
 
-#: Kind of note → a sentence with its fields, or a function that makes one.
-SAID: dict[type, str | Callable[[Any], str]] = {
-    fit_notes.HeldByPrior: f"not determined by these runs (posterior sd above {HELD:g} of the prior's): {{names}}",
-    fit_notes.OnlyTogether: only_together,
-    fit_notes.FarFromPrior: lambda note: FAR[note.of].format(note.name, note.sds),
-    fit_notes.NoiseOff: noise_off,
-    fit_notes.Fact: lambda note: FACTS[note.what],
-    fit_notes.EstimatedNoise: estimated_noise,
-    fit_notes.BesideSteady: "{inside} of {of} parameters lie within their 95 % intervals of the same "
+#: Code of a remark → a sentence with its values, or a function that makes one.
+SAID: dict[str, str | Callable[..., str]] = {
+    "held_by_prior": f"not determined by these runs (posterior sd above {HELD:g} of the prior's): {{names}}",
+    "only_together": only_together,
+    "far_from_prior": lambda name, sds, kind: FAR[kind].format(name, sds),
+    "noise_off": noise_off,
+    "not_profiled": "no profiles were made: intervals are linear, and too symmetric where the model is curved",
+    "no_covariance": "the posterior has no finite covariance: values stand, intervals do not",
+    "no_grip": "no run grips: static friction, and slip below it, are known by their priors alone",
+    "estimated_noise": estimated_noise,
+    "beside_steady": "{inside} of {total} parameters lie within their 95 % intervals of the same "
     "problem's optimum "
     "with steady; furthest apart is {furthest}, {sds:.2f} sd",
-    fit_notes.OfRows: of_rows,
-    fit_notes.AtBound: "{name} is at its {side} bound",
-    fit_notes.ProductAlone: product_alone,
-    fit_notes.PriorOfProduct: "{name}: its prior, {mean:.3g} ± {sd:.2g}, is that of its product with "
+    "of_rows": of_rows,
+    "at_bound": "{name} is at its {side} bound",
+    "product_alone": product_alone,
+    "prior_of_product": "{name}: its prior, {mean:.3g} ± {sd:.2g}, is that of its product with "
     "the share of the "
     "guides in the other fidelities; the track model puts {share:.0%} of the weight on them",
-    fit_notes.NoPrediction: no_prediction,
-    fit_notes.SamePredictions: same_predictions,
-    fit_notes.BlockNotConverged: "a search without a block of {kind} did not converge",
-    fit_notes.Agreement: search_agreement,
-    fit_notes.Unsettled: unsettled_search,
-    fit_notes.Elsewhere: "{searches} of {of} searches converged at other values of {names}",
-    fit_notes.InPieces: "{name}: the values within its 95 % interval are in {pieces} pieces, with worse ones between "
+    "no_prediction": no_prediction,
+    "same_predictions": same_predictions,
+    "block_not_converged": "a search without a block of {kind} did not converge",
+    "agreement": search_agreement,
+    "unsettled": unsettled_search,
+    "elsewhere": "{searches} of {total} searches converged at other values of {names}",
+    "in_pieces": "{name}: the values within its 95 % interval are in {pieces} pieces, with worse ones between "
     "them; samples closer together would tell them apart",
-    fit_notes.Generations: search_generations,
-    fit_notes.LostRows: lost_rows,
-    fit_notes.MembersJump: members_jump,
-    fit_notes.EndedAtEdge: ended_at_edge,
-    fit_notes.ReadFromMembers: "derivatives of the run by {names} are not those of its differences "
+    "generations": search_generations,
+    "lost_rows": lost_rows,
+    "members_jump": members_jump,
+    "ended_at_edge": ended_at_edge,
+    "read_from_members": "derivatives of the run by {names} are not those of its differences "
     "(contacts open and "
     "close): what the rows determine is read from a regression over the members near the best, which leaves "
     "{left:.2g} sd rms",

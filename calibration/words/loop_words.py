@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from types import MappingProxyType
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from calibration.data.input_errors import three_digits
+from calibration.described import describe
 from calibration.discovery import loop_notes
 from calibration.discovery.clusters import Cluster
 from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.settings import FIT, HELD_OUT, WITHOUT_NAME
 from calibration.inference import bases, blocks
 from calibration.inference.series_noise import SeriesNoise
-from calibration.words import fit_words
 from mmrjax import effects
 from mmrjax.errors import count_noun
 from mmrjax.model import channels
@@ -54,7 +55,7 @@ def verdict_sentences(said: loop_notes.Summary) -> str:
         share = 100 * said.aside / said.of
         text = f"{said.aside} of {said.of} rows ({share:.0f} %) are outliers and are set aside. {text}"
     if said.noise:
-        text = f"{text} But {'; '.join(map(fit_words.noise_off, said.noise))}"
+        text = f"{text} But {'; '.join(map(describe, said.noise))}"
     if said.cluster is not None:
         text = f"{text} {cluster_sentence(said.cluster).capitalize()}: that is a finding, so all of them are kept."
     return text
@@ -695,128 +696,140 @@ def in_parts(noise: SeriesNoise) -> str:
     return " and ".join(filter(None, parts)) + shown
 
 
-def noise_from_series(note: loop_notes.NoiseFromSeries) -> str:
+def noise_from_series(noise: tuple[SeriesNoise, ...]) -> str:
     """Channels whose sds are estimated along series."""
-    shown = [f"{s.channel.label} {in_parts(s)}" for s in note.noise]
-    along = dict.fromkeys(f"{s.count} series of {s.axis}" for s in note.noise)
-    freedom = min(s.freedom for s in note.noise)
+    shown = [f"{s.channel.label} {in_parts(s)}" for s in noise]
+    along = dict.fromkeys(f"{s.count} series of {s.axis}" for s in noise)
+    freedom = min(s.freedom for s in noise)
     return (
-        f"no sd is stated for {', '.join(s.channel.name for s in note.noise)}: {', '.join(shown)} are estimated "
+        f"no sd is stated for {', '.join(s.channel.name for s in noise)}: {', '.join(shown)} are estimated "
         f"from how readings scatter along {' and '.join(along)} ({freedom:.1f} degrees of freedom); state yours with "
         "--noise"
     )
 
 
-def copied_rows(note: loop_notes.Copies) -> str:
+def copied_rows(rows: tuple[int, ...]) -> str:
     """Rows that copy earlier ones."""
-    rows = ", ".join(map(str, note.rows))
-    if len(note.rows) == 1:
-        return f"row {rows} is an exact copy of an earlier one and counts once"
-    return f"rows {rows} are exact copies of earlier ones and count once"
+    if len(rows) == 1:
+        return f"row {rows[0]} is an exact copy of an earlier one and counts once"
+    return f"rows {', '.join(map(str, rows))} are exact copies of earlier ones and count once"
 
 
-def kept_out(note: loop_notes.KeptOut) -> str:
+def kept_out(rows: tuple[int, ...], why: str) -> str:
     """Rows that do not count."""
-    why = {
+    reasons = {
         "unusable": "are not used: the fitted model slides or fails there",
         "outliers": "are outliers, which no effect explains; they are left out",
     }
-    return f"rows {', '.join(map(str, note.rows))} {why[note.why]}"
+    return f"rows {', '.join(map(str, rows))} {reasons[why]}"
 
 
-def still_lacks(note: loop_notes.StillLacks) -> str:
+def still_lacks(place: str, variable: str) -> str:
     """Sentence on the discrepancy that remains with the effects found."""
-    place, over = bases.place_in_words(note.place), note.variable.replace("_", " ")
-    return f"not everything is explained: an error in the {place} that varies with {over} remains"
+    where, over = bases.place_in_words(place), variable.replace("_", " ")
+    return f"not everything is explained: an error in the {where} that varies with {over} remains"
 
 
-def imposed_delay(note: loop_notes.Late) -> str:
+def imposed_delay(delay: float, sd: float) -> str:
     """Delay of the imposed quantity, and the line for the rig's file."""
-    when = "later" if note.delay > 0 else "earlier"
+    when = "later" if delay > 0 else "earlier"
     return (
-        f"what is imposed acts {1e3 * abs(note.delay):.3g} ± {1e3 * note.sd:.2g} ms {when} than its column says, and "
-        f'the rig\'s file states no delay: with [rig] delay = "{note.delay:.3g} ± {note.sd:.2g}" it begins there'
+        f"what is imposed acts {1e3 * abs(delay):.3g} ± {1e3 * sd:.2g} ms {when} than its column says, and "
+        f'the rig\'s file states no delay: with [rig] delay = "{delay:.3g} ± {sd:.2g}" it begins there'
     )
 
 
-def leader_choice(note: loop_notes.Led) -> str:
+def leader_choice(
+    names: tuple[str, ...],
+    rms_sigma: tuple[float, ...],
+    leader: int,
+    closest: int,
+    best: int,
+    by: str,
+    prefer: str,
+    told: float,
+    rise_chi2: float,
+) -> str:
     """Criterion that chose the leader of a class; a different choice by the other criterion is reported."""
-    names, leader = note.names, note.leader
-    by = {
+    criteria = {
         HELD_OUT: "errors held out",
         FIT: "the fit to all rows",
-        loop_notes.DRAW: f"the fit to all rows, as errors held out are within {note.told:.0%}",
+        loop_notes.DRAW: f"the fit to all rows, as errors held out are within {told:.0%}",
     }
-    each = ", ".join(f"{n} {x:.2f} σ" for n, x in zip(names, note.rms_sigma, strict=True))
-    said = f"{names[leader]} comes first in its class by {by[note.by]}; errors held out: {each}"
-    if note.prefer == HELD_OUT and leader != note.closest:
-        said += f"; by the fit to all rows {names[note.closest]} would, by Δχ² {note.rise_chi2:.1f}"
-    if leader != note.best:
-        asked = note.prefer == HELD_OUT
+    each = ", ".join(f"{n} {x:.2f} σ" for n, x in zip(names, rms_sigma, strict=True))
+    said = f"{names[leader]} comes first in its class by {criteria[by]}; errors held out: {each}"
+    if prefer == HELD_OUT and leader != closest:
+        said += f"; by the fit to all rows {names[closest]} would, by Δχ² {rise_chi2:.1f}"
+    if leader != best:
+        asked = prefer == HELD_OUT
         why = "is not as adequate" if asked else f"would come first by --prefer {HELD_OUT}, where adequate"
-        said += f"; {names[note.best]} {why}"
+        said += f"; {names[best]} {why}"
     return said
 
 
-def rests_on(note: loop_notes.RestsOn) -> str:
+def rests_on(
+    test: loop_notes.NameTest,
+    conditions: Mapping[str, str | float] = MappingProxyType({}),
+    axis: str = "",
+    beside: tuple[float, ...] = (),
+) -> str:
     """Sentence on an effect that depends on one run."""
-    test = note.test
-    at = _conditions(note.conditions)
+    at = _conditions(conditions)
     run = f"{test.what} {test.rests_on}{f' ({at})' * bool(at)}"
-    beside = " and ".join(f"{x:g}" for x in note.beside)
-    others = f"run it at {note.axis} {beside} too" if beside else "runs at conditions on either side of it"
+    others = (
+        f"run it at {axis} {' and '.join(f'{x:g}' for x in beside)} too"
+        if beside
+        else "runs at conditions on either side of it"
+    )
     return (
         f"{test.effect} rests on {test.what} {test.rests_on} ({test.root:.1f} σ with it, {test.root_without:.1f} σ "
         f"without): repeat {run}, and {others}"
     )
 
 
-def unwritten_reason(note: loop_notes.Unwritten) -> str:
+def unwritten_reason(curve: bool, gain: float, se: float) -> str:
     """Reason why identified effects are not in the written robot."""
-    what = "the curve" if note.curve else "what was found"
-    how = "no better than" if note.curve and note.gain > 0 else "worse than"
+    what = "the curve" if curve else "what was found"
+    how = "no better than" if curve and gain > 0 else "worse than"
     return (
-        f"{what} predicts runs that it has not seen {how} the refit ({note.gain:+.2f} ± {note.se:.2f} nat a "
+        f"{what} predicts runs that it has not seen {how} the refit ({gain:+.2f} ± {se:.2f} nat a "
         "reading): robot.toml is the refit"
     )
 
 
-def outstanding_verdicts(note: loop_notes.Outstanding) -> str:
+def outstanding_verdicts(factors: tuple[float, ...], word: str) -> str:
     """Verdicts that are not there yet."""
-    at = " and ".join(f"{f:g}" for f in note.factors)
+    at = " and ".join(f"{f:g}" for f in factors)
     return (
-        f"out of time: whether the verdict stands with {at} times the {note.word} noise is not known; run the same "
+        f"out of time: whether the verdict stands with {at} times the {word} noise is not known; run the same "
         "command without --within"
     )
 
 
-#: Kind of note → a sentence with its fields, or a function that makes one.
-SAID: dict[type, str | Callable[[Any], str]] = {
-    loop_notes.AssumedNoise: "no sd is stated for {channels}: {usual} is assumed; state yours with --noise",
-    loop_notes.NoiseFromSeries: noise_from_series,
-    loop_notes.RefitWorse: lambda note: (
-        f"{note.channel}: the refit misses it by {note.refit:.0%} of its measured rms and the robot as stated by "
-        f"{note.stated:.0%}, so the {note.word} noise gives some of its readings too large a weight; state the "
-        "instrument's with --noise"
-    ),
-    loop_notes.Copies: copied_rows,
-    loop_notes.KeptOut: kept_out,
-    loop_notes.PhasesDiffer: "the wave stands at another angle in each run (it explains {free:.0f} σ² free in each, "
+#: Code of a remark → a sentence with its values, or a function that makes one.
+SAID: dict[str, str | Callable[..., str]] = {
+    "assumed_noise": "no sd is stated for {channels}: {usual} is assumed; state yours with --noise",
+    "noise_from_series": noise_from_series,
+    "refit_worse": "{channel}: the refit misses it by {refit:.0%} of its measured rms and the robot as stated by "
+    "{stated:.0%}, so the {word} noise gives some of its readings too large a weight; state the "
+    "instrument's with --noise",
+    "copies": copied_rows,
+    "kept_out": kept_out,
+    "phases_differ": "the wave stands at another angle in each run (it explains {free:.0f} σ² free in each, "
     "{held:.0f} with one phase): robot.toml holds the mean; start runs from a mark",
-    loop_notes.StillLacks: still_lacks,
-    loop_notes.Late: imposed_delay,
-    loop_notes.Led: leader_choice,
-    loop_notes.NotPredictable: lambda note: (
+    "still_lacks": still_lacks,
+    "late": imposed_delay,
+    "led": leader_choice,
+    "not_predictable": lambda kinds: (
         f"not predictable from the others, so neither scored nor tested: blocks by "
-        f"{' and by '.join(blocks.kind_in_words(kind) for kind in note.kinds)} that hold all runs of a configuration "
+        f"{' and by '.join(blocks.kind_in_words(kind) for kind in kinds)} that hold all runs of a configuration "
         "with parameters of its own"
     ),
-    loop_notes.LostReplicates: "only {settled} of {asked} bootstrap tables could be fitted again; the thresholds are "
-    "theirs",
-    loop_notes.Outstanding: outstanding_verdicts,
-    loop_notes.TooFewReplicates: "{settled} bootstrap tables are too few for every kind of evidence "
+    "lost_replicates": "only {settled} of {asked} bootstrap tables could be fitted again; the thresholds are theirs",
+    "outstanding": outstanding_verdicts,
+    "too_few_replicates": "{settled} bootstrap tables are too few for every kind of evidence "
     "to count; use 500 or "
     "more",
-    loop_notes.RestsOn: rests_on,
-    loop_notes.Unwritten: unwritten_reason,
+    "rests_on": rests_on,
+    "unwritten": unwritten_reason,
 }

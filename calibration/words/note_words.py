@@ -9,6 +9,7 @@ from calibration.discovery import instructions, loop_notes
 from calibration.discovery import result as loop_results
 from calibration.inference import fit_notes
 from calibration.inference import result as fit_results
+from calibration.inference.fit_notes import Remark as Remark
 from calibration.inference.lack_of_fit import Adequacy
 from calibration.inference.residual_clusters import ResidualCluster
 from calibration.sensitivity.result import SensitivityResult
@@ -22,17 +23,17 @@ from calibration.words import (
     table_words,
 )
 
-Said = str | Callable[..., str]
-#: Kind of note → a sentence with its fields, or a function that makes one.
-NOTES: dict[type, Said] = {
-    fit_notes.Step: step_words.step_sentence,
+#: Code of a remark → a sentence with its values, or a function that makes one.
+NOTES: dict[str, str | Callable[..., str]] = {
+    "step": step_words.step_sentence,
+    "residual_cluster": lambda cluster: fit_words.residual_cluster(cluster),
     **table_words.SAID,
     **fit_words.SAID,
     **loop_words.SAID,
     **sensitivity_words.SAID,
 }
-#: The same of results and of their parts that are no notes.
-RESULTS: dict[type, Said] = {
+#: Kind of result, or part of one → the function that makes its sentence.
+RESULTS: dict[type, Callable[..., str]] = {
     **dict.fromkeys(instructions.KINDS, experiment_words.experiment_instruction),
     fit_notes.Determination: fit_words.is_determined_answer,
     fit_notes.Edge: fit_words.prior_edge,

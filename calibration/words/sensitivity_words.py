@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calibration.sensitivity import sensitivity_notes
 from mmrjax.errors import count_noun
 
 if TYPE_CHECKING:
@@ -89,33 +88,30 @@ def _in_words(points: Points, mask: np.ndarray) -> str:
     return " and ".join([words] * bool(words) + [f"{others} more" if words else str(others)] * bool(others))
 
 
-def sampling_scope(note: sensitivity_notes.Sampling) -> str:
+def sampling_scope(method: str, points: int) -> str:
     """Distribution of the inputs that a method samples."""
-    return f"{METHODS[note.method]}, over {note.points} operating points"
+    return f"{METHODS[method]}, over {points} operating points"
 
 
-def points_left_out(note: sensitivity_notes.PointsLeftOut) -> str:
+def points_left_out(points: int, total: int, sampled: bool, outputs: tuple[str, ...]) -> str:
     """Points that are left out."""
-    who = "too many robots of the sample do" if note.sampled else "the robot does"
-    return (
-        f"{note.points} of {note.of} operating points are left out, since {who} not travel there "
-        f"({', '.join(note.outputs)})"
-    )
+    who = "too many robots of the sample do" if sampled else "the robot does"
+    return f"{points} of {total} operating points are left out, since {who} not travel there ({', '.join(outputs)})"
 
 
-def sample_left_out(note: sensitivity_notes.SampleLeftOut) -> str:
+def sample_left_out(points: int, share: float, outputs: tuple[str, ...]) -> str:
     """Operating points with part of the sample left out."""
     return (
-        f"at {note.points} operating points up to {100 * note.share:.1f} % of the sample is left out, since the "
-        f"robot does not travel there: the indices are of robots that do ({', '.join(note.outputs)})"
+        f"at {points} operating points up to {100 * share:.1f} % of the sample is left out, since the "
+        f"robot does not travel there: the indices are of robots that do ({', '.join(outputs)})"
     )
 
 
-#: Kind of note → a sentence with its fields, or a function that makes one.
-SAID: dict[type, str | Callable[[Any], str]] = {
-    sensitivity_notes.Sampling: sampling_scope,
-    sensitivity_notes.PointsLeftOut: points_left_out,
-    sensitivity_notes.SampleLeftOut: sample_left_out,
-    sensitivity_notes.Inert: "not sampled, because every computed derivative by them is zero: {inputs}",
-    sensitivity_notes.Tied: "kept at their ratio to another input, and part of what it does: {inputs}",
+#: Code of a remark → a sentence with its values, or a function that makes one.
+SAID: dict[str, str | Callable[..., str]] = {
+    "sampling": sampling_scope,
+    "points_left_out": points_left_out,
+    "sample_left_out": sample_left_out,
+    "inert": "not sampled, because every computed derivative by them is zero: {inputs}",
+    "tied": "kept at their ratio to another input, and part of what it does: {inputs}",
 }

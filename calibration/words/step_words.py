@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from calibration.inference.fit_notes import Step
 from mmrjax.errors import count_noun
 
 STEPS = {
@@ -57,11 +56,10 @@ OF = max(STAGES.values())
 OVER = {2: 0.45, 3: 0.5, 4: 0.7, 5: 0.75, 6: 0.8, 7: 0.9}
 
 
-def step_sentence(now: Step) -> str:
+def step_sentence(name: str, about: tuple[object, ...]) -> str:
     """A step in a sentence, a stage of the loop with its number."""
-    about = (" and ".join(x) if isinstance(x, tuple) else x for x in now.about)
-    text = STEPS[now.name].format(*about)
-    return f"{STAGES[now.name]} of {OF}, {text}" if now.name in STAGES else text
+    text = STEPS[name].format(*(" and ".join(x) if isinstance(x, tuple) else x for x in about))
+    return f"{STAGES[name]} of {OF}, {text}" if name in STAGES else text
 
 
 def expected_time(text: str, seconds: float) -> float | None:

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
 
 from calibration.data.columns import LOAD
 from calibration.data.input_errors import bound_text
-from calibration.inference import fit_notes
 
 #: Measurements that determine a parameter which the data do not, by the start or end of its name.
 WOULD_MEASURE = {
@@ -40,64 +38,71 @@ def would_measure(name: str) -> str:
     return "runs under conditions in which it acts"
 
 
-def unmeasured_parameter(note: fit_notes.Unmeasured) -> str:
+def unmeasured_parameter(name: str) -> str:
     """A free parameter that moves no reading."""
-    return (
-        f"{note.name}: nothing in these data measures it; its value is its prior's. {would_measure(note.name)} would"
-    )
+    return f"{name}: nothing in these data measures it; its value is its prior's. {would_measure(name)} would"
 
 
-def differing_repeats(note: fit_notes.Repeats) -> str:
+def differing_repeats(
+    source: str,
+    rows: tuple[int, int],
+    column: str,
+    values: tuple[float, float],
+    apart: str,
+    unused: tuple[str, ...] = (),
+    more: int = 0,
+    near: str = "",
+) -> str:
     """Rows under the same conditions whose readings differ."""
-    (first, second), (one, other) = note.rows, map(bound_text, note.values)
-    more = f" (and so {note.more} more)" if note.more else ""
+    (first, second), (one, other) = rows, map(bound_text, values)
     said = (
-        f"{note.source} rows {first} and {second}, {note.column}: the same conditions gave {one} and {other}, "
-        f"{note.apart} apart{more}"
+        f"{source} rows {first} and {second}, {column}: the same conditions gave {one} and {other}, "
+        f"{apart} apart{f' (and so {more} more)' * bool(more)}"
     )
-    if note.unused:
-        many = len(note.unused) > 1
-        name = f'state [columns] {note.near} = "{note.unused[0]}"' if note.near else "name it under [columns]"
+    if unused:
+        many = len(unused) > 1
+        name = f'state [columns] {near} = "{unused[0]}"' if near else "name it under [columns]"
         return (
-            f"{said}; {', '.join(note.unused)} {'vary' if many else 'varies'} there and {'are' if many else 'is'} "
+            f"{said}; {', '.join(unused)} {'vary' if many else 'varies'} there and {'are' if many else 'is'} "
             f"not used as a condition: {name}, or give each level of a load a configuration"
         )
     wrong = f"{said}; if one is wrong, remove it"
-    return f"{wrong}, else find what changed between such rows that the table does not state" if note.more else wrong
+    return f"{wrong}, else find what changed between such rows that the table does not state" if more else wrong
 
 
-def unused_columns(note: fit_notes.Unused) -> str:
+def unused_columns(source: str, columns: tuple[tuple[str, str], ...]) -> str:
     """Columns that vary and have no role, and what each may be."""
-    names = [name for name, _ in note.columns]
+    names = [name for name, _ in columns]
     vary, are = ("vary", "are") if len(names) > 1 else ("varies", "is")
-    said = [f"{note.source}: {', '.join(names)} {vary} from row to row and {are} not used"]
-    for name, near in note.columns:
+    said = [f"{source}: {', '.join(names)} {vary} from row to row and {are} not used"]
+    for name, near in columns:
         if near:
             said.append(f'if {name} is {near}, state [columns] {near} = "{name}" in the robot\'s file')
     return "; ".join(said)
 
 
-def nothing_varies(note: fit_notes.NothingVaries) -> str:
+def nothing_varies(source: str, rows: int, column: str, unused: tuple[str, ...] = ()) -> str:
     """Runs of one condition."""
-    many = len(note.unused) > 1
-    unused = f"{', '.join(note.unused)} {'vary' if many else 'varies'} and {'are' if many else 'is'} not used: name "
-    unused += (
-        f"{'them' if many else 'it'} under [columns] if {'they are conditions' if many else 'it is a condition'}, or "
+    vary, are, them, if_conditions = (
+        ("vary", "are", "them", "they are conditions")
+        if len(unused) > 1
+        else ("varies", "is", "it", "it is a condition")
     )
+    name = f"{', '.join(unused)} {vary} and {are} not used: name {them} under [columns] if {if_conditions}, or "
     return (
-        f"{note.source}: nothing varies in these {note.rows} runs but noise, so nothing can be told from them; "
-        f"{unused * bool(note.unused)}record runs at several values of {note.column} or of the load"
+        f"{source}: nothing varies in these {rows} runs but noise, so nothing can be told from them; "
+        f"{name * bool(unused)}record runs at several values of {column} or of the load"
     )
 
 
-def copied_channel(note: fit_notes.Copied) -> str:
+def copied_channel(source: str, column: str, other: str, intercept: float, slope: float, tied: bool) -> str:
     """A channel that is a line of another."""
-    start = f"{note.intercept:.4g} {'+' if note.slope >= 0 else '-'} " if note.intercept else ""
-    slope = abs(note.slope) if note.intercept else note.slope
-    said = f"{note.source}, {note.column}: in every row {start}{slope:.4g} times {note.of}, to the last digit"
-    if note.tied:
+    start = f"{intercept:.4g} {'+' if slope >= 0 else '-'} " if intercept else ""
+    factor = abs(slope) if intercept else slope
+    said = f"{source}, {column}: in every row {start}{factor:.4g} times {other}, to the last digit"
+    if tied:
         return f"{said}; if it is computed from it and no reading, remove it, as its noise then counts twice"
-    if note.column == LOAD:
+    if column == LOAD:
         return (
             f"{said}: it is computed and was never measured, so it tells nothing of torque constant, friction or "
             "efficiency; remove the column and keep the rows without a load, or give a torque that was set or read"
@@ -105,25 +110,25 @@ def copied_channel(note: fit_notes.Copied) -> str:
     return f"{said}: it is computed from it and no reading; remove it from channels and table, or read an instrument"
 
 
-def constant_condition(note: fit_notes.Constant) -> str:
+def constant_condition(column: str, value: float, alike: str) -> str:
     """A condition that does not vary."""
-    here = f"{note.column} is {bound_text(note.value)} in every row"
-    return f"{here}: {ALIKE[note.alike]}, and only their priors tell them apart"
+    here = f"{column} is {bound_text(value)} in every row"
+    return f"{here}: {ALIKE[alike]}, and only their priors tell them apart"
 
 
-def ends_early(note: fit_notes.EndsEarly) -> str:
+def ends_early(runs: tuple[str, ...], lasts: float, share: float) -> str:
     """Histories that end before the robot is under way."""
-    at = "" if math.isnan(note.share) else f", at {note.share:.0%} of the speed of steady travel"
+    at = "" if math.isnan(share) else f", at {share:.0%} of the speed of steady travel"
     return (
-        f"{_runs(note.runs, 'ends', 'end')} after {note.lasts:.2g} s at the latest{at}: before the robot is under "
+        f"{_runs(runs, 'ends', 'end')} after {lasts:.2g} s at the latest{at}: before the robot is under "
         "way, so what resists its travel is known by its priors; record until the speed is steady"
     )
 
 
-def never_grips(note: fit_notes.NeverGrips) -> str:
+def never_grips(runs: tuple[str, ...], share: float) -> str:
     """Histories in which the movers slide to the end."""
     return (
-        f"{_runs(note.runs, 'never grips', 'never grip')}: in the end the robot travels at {note.share:.0%} of the "
+        f"{_runs(runs, 'never grips', 'never grip')}: in the end the robot travels at {share:.0%} of the "
         "speed of its movers, so what the ground holds before it slides is not measured there"
     )
 
@@ -132,73 +137,73 @@ def _runs(names: tuple[str, ...], one: str, several: str) -> str:
     return f"run {names[0]} {one}" if len(names) == 1 else f"runs {', '.join(names)} {several}"
 
 
-def coarse_steps(note: fit_notes.CoarseSteps) -> str:
+def coarse_steps(lasts: float, step: float) -> str:
     """Steps that do not resolve waves."""
     return (
-        f"runs of {note.lasts:.0f} s are followed in steps of {1e3 * note.step:.0f} ms: waves of a shaft faster than "
+        f"runs of {lasts:.0f} s are followed in steps of {1e3 * step:.0f} ms: waves of a shaft faster than "
         "some ten steps are not resolved; cut the runs to look for them"
     )
 
 
-def inherited_priors(note: fit_notes.InheritedPriors) -> str:
+def inherited_priors(part: str, changed: tuple[tuple[str, float, float], ...], kept: tuple[str, ...]) -> str:
     """A part that is not the nominal robot's while friction of it is."""
-    changed = ", ".join(
-        f"{name} {bound_text(mine)} for {bound_text(nominal)}" for name, mine, nominal in note.changed
-    )
-    one = len(note.kept) == 1
+    each = ", ".join(f"{name} {bound_text(mine)} for {bound_text(nominal)}" for name, mine, nominal in changed)
+    one = len(kept) == 1
     return (
-        f"{note.part} is not the nominal robot's ({changed}), but its {', '.join(note.kept)} still "
+        f"{part} is not the nominal robot's ({each}), but its {', '.join(kept)} still "
         f"{'is' if one else 'are'}: {'that prior comes' if one else 'those priors come'} from another robot; state "
         "yours in the robot's file or with --prior"
     )
 
 
-def off_by(note: fit_notes.OffBy) -> str:
+def off_by(
+    column: str, unit: str, factor: float, units: tuple[str, ...], others: tuple[str, ...], imposed: str
+) -> str:
     """Readings that no robot like this one shows."""
-    off, size = (note.factor, "large") if note.factor > 1 else (1 / note.factor, "small")
-    what = f"{note.column}: readings are about {bound_text(float(f'{off:.2g}'))} times too {size} for this robot"
-    alike = f"; {' and '.join(note.others)} alike: check {note.imposed} and the robot's file" if note.others else ""
-    if note.units:
-        return f"{what}; are they in {' or '.join(note.units)}? expected {note.unit}{alike}"
-    return f"{what}{alike}" if note.others else f"{what}; check the unit, {note.unit}, and the robot's file"
+    off, size = (factor, "large") if factor > 1 else (1 / factor, "small")
+    what = f"{column}: readings are about {bound_text(float(f'{off:.2g}'))} times too {size} for this robot"
+    alike = f"; {' and '.join(others)} alike: check {imposed} and the robot's file" if others else ""
+    if units:
+        return f"{what}; are they in {' or '.join(units)}? expected {unit}{alike}"
+    return f"{what}{alike}" if others else f"{what}; check the unit, {unit}, and the robot's file"
 
 
-#: Kind of note → a sentence with its fields, or a function that makes one.
-SAID: dict[type, str | Callable[[Any], str]] = {
-    fit_notes.Unmeasured: unmeasured_parameter,
-    fit_notes.Constant: constant_condition,
-    fit_notes.Repeats: differing_repeats,
-    fit_notes.LargerNoise: "{channel}: {pairs} pairs of rows at the same conditions scatter "
+#: Code of a remark → a sentence with its values, or a function that makes one.
+SAID: dict[str, str | Callable[..., str]] = {
+    "unmeasured": unmeasured_parameter,
+    "constant": constant_condition,
+    "repeats": differing_repeats,
+    "larger_noise": "{channel}: {pairs} pairs of rows at the same conditions scatter "
     "{factor:.2g} times as much "
     "as the {source} noise says; its sd is taken {factor:.2g} times as large. Check the repeats, or state the noise "
     "with --noise",
-    fit_notes.Unused: unused_columns,
-    fit_notes.NoLoadGives: "{source}, {theirs}: friction and a constant torque of a load leave {share:.0%} of its "
+    "unused": unused_columns,
+    "no_load_gives": "{source}, {theirs}: friction and a constant torque of a load leave {share:.0%} of its "
     "variance unexplained; if a brake sets it, it is a condition: state [columns] load_torque_Nm = "
     '"{theirs}" in the robot\'s file, and take output_torque out of its channels',
-    fit_notes.NothingVaries: nothing_varies,
-    fit_notes.Copied: copied_channel,
-    fit_notes.Turned: "{source}, {theirs}: off by {off:.2g} (rms) from what the file's numbers give, "
+    "nothing_varies": nothing_varies,
+    "copied": copied_channel,
+    "turned": "{source}, {theirs}: off by {off:.2g} (rms) from what the file's numbers give, "
     "with the other sign "
     'by {turned:.2g}; if it is turned round, state [columns] {column} = {{column = "{theirs}", factor = -1}}',
-    fit_notes.StiffSupply: "{column} is {value:g} in every row: taken for a stiff supply; if it is "
+    "stiff_supply": "{column} is {value:g} in every row: taken for a stiff supply; if it is "
     "no reading, remove "
     "the column",
-    fit_notes.EndsEarly: ends_early,
-    fit_notes.NeverGrips: never_grips,
-    fit_notes.Thinned: "{source}: readings of {kept} of {rows} rows are used, evenly in time, and "
+    "ends_early": ends_early,
+    "never_grips": never_grips,
+    "thinned": "{source}: readings of {kept} of {rows} rows are used, evenly in time, and "
     "what drives the runs "
     "in all of them; --rows uses more or fewer, and settle uses all",
-    fit_notes.ThinnedTable: "{source}: {kept} of {rows} rows are used, spread evenly over the conditions; row "
+    "thinned_table": "{source}: {kept} of {rows} rows are used, spread evenly over the conditions; row "
     "numbers count these; --rows uses more or fewer",
-    fit_notes.CoarseSteps: coarse_steps,
-    fit_notes.StopsOnSlope: "run {runs}: the motors are not driven on a slope; histories have smooth "
+    "coarse_steps": coarse_steps,
+    "stops_on_slope": "run {runs}: the motors are not driven on a slope; histories have smooth "
     "friction at rest, "
     "and a robot that should stand there creeps by some mm/s. Leave rows at rest out where their readings are finer "
     "than that",
-    fit_notes.InheritedPriors: inherited_priors,
-    fit_notes.OffBy: off_by,
-    fit_notes.SlopesIn: "slope_deg: the current rises {rise:.2g} times as fast with the slope as "
+    "inherited_priors": inherited_priors,
+    "off_by": off_by,
+    "slopes_in": "slope_deg: the current rises {rise:.2g} times as fast with the slope as "
     "this robot's; are the "
     "slopes in {unit}? expected degrees",
 }

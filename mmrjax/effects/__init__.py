@@ -1,6 +1,7 @@
 """The library of effects, one file for each balance; a new effect is a class in the file of its balance."""
 
 from mmrjax.effects import (
+    duty_effects,
     electrical_effects,
     gearbox_effects,
     ground_effects,
@@ -30,6 +31,7 @@ _FILES = (
     ground_effects,
     slip_effects,
     sensor_effects,
+    duty_effects,
 )
 
 #: All effects of the library by balance, in the order of each file. Tables of scores and the random numbers of a

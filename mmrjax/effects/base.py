@@ -21,7 +21,7 @@ from mmrjax.model.signals import Signals
 
 #: Quantity that the balances of one equation sum up, in words; balances with equal words change the readings equally.
 EQUATION = {
-    **dict.fromkeys(("supply", "electrical"), "voltage drop"),
+    **dict.fromkeys(("duty", "supply", "electrical"), "voltage drop"),
     **dict.fromkeys(("motor", "gearbox", "track"), "loss torque"),
     "ground": "resistance to travel",
     **dict.fromkeys(("lateral", "yaw"), "resistance to turning"),

@@ -160,7 +160,7 @@ def _initial(robot: Robot, conditions: Conditions) -> Array:
     rolling = radius * turning / robot.gearbox.ratio
     left = voltage_at_rest(robot, conditions)
     if conditions.motor_current is None:  # an amplifier compensates it
-        share = jnp.abs(conditions.duty) if robot.driver.decay == FAST else 1.0
+        share = jnp.abs(balances.duty_given(robot, conditions)) if robot.driver.decay == FAST else 1.0
         left = left - share * robot.motor.voltage_back(turning)
     open_circuit = (conditions.open > 0.5) | (conditions.motor_speed is not None)
     current = jnp.where(open_circuit, 0.0, robot.motor.current_stall(left))

@@ -57,7 +57,7 @@ def travel_direction(robot: Robot, conditions: Conditions) -> Array:
     mass = chassis.mass + conditions.payload if conditions.total_mass is None else conditions.total_mass
     stall = robot.motor.current_stall(voltage_at_rest(robot, conditions))
     if not conditions.voltage_follows:
-        most = robot.driver.current_limit * (1 + jnp.abs(conditions.duty) * (1 / STEEPNESS))
+        most = robot.driver.current_limit * (1 + jnp.abs(balances.duty_given(robot, conditions)) * (1 / STEEPNESS))
         stall = one_sided.clip(stall, -most, most)
     stall = robot.motor.torque_electromagnetic(stall)
     weight = chassis.torque_weight(mass * (1 / robot.sides), conditions.slope)
@@ -71,7 +71,9 @@ def voltage_at_rest(robot: Robot, conditions: Conditions) -> Array:
         return jnp.asarray(robot.motor.voltage_back(conditions.motor_speed))
     if conditions.motor_current is not None:  # an amplifier's, see `balances.electrical`
         return jnp.asarray(robot.motor.resistance * conditions.motor_current)
-    return conditions.duty * jnp.where(conditions.open > 0.5, 0.0, _source_at_rest(robot, conditions))
+    return balances.duty_given(robot, conditions) * jnp.where(
+        conditions.open > 0.5, 0.0, _source_at_rest(robot, conditions)
+    )
 
 
 def _source_at_rest(robot: Robot, conditions: Conditions) -> Array:
@@ -87,7 +89,7 @@ def admitted_current(robot: Robot, conditions: Conditions, wanted: Scalar) -> tu
     """
     if conditions.voltage_follows:
         return wanted, jnp.zeros_like(wanted)
-    battery, duty = robot.battery, conditions.duty
+    battery, duty = robot.battery, balances.duty_given(robot, conditions)
     behind = robot.sides * battery.cells * battery.resistance * duty * robot.driver.share_drawn(duty)
     resistance = robot.motor.resistance + jnp.where(conditions.battery > 0.5, behind, 0.0)
     resistance, source = jax.lax.stop_gradient((resistance, _source_at_rest(robot, conditions)))

@@ -151,7 +151,7 @@ def slowness(asked: SegmentInputs, y: Array, stands: Array) -> tuple[Scalar, Sca
 
 def drawn(asked: SegmentInputs, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
     robot, state = asked.robot, state_of(asked.robot, y, stands)
-    duty = robot.driver.duty_limited(asked.conditions.duty, state.current)
+    duty = robot.driver.duty_limited(balances.duty_given(robot, asked.conditions), state.current)
     motors = robot.sides * state.current * robot.driver.share_drawn(duty)
     return motors, state.discharge
 

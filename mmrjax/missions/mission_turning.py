@@ -171,7 +171,7 @@ def slowness(asked: SegmentInputs, y: Array, stands: Array) -> tuple[Scalar, Sca
 
 def drawn(asked: SegmentInputs, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
     robot, motion = asked.robot, state_of(asked.robot, y, stands)
-    duty = robot.driver.duty_limited(asked.conditions.of_sides().duty, motion.current)
+    duty = robot.driver.duty_limited(balances.duty_given(robot, asked.conditions.of_sides()), motion.current)
     return robot.sides * sum_of_sides(
         jnp.asarray(motion.current * robot.driver.share_drawn(duty))
     ) / 2, motion.discharge

@@ -25,7 +25,7 @@ from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Load, Robot
 from mmrjax.model.shaft import Shaft
 from mmrjax.model.signals import GRAVITY, PlaneMotion, Signals, State
-from mmrjax.numerics.one_sided import at_least
+from mmrjax.numerics.one_sided import at_least, clip
 from mmrjax.numerics.trigonometry import cosine, sine
 from mmrjax.turning.two_sides import SIDES, Grip, Stance, grip, sum_of_sides
 
@@ -34,6 +34,7 @@ BALANCES = {
     "mass": ("kg", "M = robot + payload"),
     "inertia": ("kg·m^2", "J_w of one side's parts that turn with the driving wheel, eq. (31)"),
     "inductance": ("H", "L of one armature circuit, eq. (15)"),
+    "duty": ("-", "D of the bridge, of the duty that is demanded"),
     "supply": ("V", "U_e from battery or external source, eqs. (8)-(13)"),
     "electrical": ("V", "U_e = E + I R + L dI/dt, eq. (15)"),
     "motor": ("N·m", "C_m I - M_df = M_d, eqs. (14), (17), (18)"),
@@ -53,10 +54,10 @@ ROUND = ("lateral", "yaw")
 def absent_balances(robot: Robot) -> frozenset[str]:
     """Balances that a robot lacks or that its instruments cannot show.
 
-    A load on a shaft lacks those of the ground. `supply` needs an imposed voltage, `electrical` and `inductance` an
-    imposed or measured one, `lateral` and `yaw` instruments of a turn.
+    A load on a shaft lacks those of the ground. `duty` and `supply` need an imposed voltage,
+    `electrical` and `inductance` an imposed or measured one, `lateral` and `yaw` instruments of a turn.
     """
-    supply = set() if robot.rig.imposed == "voltage" else {"supply"}
+    supply = set() if robot.rig.imposed == "voltage" else {"duty", "supply"}
     winding = set() if robot.rig.shows_voltage else {"electrical", "inductance"}
     return robot.lacks | supply | winding | (set() if robot.rig.turns else {*ROUND})
 
@@ -84,13 +85,28 @@ def _fill(signals: Signals, **values: Any) -> Signals:
 IN_PLANE = ("speed_lateral", "yaw_rate", "heading", "place_x", "place_y")
 
 
+def duty_given(robot: Robot, conditions: Conditions) -> Scalar:
+    """Duty that the bridge gives for the demanded one [-], before its current limit, in the same direction."""
+    if conditions.voltage_follows or not any(e.balance == "duty" for e in robot.effects):
+        return conditions.duty
+    demanded = Signals(
+        configuration=conditions.configuration,
+        on_tracks=robot.chassis(conditions.configuration).on_tracks,
+        battery=conditions.battery,
+        order=conditions.order,
+        duty=conditions.duty,
+    )
+    way = jnp.where(conditions.duty < 0, -1.0, 1.0)
+    return way * clip(way * (conditions.duty - effects_sum(robot, demanded, "duty")), 0.0, 1.0)
+
+
 def begin_signals(robot: Robot, conditions: Conditions, state: State, direction: Scalar | None = None) -> Signals:
     """Kinematics and mass of the instant; `direction` None takes it from the speeds, smooth through rest."""
     chassis = robot.chassis(conditions.configuration)
     speed_wheel = state.speed_motor * (1 / robot.gearbox.ratio)
     speed_theoretical = chassis.radius * speed_wheel
     rest = chassis.speed_still
-    duty = robot.driver.duty_limited(conditions.duty, state.current, conditions.polarity)
+    duty = robot.driver.duty_limited(duty_given(robot, conditions), state.current, conditions.polarity)
     straight = dict.fromkeys(IN_PLANE, jnp.zeros_like(state.speed))
     signals = Signals(
         **straight,
@@ -136,7 +152,7 @@ def supply(robot: Robot, conditions: Conditions, signals: Signals) -> Signals:
     )
     back = robot.motor.voltage_back(signals.speed_motor)
     voltage = robot.driver.voltage(source - effects_sum(robot, signals, "supply"), signals.duty, signals.pause, back)
-    demanded, limited = (conditions.polarity * duty for duty in (conditions.duty, signals.duty))
+    demanded, limited = (conditions.polarity * duty for duty in (duty_given(robot, conditions), signals.duty))
     conducts = robot.driver.conducts(demanded, limited, signals.current, voltage - back, conditions.open)
     voltage = jnp.where(conducts == 1, voltage, back + conducts * (voltage - back))
     return _fill(signals, voltage_source=source, voltage=voltage)

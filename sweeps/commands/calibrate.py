@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from calibration.inference import priors
 from calibration.inference.calibration import calibrate as run
 from sweeps import config as configuration
@@ -15,24 +13,22 @@ from sweeps.skeleton import finish_run_folder, print_report
 from sweeps.store import open_folder
 
 
-def calibrate_robot(
-    config: configuration.Calibrate, source: str, out: Path | None, force: bool, members: Path | None = None
-) -> int:
+def execute(config: configuration.Calibrate, beside: configuration.FittedRuns) -> int:
     """Calibrate a robot to a table and leave a run folder; returns the exit code.
 
     0 done; 3 done, but the search or a fit without a block did not converge, or the solver failed at a row.
     """
     robot = load_robot(config).robot
-    runs = read_runs(source, robot, columns=config.columns, measured=True, series=True)
+    runs = read_runs(beside.data, robot, columns=config.columns, measured=True, series=True)
     stated = priors.parse_priors(config.prior)
     with (
-        open_folder("calibrate", config, robot, out, force, runs) as folder,
+        open_folder("calibrate", config, robot, beside, runs) as folder,
         step_reporter(print_message, "fitting") as heard,
     ):
         found = run(
             runs, robot, rows=config.rows, free=config.free, fix=config.fix, stated=stated,
             noise=config.noise or None, model=config.model, starts=config.starts, population=config.population,
-            generations=config.generations, members=members, seed=config.seed,
+            generations=config.generations, members=beside.members, seed=config.seed,
             profiles=config.profiles, blocks=config.hold_out, solver=config.solver, tell=heard,
         )  # fmt: skip
         found.save(folder.results(), config.robot, folder.tables)

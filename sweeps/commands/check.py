@@ -27,7 +27,7 @@ from sweeps.skeleton import finish_run_folder, print_report
 from sweeps.store import RunFolder, open_folder
 
 
-def check_robot(config: configuration.Check, out: Path | None, force: bool) -> int:
+def execute(config: configuration.Check, beside: configuration.FolderPart) -> int:
     """Compare a robot with requirements and write a run folder; returns the exit code.
 
     The code is 0 whether or not requirements are missed, and 3 if the solver failed at a worst corner.
@@ -38,8 +38,14 @@ def check_robot(config: configuration.Check, out: Path | None, force: bool) -> i
     imposed.check_on_ground(robot, "check")
     sheet.refuse_impossible(robot, asked)
     _check_charge(robot, asked)
-    _check_heat(robot, asked)
-    with open_folder("check", config, robot, out, force) as folder:
+    lacking = robot.unknown(HEAT)
+    for r in asked.each:
+        if lacking and r.name in OF_HEAT:
+            raise BadConfiguration(
+                f"{asked.source}, {r.name}: rests on how warm the windings become, and the robot's file does not "
+                f"state {', '.join(lacking)}; state them, or leave the requirement out"
+            )
+    with open_folder("check", config, robot, beside) as folder:
         with step_reporter(print_message, "reading the requirements") as heard:
             outcomes = sheet.check_requirements(robot, asked, changes=config.changes, tell=in_words(heard))
             found = CheckResult(asked, robot, outcomes, posture_results.of_requirements(robot, outcomes))
@@ -58,17 +64,6 @@ def _check_charge(robot: Robot, asked: requirements_file.Requirements) -> None:
             raise BadConfiguration(
                 f"{asked.source}, {r.name}: the robot's file states no battery; add [battery] to it, or state "
                 "supply_voltage_V in [envelope]"
-            )
-
-
-def _check_heat(robot: Robot, asked: requirements_file.Requirements) -> None:
-    """Raise if a requirement on the winding's final temperature needs a heat number that the file does not state."""
-    lacking = robot.unknown(HEAT)
-    for r in asked.each:
-        if lacking and r.name in OF_HEAT:
-            raise BadConfiguration(
-                f"{asked.source}, {r.name}: rests on how warm the windings become, and the robot's file does not "
-                f"state {', '.join(lacking)}; state them, or leave the requirement out"
             )
 
 

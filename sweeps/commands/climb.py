@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -42,7 +41,7 @@ ROUND = 12
 WIDTHS, WIDTH = {"payload": 0.2, "levers_front_deg": 1.0, "levers_rear_deg": 1.0, SIZE: 1.0}, 0.02
 
 
-def climb_obstacle(config: configuration.Climb, out: Path | None, force: bool) -> int:
+def execute(config: configuration.Climb, beside: configuration.FolderPart) -> int:
     """Climb and leave a run folder; returns the exit code.
 
     0 done, whatever the verdict; 3 numbers went wrong.
@@ -66,7 +65,7 @@ def climb_obstacle(config: configuration.Climb, out: Path | None, force: bool) -
         adhesion=adhesion_ratio(config.surface, bool(np.asarray(robot.configurations[name].on_tracks) > 0.5)),
     ).resolved(robot)  # fmt: skip
     along = _along(config, robot, conditions, sequence)
-    with open_folder("climb", config, robot, out, force) as folder:
+    with open_folder("climb", config, robot, beside) as folder:
         found = _climbed(config, robot, name, words, conditions, sequence, along)
         folder.write_table("history.csv", found.table)
         if rows := found.slopes:

@@ -30,23 +30,23 @@ from sweeps.store import open_folder
 HISTORIES, OVER = "drive", {"time_s": "time [s]"}
 
 
-def compare_with_table(
-    config: configuration.Compare, source: str, own_mass: bool, out: Path | None, force: bool
-) -> int:
+def execute(config: configuration.Compare, beside: configuration.ComparedRuns) -> int:
     """Simulate the runs of a table, compare them with its readings, write a run folder; returns the exit code."""
     file = load_robot(config)
-    stated = runs = read_runs(source, file.robot, columns=config.columns, measured=True, series=True, of_turns=True)
+    stated = runs = read_runs(
+        beside.data, file.robot, columns=config.columns, measured=True, series=True, of_turns=True
+    )
     if runs.turns:
         file = dataclasses.replace(file, robot=file.robot.showing_turns(runs.layout.measured_columns), remarks=())
     second = _second_robot(config, file)
     if runs.sampled:
-        return _over_time(config, file, second, runs, own_mass, out, force)
+        return _over_time(config, file, second, runs, beside)
     robot = instruments.with_inferred_instruments(file.robot, runs)
-    if own_mass:
+    if beside.own_mass:
         runs = dataclasses.replace(runs, columns={k: v for k, v in runs.columns.items() if k != "total_mass_kg"})
     said = sentences(check_ranges(runs, robot))
     drawn = None if config.posterior is None else beside_robot(file)
-    with open_folder("compare", config, robot, out, force, runs) as folder:
+    with open_folder("compare", config, robot, beside, runs) as folder:
         table = run.evaluate_runs(robot, runs, config, folder)
         comparison, summary = compare_readings(stated, table, robot)
         if second is not None:
@@ -81,12 +81,10 @@ def _over_time(
     file: RobotFile,
     second: RobotFile | None,
     runs: records.Runs,
-    own_mass: bool,
-    out: Path | None,
-    force: bool,
+    beside: configuration.ComparedRuns,
 ) -> int:
     """The same for time histories, each simulated from its beginning as in fits."""
-    options = {"--own-mass": own_mass, "--posterior": config.posterior, "--duration": config.duration_s}
+    options = {"--own-mass": beside.own_mass, "--posterior": config.posterior, "--duration": config.duration_s}
     for option in (name for name, stated in options.items() if stated):
         raise BadConfiguration(
             f"{option}: {Path(runs.source).name} holds time histories, which are followed sample by sample, with the "
@@ -94,7 +92,7 @@ def _over_time(
         )
     model = None if config.model == fidelities.NAMES[0] else config.model
     ready = preparation.prepare(runs, file.robot)
-    with open_folder("compare", config, ready.robot, out, force, runs) as folder:
+    with open_folder("compare", config, ready.robot, beside, runs) as folder:
         table = run.follow_histories(ready.robot, runs, model)
         comparison, summary = compare_readings(runs, table, ready.robot)
         comparison |= {column: runs[column] for column in (*OVER, "run_id") if runs.has(column)}

@@ -74,6 +74,7 @@ def explainable_names(library: dict[str, type[Effect]]) -> dict[str, list[str]]:
     """Every name that can be explained, by kind."""
     return {
         "effects": [name for name in library if name not in effects.UNNAMED],
+        "words of the reports": [word for word in words.GLOSSARY if word not in words.LOOP_VERDICTS],
         "statuses": list(words.STATUSES),
         "verdicts of the loop": list(words.LOOP_VERDICTS),
         "verdicts of a climb": list(VERDICTS),
@@ -168,6 +169,11 @@ def _verdict_of_loop(name: str, library: dict[str, type[Effect]]) -> Iterator[Li
     if name in words.LOOP_VERDICTS:
         yield "means", words.LOOP_VERDICTS[name]
         yield "in files", "verdict of result.json of mmrjax loop"
+
+
+def _word(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
+    if name in words.GLOSSARY and name not in words.LOOP_VERDICTS:
+        yield "means", words.GLOSSARY[name]
 
 
 def _flag(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
@@ -268,5 +274,5 @@ def _bounds(spec: Spec) -> str:
 EXPLAINED: dict[str, Callable[[str, dict[str, type[Effect]]], Iterator[Line]]] = {
     "effect": _effect, "status": _status, "verdict of the loop": _verdict_of_loop, "verdict of a climb": _verdict,
     "flag": _flag, "channel": _channel, "output": _output, "parameter": _parameter,
-    "condition": _condition,
+    "condition": _condition, "word of the reports": _word,
 }  # fmt: skip

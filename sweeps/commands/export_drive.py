@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from calibration.data import Json, robot_file
 from sweeps import config as configuration
 from sweeps.export.formats import Export, export_format
@@ -14,10 +12,10 @@ from sweeps.skeleton import finish_run_folder, print_report
 from sweeps.store import open_folder
 
 
-def export_to_folder(config: configuration.Export, out: Path | None, force: bool) -> int:
+def execute(config: configuration.Export, beside: configuration.FolderPart) -> int:
     """Export a drive and leave a run folder with its files; returns the exit code, 0."""
     file = load_robot(config)
-    with open_folder("export", config, file.robot, out, force) as folder:
+    with open_folder("export", config, file.robot, beside) as folder:
         found = export_format(
             file, config.to, configuration=config.configuration, data=config.data, at=config.joint,
             draws=config.draws, seed=config.seed,

@@ -42,37 +42,25 @@ T = TypeVar("T")
 SCREENING_FILE, SCREENING = "screening.json", "mmrjax.screening/1"
 
 
-def run_loop(
-    config: configuration.Loop,
-    source: str,
-    out: Path | None,
-    force: bool,
-    members: Path | None = None,
-    within: float | None = None,
-) -> int:
+def execute(config: configuration.Loop, beside: configuration.LoopBeside) -> int:
     """Run the closed loop on a table and leave a run folder; returns the exit code.
 
     0 done, whatever the verdict; 3 done, but the fit that is proposed did not converge, or its time was out before
     there was a verdict. Stages are kept as they end, so that the same command goes on after that, or an interrupt.
-
-    Args:
-        within: wall-clock time after which it ends with the best that there is [s].
     """
     try:
-        return _loop(config, source, out, force, members, within)
+        return _loop(config, beside)
     except OutOfTime:
         return SOLVER_FAILED
 
 
-def _loop(
-    config: configuration.Loop, source: str, out: Path | None, force: bool, members: Path | None, within: float | None
-) -> int:
-    began = time.monotonic()
+def _loop(config: configuration.Loop, beside: configuration.LoopBeside) -> int:
+    began, within = time.monotonic(), beside.seconds
     robot = load_robot(config).robot
-    runs = read_runs(source, robot, columns=config.columns, measured=True, series=True)
+    runs = read_runs(beside.data, robot, columns=config.columns, measured=True, series=True)
     stated = priors.parse_priors(config.prior)
     if config.resolve:
-        check_resolvable(runs, members)
+        check_resolvable(runs, beside.members)
     replicates = max(config.replicates, fewest_replicates(observers.observer_kind(runs)))
 
     stages: Json = {}
@@ -86,7 +74,7 @@ def _loop(
         print_message(f"{used:4.0f} s  {text}{'' if more is None else f' (about {more:.0f} s more)'}")
 
     with (
-        open_folder("loop", config, robot, out, force, runs) as folder,
+        open_folder("loop", config, robot, beside, runs) as folder,
         step_reporter(timed, "preparing the table") as heard,
     ):
 
@@ -116,7 +104,7 @@ def _loop(
             _say_kept(stages, folder, config.robot)
             raise
         if config.resolve:
-            found = _resolved(found, config, members, progress)
+            found = _resolved(found, config, beside.members, progress)
         document = loop_report.loop_document(found, config.robot, changes_by_effect(found))
         shown = print_report(document)
         if config.resolve and found.resolved is None:

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection
-from pathlib import Path
 
 import jax
 import numpy as np
 
-from calibration.data import Columns, Json, profiles
+from calibration.data import Columns, profiles
 from calibration.data import runs as records
 from calibration.data.columns import LOAD, ON_SHAFT, SUPPLY
 from calibration.data.input_errors import BadConfiguration
@@ -27,7 +25,7 @@ from mmrjax.model.robot import Robot
 from sweeps import capabilities
 from sweeps import config as configuration
 from sweeps.console import print_message, progress_bar
-from sweeps.inputs import OPTIONS, load_robot, one_run, read_runs
+from sweeps.inputs import OPTIONS, given_runs, load_robot
 from sweeps.points import imposed, run
 from sweeps.report import mission_report
 from sweeps.results.mission_results import Missions
@@ -39,17 +37,8 @@ MOST_ROWS, LEAST_ROWS, ALL_ROWS = 20_000, 200, 200_000
 _LASTING = MARKS.index("battery_empty")  # events from here on are kept in history.csv: stops and starts are too many
 
 
-def simulate_missions(
-    config: configuration.Simulate,
-    given: str | Json,
-    stated: Collection[str],
-    out: Path | None,
-    force: bool,
-) -> int:
-    """Simulate runs of a file (its name), or one of options (by column), over a profile; returns the exit code.
-
-    Args:
-        stated: columns of conditions that options state.
+def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> int:
+    """Simulate runs of a file, or one of options, over a profile; returns the exit code.
 
     Raises:
         BadConfiguration: a condition that both the options and the profile state, a battery that is empty or below
@@ -66,23 +55,20 @@ def simulate_missions(
     _check_acting(robot, source)
     source.check_source(config.battery)
     for column in source.stated:
-        if column in stated and not isinstance(given, str):
+        if column in beside.stated:
             raise BadConfiguration(
                 f"{OPTIONS[column]}: got it beside {source.source}, which states {column}; expected one of the two"
             )
     _check_charge(robot, config)
-    if isinstance(given, str):
-        runs = read_runs(given, robot, columns=config.columns, measured=False, battery=config.battery)
-    else:
-        runs = one_run(robot, given, config.battery, source.stated)
+    runs = given_runs(robot, beside, config, source.stated)
     for column in source.stated:
-        if isinstance(given, str) and runs.has(column):
+        if beside.runs is not None and runs.has(column):
             print_message(f"{runs.source}, {column}: not used, {source.source} states it")
     if "current_other" in source.values and not config.battery:
         print_message(f"{source.source}, current_other_A: not used, other consumers are on the battery")
     _check_turning(robot, runs, source)
     _check_cutoff(robot, runs, source, config)
-    with open_folder("simulate", config, robot, out, force, runs) as folder:
+    with open_folder("simulate", config, robot, beside, runs) as folder:
         found = run_missions(robot, runs, source, config)
         folder.write_table("segments.csv", capabilities.without_idle(robot, found.segments))
         folder.write_table("history.csv", capabilities.without_idle(robot, found.course))

@@ -8,7 +8,6 @@ from typing import Any
 
 import jax
 
-from calibration.data import Json
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.writing import replacing
 from mmrjax.fidelities.track import track_batch
@@ -24,20 +23,32 @@ from sweeps.results.climb_results import Seen
 from sweeps.store import DONE, SOLVER_FAILED
 
 
-def render_run(
-    config: configuration.Render, given: Json, file: Path, begin: float, end: float | None, slow: float,
-    force: bool,
-) -> int:  # fmt: skip
-    """Draw one run (of options, by column) from standstill, as a picture or a film; returns the exit code.
+def execute(config: configuration.Render, picture: configuration.Picture) -> int:
+    """Draw one run from standstill, or a climb of a folder, as a picture or a film; returns the exit code.
 
     0 also where the run has not settled; 3 where it ends otherwise.
     """
+    file, begin, end, slow = picture.file, picture.begin, picture.end, picture.slow
+    if picture.climb is not None:
+        if config != configuration.Render() or picture.stated:
+            raise BadConfiguration("--climb: not allowed with options of a run of the track model; give one of them")
+        _check_free(picture)
+        found = Seen.read(picture.climb)
+        from sweeps.pages import climb_figures
+
+        _write(file, lambda aside: climb_figures.render_climb(found, aside, begin, end, slow))
+        print_output(str(file))
+        return DONE
+    still, given = file.suffix == ".png", picture.stated
+    slow = 20.0 if slow is None else slow
+    begin = (0.8 if still else 0.0) if begin is None else begin
+    end = begin + 0.1 if end is None and not still else end
     options = config.options
     try:
         rendering.frame_times(file, begin, end, slow, options["duration"])
     except ValueError as error:
         raise BadConfiguration(f"render: {error}") from error
-    _check_free(file, force)
+    _check_free(picture)
     robot = load_robot(config).robot
     imposed.check_on_ground(robot, "render")
     if config.turns:
@@ -62,23 +73,9 @@ def render_run(
     return SOLVER_FAILED if status == "failed" else DONE
 
 
-def render_climb(
-    folder: Path, stated: bool, file: Path, begin: float | None, end: float | None, slow: float | None, force: bool
-) -> int:
-    """Draw a climb that is in a folder; returns the exit code. `stated`: whether conditions of a run are, too."""
-    if stated:
-        raise BadConfiguration("--climb: not allowed with options of a run of the track model; give one of them")
-    _check_free(file, force)
-    found = Seen.read(folder)
-    from sweeps.pages import climb_figures
-
-    _write(file, lambda aside: climb_figures.render_climb(found, aside, begin, end, slow))
-    print_output(str(file))
-    return DONE
-
-
-def _check_free(file: Path, force: bool) -> None:
-    if file.exists() and not force:
+def _check_free(picture: configuration.Picture) -> None:
+    file = picture.file
+    if file.exists() and not picture.force:
         raise BadConfiguration(f"FILE: {file} exists already; choose another name (--force replaces it)")
     if not file.parent.is_dir():
         raise BadConfiguration(f"FILE: {file.parent} is no folder; choose another path")

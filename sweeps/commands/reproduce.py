@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from calibration.data import robot_file
 from calibration.data import runs as records
 from mmrjax import fidelities
@@ -17,14 +15,14 @@ from sweeps.skeleton import finish_run_folder
 from sweeps.store import open_folder
 
 
-def reproduce_paper(config: configuration.Reproduce, out: Path | None, force: bool) -> int:
+def execute(config: configuration.Reproduce, beside: configuration.FolderPart) -> int:
     """Write the paper's figures and tables for a robot into a run folder; returns the exit code."""
     file = load_robot(config)
     robot = file.robot
     imposed.check_on_ground(robot, "reproduce")
     runs = records.read_runs("measured")
     gear = "track.guide_share" in fidelities.fidelity_facts(config.model).computes
-    with open_folder("reproduce", config, robot, out, force) as folder:
+    with open_folder("reproduce", config, robot, beside) as folder:
         _, rows = report.write_paper_page(folder.results(), file, model=config.model, gear=gear)
         result = {"schema": "mmrjax.reproduce/1", "model": config.model, "rows": 0}
         if rows is None:

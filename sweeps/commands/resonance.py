@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -46,7 +45,7 @@ FEWEST = 5  # voltages over which a peak can be told
 SHORTEST = 0.5  # [s], of a run
 
 
-def map_resonance(config: configuration.Resonance, out: Path | None, force: bool) -> int:
+def execute(config: configuration.Resonance, beside: configuration.FolderPart) -> int:
     """Map the ripple of a robot and leave a run folder; returns the exit code.
 
     0 done; 3 done, but some runs did not settle, or slid, tipped or failed.
@@ -77,7 +76,7 @@ def map_resonance(config: configuration.Resonance, out: Path | None, force: bool
     runs, of_table8 = _points(config, robot)
     conditions = run.conditions_of_runs(robot, runs, config)
     run.check_runs_bearable(robot, conditions, config)
-    with open_folder("resonance", config, robot, out, force, runs) as folder:
+    with open_folder("resonance", config, robot, beside, runs) as folder:
         what = passing_parts(robot, robot.configurations.names.index(name))
         columns = _rippled(folder, robot, conditions, config, what)
         table = {**run.condition_table(robot, runs), "table8": of_table8, **columns}

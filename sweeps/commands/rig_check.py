@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.table import Table
 
 from calibration.data import Json, Names, rig_facts, settling
 from calibration.data.columns import SUPPLY, Layout
@@ -31,9 +31,11 @@ from mmrjax.model.robot import Robot
 from mmrjax.model.shaft import Shaft
 from sweeps.commands.rig_template import EXAMPLE
 from sweeps.config import RobotPart
-from sweeps.console import print_json, print_output
+from sweeps.console import print_json
 from sweeps.inputs import load_robot, read_runs
 from sweeps.pages import words
+from sweeps.report.document import Block, Document, Note, Table, columns, remarks
+from sweeps.report.terminal_renderer import print_document
 
 
 @dataclasses.dataclass(frozen=True)
@@ -202,13 +204,12 @@ class RigCheck:
         runs = None
         if self.runs is not None:
             assert self.foresight is not None
-            names, counts = np.unique(np.array(self.foresight.status), return_counts=True)
             runs = {
                 "source": self.runs.source,
                 "rows": len(self.runs),
                 "columns": self.columns(),
                 "unused": self.unused(),
-                "status": {str(n): int(c) for n, c in zip(names, counts, strict=True)},
+                "status": dict(sorted(Counter(self.foresight.status).items())),
                 "parameters": [
                     {**dataclasses.asdict(p), "determined": self.determined(p)} for p in self.foresight.parameters
                 ],
@@ -286,7 +287,7 @@ def check_rig_file(file: Path, data: str | None, effects: Names, as_json: bool, 
     if as_json:
         print_json(found.to_json())
     else:
-        print_check(found)
+        print_document(check_document(found))
     return 0
 
 
@@ -310,79 +311,75 @@ def examine_rig_file(file: Path, data: str | None, effects: Names = (), columns:
     return dataclasses.replace(found, runs=runs, foresight=seen, doubts=doubts)
 
 
-def _table(title: str, *headings: str) -> Table:
-    shown = Table(title=title, box=None, pad_edge=False, title_justify="left")
-    for heading in headings:
-        name, _, right = heading.partition(">")
-        shown.add_column(name, justify="right" if right else "left", overflow="fold")
-    return shown
-
-
-def print_check(found: RigCheck) -> None:
+def check_document(found: RigCheck) -> Document:
     """All of it, for a person."""
-    print_output(f"{found.file}")
-    for sentence in found.understood():
-        print_output(sentence)
-    shown = _table("\nchannels", "channel", "column", "sign", "step>r", "sd")
-    for c in found.channels():
-        step = FREE if c["quantum"] is None else f"{c['quantum']:.3g} {c['unit']}" if c["quantum"] else ""
-        sign = {None: FREE, True: "signed", False: "magnitude"}[c["signed"]]
-        shown.add_row(c["channel"], c["column"], sign, step, c["sd"])
-    print_output(shown)
-    shown = _table("\nnumbers", "parameter", "value>r", "±>r", "unit", "from")
-    for o in found.origins:
-        sd = "" if o.sd is None else f"{o.sd:.2g}" if o.sd > 0 else "exact"
-        shown.add_row(o.name, f"{o.value:.5g}", sd, o.unit, o.why)
-    print_output(shown)
-    shown = _table("\nwhat follows", "", "value>r", "")
-    for fact in found.facts:
-        shown.add_row(fact.what, fact.value, "LOOK" if fact.odd else "ok")
-    print_output(shown)
-    for sentence in found.remarks():
-        print_output(f"- {sentence}")
-    if found.runs is not None and found.foresight is not None:
-        _print_data(found, found.runs, found.foresight)
-    print_output(f"\n{found.statement()}")
-
-
-def _print_data(found: RigCheck, runs: Runs, seen: Foresight) -> None:
-    shown = _table(
-        f"\n{runs.source}: {count_noun(len(runs), 'row')}", "column", "used as", "values>r", "from>r", "to>r"
+    signs = {None: FREE, True: "signed", False: "magnitude"}
+    steps = (
+        FREE if c["quantum"] is None else f"{c['quantum']:.3g} {c['unit']}" if c["quantum"] else ""
+        for c in found.channels()
     )
-    for c in found.columns():
-        ends = [_words(c["words"]), ""] if c["words"] else [_end(c["least"]), _end(c["greatest"])]
-        name = c["column"] if c["theirs"] in ("", c["column"]) else f"{c['column']}, yours {c['theirs']}"
-        shown.add_row(name, c["use"], str(c["values"]), *ends)
-    print_output(shown)
+    shown = [
+        (c["channel"], c["column"], signs[c["signed"]], step, c["sd"])
+        for c, step in zip(found.channels(), steps, strict=True)
+    ]
+    sds = ("" if o.sd is None else f"{o.sd:.2g}" if o.sd > 0 else "exact" for o in found.origins)
+    numbers = [(o.name, o.value, sd, o.unit, o.why) for o, sd in zip(found.origins, sds, strict=True)]
+    follows = [(fact.what, fact.value, "LOOK" if fact.odd else "ok") for fact in found.facts]
+    return Document(
+        found.file,
+        f"{found.file}: {found.statement()}",
+        (
+            Note(" ".join(found.understood()), terminal=True),
+            Table("channels", columns("channel", "column", "sign", "step |", "sd"), shown, "channels"),
+            Table("numbers", columns("parameter", "value | .5g", "± |", "unit", "from"), numbers, "numbers"),
+            Table("facts", columns("fact", "value |", "check"), follows, "what follows"),
+            *remarks(found.remarks()),
+            *(_data_blocks(found, found.runs, found.foresight) if found.runs and found.foresight else ()),
+        ),
+    )
+
+
+def _data_blocks(found: RigCheck, runs: Runs, seen: Foresight) -> tuple[Block, ...]:
+    used = [
+        (
+            c["column"] if c["theirs"] in ("", c["column"]) else f"{c['column']}, yours {c['theirs']}",
+            c["use"], c["values"], *(("", "") if c["words"] else (c["least"], c["greatest"])),
+            ", ".join(c["words"]) if len(c["words"]) < 5 else f"{', '.join(c['words'][:3])}, ...",
+        )
+        for c in found.columns()
+    ]  # fmt: skip
+    said = [*found.unused(), *runs.missing()]
     if len(seen.status) < len(runs):
-        print_output(f"- loop and calibrate use the readings of {len(seen.status)} of them, evenly in time (--rows)")
-    for sentence in [*found.unused(), *runs.missing()]:
-        print_output(f"- {sentence}")
-    names, counts = np.unique(np.array(seen.status), return_counts=True)
+        said.insert(0, f"loop and calibrate use the readings of {len(seen.status)} of them, evenly in time (--rows)")
     others = [
         f"{count_noun(count, 'row')}: {name}"
-        for name, count in zip(names, counts, strict=True)
+        for name, count in Counter(seen.status).items()
         if name not in words.SETTLED
     ]
     if others:
-        print_output(
-            f"- with the file's numbers not every row settles ({', '.join(others)}); rows without a "
+        said.append(
+            f"with the file's numbers not every row settles ({', '.join(others)}); rows without a "
             "steady state are not counted"
         )
-    title = "\nwhat these data can determine (posterior sd over prior sd, at the numbers of the file)"
-    shown = _table(title, "parameter", "value>r", "prior ±>r", "unit", "posterior/prior>r", "")
-    for p in sorted(seen.parameters, key=lambda p: p.share):
-        row = (p.name, f"{p.value:.4g}", f"{p.prior_sd:.2g}", p.unit, f"{p.share:.2f}", found.determined(p))
-        shown.add_row(*row)
-    print_output(shown)
-    print_output(f"not determined: above {identifiability.HELD:g}")
-    for one, other, size in seen.alike:
-        print_output(f"- {one} and {other} are nearly indistinguishable in these data (correlation {size:+.2f})")
-
-
-def _words(words: list[str]) -> str:
-    return ", ".join(words) if len(words) < 5 else f"{', '.join(words[:3])}, ..."
-
-
-def _end(value: float | None) -> str:
-    return "" if value is None else f"{value:.5g}"
+    determined = [
+        (p.name, p.value, p.prior_sd, p.unit, p.share, found.determined(p))
+        for p in sorted(seen.parameters, key=lambda p: p.share)
+    ]
+    heads = columns("parameter", "value | .4g", "prior ± | .2g", "unit", "posterior/prior | .2f", "determined")
+    alike = (
+        f"{one} and {other} are nearly indistinguishable in these data (correlation {size:+.2f})"
+        for one, other, size in seen.alike
+    )
+    return (
+        Table(
+            "columns", columns("column", "used as", "values |", "from | .5g", "to | .5g", "words"), used,
+            f"{runs.source}: {count_noun(len(runs), 'row')}",
+        ),
+        *remarks(said),
+        Table(
+            "determined", heads, determined,
+            "what these data can determine (posterior sd over prior sd, at the numbers of the file)",
+        ),
+        Note(f"not determined: above {identifiability.HELD:g}", terminal=True),
+        *remarks(alike),
+    )  # fmt: skip

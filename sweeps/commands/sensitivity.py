@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 
@@ -56,7 +55,7 @@ AXES = {
 }
 
 
-def study_sensitivity(config: configuration.Sensitivity, out: Path | None, force: bool) -> int:
+def execute(config: configuration.Sensitivity, beside: configuration.FolderPart) -> int:
     """Study a robot and leave a run folder; returns the exit code.
 
     0 done; 3 done, but the solver failed at some operating points.
@@ -78,7 +77,7 @@ def study_sensitivity(config: configuration.Sensitivity, out: Path | None, force
     study = Study(
         robot, inputs, Points.of(runs), outputs, config.model, config.options, supply, in_words(print_message)
     )
-    with open_folder("sensitivity", config, robot, out, force, runs) as folder:
+    with open_folder("sensitivity", config, robot, beside, runs) as folder:
         found = analyse_sensitivity(study, config.method, config.evaluations, config.seed, candidates)
         folder.write_json("result.json", found.to_json())
         for name, table in found.tables().items():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-from pathlib import Path
 
 import numpy as np
 
@@ -20,12 +19,12 @@ from sweeps.skeleton import finish_run_folder, print_report
 from sweeps.store import open_folder
 
 
-def settle_to_folder(config: configuration.Settle, source: str, out: Path | None, force: bool) -> int:
+def execute(config: configuration.Settle, beside: configuration.SettledLog) -> int:
     """Find the settled runs of a log and write a run folder with their table; returns the exit code, 0."""
     robot = load_robot(config).robot
-    runs = read_runs(source, robot, columns=config.columns, measured=True, series=True)
+    runs = read_runs(beside.data, robot, columns=config.columns, measured=True, series=True)
     named = [] if config.columns is None else ["--columns", config.columns]
-    loop = shlex.join(["mmrjax", "loop", source, "--robot", config.robot, *named])
+    loop = shlex.join(["mmrjax", "loop", beside.data, "--robot", config.robot, *named])
     found = settling.settle_log(
         runs,
         shortest=config.shortest_s,
@@ -35,7 +34,7 @@ def settle_to_folder(config: configuration.Settle, source: str, out: Path | None
         loop=loop,
     )
     few = settle_words.too_few(found, SettledRuns.fewest, loop)
-    with open_folder("settle", config, robot, out, force, runs) as folder:
+    with open_folder("settle", config, robot, beside, runs) as folder:
         robot_file.write_robot(
             robot, folder.results() / "robot.toml", note=f"the rig of this log, from {config.robot}"
         )

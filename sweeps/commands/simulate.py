@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from pathlib import Path
+import importlib
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +28,7 @@ from mmrjax.model.signals import BATTERY_EMPTY, STATUSES
 from sweeps import capabilities
 from sweeps import config as configuration
 from sweeps.console import progress_bar
-from sweeps.inputs import beside_robot, load_robot, one_run, read_runs
+from sweeps.inputs import beside_robot, given_runs, load_robot
 from sweeps.pages import words
 from sweeps.points import run, scale, uncertainty
 from sweeps.points.job import showing_turns
@@ -53,24 +53,25 @@ PAD = 16
 PERMISSIBLE = "permissible_time_s"
 
 
-def simulate_to_folder(config: configuration.Simulate, given: str | Json, out: Path | None, force: bool) -> int:
-    """Simulate runs of a file (its name), or one of options (by column); leave a run folder; returns the exit code.
+def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> int:
+    """Simulate runs of a file, or one of options; leave a run folder; returns the exit code.
 
     Raises:
         BadConfiguration: more runs than histories can be kept of.
     """
+    if config.profile is not None or config.turns:
+        module = "turn" if config.profile is None else "missions"
+        code: int = importlib.import_module(f"sweeps.commands.{module}").execute(config, beside)
+        return code
     file = load_robot(config)
     robot = file.robot
-    if isinstance(given, str):
-        runs = read_runs(given, robot, columns=config.columns, measured=False, battery=config.battery)
-    else:
-        runs = one_run(robot, given, config.battery)
+    runs = given_runs(robot, beside, config)
     if fidelities.fidelity_facts(config.model).histories and len(runs) > _HISTORIES:
         raise BadConfiguration(
             f"--runs: got {len(runs)} runs; --model {config.model} keeps at most {_HISTORIES} histories"
         )
     drawn = None if config.posterior is None else beside_robot(file)
-    with open_folder("simulate", config, robot, out, force, runs) as folder:
+    with open_folder("simulate", config, robot, beside, runs) as folder:
         seen = showing_turns(robot, runs.axes)
         table, histories = _simulated(folder, seen, runs, config)
         table[PERMISSIBLE] = permissible_durations(robot, table)

@@ -26,7 +26,7 @@ from sweeps.skeleton import finish_run_folder, print_report
 from sweeps.store import RunFolder, open_folder
 
 
-def size_to_folder(config: configuration.Size, out: Path | None, force: bool) -> int:
+def execute(config: configuration.Size, beside: configuration.FolderPart) -> int:
     """Search for a design and write a run folder; returns the exit code.
 
     The code is 0 whether or not a design meets everything, and 3 if the solver failed at a worst corner of the best.
@@ -47,7 +47,7 @@ def size_to_folder(config: configuration.Size, out: Path | None, force: bool) ->
         if name not in known:
             raise BadConfiguration(f"--motors: got {name}; {allowed_words(name, known)}")
     sheet.refuse_impossible(robot, asked)
-    with open_folder("size", config, robot, out, force) as folder:
+    with open_folder("size", config, robot, beside) as folder:
         with step_reporter(print_message, "drawing designs") as heard:
             sizing = search(
                 robot, asked, objectives, starts=config.starts, motors=config.motors, seed=config.seed,

@@ -19,7 +19,7 @@ from calibration.data.robot_file import RobotFile
 from mmrjax.model.signals import STATUSES
 from sweeps import config_campaign, skeleton
 from sweeps.config import Sweep
-from sweeps.config_campaign import Campaign, How
+from sweeps.config_campaign import Campaign, StoreOptions
 from sweeps.console import print_message, print_output, progress_bar
 from sweeps.inputs import beside_robot, load_robot
 from sweeps.pages import words
@@ -41,41 +41,37 @@ TABLE = 100_000
 MARGIN = 64 * 2**20
 #: Points on which the time of a slow fidelity is estimated.
 PROBED = 64
-NOTHING_SPECIAL = How()
 
 
-def sweep_to_folder(
-    config: Campaign | Sweep, where: str, out: Path | None, force: bool, options: How = NOTHING_SPECIAL
-) -> int:
+def execute(config: Campaign | Sweep, options: StoreOptions) -> int:
     """Simulate a design and leave a run folder, of a grid of up to `TABLE` runs with a table; returns the exit code.
 
     Args:
-        config: the configuration; where: its file, for messages; out: the run folder; force: replace one.
-        options: of a store; with any of them a small grid leaves one too.
+        config: the configuration; options: of a store; with any of them a small grid leaves one too.
     """
     file = load_robot(config)
     if not isinstance(config, Sweep):
-        return _into_store(config, file, where, out, force, options)
+        return _into_store(config, file, options)
     notes: list[str] = []
     resolved = grid.resolve_grid(config, file.robot, config.battery, notes)
     count = math.prod(map(len, grid.grid_axes(resolved, file.robot, config.battery).values()))
-    small = options == NOTHING_SPECIAL and (count <= TABLE or config.posterior is not None)
-    if options == NOTHING_SPECIAL and not small:
+    small = not options.of_store and (count <= TABLE or config.posterior is not None)
+    if not options.of_store and not small:
         print_message(f"{count:,} points: {STORE} in place of runs.csv, which a sweep of at most {TABLE:,} has; "
              "the same command with --export csv writes it too")  # fmt: skip
     for note in notes:
         print_message(note)
     if small:
-        return _into_table(resolved, file, out, force)
+        return _into_table(resolved, file, options)
     of_grid = resolved.model_copy(update={"configurations": config.configurations})
-    return _into_store(config_campaign.of_grid(of_grid), file, where, out, force, options)
+    return _into_store(config_campaign.of_grid(of_grid), file, options)
 
 
-def _into_table(config: Sweep, file: RobotFile, out: Path | None, force: bool) -> int:
+def _into_table(config: Sweep, file: RobotFile, options: StoreOptions) -> int:
     robot = file.robot
     runs = grid.grid_conditions(config, robot, config.battery)
     drawn = None if config.posterior is None else beside_robot(file)
-    with open_folder("sweep", config, robot, out, force) as folder:
+    with open_folder("sweep", config, robot, options) as folder:
         table = run.evaluate_runs(robot, runs, config, folder)
         notes: list[str] = []
         if drawn is not None and config.posterior is not None:
@@ -87,8 +83,8 @@ def _into_table(config: Sweep, file: RobotFile, out: Path | None, force: bool) -
         return run.write_run_folder(folder, config, result, shown)
 
 
-def _into_store(config: Campaign, file: RobotFile, where: str, out: Path | None, force: bool, options: How) -> int:
-    robot = file.robot
+def _into_store(config: Campaign, file: RobotFile, options: StoreOptions) -> int:
+    robot, where = file.robot, options.where
     plan = axes.plan_design(config, robot, where)
     robot = showing_turns(robot, {*plan.axes, *plan.conditions})
     pool = None
@@ -104,7 +100,7 @@ def _into_store(config: Campaign, file: RobotFile, where: str, out: Path | None,
         config = config.model_copy(update={"chunk": chunk, "outputs": wanted})
         job = prepare_job(config, robot, plan, where)
         layout = laid_out(config, job)
-        path = out or default_path("sweep")
+        path = options.out or default_path("sweep")
         if options.dry_run:
             dry_run(job, layout, path)
             return DONE
@@ -113,7 +109,7 @@ def _into_store(config: Campaign, file: RobotFile, where: str, out: Path | None,
         same = job_identity(config, robot, files, device)
         if not any((folder / IDENTITY).is_file() for folder in (path, path.with_name(f"{path.name}.partial"))):
             _refuse_without_space(layout.size, 1.0, path)  # a sweep that goes on needs less
-        store = SweepStore(path, same, layout, force=force)
+        store = SweepStore(path, same, layout, force=options.force)
         try:
             if not store.finished:
                 simulate_chunks(store, job, options, pool)
@@ -210,22 +206,22 @@ def duration_text(seconds: float) -> str:
 # --- the run --------------------------------------------------------------------------------------------------------
 
 
-def chunks_of_shard(shard: tuple[int, int] | None, chunks: int) -> range:
+def chunks_of_shard(share: tuple[int, int], chunks: int) -> range:
     """Chunks of the k-th of n shares."""
-    k, n = shard or (1, 1)
+    k, n = share
     return range((k - 1) * chunks // n, k * chunks // n)
 
 
-def simulate_chunks(store: SweepStore, job: scale.Job, options: How, pool: Any) -> None:
+def simulate_chunks(store: SweepStore, job: scale.Job, options: StoreOptions, pool: Any) -> None:
     """Compute and write the chunks of this process's share that are not done.
 
     Raises:
         BadConfiguration: no room on the disk, before anything is computed, or in the middle; the scheduler's workers
             are lost for good.
     """
-    store.begin(options.shard or (1, 1))
+    store.begin(options.share)
     done = store.done()
-    mine = chunks_of_shard(options.shard, len(job.blocks))
+    mine = chunks_of_shard(options.share, len(job.blocks))
     left = [k for k in mine if k not in done]
     _refuse_without_space(store.layout.size, len(left) / len(job.blocks), store.path)
     if not left:
@@ -257,14 +253,26 @@ class DiskFull(InputError):
 
 
 def finish_sweep(
-    store: SweepStore, config: Campaign, file: RobotFile, job: scale.Job, same: Identity, options: How
+    store: SweepStore, config: Campaign, file: RobotFile, job: scale.Job, same: Identity, options: StoreOptions
 ) -> int:
     """Write what a whole sweep leaves, and move it into place; say how far it is where it is not whole."""
     left = False
     if not store.finished:
         with store.last() as left:
             if left:
-                write_sweep_folder(store, config, file, job, same)
+                # Write all files of a run folder except the store, then move the store into place
+                robot_file.write_robot(
+                    job.robot, store.results() / "robot.toml", note=f"the robot of this sweep, from {config.robot}"
+                )
+                found = sweep_summary(store.layout, job, store.done().values())
+                store.write_json("result.json", found)
+                manifest = {
+                    "statuses": found["statuses"],
+                    "seed": config.samples.get("seed", 0),
+                    "hashes": same["data"],
+                }
+                document = campaign_report.campaign_document(file, store.layout, found, store.partial / STORE)
+                skeleton.finish_run_folder(store, config, manifest, page=skeleton.print_report(document, file))
     done = store.done()
     if not store.finished:
         print_output(f"{len(done)} of {len(job.blocks)} chunks of {store.partial} are done; the last share "
@@ -280,18 +288,6 @@ def finish_sweep(
         print_table(endings_table(counts, "points", job.task.model))
         print_output(str(store.path))
     return DONE if words.every_run_solved(counts) else SOLVER_FAILED
-
-
-def write_sweep_folder(store: SweepStore, config: Campaign, file: RobotFile, job: scale.Job, same: Identity) -> None:
-    """Write all files of a run folder except the store, then move the store into place."""
-    robot_file.write_robot(
-        job.robot, store.results() / "robot.toml", note=f"the robot of this sweep, from {config.robot}"
-    )
-    found = sweep_summary(store.layout, job, store.done().values())
-    store.write_json("result.json", found)
-    manifest = {"statuses": found["statuses"], "seed": config.samples.get("seed", 0), "hashes": same["data"]}
-    document = campaign_report.campaign_document(file, store.layout, found, store.partial / STORE)
-    skeleton.finish_run_folder(store, config, manifest, page=skeleton.print_report(document, file))
 
 
 def sweep_summary(layout: Layout, job: scale.Job, done: Iterable[Done]) -> Json:

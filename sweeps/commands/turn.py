@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -40,21 +39,21 @@ SHARES = np.linspace(1.0, -1.0, 97)
 SHOWN = tuple(c.name for c in channels.OF_TURNS)
 
 
-def simulate_turn(config: configuration.Simulate, given: str | Json, out: Path | None, force: bool) -> int:
+def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> int:
     """Simulate one run of options whose sides are driven apart; leave a run folder; returns the exit code.
 
     Raises:
         BadConfiguration: runs of a file, a robot that cannot turn, a turn without a steady state.
     """
-    if isinstance(given, str):
+    if beside.runs is not None:
         raise BadConfiguration("--runs: got a file and --left, --right or --heading; state columns duty_left and "
                                "duty_right in it, or one run by options")  # fmt: skip
-    file = load_robot(config)
+    file, given = load_robot(config), beside.stated
     robot = file.robot
     check_can_turn(robot, given.get("configuration") or robot.configurations.names[0])
     runs = one_run(robot, {**given, **turn_columns(config, given)}, config.battery)
     settled = config.model == fidelities.NAMES[0]
-    with open_folder("simulate", config, robot, out, force, runs) as folder:
+    with open_folder("simulate", config, robot, beside, runs) as folder:
         asked = run.conditions_of_runs(robot, runs, config)
         run.check_runs_bearable(robot, asked, config)
         shown = _channels(robot, settled)

@@ -204,7 +204,7 @@ def share_kept(law: FormatLaw, bare: FormatLaw, situation: Situation, native: At
         _stacked(exact) - _stacked(_at(model, refit_parameters(model, situation, exact), situation))
         for model, exact in ((law, native), (bare, native_bare))
     ]
-    change = (_stacked(native) - _stacked(native_bare)) / (sizes := _sizes(native))
+    change = (_stacked(native) - _stacked(native_bare)) / (sizes := np.sqrt(np.mean(_stacked(native) ** 2, 0)))
     size = float(np.sqrt(np.mean(change**2)))
     if size < 1e-9:
         return float("nan")
@@ -213,7 +213,3 @@ def share_kept(law: FormatLaw, bare: FormatLaw, situation: Situation, native: At
 
 def _stacked(found: AtJoint) -> np.ndarray:
     return np.stack([found.current, found.speed], -1)
-
-
-def _sizes(found: AtJoint) -> np.ndarray:
-    return np.sqrt(np.mean(_stacked(found) ** 2, 0))

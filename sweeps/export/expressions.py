@@ -7,13 +7,14 @@ text of a law follows from the code of the model, and a user's own effect needs 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from calibration.data import Json
 from calibration.data.input_errors import BadConfiguration
 
 #: Operators with their precedence, and how they are written.
@@ -173,7 +174,7 @@ _SIMPLE = {
 _SAME = frozenset(("copy", "copy_p", "stop_gradient", "optimization_barrier", "reduce_precision"))
 
 
-def _shaped(name: str, x: list[np.ndarray], p: Mapping[str, Any]) -> np.ndarray:
+def _shaped(name: str, x: list[np.ndarray], p: Json) -> np.ndarray:
     """Result of a primitive that only moves or joins elements."""
     if name == "broadcast_in_dim":
         shape = [1] * len(p["shape"])
@@ -194,7 +195,7 @@ def _shaped(name: str, x: list[np.ndarray], p: Mapping[str, Any]) -> np.ndarray:
     raise NotImplementedError(name)
 
 
-def _kept(name: str, shape: tuple[int, ...], p: Mapping[str, Any]) -> tuple[int, ...]:
+def _kept(name: str, shape: tuple[int, ...], p: Json) -> tuple[int, ...]:
     if name == "squeeze":
         return tuple(n for k, n in enumerate(shape) if k not in p["dimensions"])
     sizes = list(shape)
@@ -228,7 +229,12 @@ def _evaluated(jaxpr: Any, consts: Sequence[Any], arguments: Sequence[np.ndarray
         elif name == "logistic":
             found = [_each(_logistic, x[0])]
         elif name == "select_n" and len(x) == 3:
-            found = [_each(lambda c, no, yes: choice_symbol(_truth(c), yes, no), *x)]
+            found = [
+                _each(
+                    lambda c, no, yes: choice_symbol((constant_symbol(bool(c.value)) if c.is_const else c), yes, no),
+                    *x,
+                )
+            ]
         elif name == "clamp":
             found = [_each(lambda low, a, high: apply_operation("min", apply_operation("max", a, low), high), *x)]
         elif name == "convert_element_type":
@@ -248,10 +254,6 @@ def _evaluated(jaxpr: Any, consts: Sequence[Any], arguments: Sequence[np.ndarray
             found = [_shaped(name, x, p)]
         known.update(zip(eqn.outvars, found, strict=True))
     return [read(v) for v in jaxpr.outvars]
-
-
-def _truth(x: Symbol) -> Symbol:
-    return constant_symbol(bool(x.value)) if x.is_const else x
 
 
 def _numbers(value: Any) -> np.ndarray:

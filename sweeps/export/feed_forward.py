@@ -58,9 +58,7 @@ def symmetric_axis(largest: float) -> np.ndarray:
     return np.concatenate([-half[::-1], -near, [0.0], near, half])
 
 
-def steady_state_map(
-    module: ModuleType, params: Mapping[str, Any], speed: np.ndarray, torque: np.ndarray, guess: float
-) -> Map:
+def steady_state_map(module: ModuleType, params: Json, speed: np.ndarray, torque: np.ndarray, guess: float) -> Map:
     """Steady states at each speed [rad/s] and torque [N·m] of the joint; `guess`: resistance, of the first step."""
     speeds, torques = (jnp.asarray(x.ravel()) for x in np.meshgrid(speed, torque, indexing="ij"))
     params = {name: jnp.asarray(value, float) for name, value in params.items()}

@@ -55,7 +55,7 @@ class ActuatorLaw(eqx.Module):
         return settled_actuator(self.module, self.params, command, speed)[1]["current"], speed
 
 
-def settled_actuator(module: ModuleType, params: Mapping[str, Any], command: Any, speed: Any) -> tuple[Any, Json]:
+def settled_actuator(module: ModuleType, params: Json, command: Any, speed: Any) -> tuple[Any, Json]:
     """Torque [N·m] and inside of an actuator at a constant voltage [V] and speed of the joint [rad/s]."""
     state = module.initial_state(jnp.shape(speed))
 

@@ -69,7 +69,7 @@ def draw_parameters(
     return {name: np.asarray(x) for name, x in found.items()} | actuator
 
 
-def randomization_files(found: Mapping[str, np.ndarray]) -> dict[str, str | bytes]:
+def randomization_files(found: Columns) -> dict[str, str | bytes]:
     """The draws as NumPy's archive and as JSON."""
     stream = io.BytesIO()
     arrays: Any = dict(found)

@@ -59,7 +59,14 @@ def draw_output_spread(output: np.ndarray, label: str, varied: Mapping[str, Vari
     histogram.hist(output, bins=_number(output, BARS), color=BLUE)
     histogram.set(xlabel=label, ylabel="points", title="how often")
     for axes, name in zip(others, names, strict=False):
-        _band(axes, varied[name].values, output)
+        values = varied[name].values
+        which, middles = bin_values(values)
+        quantiles = np.array([np.quantile(output[which == k], (0.05, 0.5, 0.95)) for k in range(len(middles))])
+        axes.fill_between(middles, quantiles[:, 0], quantiles[:, 2], color=BLUE, alpha=0.2, linewidth=0)
+        axes.plot(middles, quantiles[:, 1], color=BLUE)
+        found = variance_share(values, output)
+        if found > by_chance(values):
+            corner_note(axes, f"{100 * found:.0f} % of the variance")
         axes.set(xlabel=varied[name].label, ylabel=label, title=f"over {short_name(name)}")
         _ticks(axes.xaxis, varied[name])
     if len(names) == 2:
@@ -132,16 +139,6 @@ def by_chance(values: np.ndarray) -> float:
     """
     within, between = len(values) - (used := len(np.unique(bin_values(values)[0]))), used - 1
     return float(scipy.stats.beta.ppf(0.99, between / 2, within / 2)) if within and between else float(within == 0)
-
-
-def _band(axes: Axes, values: np.ndarray, output: np.ndarray) -> None:
-    which, middles = bin_values(values)
-    quantiles = np.array([np.quantile(output[which == k], (0.05, 0.5, 0.95)) for k in range(len(middles))])
-    axes.fill_between(middles, quantiles[:, 0], quantiles[:, 2], color=BLUE, alpha=0.2, linewidth=0)
-    axes.plot(middles, quantiles[:, 1], color=BLUE)
-    found = variance_share(values, output)
-    if found > by_chance(values):
-        corner_note(axes, f"{100 * found:.0f} % of the variance")
 
 
 def _ticks(axis: Axis, varied: Varied) -> None:

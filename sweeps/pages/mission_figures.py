@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from calibration.data import Columns, Json
 from mmrjax.model.channels import SIDES
 from mmrjax.model.energy import SINKS
 from sweeps.pages import words
@@ -36,9 +34,7 @@ _COLOURS = {
 }  # fmt: skip
 
 
-def draw_mission_course(
-    rows: Mapping[str, np.ndarray], cycle: float | None, limit: float, linear: bool, sides: float
-) -> Figure:
+def draw_mission_course(rows: Columns, cycle: float | None, limit: float, linear: bool, sides: float) -> Figure:
     """A run over its profile, a row a subject; with several cycles, the first one is also drawn.
 
     Args:
@@ -71,7 +67,7 @@ def draw_mission_course(
     return fig
 
 
-def of_sides(rows: Mapping[str, np.ndarray]) -> Figure:
+def of_sides(rows: Columns) -> Figure:
     """Current and duty of either side, and the yaw rate, over time.
 
     Args:
@@ -110,7 +106,7 @@ def _legend(axes: Axes, *others: Axes) -> None:
     axes.set_ylim(low, high + 0.22 * (high - low))  # room for it
 
 
-def _speed(axes: Axes, time: np.ndarray, rows: Mapping[str, np.ndarray], linear: bool, legend: bool) -> None:
+def _speed(axes: Axes, time: np.ndarray, rows: Columns, linear: bool, legend: bool) -> None:
     turning = "demanded_motor_speed_rpm" in rows  # a shaft's
     speed = rows["motor_speed_rpm"] if turning else rows.get("speed_mm_s", rows["theoretical_speed_mm_s"])
     axes.plot(time, speed, color=BLUE, lw=1.4, label="speed")
@@ -133,7 +129,7 @@ def _speed(axes: Axes, time: np.ndarray, rows: Mapping[str, np.ndarray], linear:
         _legend(axes, slope)
 
 
-def _current(axes: Axes, time: np.ndarray, rows: Mapping[str, np.ndarray], sides: float, legend: bool) -> None:
+def _current(axes: Axes, time: np.ndarray, rows: Columns, sides: float, legend: bool) -> None:
     current, driven = (of_motors(rows, *name) for name in (("motor_current", "_A"), ("duty", "")))
     current = sides * current
     axes.plot(time, current, color=VERMILION, lw=1.0, label="current")
@@ -148,18 +144,18 @@ def _current(axes: Axes, time: np.ndarray, rows: Mapping[str, np.ndarray], sides
         _legend(axes, duty)
 
 
-def of_motors(rows: Mapping[str, np.ndarray], name: str, unit: str) -> np.ndarray:
+def of_motors(rows: Columns, name: str, unit: str) -> np.ndarray:
     """Of a motor on average; of motors of two sides, which cancel one another on the spot, of their sizes."""
     of_sides = [np.abs(rows[f"{name}_{side}{unit}"]) for side in SIDES if f"{name}_{side}{unit}" in rows]
     return np.asarray(np.mean(of_sides, axis=0) if of_sides else rows[f"{name}{unit}"])
 
 
-def _near(rows: Mapping[str, np.ndarray], limit: float) -> bool:
+def _near(rows: Columns, limit: float) -> bool:
     """True if the limit is near enough to be drawn; a far limit would flatten the curve."""
     return "housing_temperature_C" in rows and bool(np.max(rows["winding_temperature_C"]) > 0.6 * limit)
 
 
-def _temperatures(axes: Axes, time: np.ndarray, rows: Mapping[str, np.ndarray], limit: float, legend: bool) -> None:
+def _temperatures(axes: Axes, time: np.ndarray, rows: Columns, limit: float, legend: bool) -> None:
     if "housing_temperature_C" not in rows:
         corner_note(axes, "not known: the robot's file does not\nstate how heat leaves the windings")
         axes.set_yticks([])
@@ -177,7 +173,7 @@ def _temperatures(axes: Axes, time: np.ndarray, rows: Mapping[str, np.ndarray], 
         _legend(axes)
 
 
-def _source(axes: Axes, time: np.ndarray, rows: Mapping[str, np.ndarray]) -> None:
+def _source(axes: Axes, time: np.ndarray, rows: Columns) -> None:
     charge = rows["state_of_charge"]
     volts = rows["source_voltage_V"]
     if not np.isfinite(charge).any():
@@ -200,7 +196,7 @@ def _source(axes: Axes, time: np.ndarray, rows: Mapping[str, np.ndarray]) -> Non
         )
 
 
-def draw_mission_energy(run: Mapping[str, Any], on_battery: bool) -> Figure:
+def draw_mission_energy(run: Json, on_battery: bool) -> Figure:
     """Energy of one run by use, in the order of the chain [Wh], and its share of the energy drawn [%].
 
     Args:

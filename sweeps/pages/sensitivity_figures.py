@@ -54,8 +54,9 @@ def _cells(ax: Axes, shares: np.ndarray, labelled: int) -> None:
                 ax.text(j, i, f"{100 * x:.0f}", ha="center", va="center", fontsize=8.5, color=ink)
 
 
-def tornado_points(study: OutputStudy, found: SensitivityResult) -> list[int]:
-    """Operating points of a tornado: of each configuration the gentlest and the hardest that it runs, or between."""
+def draw_tornado(study: OutputStudy, found: SensitivityResult) -> Figure:
+    """The output with each input alone at the ends of its 95 % interval, at a few operating points."""
+    # Operating points of a tornado: of each configuration the gentlest and the hardest that it runs, or between
     points = found.points
     kinds = list(dict.fromkeys(map(str, points.configuration)))
     each = max(PANELS // len(kinds), 1)
@@ -65,12 +66,7 @@ def tornado_points(study: OutputStudy, found: SensitivityResult) -> list[int]:
         order = mine[np.lexsort((points.payload[mine], points.slope_deg[mine], points.imposed[1][mine]))]
         if order.size:
             chosen += [int(order[k]) for k in np.unique(np.linspace(0, order.size - 1, each).astype(int))]
-    return chosen[:PANELS]
-
-
-def draw_tornado(study: OutputStudy, found: SensitivityResult) -> Figure:
-    """The output with each input alone at the ends of its 95 % interval, at a few operating points."""
-    where = tornado_points(study, found)
+    where = chosen[:PANELS]
     unit, factor = study.row.unit_shown, study.row.factor
     swing, value = study.swing[:, where] / factor, study.value[where] / factor
     reach = np.nanmax(np.abs(swing - value[:, None]), 0, initial=0.0, where=np.isfinite(swing))

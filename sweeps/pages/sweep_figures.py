@@ -47,11 +47,6 @@ def panels_by_imposed(voltages: np.ndarray, column: str = "supply_voltage_V") ->
     return [(f"{v:.4g} {unit}", voltages == v) for v in levels]
 
 
-def is_map(runs: Columns) -> bool:
-    """True if the runs have at least two slopes and two payloads and so fill a map."""
-    return on_ground(runs) and np.unique(runs["slope_deg"]).size > 1 and np.unique(runs["payload_kg"]).size > 1
-
-
 def runs_with_number(runs: Columns, channel: Channel) -> np.ndarray:
     """Mask of runs with a settled number; `drive` also leaves instantaneous numbers with other statuses."""
     return np.isin(runs["status"], words.SETTLED) & np.isfinite(runs[channel.column])
@@ -65,7 +60,7 @@ def draw_sweep(runs: Columns, channel: Channel) -> Figure:
     """
     kinds = list(dict.fromkeys(map(str, runs["configuration"])))
     volts = panels_by_imposed(runs[imposed_column(runs)], imposed_column(runs))
-    if not is_map(runs):
+    if not (on_ground(runs) and np.unique(runs["slope_deg"]).size > 1 and np.unique(runs["payload_kg"]).size > 1):
         return _lines(runs, channel, kinds)
     readings = runs[channel.column][runs_with_number(runs, channel)]
     low, high = (float(readings.min()), float(readings.max())) if readings.size else (0.0, 1.0)

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from calibration.data import Json
+from calibration.data import Columns, Json
 from calibration.data.table import Runs
 from mmrjax.model.channels import Channel
 from sweeps.pages.figure_style import BLUE, FAINT, INK, ORANGE, axis_label, new_figure
@@ -30,10 +30,10 @@ class TimeOverlay:
         rows: rows of each run in the order of time.
     """
 
-    table: Mapping[str, np.ndarray]
+    table: Columns
     channels: Sequence[Channel]
     simulated: Mapping[str, str]
-    rows: Mapping[str, np.ndarray]
+    rows: Columns
 
     @property
     def worst(self) -> str:
@@ -125,9 +125,7 @@ def _numbers(values: np.ndarray) -> list[float | None]:
     return [float(f"{v:.6g}") if np.isfinite(v) else None for v in values]
 
 
-def time_overlay(
-    table: Mapping[str, np.ndarray], channels: Sequence[Channel], simulated: Mapping[str, str]
-) -> TimeOverlay:
+def time_overlay(table: Columns, channels: Sequence[Channel], simulated: Mapping[str, str]) -> TimeOverlay:
     """Overlay of a table of time histories, run by run.
 
     Args:

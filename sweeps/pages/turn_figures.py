@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from calibration.data import Columns
+from calibration.data import Columns, Json
 from mmrjax.fidelities.base import History
 from mmrjax.model.quantities import MM, RPM
 from mmrjax.model.robot import Robot
@@ -24,7 +21,7 @@ ARC = 20.0
 BEND = 0.05
 
 
-def _outline(axes: Axes, robot: Robot, row: Mapping[str, Any], x: float, y: float, yaw: float, color: str) -> None:
+def _outline(axes: Axes, robot: Robot, row: Json, x: float, y: float, yaw: float, color: str) -> None:
     """The robot from above: its contact lines, a bar between them and an arrow ahead."""
     length = float(robot.running_gear.wheelbase)
     width = float(robot.configurations[str(row["configuration"])].turning.width)
@@ -43,7 +40,7 @@ def _plan(axes: Axes) -> None:
     axes.set_ylabel("uphill, or ahead of the start [m]", color=INK)
 
 
-def draw_turn_circle(robot: Robot, row: Mapping[str, Any]) -> Figure:
+def draw_turn_circle(robot: Robot, row: Json) -> Figure:
     """The circle of a settled turn from above, or an arc of it, with the robot and the centre of rotation."""
     rate, speed, across = (float(row[c]) for c in ("yaw_rate_rad_s", "speed_mm_s", "lateral_speed_mm_s"))
     fig, grid = new_figure(1, 1, 4.6)
@@ -90,7 +87,7 @@ def path_arcs(
     return whole.real, whole.imag
 
 
-def draw_path(robot: Robot, row: Mapping[str, Any], x: np.ndarray, y: np.ndarray, yaw: np.ndarray) -> Figure:
+def draw_path(robot: Robot, row: Json, x: np.ndarray, y: np.ndarray, yaw: np.ndarray) -> Figure:
     """A path from above, the robot at its beginning and its end, and between."""
     finite = np.isfinite(x)
     x, y, yaw = x[finite], y[finite], yaw[finite]
@@ -104,7 +101,7 @@ def draw_path(robot: Robot, row: Mapping[str, Any], x: np.ndarray, y: np.ndarray
     return fig
 
 
-def draw_history_path(robot: Robot, row: Mapping[str, Any], history: History) -> Figure:
+def draw_history_path(robot: Robot, row: Json, history: History) -> Figure:
     """The path of a run over time from above."""
     return draw_path(robot, row, *(np.asarray(history.reading[c])[0] for c in ("place_x", "place_y", "yaw")))
 
@@ -128,11 +125,11 @@ def draw_turn_course(history: History) -> Figure:
     return fig
 
 
-def over_yaw_rate(turns: Columns, row: Mapping[str, Any]) -> Figure:
+def over_yaw_rate(turns: Columns, row: Json) -> Figure:
     """Current of either side and power over the yaw rate of settled turns, the one asked for marked."""
     fig, grid = new_figure(1, 2, 3.4)
 
-    def rate(motion: Mapping[str, Any]) -> np.ndarray:
+    def rate(motion: Json) -> np.ndarray:
         # On the spot the curvature is without limit, the yaw rate is not.
         return np.asarray(motion["yaw_rate_rad_s"], float)
 

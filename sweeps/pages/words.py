@@ -121,28 +121,29 @@ SINKS = {
 
 #: Words of the pages, for docs/reference/glossary.md.
 GLOSSARY = {
-    "balance": "one of the model's equations, such as volts along the motor's circuit or torque at the "
-    "driving wheel; every effect enters one",
-    "effect": "a term that the model may lack, with an equation and a size; `mmrjax explain NAME` says "
-    "what it is and how to test for it",
-    "established": "an effect that chance, a smooth curve, one run or one block of runs cannot account for",
-    "tentative": "an effect that is in the robot because it predicts better, while something speaks against its name",
-    "class": "effects that these data cannot tell apart",
-    "mechanism": "the equation that lacks something and what drives it, without the exact law: it explains half of "
-    "the excess misfit or more, predicts runs that the fit has not seen, and is found again without blocks of runs",
-    "place": "the incomplete equation, or several that these data cannot separate; no mechanism is established",
-    "excess misfit": "χ² beyond what noise alone leaves, about one a reading",
-    "refit": "the same model with its parameters fitted to the runs, and nothing added",
-    "seen, held out": "errors of runs that the fit was made with, and of runs that it has not seen: a whole "
-    "slope, voltage or configuration at a time",
-    "rms error": "root of the mean square of simulated less measured, in percent of that of the measured readings",
-    "σ (sd)": "standard deviation of an instrument: 2 of 3 readings are within 1 σ of the truth, 19 of 20 within 2 σ",
-    "misfit, χ²": "sum of (simulated less measured)² / σ² over all readings; noise alone leaves about one a reading",
-    "prior": "what a bench or a maker states of a parameter, with its standard deviation, before any "
-    "run is looked at",
-    "p": "how often noise alone would look like this",
-    "nat": "unit of how probable held-out readings are: +0.1 a reading is a clear gain over 60 readings",
-    "reached": "runs with a steady state of the robot; in the others it slides or does not move",
+    "balance": "one equation of the model, for instance the voltages along the motor's circuit or the torques at the "
+    "driving wheel. Every effect enters one balance",
+    "effect": "a term that the model may lack, with an equation and a size. `mmrjax explain NAME` gives both, and a "
+    "test for it",
+    "established": "an effect that chance, a smooth curve, one run or one block of runs cannot explain",
+    "tentative": "an effect that improves predictions and is in the robot, although a listed test failed",
+    "class": "effects that these data cannot distinguish",
+    "mechanism": "the incomplete equation and its driver, without the exact law. It explains at least half of the "
+    "excess misfit, predicts runs that the fit has not seen, and is found again when blocks of runs are left out",
+    "place": "the incomplete equation, or several that these data cannot distinguish. No mechanism is established",
+    "excess misfit": "χ² beyond the part that noise explains, which is about one per reading",
+    "refit": "the same model with its parameters fitted to the runs, without new effects",
+    "seen": "errors of runs that the fit was made with",
+    "held out": "errors of runs that the fit has not seen: a slope, voltage or configuration at a time",
+    "noise": "standard deviation of an instrument. State it with --noise or in `_sd` columns, or it is estimated",
+    "rms error": "root mean square of simulated minus measured, in percent of the rms of the measured readings",
+    "σ": "standard deviation of an instrument: 2 of 3 readings are within 1 σ of the truth, 19 of 20 within 2 σ",
+    "χ²": "sum of (simulated minus measured)² / σ² over all readings. Noise alone gives about one per reading",
+    "prior": "value and standard deviation of a parameter from a bench or a data sheet, before any run is used",
+    "p": "probability that noise alone gives a result as extreme as this one",
+    "nat": "unit of the log probability of held-out readings. A gain of 0.1 per reading is clear over 60 readings",
+    "reached": "runs in which the robot has a steady state. In the others it slides or does not move",
+    "voltage_limit": "largest voltage that the loop may propose for an experiment, from `[motor]` of the robot file",
 }
 
 FLAGS = {

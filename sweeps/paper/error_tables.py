@@ -73,7 +73,10 @@ def row_by_row(nominal: Robot, rows: data.Rows) -> list[Json]:
             reasons.append("E")
         if raised[k, 1] > 1.03 * rows.measured[k, 1]:
             reasons.append("B")
-        following = (table["slope_deg"] == table["slope_deg"][k] + 5) & _same_mode(table, k)
+        following = (table["slope_deg"] == table["slope_deg"][k] + 5) & (
+            (table["configuration"] == table["configuration"][k])
+            & (table["supply_voltage_V"] == table["supply_voltage_V"][k])
+        )
         if following.any() and rows.paper[following, 1][0] > rows.paper[k, 1]:
             reasons.append("N")
         creep = rows.raised["theoretical_speed_mm_s"][k] * rows.raised["slip"][k]
@@ -99,12 +102,6 @@ def row_by_row(nominal: Robot, rows: data.Rows) -> list[Json]:
             }
         )
     return answer
-
-
-def _same_mode(table: runs.Runs, k: int) -> np.ndarray:
-    return (table["configuration"] == table["configuration"][k]) & (
-        table["supply_voltage_V"] == table["supply_voltage_V"][k]
-    )
 
 
 def _cells(channel: str, measured: float, paper: float, own: float, raised: float, weighed: float) -> Json:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from calibration.data import Names
+from calibration.data import Json, Names
 from calibration.data.columns import IMPOSED as OF_IMPOSED
 from calibration.data.columns import LEVERS
 from calibration.data.contradictions import without_levers
@@ -22,8 +22,8 @@ from mmrjax.model.conditions import Conditions
 from mmrjax.model.paper_tables import SURFACES, adhesion_ratio
 from mmrjax.model.rig import IMPOSED
 from mmrjax.model.robot import Robot
-from sweeps import config as configuration
 from sweeps.config_campaign import Campaign
+from sweeps.options import parse_axis
 from sweeps.points import imposed
 from sweeps.points.sampled_design import DESIGNS, ROW, Design, Drawn, Joint, Samples, in_blocks
 from sweeps.points.tasks import task_of
@@ -193,10 +193,10 @@ def _axis(name: str, stated: Any, robot: Robot, where: str, extra: Mapping[str, 
             list(robot.configurations.names) if stated == "all" else stated if isinstance(stated, list) else [stated]
         )
         values = np.array([_configuration(n, robot, where) for n in names])
-    elif isinstance(stated, Mapping):
+    elif isinstance(stated, dict):
         values = _range(stated, where)
     elif isinstance(stated, str):
-        values = np.array(configuration.parse_axis(where, stated))
+        values = np.array(parse_axis(where, stated))
     else:
         values = np.array([_value(name, v, where) for v in (stated if isinstance(stated, list) else [stated])])
     if not len(values):
@@ -212,7 +212,7 @@ def _axis(name: str, stated: Any, robot: Robot, where: str, extra: Mapping[str, 
 _RANGE = ("start", "stop", "number", "scale")
 
 
-def _range(stated: Mapping[str, Any], where: str) -> np.ndarray:
+def _range(stated: Json, where: str) -> np.ndarray:
     _keys(stated, _RANGE, ("start", "stop", "number"), where)
     start, stop = (stated_number(stated[k], f"{where}.{k}") for k in ("start", "stop"))
     number = stated_count(stated["number"], f"{where}.number", 1, LONGEST)
@@ -229,7 +229,7 @@ def _range(stated: Mapping[str, Any], where: str) -> np.ndarray:
     return np.linspace(start, stop, number) if scale == "linear" else np.geomspace(start, stop, number)
 
 
-def _keys(stated: Mapping[str, Any], allowed: Names, needed: Names, where: str) -> None:
+def _keys(stated: Json, allowed: Names, needed: Names, where: str) -> None:
     for key in stated:
         if key not in allowed:
             raise BadConfiguration(f"{where}.{key}: no such key; {allowed_words(key, allowed)}")
@@ -241,7 +241,7 @@ def _keys(stated: Mapping[str, Any], allowed: Names, needed: Names, where: str) 
 # --- fixed conditions -------------------------------------------------------------------------------------------
 
 
-def _fixed(stated: Mapping[str, Any], robot: Robot, where: str) -> tuple[dict[str, float], str | None]:
+def _fixed(stated: Json, robot: Robot, where: str) -> tuple[dict[str, float], str | None]:
     allowed = (*variation.CONDITIONS, SURFACE)
     fixed: dict[str, float] = {}
     surface = None
@@ -266,7 +266,7 @@ def _fixed(stated: Mapping[str, Any], robot: Robot, where: str) -> tuple[dict[st
 _SAMPLES = ("design", "number", "seed", "over", "posterior")
 
 
-def _samples(stated: Mapping[str, Any], robot: Robot, where: str, data: list[str]) -> Samples | None:
+def _samples(stated: Json, robot: Robot, where: str, data: list[str]) -> Samples | None:
     if not stated:
         return None
     _keys(stated, _SAMPLES, ("design", "number"), where)
@@ -278,7 +278,7 @@ def _samples(stated: Mapping[str, Any], robot: Robot, where: str, data: list[str
     if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**32:
         raise BadConfiguration(f"{where}.seed: got {seed!r}; expected a whole number from 0 to {2**32 - 1}")
     over = stated.get("over", {})
-    if not isinstance(over, Mapping):
+    if not isinstance(over, dict):
         raise BadConfiguration(f"{where}.over: got {over!r}; expected a table of names with their distributions")
     marginals = {name: _quantile(name, d, robot, f"{where}.over.{name}") for name, d in over.items()}
     joint = None
@@ -319,7 +319,7 @@ def _quantile(name: str, stated: Any, robot: Robot, where: str) -> Quantile:
     if name == CONFIGURATION:
         raise BadConfiguration(f"{where}: cannot be sampled; expected it among axes or conditions")
     table = {"distribution": stated} if isinstance(stated, str) else stated
-    kind = table.get("distribution") if isinstance(table, Mapping) else None
+    kind = table.get("distribution") if isinstance(table, dict) else None
     if not isinstance(kind, str) or kind not in DISTRIBUTIONS:
         raise BadConfiguration(f"{where}.distribution: got {kind!r}; {allowed_words(str(kind), DISTRIBUTIONS)}")
     needed = DISTRIBUTIONS[kind]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -83,9 +83,7 @@ def terrains_of(obstacle: Obstacle, sizes: np.ndarray) -> Terrain:
     return jax.vmap(make[obstacle.kind])(jnp.asarray(sizes) / 1000)
 
 
-def further_variation(
-    obstacle: Obstacle, varied: Mapping[str, np.ndarray], robot: Robot, where: str
-) -> dict[str, float]:
+def further_variation(obstacle: Obstacle, varied: Columns, robot: Robot, where: str) -> dict[str, float]:
     """Further conditions: a low voltage, if a sweep of climbs states none.
 
     Args:

@@ -7,8 +7,8 @@ import importlib.metadata
 import platform
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
 
+from calibration.data import Json
 from calibration.data.input_errors import BadConfiguration
 from mmrjax.model import params
 from mmrjax.model.robot import Robot
@@ -65,10 +65,10 @@ def _hash(file: str) -> str:
         raise BadConfiguration(f"{file}: cannot be read ({error.strerror})") from error
 
 
-def _flat(content: Mapping[str, Any], prefix: str) -> dict[str, str]:
+def _flat(content: Json, prefix: str) -> dict[str, str]:
     found: dict[str, str] = {}
     for key, value in content.items():
-        if isinstance(value, Mapping):
+        if isinstance(value, dict):
             found |= _flat(value, f"{prefix}{key}.")
         else:
             found[f"{prefix}{key}"] = repr(value)

@@ -61,7 +61,7 @@ class SimulationResult:
     @property
     def statuses(self) -> dict[str, int]:
         """Number of runs by status; every status is included."""
-        return runs_by_status(self.table)
+        return {status: int(np.sum(self.table["status"] == status)) for status in STATUSES}
 
     @property
     def flags(self) -> dict[str, int]:
@@ -209,11 +209,6 @@ def condition_table(robot: Robot, runs: Runs) -> Columns:
         columns["total_mass_kg"] = own[runs.configurations(robot)] + runs["payload_kg"]
     shown = ("configuration", *dict.fromkeys((*runs.layout.axes, *runs.axes)), "surface", "run_id")
     return {key: columns[key] for key in shown if key in columns}
-
-
-def runs_by_status(table: Columns) -> dict[str, int]:
-    """Number of runs by status; every status is included."""
-    return {status: int(np.sum(table["status"] == status)) for status in STATUSES}
 
 
 def write_run_folder(

@@ -23,7 +23,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float
 
-from calibration.data import Columns, Names
+from calibration.data import Columns, Json, Names
 from mmrjax import WORKER, fidelities
 from mmrjax.compile.compiling import compiled
 from mmrjax.compile.precision import Threads
@@ -105,7 +105,9 @@ class Compiled:
         each = each if each < SHARED else -(-each // SHARED) * SHARED
         self.size = each * len(devices)
         everywhere = NamedSharding(self.mesh, PartitionSpec())
-        self._variation, self._fixed = _placed((job.plan.varied(job.robot), job.plan.fixed()), everywhere)
+        tree = (job.plan.varied(job.robot), job.plan.fixed())
+        arrays, rest = eqx.partition(tree, eqx.is_array)
+        self._variation, self._fixed = eqx.combine(jax.device_put(arrays, everywhere), rest)
         self._split = NamedSharding(self.mesh, PartitionSpec(POINTS))
         factors = {row.name: row.factor for row in outputs.output_table(job.robot.channels)}
         surface = None if job.plan.surface is None else adhesion_ratios(job.robot, job.plan.surface)
@@ -168,11 +170,6 @@ class _Asked(NamedTuple):
     factors: tuple[tuple[str, float], ...]
     storage: str
     surface: tuple[float, ...] | None
-
-
-def _placed(tree: Any, sharding: NamedSharding) -> Any:
-    arrays, rest = eqx.partition(tree, eqx.is_array)
-    return eqx.combine(jax.device_put(arrays, sharding), rest)
 
 
 def _wide(conditions: Conditions, points: int) -> Conditions:
@@ -247,7 +244,7 @@ class Piece:
     """
 
     chunk: int
-    arrays: Mapping[str, Any]
+    arrays: Json
     values: Float[np.ndarray, "points names"] | None = None
     told: float = 0.0
 
@@ -306,7 +303,7 @@ def share_counter(advance: Advance, count: int) -> Callable[[float], None]:
     return told
 
 
-def fetch_values(arrays: Mapping[str, Any], count: int) -> Columns:
+def fetch_values(arrays: Json, count: int) -> Columns:
     """The first `count` values of each array, on this machine."""
     return {name: np.asarray(values)[:count] for name, values in jax.device_get(dict(arrays)).items()}
 

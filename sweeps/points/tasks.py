@@ -5,11 +5,8 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping
-from typing import Any
 
-import numpy as np
-
-from calibration.data import Json, Names
+from calibration.data import Columns, Json, Names
 from mmrjax import fidelities
 from mmrjax.fidelities import outputs
 from mmrjax.fidelities.variation import FLAGS, Axis
@@ -22,7 +19,7 @@ from sweeps.points import climbs
 Attributes = dict[str, Json]
 
 
-def nothing_further(stated: Mapping[str, np.ndarray], robot: Robot, where: str) -> dict[str, float]:
+def nothing_further(stated: Columns, robot: Robot, where: str) -> dict[str, float]:
     """No conditions besides."""
     return {}
 
@@ -47,8 +44,8 @@ class Task:
     slow: bool
     at_once: tuple[int, int]
     axes: Mapping[str, Axis] = dataclasses.field(default_factory=dict)
-    further: Callable[[Mapping[str, np.ndarray], Robot, str], dict[str, float]] = nothing_further
-    run: Callable[..., Mapping[str, Any]] | None = None
+    further: Callable[[Columns, Robot, str], dict[str, float]] = nothing_further
+    run: Callable[..., Json] | None = None
 
 
 def task_of(config: Campaign, robot: Robot, turns: bool = False) -> Task:

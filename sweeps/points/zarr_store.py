@@ -23,7 +23,7 @@ from typing import Any, TextIO
 
 import numpy as np
 
-from calibration.data import Json, Names
+from calibration.data import Columns, Json, Names
 from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.data.writing import naming_file
 from mmrjax.fidelities.variation import STATUS
@@ -63,7 +63,7 @@ class Variable:
 
     name: str
     dtype: str
-    attributes: Mapping[str, Any]
+    attributes: Json
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,9 +79,9 @@ class Layout:
     design: Design
     blocks: Blocks
     variables: tuple[Variable, ...]
-    coordinates: Mapping[str, Mapping[str, Any]]
+    coordinates: Mapping[str, Json]
     labels: Mapping[str, Names]
-    attributes: Mapping[str, Any]
+    attributes: Json
     compression: str = "none"
 
     @property
@@ -365,7 +365,7 @@ class SweepStore(Folder):
             found |= {name: Path(name, "c", *map(str, place[-1:])) for name in samples.names}
         return found
 
-    def write(self, chunk: int, arrays: Mapping[str, np.ndarray], drawn: np.ndarray | None) -> Done:
+    def write(self, chunk: int, arrays: Columns, drawn: np.ndarray | None) -> Done:
         """Write a chunk and count it as done.
 
         Args:
@@ -530,7 +530,7 @@ def _counts(status: np.ndarray) -> tuple[int, ...]:
     return tuple(np.bincount(np.asarray(status, np.intp), minlength=len(STATUSES)).tolist())
 
 
-def _range(arrays: Mapping[str, np.ndarray], variable: Variable) -> tuple[float, float] | None:
+def _range(arrays: Columns, variable: Variable) -> tuple[float, float] | None:
     if np.dtype(variable.dtype).kind != "f":
         return None
     values = arrays[variable.name]

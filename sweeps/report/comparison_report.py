@@ -28,7 +28,17 @@ def comparison_document(found: Comparison) -> Document:
         f"Robot: **{found.robot_name}**. Fidelity: **{found.model}**. Measured: **{found.source}**, "
         f"{count_noun(len(found.table['status']), 'row')}."
     )
-    parity = catalogue.figure("comparison.parity", *known, False, finding=_bias(found))
+    parity = catalogue.figure(
+        "comparison.parity",
+        *known,
+        False,
+        finding="Simulated less measured, on average: "
+        + "; ".join(
+            f"{c.label} {np.nanmean(e):+.1f} %"
+            for c in found.channels
+            if np.isfinite(e := found.table[f"error_{c.name}_percent"]).any()
+        ),
+    )
     errors = catalogue.figure("comparison.errors", *known, True, found.over, finding=_trend(found))
     return Document(
         f"{found.robot_name} against {found.source}",
@@ -139,15 +149,6 @@ def _rows(found: Comparison) -> Table:
 
 def _status(status: str) -> Cell:
     return Cell(words.short_status(status), "" if status in words.SETTLED else "slides")
-
-
-def _bias(found: Comparison) -> str:
-    """Mean error of each channel, with its sign."""
-    return "Simulated less measured, on average: " + "; ".join(
-        f"{c.label} {np.nanmean(e):+.1f} %"
-        for c in found.channels
-        if np.isfinite(e := found.table[f"error_{c.name}_percent"]).any()
-    )
 
 
 def _trend(found: Comparison) -> str:

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from calibration.data import Columns
 from calibration.inference.residual_clusters import ResidualCluster
 from mmrjax.model.channels import Channel
 from sweeps.report import catalogue, run_tables
@@ -74,7 +75,7 @@ def clusters_section(clusters: Sequence[ResidualCluster]) -> tuple[Section, ...]
 
 
 def rows_section(
-    table: Mapping[str, np.ndarray], shown: Sequence[Channel], kinds: Mapping[str, str], sized: bool, **more: Any
+    table: Columns, shown: Sequence[Channel], kinds: Mapping[str, str], sized: bool, **more: Any
 ) -> Section:
     """The rows with their conditions, readings, and the error of the last kind of readings.
 

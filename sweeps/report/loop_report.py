@@ -15,7 +15,7 @@ from calibration.discovery.result import DiscoveryResult
 from calibration.discovery.settings import WITHOUT_NAME
 from calibration.inference import blocks
 from calibration.inference.details import EquationDefects, TimeStatistics
-from calibration.inference.fit_notes import Copied, Determination, FarFromPrior, Repeats
+from calibration.inference.fit_notes import Determination, with_codes
 from calibration.inference.simulation_errors import OF_SIZE
 from calibration.words import loop_words
 from mmrjax.effects import BY_NAME
@@ -144,7 +144,7 @@ def held_out_table(found: DiscoveryResult) -> Table:
 
 def check_first(found: DiscoveryResult) -> list[str]:
     """Points to check before use: the reading with the largest weight, parameters that moved far, contradictions."""
-    far = [describe(note) for note in found.remarks if isinstance(note, FarFromPrior | Repeats | Copied)]
+    far = [describe(note) for note in with_codes(found.remarks, "far_from_prior", "repeats", "copied")]
     against = [note for note in found.remarks if isinstance(note, str)]
     said = [loop_words.largest_share(found), *far, *against[:1]]
     # a sentence begins with a capital, a parameter's name does not

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
-from typing import Any
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -72,7 +71,7 @@ def missions_document(file: RobotFile, found: Missions) -> Document:
     )
 
 
-def _sections(robot: Robot, found: Missions, first: Mapping[str, Any]) -> Iterable[Section]:
+def _sections(robot: Robot, found: Missions, first: Json) -> Iterable[Section]:
     """The first run over time, from above, its energy and its segments."""
     source, name, limit = found.source, found.segments["run_id"][0], float(robot.motor.temperature_limit)
     mine = found.course["run_id"] == name
@@ -99,7 +98,7 @@ def _sections(robot: Robot, found: Missions, first: Mapping[str, Any]) -> Iterab
     )  # fmt: skip
 
 
-def _from_above(robot: Robot, first: Mapping[str, Any], rows: Mapping[str, np.ndarray]) -> tuple[Block, ...]:
+def _from_above(robot: Robot, first: Json, rows: Columns) -> tuple[Block, ...]:
     place = rows["x_mm"] / 1e3, rows["y_mm"] / 1e3, np.radians(rows["yaw_deg"])
     sides = [[first[f"{name}_{side}_{unit}"] for side in channels.SIDES]
              for name, unit in (("rms_current", "A"), ("winding_peak", "C"))]  # fmt: skip
@@ -116,7 +115,7 @@ def _names(runs: Columns) -> list[str]:
     return [", ".join([head, *(p for p in rest if not p.startswith("nan"))]) for head, *rest in parts]
 
 
-def mission_answer(run: Mapping[str, Any]) -> str:
+def mission_answer(run: Json) -> str:
     """One sentence: energy of the mission, its largest shares, and how long the battery lasts."""
     drawn = float(run["energy_drawn_Wh"])
     text = f"The mission takes {float(run['energy_Wh']):.3g} Wh"
@@ -133,7 +132,7 @@ def mission_answer(run: Mapping[str, Any]) -> str:
     return text + ("." if status == "converged" else f". It ends early: {words.status_meaning(status)}.")
 
 
-def mission_limits(robot: Robot, run: Mapping[str, Any]) -> list[Json]:
+def mission_limits(robot: Robot, run: Json) -> list[Json]:
     """Use of each limit by a mission."""
     motor, gearbox, heat = robot.motor, robot.gearbox, robot.knows(WARMING)
     speed, unknown = run["peak_motor_speed_rpm"], 0.0 if heat else np.nan
@@ -165,7 +164,7 @@ def _exceeded(found: Missions) -> Iterable[str]:
             yield f"`{flag}`: {words.FLAGS[flag]} ({of_runs}{segments} of {len(raised)} segments)"
 
 
-def _charge_left(table: Mapping[str, np.ndarray]) -> Iterable[str]:
+def _charge_left(table: Columns) -> Iterable[str]:
     """Charge at which missions were cut off, if any was."""
     left = 100 * table["state_of_charge"][table["status"] == "cut_off"]
     if len(left):

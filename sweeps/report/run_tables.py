@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from calibration.data import Json
+from calibration.data import Columns, Json
 from calibration.data.robot_file import RobotFile
 from mmrjax import effects
 from mmrjax.model.channels import Channel
@@ -55,7 +55,7 @@ def quantity_column(name: str, **options: Any) -> Column:
     return Column(heading, unit, form, **options)
 
 
-def quantity_cells(table: Mapping[str, np.ndarray], name: str) -> list[Any]:
+def quantity_cells(table: Columns, name: str) -> list[Any]:
     """Cells of a column, each with its standard deviation if the table has one; infinite numbers in words."""
     values, spread = table[name], table.get(name + uncertainty.SD)
     if spread is not None:
@@ -71,7 +71,7 @@ def quantity_cells(table: Mapping[str, np.ndarray], name: str) -> list[Any]:
     return [missing if math.isnan(v) else endless if math.isinf(v) else v for v in values]
 
 
-def quantity_table(name: str, table: Mapping[str, np.ndarray], names: Iterable[str], **options: Any) -> Table:
+def quantity_table(name: str, table: Columns, names: Iterable[str], **options: Any) -> Table:
     """The quantities `names` that a table of runs has numbers of, a row for each run.
 
     Args:
@@ -123,7 +123,7 @@ def endings_table(
     things: str = "runs",
     model: str = "",
     meanings: Mapping[str, str] = MappingProxyType({}),
-    **more: Mapping[str, Any],
+    **more: Json,
 ) -> Table:
     """How runs or points ended: statuses that occurred, in words, with their number.
 
@@ -144,7 +144,7 @@ def endings_table(
     return Table("statuses", heads, rows)
 
 
-def limits_table(limits: Sequence[Mapping[str, Any]], what: str) -> Table:
+def limits_table(limits: Sequence[Json], what: str) -> Table:
     """Use of each limit: its value, the limit and the share of it that is used."""
     rows = [(limit["words"], limit["value"], limit["limit"], _used(limit)) for limit in limits]
     return catalogue.table("run.limits", rows, f"{what} |")
@@ -174,7 +174,7 @@ def warming_share(value: float, limit: float, ambient: float) -> float:
     return 100 * (value - ambient) / max(limit - ambient, 1.0)
 
 
-def _used(limit: Mapping[str, Any]) -> Cell | str:
+def _used(limit: Json) -> Cell | str:
     if limit["percent"] is None:
         return f"not judged: the robot's file states no `{limit['unstated']}`"
     return Cell(limit["percent"], "over" if limit["percent"] > 100 else "bar")

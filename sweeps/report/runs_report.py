@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -77,7 +77,7 @@ def runs_document(
     return Document(title, runs_answer(runs, robot.channels, used), tuple(blocks), (of_runs,), sections)
 
 
-def runs_answer(runs: Columns, channels: Sequence[Channel], used: Sequence[Mapping[str, Any]]) -> str:
+def runs_answer(runs: Columns, channels: Sequence[Channel], used: Sequence[Json]) -> str:
     """One sentence: readings of a single run and its most used limit, or how many of several runs settle.
 
     Args:
@@ -101,13 +101,13 @@ def runs_answer(runs: Columns, channels: Sequence[Channel], used: Sequence[Mappi
     return f"{readings}; {nearest['words']} {verb} ({nearest['percent']:.0f} % of {nearest['limit']})."
 
 
-def run_headings(runs: Mapping[str, np.ndarray]) -> list[str]:
+def run_headings(runs: Columns) -> list[str]:
     """A heading for each run: its name where it has one, and its conditions."""
     found = [conditions_in_words(runs, k) for k in range(len(runs["status"]))]
     return [f"{runs['run_id'][k]}: {at}" for k, at in enumerate(found)] if "run_id" in runs else found
 
 
-def conditions_in_words(table: Mapping[str, np.ndarray], row: int) -> str:
+def conditions_in_words(table: Columns, row: int) -> str:
     """The conditions of a row in words: what is imposed, and on a vehicle payload, slope and a rig's surface."""
     parts = [str(table["configuration"][row])]
     if "supply_voltage_V" in table:
@@ -125,7 +125,7 @@ def conditions_in_words(table: Mapping[str, np.ndarray], row: int) -> str:
     return ", ".join(parts)
 
 
-def _histories(robot: Robot, runs: Mapping[str, np.ndarray], names: list[str], histories: Run) -> Iterable[Section]:
+def _histories(robot: Robot, runs: Columns, names: list[str], histories: Run) -> Iterable[Section]:
     """Runs over time: as instruments show them, or from standstill on a ground, with what the running gear does."""
     from sweeps.pages import gear_figures, history_figures
 
@@ -210,7 +210,7 @@ def _power_chain(robot: Robot, runs: Columns, names: Sequence[str]) -> Iterable[
     yield catalogue.figure("runs.power", picked, [names[k] for k in chain], robot.has_ground, more=more)
 
 
-def limits_used(robot: Robot, run: Mapping[str, Any]) -> list[Json]:
+def limits_used(robot: Robot, run: Json) -> list[Json]:
     """Use of each limit by a run; an inrush without a stated limit has no share."""
     idle = capabilities.idle_columns(robot)
     radius = float(robot.configurations[str(run["configuration"])].radius)

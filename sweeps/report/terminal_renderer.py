@@ -28,14 +28,16 @@ def print_table(table: Table) -> None:
     """Print a table for a person, without the columns and rows that only the page has room for."""
     shown = table.turned
     rows = shown.rows if shown.brief is None else [shown.rows[k] for k in shown.brief]
-    if len(rows) > TERMINAL_ROWS:
+    if table.file and len(rows) > TERMINAL_ROWS:
         print_output(f"{len(rows):,} rows: see {table.file}")
         return
     printed = rich.table.Table(title=table.title or None, title_justify="left", box=None, pad_edge=False)
     kept = [k for k, column in enumerate(shown.columns) if column.terminal]
     for k in kept:
         column, number = shown.columns[k], bool(shown.columns[k].form)
-        printed.add_column(plain_text(column.full_title), justify="right" if number else "left", no_wrap=number)
+        printed.add_column(
+            plain_text(column.full_title), justify="right" if number else "left", no_wrap=number, overflow="fold"
+        )
     for row in rows:
         printed.add_row(
             *(Text(plain_text(shown.columns[k].text(row[k])), TONES.get(cell_tone(row[k]), "")) for k in kept)

@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-import numpy as np
-
 from calibration.data import Columns
 from calibration.data.robot_file import RobotFile
 from mmrjax.fidelities.base import History
@@ -32,7 +30,7 @@ _ROWS = (
 def turn_document(
     file: RobotFile,
     model: str,
-    run: Mapping[str, np.ndarray],
+    run: Columns,
     ended: Mapping[str, float] | None,
     history: History | None,
     turns: Columns | None,
@@ -69,7 +67,7 @@ def turn_document(
     )
 
 
-def sides_table(robot: Robot, row: Mapping[str, np.ndarray]) -> Table:
+def sides_table(robot: Robot, row: Columns) -> Table:
     """What the left and the right side do, without rows if no motion is known."""
     idle, known = capabilities.idle_columns(robot), math.isfinite(float(row["yaw_rate_rad_s"]))
     rows = []

@@ -6,7 +6,7 @@ import csv
 import dataclasses
 import functools
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +39,7 @@ COORDINATES = ("x_mm", "z_mm", "pitch_deg", "shaft_deg", "front_deg", "rear_deg"
 SHOWN = ("time_s", "traction_current_A")
 
 
-def footing_coordinates(table: Mapping[str, np.ndarray]) -> np.ndarray:
+def footing_coordinates(table: Columns) -> np.ndarray:
     """Coordinates of `mmrjax.climbing.footing` at every sample of a history, (samples, 6)."""
     x, z, pitch, shaft, front, rear = (table[name] for name in COORDINATES)
     turned = np.radians([-pitch, shaft, front, 180 - rear])

@@ -55,7 +55,7 @@ class Comparison:
         return answer
 
 
-def add_second_robot(table: Columns, channels: Sequence[Channel], simulated: Mapping[str, np.ndarray]) -> Columns:
+def add_second_robot(table: Columns, channels: Sequence[Channel], simulated: Columns) -> Columns:
     """A table of `compare_readings` with the readings that a second robot gives on its rows."""
     return table | {f"against_{c.column}": simulated[c.column] for c in channels}
 

@@ -296,6 +296,9 @@ _BOTH_WAYS: dict[str, Law] = {
     "directional_friction": Law("directional_friction", "track", lambda s, q: s.d**2, 0.05, either=True),
     "directional_stribeck": Law("directional_stribeck", "track", lambda s, q: np.exp(-abs(s.w_k) / q["fade"]) * s.d**2, 0.05, _WK_S, either=True),
     "coast_decay": Law("coast_decay", "electrical", lambda s, q: -(1 - abs(s.duty)) * s.C * s.w, 0.5),
+    "duty_exponent": Law("duty_exponent", "duty", lambda s, q: (s.duty - np.sign(s.duty) * abs(s.duty) ** q["exponent"]) / (q["exponent"] - 1), -0.2, {"exponent": (0.75, 0.85)}),
+    "duty_dead_band": Law("duty_dead_band", "duty", lambda s, q: (1 - abs(s.duty)) * np.sign(s.duty), 0.05),
+    "duty_saturation": Law("duty_saturation", "duty", lambda s, q: np.maximum(abs(s.duty) - q["full"], 0) * np.sign(s.duty), 0.5, {"full": (0.6, 0.8)}),
 }  # fmt: skip
 
 
@@ -325,6 +328,9 @@ RIGS: dict[str, Law] = {
     "directional_friction": _rig("directional_friction", _output(0.05), lambda a: a.reverse),
     "directional_stribeck": _rig("directional_stribeck", _output(0.05), lambda a: a.reverse, _fade_output),
     "coast_decay": _rig("coast_decay", lambda r: 0.2, lambda a: a.imposed == "duty"),
+    "duty_exponent": _rig("duty_exponent", lambda r: -0.2, lambda a: a.imposed == "duty", lambda r: {"exponent": (0.75, 0.85)}),
+    "duty_dead_band": _rig("duty_dead_band", lambda r: 0.05, lambda a: a.imposed == "duty"),
+    "duty_saturation": _rig("duty_saturation", lambda r: 0.5, lambda a: a.imposed == "duty", lambda r: {"full": (0.6, 0.8)}),
     "tension_friction": _rig("tension_friction", lambda r: 0.1, _sloped),
     "speed_rolling": _rig("speed_rolling", lambda r: 0.02 / r.V_teor**2, _vehicle),
     "adhesive_drag": _rig("adhesive_drag", lambda r: 0.02 * r.N / (r.V_teor / 1e-3) ** 0.6, _vehicle, lambda r: {"peel": (5e-4, 5e-3)}),

@@ -190,6 +190,8 @@ def instant(
     s.w_k = s.w / s.ratio
     s.r = p.get("radius", 1.0)
     s.V_teor = s.r * s.w_k
+    way = np.sign(s.duty)
+    s.duty = way * np.clip(way * (s.duty - extra("duty")), 0, 1)
     s.line = s.sides * s.I * s.duty  # of all motors, from the supply (10)
     if s.mass is not None:
         s.M_own, s.M = p["mass"], s.mass

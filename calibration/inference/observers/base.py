@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 from calibration.data.runs import Runs
 from calibration.inference.bases import Bases
 from calibration.inference.details import Detail
-from calibration.inference.fit_notes import Note
+from calibration.inference.fit_notes import Remark
 from calibration.inference.linearization import Linearization, ScoredEffect
 from calibration.inference.noise import Noise
 from calibration.inference.optimizers import Numbers, Optimum, linearise, observe_robot
@@ -142,7 +142,7 @@ class Observer(eqx.Module):
 
     @classmethod
     @abc.abstractmethod
-    def check(cls, runs: Runs, noise: Noise) -> list[Note | str]:
+    def check(cls, runs: Runs, noise: Noise) -> list[Remark | str]:
         """Refuse runs that contradict each other; return notes on the others.
 
         Raises:
@@ -151,7 +151,7 @@ class Observer(eqx.Module):
 
     @classmethod
     @abc.abstractmethod
-    def check_start(cls, runs: Runs, noise: Noise, robot: Robot) -> list[Note | str]:
+    def check_start(cls, runs: Runs, noise: Noise, robot: Robot) -> list[Remark | str]:
         """Refuse runs with a start that the model cannot follow; return notes on their length.
 
         Raises:

@@ -21,7 +21,7 @@ from calibration.described import describe
 from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
 from calibration.inference.details import EquationDefects
-from calibration.inference.fit_notes import Note, Repeats, ThinnedTable
+from calibration.inference.fit_notes import Remark
 from calibration.inference.linearization import Linearization, ScoredEffect, balance_probe, finite_or_zero
 from calibration.inference.noise import Noise
 from calibration.inference.observers.base import Diagnosis, Observer, SearchPolicy
@@ -163,10 +163,10 @@ class SettledRuns(Observer):
         return np.zeros(runs.measured().shape)
 
     @classmethod
-    def check(cls, runs: Runs, noise: Noise) -> list[Note | str]:
+    def check(cls, runs: Runs, noise: Noise) -> list[Remark | str]:
         """Refuses a table of one condition with readings that differ; notes the repeats that differ most."""
         measured, alike = runs.measured(), rows_of_same_conditions(runs)
-        least, found = cls.least(runs), list[Repeats]()
+        least, found = cls.least(runs), list[Remark]()
         shared = np.array([source == "series" for source in noise.source])
         usual = np.array([c.sd_share for c in runs.channels])
         for rows in alike:
@@ -185,15 +185,28 @@ class SettledRuns(Observer):
                 values = float(runs[column][first]), float(runs[column][second])
                 others = _unused(runs, first, second, column)
                 near = runs.layout.nearest(others[0], runs.columns) if others else ""
-                found.append(Repeats(runs.source, (first + 1, second + 1), column, values, known, others, near=near))
+                found.append(
+                    Remark(
+                        "repeats",
+                        source=runs.source,
+                        rows=(first + 1, second + 1),
+                        column=column,
+                        values=values,
+                        apart=known,
+                        unused=others,
+                        near=near,
+                    )
+                )
         if found and len(alike) == 1:
             raise BadData(f"{describe(found[0])}; no condition varies, so nothing can be fitted")
         whole = runs.whole
-        thinned = [] if whole is runs else [ThinnedTable(runs.source, len(whole), len(runs))]
-        return [*thinned, *(dataclasses.replace(each, more=len(found) - 1) for each in found[:1])]
+        thinned = (
+            [] if whole is runs else [Remark("thinned_table", source=runs.source, rows=len(whole), kept=len(runs))]
+        )
+        return [*thinned, *(Remark(x.code, **x.values, more=len(found) - 1) for x in found[:1])]
 
     @classmethod
-    def check_start(cls, runs: Runs, noise: Noise, robot: Robot) -> list[Note | str]:
+    def check_start(cls, runs: Runs, noise: Noise, robot: Robot) -> list[Remark | str]:
         return []
 
     @classmethod

@@ -36,7 +36,7 @@ from calibration.inference import bases as bases_room
 from calibration.inference import scans
 from calibration.inference.bases import Bases
 from calibration.inference.details import Memory, Strongest, TimeSide, TimeStatistics
-from calibration.inference.fit_notes import CoarseSteps, Note, StopsOnSlope, Thinned
+from calibration.inference.fit_notes import Remark
 from calibration.inference.linearization import (
     PROBED,
     Linearization,
@@ -298,7 +298,7 @@ class Histories(Observer):
         return np.broadcast_to(np.sqrt(power), measured.shape)
 
     @classmethod
-    def check(cls, runs: Runs, noise: Noise) -> list[Note | str]:
+    def check(cls, runs: Runs, noise: Noise) -> list[Remark | str]:
         names = runs.run_names
         for name in np.unique(names):
             mine = names == name
@@ -316,9 +316,9 @@ class Histories(Observer):
                         "within a run only payload_kg may change it"
                     )
         _check_signs(runs)
-        thinned: list[Note | str] = []
+        thinned: list[Remark | str] = []
         if runs.log is not None:
-            thinned.append(Thinned(runs.source, len(runs.log), len(runs)))
+            thinned.append(Remark("thinned", source=runs.source, rows=len(runs.log), kept=len(runs)))
         return [*thinned, *_stop_notes(runs)]
 
     @classmethod
@@ -326,7 +326,7 @@ class Histories(Observer):
         return measure_initial_states(robot, runs, noise)
 
     @classmethod
-    def check_start(cls, runs: Runs, noise: Noise, robot: Robot) -> list[Note | str]:
+    def check_start(cls, runs: Runs, noise: Noise, robot: Robot) -> list[Remark | str]:
         """Checks that histories begin at their first row, usually at rest, with one sample at a time."""
         names, measured = runs.run_names, runs.measured()
         # Current rises within a millisecond; speeds and angles do not.
@@ -359,12 +359,12 @@ class Histories(Observer):
                         'readings; if it began in motion, state start = "measured" or "free" in the robot\'s file; '
                         "settled travel is one row a run, without time_s"
                     )
-        said: list[Note | str] = []
+        said: list[Remark | str] = []
         step = runs["time_s"].max() / STEPS
         if robot.rig.imposed != "motor_speed":
             step = max(step, *(h.max(initial=0.0) for h in _longest_steps(runs, robot)))
         if step > FAST * LONGEST:
-            said.append(CoarseSteps(float(runs["time_s"].max()), float(step)))
+            said.append(Remark("coarse_steps", lasts=float(runs["time_s"].max()), step=float(step)))
         return said
 
     @classmethod
@@ -939,12 +939,14 @@ def _check_signs(runs: Runs) -> None:
                     )
 
 
-def _stop_notes(runs: Runs) -> list[Note | str]:
+def _stop_notes(runs: Runs) -> list[Remark | str]:
     """Note on runs with motors that are not driven on a slope."""
     still = (applied_drive(runs) == 0) & (runs["slope_deg"] != 0)
     if not still.any():
         return []
-    return [StopsOnSlope(tuple(dict.fromkeys(str(n) or "(no run_id)" for n in runs.run_names[still])))]
+    return [
+        Remark("stops_on_slope", runs=tuple(dict.fromkeys(str(n) or "(no run_id)" for n in runs.run_names[still])))
+    ]
 
 
 def _choose_knots(rows: np.ndarray, most: int) -> np.ndarray:

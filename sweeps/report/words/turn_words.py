@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
+from calibration.data import Json
 from mmrjax.derived.turning_figures import NONE
 from mmrjax.fidelities.simulation import STRAIGHT
 from mmrjax.model.channels import SIDES
@@ -70,12 +70,12 @@ def turn_not_found_reason(speed: float, rate: float, speeds: np.ndarray, rates: 
     return f"with which it reaches {' and '.join(told)}"
 
 
-def is_going(row: Mapping[str, Any]) -> bool:
+def is_going(row: Json) -> bool:
     """True if a turn has a motion, settled or not."""
     return math.isfinite(float(row["yaw_rate_rad_s"])) and row["status"] in ("converged", "not_settled")
 
 
-def turn_answer(row: Mapping[str, Any], ended: Mapping[str, float] | None) -> str:
+def turn_answer(row: Json, ended: Mapping[str, float] | None) -> str:
     """A turn in a sentence.
 
     Args:
@@ -94,21 +94,21 @@ def turn_answer(row: Mapping[str, Any], ended: Mapping[str, float] | None) -> st
     )
 
 
-def _sloping(row: Mapping[str, Any]) -> bool:
+def _sloping(row: Json) -> bool:
     return float(row["slope_deg"]) != 0
 
 
-def _way(row: Mapping[str, Any]) -> str:
+def _way(row: Json) -> str:
     return SIDES[0] if float(row["yaw_rate_rad_s"]) > 0 else SIDES[1]
 
 
-def _now(row: Mapping[str, Any]) -> str:
+def _now(row: Json) -> str:
     """A motion that still changes."""
     rate, speed = float(row["yaw_rate_rad_s"]), float(row["speed_mm_s"])
     return f"Not settled: {speed:.0f} mm/s ahead and {abs(rate):.2f} rad/s to the {_way(row)} then."
 
 
-def _moves(row: Mapping[str, Any]) -> str:
+def _moves(row: Json) -> str:
     rate, radius, speed = (float(row[c]) for c in ("yaw_rate_rad_s", "turning_radius_mm", "speed_mm_s"))
     if not math.isfinite(radius):
         return f"Straight at {speed:.0f} mm/s."
@@ -127,7 +127,7 @@ def _moves(row: Mapping[str, Any]) -> str:
     )
 
 
-def turn_notes(robot: Robot, row: Mapping[str, Any]) -> list[str]:
+def turn_notes(robot: Robot, row: Json) -> list[str]:
     """Remarks on a turn: effective width, motors that stand or are driven, limits that are exceeded."""
     notes = []
     own = float(robot.configurations[str(row["configuration"])].turning.width) / MM
