@@ -133,7 +133,7 @@ def test_numbers_of_a_page_agree(shown, capsys, name):
     assert best > -d["settings"]["same"] or "ruled out by size or sign alone" in got.page.text
     # one family-wise p on all of the page, each effect with a p of its own that is no larger than is allowed
     p = words.p_value(got.found.before.p_value)
-    assert f"family-wise p {p}" in got.page.text and f"(family-wise p {p})" in d["statement"]
+    assert f"family-wise p {p}" in got.page.text and f"(family-wise p {p})" in d["verdict_statement"]
     for e in got.found.effects:
         assert e.p_value <= d["bootstrap"]["family_wise_error"]
         fall = got.found.chi2[0] - got.found.chi2[1]
@@ -254,10 +254,13 @@ def test_first_screen_answers_in_a_minute(shown, capsys, tmp_path):
     got = shown("churning", capsys)
     found, page = got.found, got.page
     (effect,) = found.effects
-    assert (
-        words.completeness_answer(found) == f"No: missing is a {effect.families[0]}."
-        and words.completeness_answer(found) in page.text
-    )
+    assert found.statement.startswith(f"No: missing is a {effect.families[0]} (") and "churning" in found.statement
+    assert found.statement in page.text and found.statement == got.document["statement"]
+    assert got.document["statement"] == got.document["headline"]["statement"]
+    assert list(loop_report.moved_parameters(found)) == []
+    shifted = {n: dataclasses.replace(p, shift_after=3.0, shift_before=3.0) for n, p in found.base_shift.items()}
+    moved = list(loop_report.moved_parameters(dataclasses.replace(found, base_shift=shifted)))
+    assert len(moved) == len(shifted) and all("(+3.0 prior sds)" in line for line in moved)
     a = effect.parameters["amplitude"]
     size, change = f"{a.value:.3g} ± {a.sd:.2g} {a.unit}", room.changes_by_effect(found)[effect.name]
     size += f", which changes the {change.channel.label} by {change.rms:.2g} %"
@@ -276,11 +279,7 @@ def test_first_screen_answers_in_a_minute(shown, capsys, tmp_path):
     assert len(without_table.split()) <= 120
     weak = NameTest(effect.name, 6.0, 3.3, (), 5.0, 7, 2.5)
     tentative = dataclasses.replace(found, support=NameSupport(False, "beside", tests=(weak,)))
-    assert words.completeness_answer(tentative) == f"No: perhaps a {effect.families[0]}."
-    twice = dataclasses.replace(tentative, effects=(effect, dataclasses.replace(effect, name="windage")))
-    assert words.completeness_answer(twice) == words.completeness_answer(tentative)  # one kind, said once
     assert words.how_sure(tentative, effect) == "tentative: it predicts, but rests on row 7"
-    assert words.completeness_answer(dataclasses.replace(found, verdict="none", effects=())).startswith("Yes")
 
 
 def test_what_an_effect_changes_is_that_of_the_robot_without_it(shown, capsys):

@@ -550,7 +550,12 @@ class DiscoveryResult:
 
     @property
     def statement(self) -> str:
-        """The verdict as a sentence."""
+        """The answer in a sentence or two."""
+        return describe(self.headline)
+
+    @property
+    def verdict_statement(self) -> str:
+        """The verdict at the noise of the fit, with its evidence."""
         return describe(self.summary)
 
     @property
@@ -630,8 +635,15 @@ class DiscoveryResult:
             "verdict": self.verdict,
             "mechanism": None if self.summary.mechanism is None else _mechanism(self.summary.mechanism, self.unnamed),
             "missed": [m._asdict() for m in self.summary.missed],
-            "headline": dataclasses.asdict(self.headline) | {"statement": describe(self.headline)},
+            "headline": {
+                "level": self.headline.level,
+                "claims": self.headline.claims,
+                "factors": self.headline.factors,
+                "shared": self.headline.shared,
+                "statement": self.statement,
+            },
             "statement": self.statement,
+            "verdict_statement": self.verdict_statement,
             "rows": len(self.runs),
             "rows_used": int(self.included.sum()),
             "rows_unusable": list(self.unusable),
