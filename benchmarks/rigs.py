@@ -6,10 +6,16 @@ Rigs come from `tests/worlds/rigs.py`, which shares no code with the simulator: 
 a bench, a winch or a linear unit; voltage, duty or motor speed imposed; one to three channels. The loop reads only
 `rig.toml` and `table.csv`; only the scorer reads the labels. Every rig is one line of `--out`, and a restarted
 campaign continues where it ended.
+
+    python benchmarks/rigs.py --confounded 200 --jobs 16 --cache runs/cache
+
+Rows of `confounded` tables are in the order of what drives the motors, and a column of a temperature rises with them:
+a fourth has nothing missing, a half an effect of the library, a fourth another effect.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import sys
 from collections import Counter
@@ -24,7 +30,9 @@ from campaign import Task, campaign, looped, refused
 from worlds import laws
 from worlds import rigs as gr
 
-KINDS = ("clean", "library", "outside")
+KINDS = ("clean", "library", "outside", "confounded")
+#: Effects of a `confounded` table, by the remainder of its seed.
+CONFOUNDED = ("library", "clean", "library", "outside")
 #: Least and greatest sigmas of each effect.
 SIGMAS = {"library": (5.0, 15.0), "outside": (8.0, 15.0)}
 #: Rigs drawn until one can have an effect of the wanted strength: first of one effect, then of any.
@@ -57,6 +65,8 @@ def attempt(kind: str, seed: int) -> gr.Case | str:
     """The case of a kind and a seed, or the reason why it is invalid."""
     like, rows = shape(kind, seed // ALIKE)
     rng = np.random.default_rng([31, KINDS.index(kind), seed])
+    if kind == "confounded":
+        return _confounded(seed, like, rows, rng)
     if kind == "clean":
         return gr.case(gr.world(rng, like=like, rows=rows), seed=seed)
     pool = laws.RIGS if kind == "library" else laws.OUTSIDE_RIGS
@@ -74,6 +84,27 @@ def attempt(kind: str, seed: int) -> gr.Case | str:
             case.label["refused"] = dict(whys)
             return case
         whys[f"{wanted} {why}"] += 1
+    return max(whys, key=whys.__getitem__, default="no rig can have it")
+
+
+def _confounded(seed: int, like: gr.Rig, rows: tuple[int, int], rng: np.random.Generator) -> gr.Case | str:
+    """A case with rows by rising drive and a temperature that rises with them; it says nothing of the readings."""
+    kind = CONFOUNDED[seed % len(CONFOUNDED)]
+    pool = {"clean": {"": None}, "library": laws.RIGS, "outside": laws.OUTSIDE_RIGS}[kind]
+    whys: Counter[str] = Counter()
+    for _ in range(sum(TRIES)):
+        world = gr.rising(gr.world(rng, like=like, rows=rows))
+        able = ("",) if kind == "clean" else world.applicable(pool)
+        if not able:
+            continue
+        sigmas = 0.0 if kind == "clean" else float(rng.uniform(*SIGMAS[kind]))
+        case = gr.case(world, str(rng.choice(able)), sigmas, seed)
+        if why := refused(case.label, SIGMAS.get(kind, (0.0,))[0]):
+            whys[why] += 1
+            continue
+        case.label["kind"] = "confounded"
+        warm = 25 + 30 * (1 - np.exp(-2 * world.conditions.order)) + 0.2 * rng.standard_normal(len(world.conditions))
+        return dataclasses.replace(case, table=case.table | {"case_temperature_C": np.round(warm, 1)})
     return max(whys, key=whys.__getitem__, default="no rig can have it")
 
 
@@ -116,7 +147,9 @@ def program(task: Task) -> tuple[str, int]:
 
 def summary(lines: list[dict]) -> list[str]:
     """The figures of a campaign."""
-    f = scores.Figures(lines)
+    confounded = scores.Figures([x for x in lines if x["kind"] == "confounded"])
+    _of_confounded(confounded)
+    f = scores.Figures([x for x in lines if x["kind"] != "confounded"])
     scores.findings(f)
     scores.mechanisms(f)
     _clean(f)
@@ -124,7 +157,7 @@ def summary(lines: list[dict]) -> list[str]:
     _outside(f)
     _identifiability(f)
     scores.ends(f)
-    return f.out
+    return confounded.out + f.out
 
 
 #: Properties for a breakdown of clean rigs.
@@ -182,6 +215,22 @@ def _outside(f: scores.Figures) -> None:
         named = Counter(str(x["classes"]) for x in those if x["truth"][0]["name"] == name and scores.single(x))
         if named:
             f.note(f"    {name}: {dict(named)}")
+
+
+def _of_confounded(f: scores.Figures) -> None:
+    those = f.of("confounded")
+    f.say("confounded: a wrong mechanism established (goal <= 3 %)", those, scores.mechanism_wrong)
+    f.say(
+        "  counting indistinguishable balances and drivers as right", those, lambda x: scores.mechanism_wrong(x, True)
+    )
+    f.say("  led by the order, the time or a temperature", those, led_by_confounded)
+    f.say("  nothing is missing, and something is found", [x for x in those if not x["truth"]], scores.false_finding)
+    f.say("  an effect, and its mechanism is established", [x for x in those if x["truth"]], scores.mechanism_right)
+
+
+def led_by_confounded(x: dict) -> bool:
+    """True if the finding of a line changes with the order, the time or a temperature."""
+    return bool(x["where"]) and str(x["where"][1]).split(" ")[0] in ("order", "time", "temperature")
 
 
 def _identifiability(f: scores.Figures) -> None:

@@ -24,3 +24,13 @@ def rows(path: Path) -> list[dict[str, str]]:
     """The rows of a CSV file."""
     with path.open(newline="", encoding="utf-8") as stream:
         return list(csv.DictReader(stream))
+
+
+def ends(run: tuple[int, str, str], *said: str, code: int = 2) -> tuple[int, str, str]:
+    """A run (exit code, stdout, stderr) that ended with `code` and says each sentence, on stderr if it was refused."""
+    ended, out, err = run
+    text = out + err if code == 0 else err
+    assert ended == code, err
+    for sentence in said:
+        assert sentence in text or sentence in " ".join(text.split()), text
+    return run

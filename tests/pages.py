@@ -1,10 +1,48 @@
-"""Reading the pages of reports."""
+"""Reading the pages of reports, and texts that are recorded."""
 
 from __future__ import annotations
 
+import os
 import re
 from html.parser import HTMLParser
 from pathlib import Path
+
+from sweeps.report.document import Document, Figure, Note, Section
+
+#: Texts of documents and sentences as they are; `MMRJAX_RECORD=1 pytest FILE` writes those of a file anew.
+RECORD = Path(__file__).parent / "record" / "pages"
+
+
+def recorded(name: str, text: str) -> str:
+    """The recorded text of this name, after writing it where that is asked for."""
+    path = RECORD / f"{name}.txt"
+    if os.environ.get("MMRJAX_RECORD"):
+        path.write_text(text, encoding="utf-8")
+    return path.read_text(encoding="utf-8")
+
+
+def as_text(document: Document) -> str:
+    """A document as lines of text: headings, notes, alternative texts of figures, and tables with their headings."""
+    lines = [f"# {document.title}", document.answer]
+    for section in (Section("", document.blocks), *document.sections):
+        lines += [f"## {section.heading}"] * bool(section.heading)
+        for block in section.blocks:
+            if isinstance(block, Note):
+                lines += [block.text] if isinstance(block.text, str) else [f"- {item}" for item in block.text]
+            elif isinstance(block, Figure):
+                lines += [f"[{block.name}] {block.alternative}", block.caption]
+            elif block.rows:
+                lines.append(f"{block.name}: " + " | ".join(c.full_title for c in block.columns))
+                lines += [
+                    " | ".join(c.text(v) for c, v in zip(block.columns, row, strict=True)) for row in block.rows
+                ]
+    return "\n".join(lines) + "\n"
+
+
+def tokens(text: str) -> tuple[list[str], list[float]]:
+    """Words of a text with # for each number, and the numbers."""
+    number = r"\d+(?:\.\d+)?(?:e[+-]?\d+)?"
+    return re.sub(number, "#", text).split(), [float(x) for x in re.findall(number, text)]
 
 
 class Tables(HTMLParser):

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from calibration.data import robot_file
 from calibration.data import runs as records
@@ -47,8 +48,8 @@ def driven(robot):
 def test_a_little_backlash_is_a_rigid_gear_once_things_have_settled():
     rigid, tight = driven(bench(0.0)), driven(bench(1e-4))
     ends = np.searchsorted(TIMES, [0.49, 0.99, 1.49, 1.99])
-    np.testing.assert_allclose(np.asarray(tight.speed_motor)[ends], np.asarray(rigid.speed_motor)[ends], rtol=2e-4)
-    np.testing.assert_allclose(np.asarray(tight.current)[ends], np.asarray(rigid.current)[ends], rtol=2e-3)
+    assert_allclose(np.asarray(tight.speed_motor)[ends], np.asarray(rigid.speed_motor)[ends], rtol=2e-4)
+    assert_allclose(np.asarray(tight.current)[ends], np.asarray(rigid.current)[ends], rtol=2e-3)
 
 
 def test_effects_of_the_gearbox_go_by_the_load_within_the_backlash_too():
@@ -81,7 +82,7 @@ def test_steady_travel_knows_no_backlash():
     run = drive_batch(bench(0.05), conditions, jnp.asarray([0.0, 3.0])).result
     steady = steady_batch(bench(0.05), conditions)
     for name in ("motor_speed", "output_speed", "total_current", "output_torque"):
-        np.testing.assert_allclose(run.reading[name], steady.reading[name], rtol=1e-4)
+        assert_allclose(run.reading[name], steady.reading[name], rtol=1e-4)
 
 
 def test_at_a_reversal_the_motor_turns_through_the_backlash_before_the_load():
@@ -93,7 +94,7 @@ def test_at_a_reversal_the_motor_turns_through_the_backlash_before_the_load():
         gap = np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(TIMES))])
         forward, backward = gap[np.searchsorted(TIMES, 0.49)], gap[np.searchsorted(TIMES, 0.99)]
         apart.append(forward - backward)
-    np.testing.assert_allclose(np.diff(apart), [0.05], rtol=1e-3)
+    assert_allclose(np.diff(apart), [0.05], rtol=1e-3)
     assert 0.05 < apart[0] < 0.052
 
 

@@ -3,6 +3,7 @@
 import jax
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from calibration.inference import bases
 from calibration.inference.bases import (
@@ -135,7 +136,7 @@ def test_windows_cover_the_order_and_overlap_by_half():
     mine = [k for k, n in enumerate(basis.names) if n[0] == "track" and window_from_name(n[1]).axis == "order"]
     for k in mine:
         of, inside = window_from_name(basis.names[k][1]), np.asarray(basis.columns)[k, :, 0] > 0
-        np.testing.assert_array_equal(inside, of.holds(order))
+        assert_array_equal(inside, of.holds(order))
         assert bases.FEWEST <= inside.sum() <= ROWS / 2
     shapes = np.asarray(basis.columns)[mine, :, 0]
     assert (shapes.sum(0) >= 1).all()
@@ -171,7 +172,7 @@ def test_windows_of_histories_are_in_time_at_the_same_instants_of_all_runs():
         over_time = [k for k, (_, v) in enumerate(basis.names) if window_from_name(v).axis == "time"]
         assert over_time
         for shape in np.asarray(basis.columns)[over_time, :, 0]:
-            np.testing.assert_array_equal(shape[:30], shape[30:])
+            assert_array_equal(shape[:30], shape[30:])
 
 
 def test_levels_of_conditions_are_windows():
@@ -180,11 +181,11 @@ def test_levels_of_conditions_are_windows():
     found = {window_from_name(v) for place, v in basis.names if place == "slip"}
     slopes = np.unique(columns["slope_deg"])
     mine = sorted((w for w in found if w.axis == "slope"), key=lambda w: w.low)
-    np.testing.assert_allclose([w.low for w in mine], np.radians(slopes), rtol=1e-4, atol=1e-6)
+    assert_allclose([w.low for w in mine], np.radians(slopes), rtol=1e-4, atol=1e-6)
     for w in found:
         k = basis.names.index(("slip", str(w)))
         x = columns[bases.VARIABLES[w.axis]] * bases.LEVELS[w.axis][0]
-        np.testing.assert_array_equal(np.asarray(basis.columns)[k, :, 0] > 0, w.holds(x))
+        assert_array_equal(np.asarray(basis.columns)[k, :, 0] > 0, w.holds(x))
     assert mine[-1].words == f"{slopes[-1]:g} deg of slope"
 
 
@@ -240,7 +241,7 @@ def test_families_that_fill_up_repeat_others():
         for k, name in enumerate(basis.names):
             same = [j for j, n in enumerate(basis.names) if n == name]
             for j in same:
-                np.testing.assert_array_equal(columns[j], columns[k])
+                assert_array_equal(columns[j], columns[k])
     assert len(set(family_names(found))) < len(family_names(found))
 
 
@@ -267,9 +268,7 @@ def test_a_wave_is_of_the_runs_that_pass_two_of_it_wherever_they_end():
     angle, rows, found = waves_of(7.0)
     wave = found["order 2 of the driving shaft"]
     for k, mine in enumerate(rows):
-        np.testing.assert_allclose(
-            wave[mine, 2 * k : 2 * k + 2].T, [np.cos(2 * angle[mine]), np.sin(2 * angle[mine])]
-        )
+        assert_allclose(wave[mine, 2 * k : 2 * k + 2].T, [np.cos(2 * angle[mine]), np.sin(2 * angle[mine])])
         assert not np.delete(wave[mine], [2 * k, 2 * k + 1], 1).any()
 
 
@@ -279,7 +278,7 @@ def test_pieces_of_a_wave_have_one_phase_in_all_runs():
     assert set(found) == {f"order {k} of the driving shaft" for k in (1, 2, 3)}
     for k in (1, 2, 3):
         wave = found[f"order {k} of the driving shaft"]
-        np.testing.assert_allclose(wave[:, :2].T, [np.cos(k * angle), np.sin(k * angle)])
+        assert_allclose(wave[:, :2].T, [np.cos(k * angle), np.sin(k * angle)])
         assert not wave[:, 2:].any()
 
 

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from worlds import bridges, paper
 
 import mmrjax as mm
@@ -89,7 +90,7 @@ def checked(kind, one_way, number):
     numbers = np.isfinite(found["motor_speed"])
     assert (numbers | (demand > 1)).all() and numbers.mean() > 0.9
     for got, exact in ((found["motor_current"], current), (found["motor_speed"], speed)):
-        np.testing.assert_allclose(np.asarray(got)[numbers], exact[numbers], rtol=1e-9, atol=1e-9)
+        assert_allclose(np.asarray(got)[numbers], exact[numbers], rtol=1e-9, atol=1e-9)
     # Runs of each kind are among them.
     assert {STATUSES.index(s) for s in ("converged", "stalled", "reverses", "rolls_back")} <= set(status.tolist())
     limited, blocked = np.abs(current) > limits, one_way & (np.abs(current) < 1e-9) & (speed != 0)
@@ -130,7 +131,7 @@ def test_derivatives_in_each_mode_are_differences_of_the_bisection(one_way):
         smooth &= np.abs(a - 2 * middle + b) < 1e-3 * np.abs(b - a) + 1e-9
     assert smooth.mean() > 0.95
     for got, wanted in zip(slope, rises, strict=True):
-        np.testing.assert_allclose(got[smooth], wanted[smooth], rtol=1e-4, atol=1e-4)
+        assert_allclose(got[smooth], wanted[smooth], rtol=1e-4, atol=1e-4)
         assert np.isfinite(got).all()
     limited = np.abs(here[0]) > limits
     assert (np.abs(slope[1][limited]) > 1).sum() > 20 and (slope[1][~limited] != 0).sum() > 20
@@ -163,7 +164,7 @@ def test_requirements_behind_a_limit_or_a_diode_are_those_of_a_bisection(one_way
     exact = bridges.settled(VEHICLE, load, volts, np.ones(number), limits, way, none)
     assert not (found[2] == STATUSES.index("failed")).any()
     for got, right in zip(found[:2], (exact[0], np.abs(exact[1])), strict=True):
-        np.testing.assert_allclose(got, right, rtol=1e-9, atol=1e-9)
+        assert_allclose(got, right, rtol=1e-9, atol=1e-9)
     assert (np.abs(exact[0]) > limits).sum() > 10
 
 
@@ -192,11 +193,11 @@ def test_settled_turns_with_a_limit_or_a_diode_are_solved(one_way):
         VEHICLE, np.asarray(motion.speed_motor), lambda _: volts + np.zeros(shape), np.ones(shape), duties.T,
         limits[:, None] + np.zeros(shape), np.full(shape, one_way),
     )  # fmt: skip
-    np.testing.assert_allclose(motion.current, current, rtol=1e-9, atol=1e-9)
+    assert_allclose(motion.current, current, rtol=1e-9, atol=1e-9)
     blocked = (np.abs(current) < 1e-9) & (np.abs(motion.speed_motor) > 1)
     assert blocked.any() == one_way
     for rate in (travel.acceleration, travel.acceleration_yaw, travel.signals.acceleration_wheel):
-        np.testing.assert_allclose(rate, 0.0, atol=1e-6)
+        assert_allclose(rate, 0.0, atol=1e-6)
 
 
 @pytest.mark.slow
@@ -211,7 +212,7 @@ def test_a_hundred_turns_with_a_limit_or_a_diode_settle_as_over_time(one_way):
     assert rolls.sum() > 60
     for name in ("current", "speed_motor"):
         ended = np.asarray(getattr(history.signals, name))[rolls, -1]
-        np.testing.assert_allclose(ended, np.asarray(getattr(motion, name))[rolls], rtol=1e-3, atol=1e-4)
+        assert_allclose(ended, np.asarray(getattr(motion, name))[rolls], rtol=1e-3, atol=1e-4)
 
 
 def test_a_start_leaves_the_current_limit_as_by_radau():

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from calibration.data import runs as records
 from calibration.inference import noise as noise_room
@@ -53,7 +54,7 @@ def made(seen):
 
 @pytest.mark.slow
 def test_the_share_of_the_guides_is_what_the_track_model_puts_out(seen):
-    np.testing.assert_allclose(seen[1].steady.guide_share, GUIDED, atol=0.01)
+    assert_allclose(seen[1].steady.guide_share, GUIDED, atol=0.01)
 
 
 def test_in_track_the_guide_friction_stands_for_the_product(base):
@@ -95,7 +96,7 @@ def test_jacobian_through_the_rollout_is_the_central_difference(posed):
     assert (np.asarray(seen.status) == CONVERGED).all()
     moved = [[fit.linearise(posed, at + s * e, posed.data)[0] for s in (step, -step)] for e in np.eye(2)]
     central = np.stack([(up - down) / (2 * step) for up, down in moved], 1)
-    np.testing.assert_allclose(jacobian, central, rtol=0.01, atol=1e-4 * np.abs(central).max())
+    assert_allclose(jacobian, central, rtol=0.01, atol=1e-4 * np.abs(central).max())
     assert (np.abs(jacobian[:6]).max(0) > 0.1).all()  # both move the readings
 
 
@@ -118,7 +119,7 @@ def test_track_calibration_recovers_the_guide_friction(found, made, told):
 @pytest.mark.slow
 def test_the_robot_says_the_same_in_the_other_fidelities(found, made):
     current = steady_batch(found.robot, made.conditions(found.robot)).total_current
-    np.testing.assert_allclose(current, made["total_current_A"], rtol=5e-3)
+    assert_allclose(current, made["total_current_A"], rtol=5e-3)
 
 
 @pytest.mark.slow

@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import jax
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import calibration
 import mmrjax as mm
@@ -120,15 +121,15 @@ def test_a_robot_has_the_channels_of_its_rig(bench):
 def test_a_reading_keeps_its_column_and_size_from_file_to_result(tmp_path, bench, unit):
     runs = calibration.read_runs(written(tmp_path / "t.csv", made_up(bench, unit)), robot=bench)
     assert channels.channel_names(runs.channels) == TORQUE and runs.unknown == ()
-    np.testing.assert_allclose(runs.measured()[:, 2], FIRST + 2 + np.arange(12.0), rtol=1e-12)
-    np.testing.assert_allclose(runs.deviations()[:, 2], 0.03, rtol=1e-12)
-    np.testing.assert_allclose(runs.measured()[:, 1], (FIRST + 1 + np.arange(12.0)) * quantities.RPM, rtol=1e-12)
+    assert_allclose(runs.measured()[:, 2], FIRST + 2 + np.arange(12.0), rtol=1e-12)
+    assert_allclose(runs.deviations()[:, 2], 0.03, rtol=1e-12)
+    assert_allclose(runs.measured()[:, 1], (FIRST + 1 + np.arange(12.0)) * quantities.RPM, rtol=1e-12)
     for table in (calibrated(runs, bench).rows(), discovered(runs).rows_table()):
         assert "speed_mm_s" not in table
         for k, c in enumerate(bench.channels):
             for column in (c.column, f"before_{c.column}", f"after_{c.column}"):
-                np.testing.assert_allclose(table[column], FIRST + k + np.arange(12.0), rtol=1e-12)
-            np.testing.assert_allclose(table[c.sd_column], 0.01 * (k + 1), rtol=1e-12)
+                assert_allclose(table[column], FIRST + k + np.arange(12.0), rtol=1e-12)
+            assert_allclose(table[c.sd_column], 0.01 * (k + 1), rtol=1e-12)
 
 
 def test_noise_is_of_the_channels_of_a_table(tmp_path, bench):
@@ -155,7 +156,7 @@ def test_a_table_without_a_robot_has_every_channel_of_which_it_has_a_column(tmp_
     path = written(tmp_path / "t.csv", columns)
     runs = calibration.read_runs(path)
     assert channels.channel_names(runs.channels) == (*channels.USUAL, "output_torque") and runs.unknown == ()
-    np.testing.assert_allclose(runs.measured()[:, 3], FIRST + np.arange(12.0), rtol=1e-12)
+    assert_allclose(runs.measured()[:, 3], FIRST + np.arange(12.0), rtol=1e-12)
     assert np.isnan(runs.measured()[:, 1:3]).all() and len(runs.missing()) == 2
     # Of a robot without that channel, read so or used so, its columns are said to be left out.
     for left in (calibration.read_runs(path, robot=mm.nominal()), runs.of(mm.nominal())):
@@ -172,7 +173,7 @@ def test_a_table_takes_the_channels_of_the_robot_that_it_is_used_with(tmp_path, 
     wide = calibration.read_runs(path, robot=bench)
     assert wide.of(bench) is wide and wide.of(other).channels == narrow.channels
     assert wide.of(other).unknown == narrow.unknown and wide.of(other).columns.keys() == narrow.columns.keys()
-    np.testing.assert_array_equal(wide.of(other).measured(), narrow.measured())
+    assert_array_equal(wide.of(other).measured(), narrow.measured())
     with pytest.raises(BadData, match=r"t\.csv, output_torque_Nm: left out as the table was read, .* with robot="):
         narrow.of(bench)
 
@@ -266,7 +267,7 @@ def test_two_rigs_are_calibrated_side_by_side_as_alone(tmp_path):
         with (tmp_path / "found" / "rows.csv").open() as file:
             rows = list(csv.DictReader(file))
         for c in robot.channels:
-            np.testing.assert_allclose(
+            assert_allclose(
                 [float(r[c.column]) for r in rows], runs[c.column], rtol=1e-8
             )  # as many digits as a file has
             assert np.abs(found.readings[c.name].sigma).max() < 4
@@ -303,7 +304,7 @@ def test_what_the_loop_finds_is_written_under_its_channels(tmp_path, bench):
     table = found.rows_table()
     assert "speed_mm_s" not in table and found.channels == bench.channels
     for c in bench.channels:
-        np.testing.assert_allclose(table[c.column], runs[c.column], rtol=1e-12)
-        np.testing.assert_allclose(table[f"after_{c.column}"], runs[c.column], rtol=0.1)
+        assert_allclose(table[c.column], runs[c.column], rtol=1e-12)
+        assert_allclose(table[f"after_{c.column}"], runs[c.column], rtol=0.1)
     found.save(tmp_path / "found")
     assert set(found.noise) == set(TORQUE)

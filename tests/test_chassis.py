@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from worlds import paper
 
 from mmrjax.model import balances, chassis, params
@@ -15,13 +16,13 @@ def test_chassis_inertias_match_reference():
     for _ in range(100):
         J_d, i, eta, J_w = RNG.uniform((0, 5, 0.3, 0), (1e-5, 100, 1, 1e-2))
         rotating = chassis.inertia_reduced(J_d, i, eta, J_w)
-        np.testing.assert_allclose(rotating, paper.rotating_inertia(J_d, i, eta, J_w), rtol=1e-9)
+        assert_allclose(rotating, paper.rotating_inertia(J_d, i, eta, J_w), rtol=1e-9)
 
 
 def test_normal_load_matches_reference():
     for mass, alpha in RNG.uniform((5, -0.7), (40, 0.7), (50, 2)):
         expected = paper.rolling_force(mass / 2, alpha, 1.0)
-        np.testing.assert_allclose(chassis.normal_load(mass, alpha, paper.G, 2), expected, rtol=1e-9)
+        assert_allclose(chassis.normal_load(mass, alpha, paper.G, 2), expected, rtol=1e-9)
 
 
 @pytest.mark.quick(1)
@@ -46,7 +47,7 @@ def test_mass_factor_is_that_of_acceleration_without_sliding(robot, wheeled):
     turned = paper.equivalent_inertia(m, body.radius, robot.motor.inertia, robot.gearbox.ratio, eta, body.inertia)
     delta = paper.mass_factor(m, body.radius, turned)
     assert float(delta) > 1.3  # 48 : 1 makes the rotor count
-    np.testing.assert_allclose(s.acceleration, free / (m * delta), rtol=1e-9)
+    assert_allclose(s.acceleration, free / (m * delta), rtol=1e-9)
 
 
 def test_total_mass_stated_overrides_robot_and_payload(robot):
@@ -57,7 +58,7 @@ def test_total_mass_stated_overrides_robot_and_payload(robot):
 
 def test_table7_motor_side_is_the_reflected_rotor(robot):
     # 5760 kg·mm² = 2.5 x 48²; the rotor of the sheet has 3.35 kg·mm²
-    np.testing.assert_allclose(5760e-6 / 48**2, 2.5e-6)
+    assert_allclose(5760e-6 / 48**2, 2.5e-6)
     assert float(robot.motor.inertia) > 2.5e-6
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import json
 import math
@@ -24,9 +23,8 @@ from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.signals import CONVERGED, SLIDES, STALLED, STATUSES
-from sweeps.pages import posture_figures
 from tests.commands import command
-from tests.pages import Tables, drawn, outside
+from tests.pages import Tables
 
 SCHEMA = json.loads((Path(__file__).parents[1] / "docs" / "schemas" / "check.schema.json").read_text("utf-8"))
 
@@ -303,20 +301,6 @@ def test_external_supply_and_another_configuration(tmp_path):
     assert again == found and (tmp_path / "run" / "requirements.toml").read_text() == file.read_text()
 
 
-@pytest.mark.slow
-def test_report_shows_the_sheet(folder, result):
-    page = (folder / "report.html").read_text()
-    tables = Tables(page)
-    posed = {"postures"} if any(r["name"] in posture_figures.ASKED for r in result["requirements"]) else set()
-    assert drawn(page) == {"margins"} | posed and outside(folder) == []
-    rows = tables.tables["requirements"][1:]
-    assert [r[0] for r in rows] == ["met" if r["met"] else "missed" for r in result["requirements"]]
-    assert "0.947 m/s" in rows[0][3] and "what would meet them" in tables.text.lower()
-    with (folder / "requirements.csv").open(newline="") as stream:
-        assert [r["name"] for r in csv.DictReader(stream)] == [r["name"] for r in result["requirements"]]
-    assert command(["check", "--out", folder]) == 2  # --force is needed
-
-
 def test_paper_file_states_where_each_aim_comes_from():
     asked = requirements_file.load_requirements(None)
     assert all("Section" in r.source or "Table" in r.source or "sheet" in r.source for r in asked.each)
@@ -467,29 +451,6 @@ def test_stairs_need_friction_reach_and_a_tread(robot):
         requirements_file.parse_requirements("stairs_rise_mm = 170", "stairs.toml")
     with pytest.raises(BadConfiguration, match="step_mm, tread_mm: no such key"):
         requirements_file.parse_requirements("step_mm = { least = 100, tread_mm = 290 }", "stairs.toml")
-
-
-@pytest.mark.slow
-def test_derivatives_of_the_highest_step_are_differences(robot):
-    given = (
-        "running_gear.lever_length",
-        "running_gear.wheelbase",
-        "6T2A.mass",
-        "running_gear.centre_height",
-        "6T2A.radius",
-    )
-    known = {p.name: float(p.value) for p in params.walk_parameters(robot)}
-    theta = jnp.asarray([known[n] for n in given])
-
-    @jax.jit
-    def value(theta):
-        made = params.replace(robot, dict(zip(given, theta, strict=True)))
-        return evaluate_requirement(made, point(payload=3.0), ratings(robot), "step_mm").value
-
-    exact = np.asarray(jax.jit(jax.grad(value))(theta))
-    for k in range(len(given)):
-        up, down = (float(value(theta.at[k].multiply(1 + s * 1e-4))) for s in (1, -1))
-        assert exact[k] == pytest.approx((up - down) / (2e-4 * float(theta[k])), rel=2e-3), given[k]
 
 
 def test_posture_of_a_robot_that_states_no_running_gear_is_not_known(robot):

@@ -9,7 +9,6 @@ import time
 import tomllib
 from pathlib import Path
 
-import numpy as np
 import pytest
 import rich.text
 import typer
@@ -18,6 +17,7 @@ from calibration.data.input_errors import BadConfiguration
 from mmrjax import SOUND_AT_LEVEL_0, errors, fidelities
 from sweeps import cli, config, options
 from sweeps.points import scale
+from tests.commands import ends
 from tests.commands import rows as table
 
 MMRJAX = [sys.executable, "-c", "from sweeps.cli import main; main()"]
@@ -29,8 +29,7 @@ CLIMBS = ["--set", "6T2A.ground.friction.static=0.6", "--set", "4W2T.ground.fric
 
 @pytest.mark.slow
 def test_sweep_is_table_8_in_both_configurations(mmrjax, tmp_path):
-    code, out, _ = mmrjax("sweep", "--no-report", "--out", "s")
-    assert code == 0  # that some slide is an answer
+    _, out, _ = ends(mmrjax("sweep", "--no-report", "--out", "s"), code=0)  # that some slide is an answer
     assert out.rstrip().splitlines()[-1] == "s"
     rows = table(tmp_path / "s" / "runs.csv")
     points = {(r["configuration"], r["supply_voltage_V"], r["payload_kg"], r["slope_deg"]) for r in rows}
@@ -60,32 +59,11 @@ def test_sweep_repeats_from_what_it_left(mmrjax, tmp_path):
 
 
 @pytest.mark.slow
-def test_drive_sweep_agrees_with_steady(mmrjax, tmp_path):
-    axes = ["--slopes", "0,10", "--payloads", "0,8", "--voltages", "15,33", "--no-report", *CLIMBS]
-    assert mmrjax("sweep", *axes, "--out", "steady")[0] == 0
-    assert mmrjax("sweep", *axes, "--out", "drive", "--model", "drive")[0] == 0
-    for a, b in zip(table(tmp_path / "steady" / "runs.csv"), table(tmp_path / "drive" / "runs.csv"), strict=True):
-        for column in ("total_current_A", "motor_speed_rpm", "speed_mm_s", "power_ground_W", "efficiency_gear"):
-            assert float(b[column]) == pytest.approx(float(a[column]), rel=1e-3)
-
-
-@pytest.mark.slow
-def test_simulate_drive_leaves_a_history_that_ends_on_its_run(mmrjax, tmp_path):
-    code, out, _ = mmrjax("simulate", "--model", "drive", "--slope", "5", "--no-report", "--out", "d")
-    assert code == 0 and "total current [A]" in out and "total mass [kg]" in out
-    history, (end,) = table(tmp_path / "d" / "history.csv"), table(tmp_path / "d" / "runs.csv")
-    assert float(history[0]["speed_mm_s"]) == 0.0 and float(history[-1]["time_s"]) == 5.0
-    for column in ("total_current_A", "motor_speed_rpm", "speed_mm_s", "theoretical_speed_mm_s"):
-        assert float(history[-1][column]) == pytest.approx(float(end[column]), rel=1e-6)
-
-
-@pytest.mark.slow
 def test_simulate_runs_from_a_file_of_conditions(mmrjax, tmp_path):
     (tmp_path / "plan.csv").write_text(
         "configuration,supply_voltage_V,payload_kg,slope_deg,run_id,note\n6T2A,24,2,3,a,x\n"
     )
-    code, _, err = mmrjax("simulate", "--runs", "plan.csv", "--no-report", "--out", "p")
-    assert code == 0 and "not used: note" in err
+    ends(mmrjax("simulate", "--runs", "plan.csv", "--no-report", "--out", "p"), "not used: note", code=0)
     assert table(tmp_path / "p" / "runs.csv")[0]["run_id"] == "a"
 
 
@@ -95,22 +73,12 @@ def test_battery_sags_and_ends_clearly(mmrjax, tmp_path):
     (full,) = table(tmp_path / "full" / "runs.csv")
     current = float(full["total_current_A"])
     assert code == 0 and float(full["voltage_V"]) == pytest.approx(8 * (4.17 - 0.049 * (current + 1.5)))
-    code, out, _ = mmrjax("simulate", "--battery", "--discharge", "2300", "--no-report", "--out", "empty")
-    assert code == 0 and "battery empty" in out and "the battery's capacity is used up" in out
-
-
-@pytest.mark.slow
-def test_compare_gives_equation_35(mmrjax, tmp_path):
-    code, out, _ = mmrjax("compare", "measured", "--no-report", "--out", "c", *CLIMBS)
-    assert code == 0 and "R²" in out
-    rows = table(tmp_path / "c" / "comparison.csv")
-    for row in rows:
-        simulated, measured = float(row["simulated_speed_mm_s"]), float(row["speed_mm_s"])
-        assert float(row["error_speed_percent"]) == pytest.approx(100 * (simulated - measured) / simulated, rel=1e-6)
-    errors = json.loads((tmp_path / "c" / "result.json").read_text())["errors"]
-    rms = np.sqrt(np.mean([float(r["error_total_current_percent"]) ** 2 for r in rows]))
-    assert errors["all"]["total_current"]["rms_percent"] == pytest.approx(rms, rel=1e-6)
-    assert errors["6T2A"]["speed"]["rows"] == 10
+    ends(
+        mmrjax("simulate", "--battery", "--discharge", "2300", "--no-report", "--out", "empty"),
+        "battery empty",
+        "the battery's capacity is used up",
+        code=0,
+    )
 
 
 def test_compare_own_mass_takes_the_robots(mmrjax, tmp_path):
@@ -204,25 +172,28 @@ def test_bad_usage_ends_with_2_and_one_sentence(mmrjax, tmp_path, case):
 
 
 def test_empty_path_and_a_table_that_is_a_number_are_refused(mmrjax, tmp_path):
-    code, _, err = mmrjax("sweep", "--out", "")
-    assert code == 2 and "--out: got '.'; expected the name of a folder" in err
+    ends(mmrjax("sweep", "--out", ""), "--out: got '.'; expected the name of a folder")
     (tmp_path / "grid.toml").write_text("set = 3\n")
-    code, _, err = mmrjax("sweep", "--config", "grid.toml", "--set", "motor.resistance=0.8")
-    assert code == 2 and "set: got 3" in err
+    ends(mmrjax("sweep", "--config", "grid.toml", "--set", "motor.resistance=0.8"), "set: got 3")
 
 
 def test_somebody_elses_partial_folder_is_left_alone(mmrjax, tmp_path):
     (tmp_path / "mine.partial").mkdir()
     (tmp_path / "mine.partial" / "thesis.txt").write_text("years of work")
-    code, _, err = mmrjax("simulate", "--no-report", "--out", "mine", "--force")
-    assert code == 2 and "mine.partial is in the way and is no run of ours" in err
+    ends(
+        mmrjax("simulate", "--no-report", "--out", "mine", "--force"),
+        "mine.partial is in the way and is no run of ours",
+    )
     assert (tmp_path / "mine.partial" / "thesis.txt").read_text() == "years of work"
 
 
 def test_time_histories_are_not_taken_for_steady_runs(mmrjax, tmp_path):
     (tmp_path / "runs.csv").write_text(f"{HEADER},run_id,time_s\n6T2A,15,13.1,0,5,2.75,4800,400,a,0.1\n")
-    code, _, err = mmrjax("simulate", "--runs", "runs.csv", "--out", "x")
-    assert code == 4 and "column time_s: time histories are for calibrate, compare and loop" in err
+    ends(
+        mmrjax("simulate", "--runs", "runs.csv", "--out", "x"),
+        "column time_s: time histories are for calibrate, compare and loop",
+        code=4,
+    )
 
 
 def test_data_are_hashed_in_the_manifest(mmrjax, tmp_path):
@@ -236,41 +207,11 @@ def test_data_are_hashed_in_the_manifest(mmrjax, tmp_path):
 
 
 @pytest.mark.slow
-def test_drive_ends_clearly_when_the_battery_is_empty(mmrjax, tmp_path):
-    arguments = [
-        "simulate",
-        "--model",
-        "drive",
-        "--battery",
-        "--discharge",
-        "2195",
-        "--duration",
-        "100",
-        "--no-report",
-    ]
-    assert mmrjax(*arguments, "--out", "d")[0] == 0
-    (end,), history = table(tmp_path / "d" / "runs.csv"), table(tmp_path / "d" / "history.csv")
-    assert end["status"] == "battery_empty" and float(end["speed_mm_s"]) > 0  # of the last instant before
-    ran = [row["speed_mm_s"] != "" for row in history]
-    assert any(ran) and not ran[-1] and ran == sorted(ran, reverse=True)  # numbers up to one instant, none after
-
-
-@pytest.mark.slow
-def test_simulate_track_writes_every_reaction(mmrjax, tmp_path):
-    code, _, _ = mmrjax("simulate", "--model", "track", "--duration", "0.1", "--no-report", "--out", "t")
-    assert code == 0  # still accelerating
-    reactions = table(tmp_path / "t" / "reactions.csv")
-    grousers = sum(float(reactions[-1][f"grouser_{k:02d}_N"]) for k in range(1, 25))
-    assert grousers == pytest.approx(13.1 / 2 * 9.81, rel=0.3)  # half the weight, with its ripple
-    assert table(tmp_path / "t" / "runs.csv")[0]["guide_share"] != ""
-
-
-@pytest.mark.slow
 def test_sweep_track_has_a_bar_a_status_a_run_and_the_share_of_each(mmrjax, tmp_path):
     """Rolling: on tracks 10° is climbed and 15° slides, on wheels both are climbed."""
     arguments = ("--voltages", "33", "--payloads", "0", "--slopes", "10,15", "--duration", "0.6", "--no-report")
-    code, out, err = mmrjax("sweep", "--model", "track", *arguments, "--out", "t")
-    assert code == 0 and out.rstrip().splitlines()[-1] == "t"
+    _, out, err = ends(mmrjax("sweep", "--model", "track", *arguments, "--out", "t"), code=0)
+    assert out.rstrip().splitlines()[-1] == "t"
     assert "simulating" in err and "4/4" in err
     rows = table(tmp_path / "t" / "runs.csv")
     assert [row["status"] for row in rows] == ["converged", "slides", "converged", "converged"]
@@ -293,8 +234,11 @@ def test_track_run_is_interrupted_while_it_runs_and_leaves_nothing(mmrjax, tmp_p
             raise KeyboardInterrupt
 
     monkeypatch.setattr(Progress, "update", update)
-    code, _, err = mmrjax("simulate", "--model", "track", "--duration", "0.06", "--no-report", "--out", "t")
-    assert code == 130 and "interrupted" in err
+    ends(
+        mmrjax("simulate", "--model", "track", "--duration", "0.06", "--no-report", "--out", "t"),
+        "interrupted",
+        code=130,
+    )
     assert moves == [0.05, 0.1, 0.15] and not any(tmp_path.iterdir())
 
 
@@ -308,42 +252,27 @@ def test_shares_of_a_batch_add_up_to_its_runs():
 
 
 @pytest.mark.slow
-def test_track_step_that_is_too_large_is_refused_before_the_run(mmrjax, tmp_path):
-    code, out, err = mmrjax(
-        "simulate", "--model", "track", "--step", "0.001", "--set", "running_gear.contact_stiffness=3e9", "--out", "x"
-    )
-    assert code == 2 and out == ""
-    assert re.search(
-        r"--model track: step: got 0\.001 s; .* the largest stable step is 0\.000\d+ s .*; take 0\.000\d+ s", err
-    )
-    assert not any(tmp_path.iterdir())
-
-
-@pytest.mark.slow
 def test_render_writes_a_picture_and_refuses_other_names(mmrjax, tmp_path):
-    code, _, err = mmrjax("render", "robot.bmp")
-    assert code == 2 and "expected a name that ends in .png, .gif, .mp4" in err
+    ends(mmrjax("render", "robot.bmp"), "expected a name that ends in .png, .gif, .mp4")
     for words, message in (
         (("robot.png", "--begin", "2"), "render: begin: got 2 s; expected times within 0 to 1.5 s, the run's"),
         (("robot.png", "--begin", "nan"), "render: begin: got nan s"),
         (("robot.gif", "--begin", "0.2", "--end", "0.1"), "render: begin, end: got 0.2 to 0.1 s"),
         (("robot.mp4", "--slow", "inf"), "render: slow: got inf, a film of inf pictures; expected at most 10000"),
     ):
-        code, out, err = mmrjax("render", *words)  # before the run: there is no progress bar
-        assert code == 2 and out == "" and message in err and len(err.strip().splitlines()) == 1
-    code, out, _ = mmrjax("render", "robot.png", "--duration", "0.05", "--begin", "0.04")
-    assert code == 0 and "not_settled" in out and out.rstrip().endswith("robot.png")  # drawn as it was asked for
+        _, out, err = ends(mmrjax("render", *words), message)
+        assert out == "" and len(err.strip().splitlines()) == 1
+    _, out, _ = ends(mmrjax("render", "robot.png", "--duration", "0.05", "--begin", "0.04"), "not_settled", code=0)
+    assert out.rstrip().endswith("robot.png")  # drawn as it was asked for
     assert (tmp_path / "robot.png").read_bytes().startswith(b"\x89PNG")
     assert [p.name for p in tmp_path.iterdir()] == ["robot.png"]
 
 
 def test_bad_config_files_name_file_and_key(mmrjax, tmp_path):
     (tmp_path / "grid.toml").write_text("slops_deg = [5]\n")
-    code, _, err = mmrjax("sweep", "--config", "grid.toml")
-    assert code == 2 and "grid.toml, slops_deg: no such key; did you mean slopes_deg?" in err
+    ends(mmrjax("sweep", "--config", "grid.toml"), "grid.toml, slops_deg: no such key; did you mean slopes_deg?")
     (tmp_path / "grid.toml").write_text("slopes_deg = [5, 95]\n")
-    code, _, err = mmrjax("sweep", "--config", "grid.toml")
-    assert code == 2 and "grid.toml, slopes_deg.1: got 95; expected -45 to 45" in err
+    ends(mmrjax("sweep", "--config", "grid.toml"), "grid.toml, slopes_deg.1: got 95; expected -45 to 45")
 
 
 BAD_RUNS = {
@@ -370,21 +299,19 @@ BAD_RUNS = {
 def test_bad_data_ends_with_4_and_leaves_nothing(mmrjax, tmp_path, case):
     text, sentence = BAD_RUNS[case]
     (tmp_path / "runs.csv").write_text(text)
-    code, out, err = mmrjax("compare", "runs.csv", "--out", "x")
-    assert code == 4 and out == "" and sentence in err and len(err.strip().splitlines()) == 1
+    _, out, err = ends(mmrjax("compare", "runs.csv", "--out", "x"), sentence, code=4)
+    assert out == "" and len(err.strip().splitlines()) == 1
     assert [p.name for p in tmp_path.iterdir()] == ["runs.csv"]
 
 
 def test_unwritable_or_taken_folder_is_refused(mmrjax, tmp_path):
     (tmp_path / "file").write_text("")
-    code, _, err = mmrjax("sweep", "--out", "file/below")
-    assert code == 2 and "--out: file/below cannot be written" in err
-    code, _, err = mmrjax("sweep", "--out", "file")
-    assert code == 2 and "--out: file exists already" in err
+    ends(mmrjax("sweep", "--out", "file/below"), "--out: file/below cannot be written")
+    ends(mmrjax("sweep", "--out", "file"), "--out: file exists already")
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.txt").write_text("years of work")
-    code, _, err = mmrjax("sweep", "--out", "mine", "--force")
-    assert code == 2 and (tmp_path / "mine" / "thesis.txt").exists()  # --force replaces run folders only
+    ends(mmrjax("sweep", "--out", "mine", "--force"))
+    assert (tmp_path / "mine" / "thesis.txt").exists()  # --force replaces run folders only
 
 
 def test_run_folder_is_replaced_only_when_told(mmrjax, tmp_path):
@@ -405,16 +332,14 @@ def test_full_disk_names_the_file_whichever_it_is(mmrjax, tmp_path, monkeypatch)
         return honest(path, text, **options)
 
     monkeypatch.setattr(Path, "write_text", full)
-    code, _, err = mmrjax("simulate", "--no-report", "--out", "r")
-    assert code == 2 and "r.partial/result.json: No space left on device" in err
+    ends(mmrjax("simulate", "--no-report", "--out", "r"), "r.partial/result.json: No space left on device")
 
     def picture(*_, **__):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(Path, "write_text", honest)
     monkeypatch.setattr("sweeps.report.page_renderer.write_report_page", picture)
-    code, _, err = mmrjax("simulate", "--out", "r")
-    assert code == 2 and "r.partial: No space left on device" in err
+    ends(mmrjax("simulate", "--out", "r"), "r.partial: No space left on device")
 
 
 def test_full_disk_leaves_no_run_folder(mmrjax, tmp_path, monkeypatch):
@@ -422,8 +347,7 @@ def test_full_disk_leaves_no_run_folder(mmrjax, tmp_path, monkeypatch):
         raise OSError(28, "No space left on device", "runs.csv")
 
     monkeypatch.setattr("sweeps.store.RunFolder.write_table", full)
-    code, _, err = mmrjax("simulate", "--no-report", "--out", "r")
-    assert code == 2 and "runs.csv: No space left on device; no run folder was left" in err
+    ends(mmrjax("simulate", "--no-report", "--out", "r"), "runs.csv: No space left on device; no run folder was left")
     assert not (tmp_path / "r").exists()
 
 
@@ -441,8 +365,7 @@ def test_interrupted_sweep_goes_on_where_it_stopped(mmrjax, tmp_path, monkeypatc
         return honest(compiled, values, *told)
 
     monkeypatch.setattr(scale.Compiled, "__call__", interrupted)
-    code, _, err = mmrjax(*arguments)
-    assert code == 130 and "goes on where it stopped" in err
+    ends(mmrjax(*arguments), "goes on where it stopped", code=130)
     assert not (tmp_path / "s").exists() and (tmp_path / "s.partial").exists()
     kept = len(list((tmp_path / "s.partial" / "chunks").glob("*.npz")))
     assert 0 < kept <= 3
@@ -478,8 +401,8 @@ def test_partial_folder_of_another_run_is_not_taken_up(mmrjax, tmp_path, monkeyp
     monkeypatch.setattr(scale.Compiled, "__call__", interrupted)
     assert mmrjax(*arguments)[0] == 130 and kept.exists()
     monkeypatch.setattr(scale.Compiled, "__call__", honest)
-    code, _, err = mmrjax(*arguments, "--set", "motor.resistance=0.9")
-    assert code == 2 and "--force" in err and kept.exists()
+    ends(mmrjax(*arguments, "--set", "motor.resistance=0.9"), "--force")
+    assert kept.exists()
     mmrjax(*arguments, "--set", "motor.resistance=0.9", "--force")
     mmrjax(*arguments[:-1], "t", "--set", "motor.resistance=0.9")
     assert (tmp_path / "s" / "runs.csv").read_text() == (tmp_path / "t" / "runs.csv").read_text()
@@ -603,8 +526,8 @@ def test_mmrjax_alone_prints_commands_that_exist(mmrjax):
 
 @pytest.mark.slow
 def test_check_passes_on_this_installation(mmrjax):
-    code, out, _ = mmrjax("--check")
-    assert code == 0 and "FAILED" not in out and "24 V / C_E" in out
+    _, out, _ = ends(mmrjax("--check"), "24 V / C_E", code=0)
+    assert "FAILED" not in out
     assert "compilation cache" in out and ("programs" in out or "off" in out)
 
 
@@ -660,94 +583,6 @@ def test_configurations_of_former_versions_are_read(tmp_path):
     assert config.resolve_configuration(config.Sweep, tmp_path / "old.toml", {}).robot == "sm1"
 
 
-@pytest.fixture(scope="module")
-def crawler(tmp_path_factory):
-    """A robot's TOML file with one configuration of its own name."""
-    path = tmp_path_factory.mktemp("crawler") / "crawler.toml"
-    path.write_text('configurations = ["crawler"]\n[crawler]\nlike = "6T2A"\nmass = 12.0\n')
-    return path
-
-
-@pytest.mark.slow
-def test_robot_with_one_configuration_simulates_and_sweeps_it(mmrjax, tmp_path, crawler):
-    assert mmrjax("simulate", "--robot", crawler, "--no-report", "--out", "one")[0] == 0
-    (run,) = table(tmp_path / "one" / "runs.csv")
-    assert (run["configuration"], run["total_mass_kg"]) == ("crawler", "12")
-    axes = ("--voltages", "24", "--payloads", "0,2", "--slopes", "0,5")
-    assert mmrjax("sweep", "--robot", crawler, *axes, "--out", "grid")[0] == 0
-    assert [row["configuration"] for row in table(tmp_path / "grid" / "runs.csv")] == ["crawler"] * 4
-    assert 'configurations = ["crawler"]' in (tmp_path / "grid" / "config.resolved.toml").read_text()
-    page = (tmp_path / "grid" / "report.html").read_text()
-    assert "6T2A" not in page and "4W2T" not in page and "crawler" in page
-    code, _, err = mmrjax("sweep", "--robot", crawler, "--configurations", "6T2A", "--out", "x")
-    assert code == 2 and "configurations: got 6T2A; the robot has no such configuration; allowed: crawler" in err
-
-
-@pytest.mark.slow
-def test_robot_with_one_configuration_is_compared(mmrjax, tmp_path, crawler):
-    (tmp_path / "runs.csv").write_text(f"{HEADER}\ncrawler,15,12,0,5,2.75,4800,400\n")
-    assert mmrjax("compare", "runs.csv", "--robot", crawler, "--out", "c")[0] == 0
-    assert set(json.loads((tmp_path / "c" / "result.json").read_text())["errors"]) == {"all", "crawler"}
-    code, _, err = mmrjax("compare", "measured", "--robot", crawler, "--out", "x")
-    assert code == 4 and re.search(r"measured row \d+, configuration: got \w+;.* allowed: crawler", err)
-
-
-@pytest.mark.slow
-def test_missing_readings_weigh_nothing_and_are_said(mmrjax, tmp_path):
-    full = f"{HEADER}\n6T2A,15,13.1,0,0,2.3,4930,420\n6T2A,15,13.1,0,5,2.75,4800,400\n6T2A,15,13.1,0,10,3,4745,390\n"
-    (tmp_path / "full.csv").write_text(full)
-    (tmp_path / "holes.csv").write_text(full.replace(",2.75,4800,400", ",,4800,400"))
-    (tmp_path / "none.csv").write_text("\n".join(line.rpartition(",")[0] for line in full.splitlines()))
-    errors = {}
-    for name in ("full", "holes", "none"):
-        code, out, _ = mmrjax("compare", f"{name}.csv", "--out", name)
-        assert code == 0
-        result = json.loads((tmp_path / name / "result.json").read_text())
-        errors[name] = result["errors"]["all"]
-        said = {"holes": "total_current_A: 1 of 3 readings are missing; they weigh nothing",
-                "none": "speed_mm_s: all readings are missing; they weigh nothing"}.get(name)  # fmt: skip
-        assert result["notes"] == ([said] if said else [])
-        assert said is None or (said in out and said in (tmp_path / name / "report.html").read_text())
-    assert errors["holes"]["total_current"]["rows"] == 2 and errors["holes"]["total_current"]["missing"] == 1
-    assert errors["holes"]["speed"] == errors["full"]["speed"]
-    assert errors["none"]["speed"]["rows"] == 0 and errors["none"]["total_current"] == errors["full"]["total_current"]
-
-
-FOURTH = """
-import dataclasses
-from mmrjax.model import channels
-channels.EVERY += (dataclasses.replace(
-    channels.EVERY[0], name="voltage", stem="terminal_voltage", unit="V",
-    label="voltage at the motors", word="voltage", range=(0.0, 100.0), read=lambda robot, signals: signals.voltage,
-),)
-channels.USUAL += ("voltage",)
-from sweeps.cli import main; main()
-"""
-
-
-@pytest.mark.slow
-def test_a_fourth_channel_is_one_row(tmp_path):
-    """Appended to the table before the command line is imported: every command has it, and no code knew."""
-    (tmp_path / "runs.csv").write_text(
-        f"{HEADER},terminal_voltage_V\n6T2A,15,13.1,0,0,2.3,4930,420,14.5\n6T2A,15,13.1,0,5,2.75,4800,400,\n"
-    )
-
-    def command(*arguments):
-        words = [sys.executable, "-c", FOURTH, *arguments]
-        return subprocess.run(words, capture_output=True, text=True, cwd=tmp_path)
-
-    swept = command("sweep", "--slopes", "0,5", "--payloads", "0,2", "--voltages", "24", "--out", "s")
-    assert swept.returncode == 0, swept.stderr
-    assert {row["terminal_voltage_V"] for row in table(tmp_path / "s" / "runs.csv")} == {"24"}
-    assert "voltage at the motors" in (tmp_path / "s" / "report.html").read_text().lower()
-    compared = command("compare", "runs.csv", "--out", "c")
-    assert compared.returncode == 0, compared.stderr
-    errors = json.loads((tmp_path / "c" / "result.json").read_text())["errors"]["all"]["voltage"]
-    assert errors["rows"] == 1 and errors["missing"] == 1
-    assert errors["rms_percent"] == pytest.approx(100 * 0.5 / 15)
-    assert "terminal_voltage_V: 1 of 2 readings are missing" in compared.stdout
-
-
 # --- what ends a command from outside -------------------------------------------------------------------------------
 
 
@@ -778,23 +613,24 @@ def test_too_little_memory_is_refused_at_once(mmrjax, tmp_path, monkeypatch):
     import resource
 
     monkeypatch.setattr(resource, "getrlimit", lambda _: (500_000_000, 500_000_000))
-    code, _, err = mmrjax("simulate", "--out", "x")
-    assert code == 2 and "memory: got a limit of 0.5 GB of address space (ulimit -v); expected at least 2 GB" in err
+    ends(
+        mmrjax("simulate", "--out", "x"),
+        "memory: got a limit of 0.5 GB of address space (ulimit -v); expected at least 2 GB",
+    )
     assert not any(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("code", ["0", "1", "'all is well'"])
 def test_an_effects_file_cannot_end_the_command_as_if_it_were_done(mmrjax, tmp_path, monkeypatch, code):
     (tmp_path / "own.py").write_text(f"import sys\nsys.exit({code})\n")
-    ended, _, err = mmrjax("simulate", "--effects", "own.py", "--out", "x")
-    assert ended == 2 and "own.py: its code fails (SystemExit:" in err and not (tmp_path / "x").exists()
+    ends(mmrjax("simulate", "--effects", "own.py", "--out", "x"), "own.py: its code fails (SystemExit:")
+    assert not (tmp_path / "x").exists()
 
     def later(*_, **__):
         raise SystemExit(0)
 
     monkeypatch.setattr(scale.Compiled, "__call__", later)
-    ended, _, err = mmrjax("simulate", "--no-report", "--out", "x")
-    assert ended == 2 and "code of a file of effects has ended the program" in err
+    ends(mmrjax("simulate", "--no-report", "--out", "x"), "code of a file of effects has ended the program")
     assert [p.name for p in tmp_path.iterdir()] == ["own.py"]
 
 
@@ -803,13 +639,15 @@ def test_a_file_that_ends_too_early_is_no_interrupt(mmrjax, monkeypatch):
         raise EOFError("No data left in file")
 
     monkeypatch.setattr(scale.Compiled, "__call__", short)
-    code, _, err = mmrjax("simulate", "--no-report", "--out", "x")
-    assert code == 1 and "internal error: No data left in file" in err and "interrupted" not in err
+    _, _, err = ends(mmrjax("simulate", "--no-report", "--out", "x"), "internal error: No data left in file", code=1)
+    assert "interrupted" not in err
 
 
 def test_a_message_is_short_whatever_it_quotes(mmrjax):
-    code, _, err = mmrjax("simulate", "--set", "m" * 100_000 + "=x", "--out", "x")
-    assert code == 2 and len(err) < 410 and "expected NAME=VALUE with a number" in err
+    _, _, err = ends(
+        mmrjax("simulate", "--set", "m" * 100_000 + "=x", "--out", "x"), "expected NAME=VALUE with a number"
+    )
+    assert len(err) < 410
 
 
 def test_output_that_is_full_is_named(mmrjax, monkeypatch):

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from mmrjax.climbing import climb_simulation as climb
 from mmrjax.climbing import footing, resting_posture, static_limits, terrain
@@ -72,7 +73,7 @@ def test_energy_in_is_stored_and_lost_at_every_instant_and_a_failed_member_harms
         assert all(since[name][-1] > 2e-3 * come[-1] for name in LOSSES), since  # or it would not be missed
     assert np.ptp(np.asarray(record.motion.q)[0, :, 1]) > 0.01  # it has climbed
     # belts bear on either side of the centre of mass until the levers lift it, though grousers leave the ground before
-    np.testing.assert_allclose(record.carried[0][(record.time[0] > 0.2) & (record.time[0] < 0.3)], 1.0, atol=0.03)
+    assert_allclose(record.carried[0][(record.time[0] > 0.2) & (record.time[0] < 0.3)], 1.0, atol=0.03)
     standing = np.asarray(record.margin[0][record.time[0] < 0.43])
     assert np.nanmin(standing) > 0.1 and np.isfinite(standing).mean() > 0.8
 
@@ -81,7 +82,7 @@ def test_a_margin_is_of_contacts_that_carry_the_robot():
     """Of what grazes the ground in a fall, or touches nothing, there is none."""
     base = jnp.array([[0.2, 0.1], [0.2, -0.1], [0.2, -0.1], [-jnp.inf, -jnp.inf]])
     shown = climb.ClimbRecord.margin.fget(SimpleNamespace(base=base, carried=jnp.array([1.0, 0.9, 0.4, 1.0])))
-    np.testing.assert_allclose(shown, [0.1, -0.1, jnp.nan, jnp.nan])
+    assert_allclose(shown, [0.1, -0.1, jnp.nan, jnp.nan])
 
 
 @pytest.mark.parametrize(("duration", "step"), [(20.0, 1e-4), (2.5, 1e-4), (2.0, 3e-4), (0.3, 7e-4), (0.05, 1e-3)])

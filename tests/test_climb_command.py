@@ -16,6 +16,7 @@ from mmrjax.climbing.climb_simulation import LOSSES
 from mmrjax.model.paper_robots import nominal
 from sweeps.commands import climb as room
 from sweeps.results.climb_results import Seen, footing_coordinates
+from tests.commands import ends
 
 SCHEMA = json.loads((Path(__file__).parents[1] / "docs" / "schemas" / "climb.schema.json").read_text("utf-8"))
 
@@ -160,11 +161,25 @@ def test_search_ends_within_a_millimetre_of_the_largest_that_is_got_over(limit):
 
 @pytest.mark.slow
 def test_one_climb_leaves_a_folder_whose_energy_adds_up(mmrjax, tmp_path):
-    code, out, _ = mmrjax(
-        "climb", "--gap", "60", "--levers-front", "45", "--voltage", "24", "--duration", "2", "--time-step", "4e-4",
-        "--out", "c",
-    )  # fmt: skip
-    assert code == 0 and "The robot gets over: a gap of 60 mm." in out
+    ends(
+        mmrjax(
+            "climb",
+            "--gap",
+            "60",
+            "--levers-front",
+            "45",
+            "--voltage",
+            "24",
+            "--duration",
+            "2",
+            "--time-step",
+            "4e-4",
+            "--out",
+            "c",
+        ),
+        "The robot gets over: a gap of 60 mm.",
+        code=0,
+    )
     folder = tmp_path / "c"
     result = json.loads((folder / "result.json").read_text("utf-8"))
     jsonschema.validate(result, SCHEMA)
@@ -182,9 +197,7 @@ def test_one_climb_leaves_a_folder_whose_energy_adds_up(mmrjax, tmp_path):
     seen = Seen.read(folder)
     assert footing_coordinates(seen.table)[-1, 4] == pytest.approx(np.radians(45), abs=2e-3)
     assert float(seen.terrain.finish) == pytest.approx(0.06)
-    code, out, _ = mmrjax("render", "c.png", "--climb", "c")
-    assert code == 0 and (tmp_path / "c.png").stat().st_size > 5000
-    code, _, err = mmrjax("render", "d.gif", "--climb", "c", "--voltage", "12")
-    assert code == 2 and "expected one of the two" in err
-    code, _, err = mmrjax("render", "d.gif", "--climb", "tests")
-    assert code == 2 and "tests cannot be read; expected a folder of mmrjax climb" in err
+    ends(mmrjax("render", "c.png", "--climb", "c"), code=0)
+    assert (tmp_path / "c.png").stat().st_size > 5000
+    ends(mmrjax("render", "d.gif", "--climb", "c", "--voltage", "12"), "expected one of the two")
+    ends(mmrjax("render", "d.gif", "--climb", "tests"), "tests cannot be read; expected a folder of mmrjax climb")

@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import samples
+from numpy.testing import assert_allclose, assert_array_equal
 
 from calibration.data import counters, repeated_readings, robot_file
 from calibration.data import runs as records
@@ -60,7 +61,7 @@ def test_a_clock_is_counted_from_the_first_row(tmp_path, robot, case, as_text):
         source.to_csv(tmp_path / "log.csv", index=False)
         source = tmp_path / "log.csv"
     found = records.read_runs(source, robot)
-    np.testing.assert_allclose(found["time_s"], TABLE["t"], rtol=0, atol=1e-6)
+    assert_allclose(found["time_s"], TABLE["t"], rtol=0, atol=1e-6)
     assert any(says in note for note in found.notes)
 
 
@@ -69,7 +70,7 @@ def test_each_recording_has_wraps_of_its_own():
     found, period = counters.unwrap_counter(np.concatenate([once, once]), np.repeat([0, 1], 60))
     assert period == 2**32 and found[60] == once[0]
     for part in (found[:60], found[60:]):
-        np.testing.assert_array_equal(part - part[0], np.arange(60) * 1000)
+        assert_array_equal(part - part[0], np.arange(60) * 1000)
 
 
 @pytest.mark.parametrize(
@@ -137,8 +138,8 @@ def test_each_reading_of_a_slow_sensor_is_used_once():
     walk[50] = walk[49]  # the same reading twice is two readings
     found, rows = repeated_readings.used_once(held(walk, 15), np.arange(3000))
     assert rows == 15
-    np.testing.assert_array_equal(np.flatnonzero(np.isfinite(found)), np.arange(0, 3000, 15))
-    np.testing.assert_array_equal(found[::15], walk)
+    assert_array_equal(np.flatnonzero(np.isfinite(found)), np.arange(0, 3000, 15))
+    assert_array_equal(found[::15], walk)
 
 
 def test_repeats_are_reported_and_weigh_nothing(robot):

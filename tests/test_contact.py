@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose
 from worlds import paper
 
 from mmrjax.model import contact
@@ -21,7 +22,7 @@ quick = settings(max_examples=60, deadline=None, derandomize=True)
 def test_friction_coefficient_matches_reference(speed, mu_s, ratio, V_s, spread):
     law = Friction(static=mu_s, dynamic=ratio * mu_s, speed_static=V_s, speed_dynamic=spread * V_s)
     expected = paper.friction(speed, mu_s, ratio * mu_s, V_s, spread * V_s)
-    np.testing.assert_allclose(law.coefficient(speed), expected, rtol=1e-9, atol=1e-15)
+    assert_allclose(law.coefficient(speed), expected, rtol=1e-9, atol=1e-15)
 
 
 @quick
@@ -29,20 +30,20 @@ def test_friction_coefficient_matches_reference(speed, mu_s, ratio, V_s, spread)
 def test_friction_speed_creep_matches_reference(share, mu_s, V_s):
     law = Friction(static=mu_s, dynamic=0.8 * mu_s, speed_static=V_s, speed_dynamic=10 * V_s)
     expected = paper.friction_speed(share * mu_s, mu_s, V_s)
-    np.testing.assert_allclose(law.speed_creep(share * mu_s), expected, rtol=1e-9, atol=1e-300)
+    assert_allclose(law.speed_creep(share * mu_s), expected, rtol=1e-9, atol=1e-300)
 
 
 def test_friction_speed_creep_inverts_coefficient():
     law = Friction(**LAW)
     mu = jnp.linspace(-0.399, 0.399, 201)
-    np.testing.assert_allclose(law.coefficient(law.speed_creep(mu)), mu, rtol=1e-9, atol=1e-15)
+    assert_allclose(law.coefficient(law.speed_creep(mu)), mu, rtol=1e-9, atol=1e-15)
 
 
 @pytest.mark.parametrize(
     ("speed", "mu"), [(0.0, 0.0), (0.02, 0.4), (-0.02, -0.4), (0.11, 0.35), (0.2, 0.3), (5.0, 0.3), (-1e6, -0.3)]
 )
 def test_friction_coefficient_at_the_knots_of_fig7(speed, mu):
-    np.testing.assert_allclose(Friction(**LAW).coefficient(speed), mu, rtol=1e-12)
+    assert_allclose(Friction(**LAW).coefficient(speed), mu, rtol=1e-12)
 
 
 def test_friction_coefficient_derivative_is_finite_and_continuous():
@@ -50,14 +51,14 @@ def test_friction_coefficient_derivative_is_finite_and_continuous():
     assert np.isfinite(slope(jnp.asarray([0.0, 1e-300, 0.02, 0.2, 1.0, 1e8, -1e8]))).all()
     for knot in (0.02, 0.2):
         left, right = slope(jnp.asarray([knot - 1e-9, knot + 1e-9]))
-        np.testing.assert_allclose(left, right, atol=1e-4)
+        assert_allclose(left, right, atol=1e-4)
 
 
 def test_friction_speed_creep_beyond_adhesion_is_flat_and_finite():
     creep = Friction(**LAW).speed_creep
     for mu in (0.4, 0.5, -0.4, -3.0):
         value, gradient = jax.value_and_grad(creep)(mu)
-        np.testing.assert_allclose(value, np.sign(mu) * 0.02)
+        assert_allclose(value, np.sign(mu) * 0.02)
         assert float(gradient) == 0.0
 
 
@@ -65,13 +66,13 @@ def test_friction_speed_creep_beyond_adhesion_is_flat_and_finite():
 @given(st.floats(-2, 3), st.floats(-1, 0), st.floats(0.1, 2), st.floats(-5, 5), st.floats(-5, 5))
 def test_step_matches_reference(x, x0, width, y0, y1):
     expected = paper.cubic_step(x, x0, y0, x0 + width, y1)
-    np.testing.assert_allclose(contact.cubic_step(x, x0, y0, x0 + width, y1), expected, rtol=1e-9, atol=1e-9)
+    assert_allclose(contact.cubic_step(x, x0, y0, x0 + width, y1), expected, rtol=1e-9, atol=1e-9)
 
 
 def test_direction_is_smooth_sign():
     speeds = np.array([-5.0, -0.002, -0.001, 0.0, 0.0005, 0.002, 7.0])
     expected = [paper.soft_sign(v, 0.002) for v in speeds]
-    np.testing.assert_allclose(contact.smooth_sign(speeds, 0.002), expected, rtol=1e-12)
+    assert_allclose(contact.smooth_sign(speeds, 0.002), expected, rtol=1e-12)
     assert np.isfinite(jax.vmap(jax.grad(lambda v: contact.smooth_sign(v, 0.002)))(jnp.asarray(speeds))).all()
 
 
@@ -82,7 +83,7 @@ def test_force_contact_matches_reference(exponent):
         c, b, d = RNG.uniform((1e3, 0, 1e-4), (1e5, 100, 2e-3))
         got = contact.force_contact(q, rate, r1 + r2, c, exponent, b, d)
         expected = paper.contact_force(q, rate, r1, r2, c, exponent, b, d)
-        np.testing.assert_allclose(got, expected, rtol=1e-9, atol=1e-9)
+        assert_allclose(got, expected, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("exponent", [0.7, 1.0, 1.5])
@@ -94,7 +95,7 @@ def test_force_contact_derivative_is_finite_through_contact(gap, exponent):
 
 
 def test_force_contact_static_is_a_spring_and_never_pulls():
-    np.testing.assert_allclose(contact.force_contact(0.008, 0.0, 0.01, 1e4, 1.0, 50.0, 1e-3), 20.0)
+    assert_allclose(contact.force_contact(0.008, 0.0, 0.01, 1e4, 1.0, 50.0, 1e-3), 20.0)
     assert float(contact.force_contact(0.008, 100.0, 0.01, 1e4, 1.0, 50.0, 1e-3)) == 0.0
 
 
@@ -102,11 +103,11 @@ def test_friction_rise_is_the_derivative_of_the_coefficient():
     law = Friction(**LAW)
     for speed in (-0.5, -0.15, -0.01, 0.0, 0.007, 0.05, 0.11, 0.19, 0.4):
         difference = (law.coefficient(speed + 1e-7) - law.coefficient(speed - 1e-7)) / 2e-7
-        np.testing.assert_allclose(law.rise(speed), difference, rtol=1e-5, atol=1e-5)
+        assert_allclose(law.rise(speed), difference, rtol=1e-5, atol=1e-5)
 
 
 def test_damping_contact_is_how_the_force_falls_with_the_rate_of_the_gap():
     for gap in (0.0085, 0.0095, 0.011):  # deeper than d, within d, without contact
         forces = [contact.force_contact(gap, rate, 0.01, 1e4, 1.0, 20.0, 1e-3) for rate in (-0.01, 0.01)]
         damping = contact.damping_contact(forces[0], gap, 0.01, 20.0, 1e-3)
-        np.testing.assert_allclose(damping, (forces[0] - forces[1]) / 0.02, atol=1e-9)
+        assert_allclose(damping, (forces[0] - forces[1]) / 0.02, atol=1e-9)

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from mmrjax.effects import BY_NAME
 from mmrjax.model import params
@@ -78,7 +79,7 @@ def test_slopes_of_the_sums_are_their_derivatives_along_a_direction(recessed):
         given = {name: jnp.asarray(value, float) for name, value in given.items()} | {"slip": jnp.asarray(1e-3)}
         ours, theirs = both(given, _changes(given, k))
         assert (np.abs(theirs) > 0).any()
-        np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-9 * float(jnp.abs(theirs).max()) + 1e-10)
+        assert_allclose(ours, theirs, rtol=1e-9, atol=1e-9 * float(jnp.abs(theirs).max()) + 1e-10)
 
 
 def _summed(setup, given, gained):
@@ -114,7 +115,7 @@ def test_slopes_of_the_sums_are_their_derivatives(recessed, name):
         assert set(ours.names) == set(given)
         assert (np.abs(expected).max(axis=1) > 0).sum() >= {"tracked": 19, "wheeled": 12}[name]
         for row, want in zip(np.asarray(ours.slopes), expected, strict=True):
-            np.testing.assert_allclose(row, want, rtol=1e-9, atol=1e-9 * np.abs(want).max() + 1e-10)
+            assert_allclose(row, want, rtol=1e-9, atol=1e-9 * np.abs(want).max() + 1e-10)
 
 
 @pytest.fixture(scope="module")
@@ -142,7 +143,7 @@ def test_impulse_is_that_of_mjx(recessed, pushed, name):
     motion = motion_of(recessed, run, 1)
     motion = dataclasses.replace(motion, q=motion.q.at[2].set(0.3), v=motion.v.at[2].set(2.0))
     force, spent = pushed(recessed, run, motion)
-    np.testing.assert_allclose(spent / STEP, force, rtol=1e-9, atol=1e-9 * float(jnp.abs(force).max()))
+    assert_allclose(spent / STEP, force, rtol=1e-9, atol=1e-9 * float(jnp.abs(force).max()))
 
 
 def _stepped(robot, run, motion, step, forward):
@@ -165,7 +166,7 @@ def _changes(tree, seed):
 def _equal(ours, theirs):
     for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
         if jnp.issubdtype(jnp.asarray(b).dtype, jnp.inexact):
-            np.testing.assert_allclose(a, b, rtol=1e-7, atol=1e-7 * max(float(jnp.abs(b).max()), 1e-12))
+            assert_allclose(a, b, rtol=1e-7, atol=1e-7 * max(float(jnp.abs(b).max()), 1e-12))
 
 
 @pytest.fixture(scope="module")
@@ -268,14 +269,4 @@ def test_second_derivatives_are_those_of_what_is_computed(recessed):
         return jax.jacfwd(jax.jacfwd(after))(v)
 
     ours, theirs = (jax.jit(lambda v, s=s: slope(v, s))(motion.v) for s in (advance, _as_computed))
-    np.testing.assert_allclose(ours, theirs, rtol=1e-6, atol=1e-7 * float(jnp.abs(theirs).max()))
-
-
-@pytest.mark.slow
-def test_a_wrong_slope_is_seen(eventful, forward):
-    """The comparison can fail: a thousandth more of what turns with the driving pulley."""
-    run = jax.tree.map(lambda x: jnp.asarray(x, float), Conditions(**RUNS["tracked"]).resolved(eventful))
-    at = (eventful, run, motion_of(eventful, run, 1), jnp.asarray(STEP))
-    ours, theirs = forward(at, _changes(at, 1), 1.001)
-    with pytest.raises(AssertionError):
-        _equal(ours, theirs)
+    assert_allclose(ours, theirs, rtol=1e-6, atol=1e-7 * float(jnp.abs(theirs).max()))

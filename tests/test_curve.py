@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import test_effects as laws
+from numpy.testing import assert_allclose
 
 from calibration.data import robot_file
 from calibration.data.input_errors import BadConfiguration
@@ -47,13 +48,13 @@ def robot(amplitudes=None, kinds=CURVES):
 
 def test_curve_passes_through_its_ordinates():
     x = jnp.linspace(2.0, 7.0, 6)
-    np.testing.assert_allclose(curve.ordinate_weights(x, 2.0, 7.0), np.eye(6), atol=1e-12)
+    assert_allclose(curve.ordinate_weights(x, 2.0, 7.0), np.eye(6), atol=1e-12)
 
 
 def test_curve_is_exact_for_parabolas():
     x, at = np.linspace(2.0, 7.0, 101), np.linspace(2.0, 7.0, 6)
     for power in range(3):
-        np.testing.assert_allclose(curve.ordinate_weights(x, 2.0, 7.0) @ at**power, x**power, rtol=1e-12)
+        assert_allclose(curve.ordinate_weights(x, 2.0, 7.0) @ at**power, x**power, rtol=1e-12)
 
 
 def test_curve_is_level_beyond_its_ends_and_has_no_corner():
@@ -64,8 +65,8 @@ def test_curve_is_level_beyond_its_ends_and_has_no_corner():
     assert np.ptp(height(far)[:3]) == np.ptp(height(far)[3:]) == 0 and not np.any(slope(far))
     x = jnp.linspace(1.0, 8.0, 7001)
     assert np.abs(np.diff(slope(x))).max() < 0.03  # 30 a unit at most: no step of the slope
-    np.testing.assert_allclose(np.gradient(height(x), x)[1:-1], slope(x)[1:-1], atol=0.01)
-    np.testing.assert_allclose(curve.ordinate_weights(x, 2.0, 7.0).sum(1), 1.0, rtol=1e-12)
+    assert_allclose(np.gradient(height(x), x)[1:-1], slope(x)[1:-1], atol=0.01)
+    assert_allclose(curve.ordinate_weights(x, 2.0, 7.0).sum(1), 1.0, rtol=1e-12)
 
 
 # --- the laws -------------------------------------------------------------------------------------------
@@ -89,7 +90,7 @@ def test_curve_obeys(effect, law):
 def test_curves_at_zero_change_nothing_in_steady_and_none_is_dead():
     both = jax.jit(lambda a: jax.jacfwd(lambda a: (_steady(robot(a)),) * 2, has_aux=True)(a))
     slopes, with_them = both(jnp.zeros(len(CURVES)))
-    np.testing.assert_allclose(with_them, jax.jit(_steady)(paper_robots.nominal()), rtol=1e-13, atol=1e-13)
+    assert_allclose(with_them, jax.jit(_steady)(paper_robots.nominal()), rtol=1e-13, atol=1e-13)
     assert np.isfinite(slopes).all()
     read = np.where(with_them == 0, np.inf, with_them)  # what this robot does not have reads 0
     moved = np.abs(slopes * SIZES / read[..., None]).max((0, 1))
@@ -113,7 +114,7 @@ def _driven(amplitudes):
 def test_settled_travel_shows_nothing_of_a_wave():
     waves = robot(jnp.asarray([laws.size(w) for w in WAVES.values()]), WAVES)
     # but for rounding: a program with effects sums in another order
-    np.testing.assert_allclose(jax.jit(_steady)(waves), jax.jit(_steady)(paper_robots.nominal()), rtol=4e-15)
+    assert_allclose(jax.jit(_steady)(waves), jax.jit(_steady)(paper_robots.nominal()), rtol=4e-15)
 
 
 @pytest.mark.slow
@@ -123,7 +124,7 @@ def test_curves_act_in_drive_and_at_zero_change_nothing():
     still, slope = both(jnp.zeros(len(DRIVEN)))
     bare = paper_robots.nominal()
     plain = jax.jit(jax.vmap(lambda c: drive(bare, c, TIMES, tolerance=1e-9)))(STARTS)
-    np.testing.assert_allclose(still, laws.readings(bare, plain.signals)[:, 1:], rtol=1e-7, atol=1e-7)
+    assert_allclose(still, laws.readings(bare, plain.signals)[:, 1:], rtol=1e-7, atol=1e-7)
     assert np.isfinite(slope).all() and np.abs(slope / still).max() > 1e-3
 
 
@@ -131,7 +132,7 @@ def test_curves_act_in_drive_and_at_zero_change_nothing():
 def test_curve_of_a_run_in_mirror_image_is_the_mirror_image(effect):
     made = params.replace(effect(), {**{n: jnp.asarray(v) for n, v in SHAPE.items()}, "amplitude": jnp.asarray(0.3)})
     there = laws.terms(made, signals=laws.mirrored(laws.STATES))
-    np.testing.assert_allclose(there, -laws.terms(made), rtol=1e-12, atol=1e-15)
+    assert_allclose(there, -laws.terms(made), rtol=1e-12, atol=1e-15)
 
 
 def test_a_curve_of_what_shows_magnitudes_is_the_same_in_mirror_image():
@@ -140,7 +141,7 @@ def test_a_curve_of_what_shows_magnitudes_is_the_same_in_mirror_image():
     made = params.replace(made, {"amplitude": jnp.asarray(0.3)})
     robot = laws.metered(signed=False)
     each = [laws.terms(made, robot, s) for s in (laws.STATES, laws.mirrored(laws.STATES))]
-    np.testing.assert_allclose(*each, rtol=1e-12, atol=1e-15)
+    assert_allclose(*each, rtol=1e-12, atol=1e-15)
     robot = dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, channels=("motor_current", "speed")))
     columns = {"order": np.tile(np.arange(9.0), 2), "supply_voltage_V": np.repeat([12.0, -12.0], 9)}
     columns |= {"configuration": np.repeat("6T2A", 18), "slope_deg": np.zeros(18), "payload_kg": np.zeros(18)}
@@ -148,7 +149,7 @@ def test_a_curve_of_what_shows_magnitudes_is_the_same_in_mirror_image():
     for looked in (curves.curve_families, curves.window_families):
         (basis,) = (b for b in looked(columns, np.ones(18), robot, None, ways) if b.places[0] in curve.READINGS)
         for (place, _), shapes in zip(basis.names, np.asarray(basis.columns), strict=True):
-            np.testing.assert_allclose(shapes[:9], (1 if place == "motor_current" else -1) * shapes[9:])
+            assert_allclose(shapes[:9], (1 if place == "motor_current" else -1) * shapes[9:])
 
 
 @EACH

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from mmrjax import SOUND_AT_LEVEL_0, derived
 from mmrjax.compile.compiling import SELDOM
@@ -104,10 +105,10 @@ def test_steepest_slope_derivatives_are_finite_differences(robot, static, voltag
     theta, f = function(tuned, Conditions(0, voltage, payload=5.0), steepest_slope.compute)
     forward = jax.jacfwd(lambda t: f(t)["steepest_slope"])
     exact = forward(theta)
-    np.testing.assert_allclose(compile_with_options(jax.jit(forward).lower(theta), SELDOM)(theta), exact, rtol=1e-9)
+    assert_allclose(compile_with_options(jax.jit(forward).lower(theta), SELDOM)(theta), exact, rtol=1e-9)
     twice = differences(f, theta, 1e-6)["steepest_slope"]
-    np.testing.assert_allclose(exact, twice, rtol=1e-5, atol=1e-4 * np.abs(twice).max())
-    np.testing.assert_allclose(jax.jacrev(lambda t: f(t)["steepest_slope"])(theta), exact, rtol=1e-9, atol=1e-9)
+    assert_allclose(exact, twice, rtol=1e-5, atol=1e-4 * np.abs(twice).max())
+    assert_allclose(jax.jacrev(lambda t: f(t)["steepest_slope"])(theta), exact, rtol=1e-9, atol=1e-9)
     assert np.abs(exact).max() > 1
 
 
@@ -128,7 +129,7 @@ def test_steepest_slope_of_a_batch_is_that_of_each(robot):
     conditions = Conditions(np.array([0, 1, 0]), np.array([15.0, 24.0, 6.0]), payload=np.array([0.0, 3.0, 8.0]))
     batch = jax.vmap(lambda c: steepest_slope.compute(robot, c))(conditions)
     each = [steepest_slope.compute(robot, jax.tree.map(lambda x, k=k: x[k], conditions)) for k in range(3)]
-    np.testing.assert_allclose(batch["steepest_slope"], [float(e["steepest_slope"]) for e in each], rtol=1e-12)
+    assert_allclose(batch["steepest_slope"], [float(e["steepest_slope"]) for e in each], rtol=1e-12)
 
 
 # --- the start ----------------------------------------------------------------------------------------------------
@@ -157,7 +158,7 @@ def test_start_derivatives_are_finite_differences(robot):
     twice = differences(f, theta, 3e-3)
     for name, by in twice.items():
         scale = np.abs(by * theta).max() / np.abs(theta)  # what matters, parameter by parameter
-        np.testing.assert_allclose(exact[name], by, rtol=3e-3, atol=2e-3 * scale.min(), err_msg=name)
+        assert_allclose(exact[name], by, rtol=3e-3, atol=2e-3 * scale.min(), err_msg=name)
         assert np.abs(exact[name]).max() > 0
 
 
@@ -171,7 +172,7 @@ def test_start_of_a_run_that_does_not_settle_has_no_numbers(robot):
 
 def test_peak_is_the_top_of_a_parabola():
     x = jnp.asarray([0.0, 0.1, 0.3, 0.5, 0.9, 1.0])  # at unequal distances
-    top = np.testing.assert_allclose
+    top = assert_allclose
     top(start_figures.curve_peak(x, 3 - (x - 0.47) ** 2), 3.0, atol=1e-12)
     top(
         start_figures.curve_peak(x, jnp.where(x < 0.8, 3 - (x - 0.37) ** 2, jnp.nan)), 3.0, atol=1e-12

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from synthetic import SETTLED, table
 from test_implausible import unnamed
 from worlds import settled, tables
@@ -109,7 +110,7 @@ def test_blocks_that_are_left_out_are_not_seen(found):
         ),
     )
     a, b = (hold_out_blocks(w.problem, w.z, [first]).reading for w in (found.what, other))
-    np.testing.assert_array_equal(a, b)
+    assert_array_equal(a, b)
     assert np.isnan(a[20:]).all()
 
 
@@ -127,7 +128,7 @@ def test_robot_written_and_read_gives_the_same_readings(found, tmp_path):
     }
     reading = steady_batch(robot, found.runs.conditions(robot)).reading
     seen = jnp.stack([reading[name] for name in channels.USUAL], -1)
-    np.testing.assert_allclose(seen, found.what.reading[: len(found.runs)], rtol=1e-10)
+    assert_allclose(seen, found.what.reading[: len(found.runs)], rtol=1e-10)
 
 
 def test_defect_of_each_row_shows_the_discrepancy(found):
@@ -174,7 +175,7 @@ def test_curve_of_a_result_is_in_its_robot_and_takes_the_discrepancy_out(tmp_pat
     assert [e.name for e in robot.effects] == [what.effect]
     reading = steady_batch(robot, found.runs.conditions(robot)).reading
     seen = np.stack([np.asarray(reading[name]) for name in channels.USUAL], -1)
-    np.testing.assert_allclose(seen, found.readings_of_rows.after, rtol=1e-9)
+    assert_allclose(seen, found.readings_of_rows.after, rtol=1e-9)
 
 
 # --- the dictionary -------------------------------------------------------------------------------------

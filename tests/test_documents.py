@@ -1,7 +1,4 @@
-"""Reports as documents: page, terminal and CSV show the same cells; one text of each document is kept.
-
-`python tests/test_documents.py` writes the texts in `tests/record/pages` anew.
-"""
+"""Reports as documents: page, terminal and CSV show the same cells; one text of each document is kept."""
 
 from __future__ import annotations
 
@@ -12,11 +9,10 @@ import json
 import re
 import urllib.parse
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
-from pages import Tables, drawn, outside
+from pages import Tables, as_text, drawn, outside, recorded
 
 from calibration.data import requirements_file, settling
 from calibration.data import runs as records
@@ -36,30 +32,10 @@ from sweeps.report import (
     size_report,
     terminal_renderer,
 )
-from sweeps.report.document import Cell, Column, Document, Figure, Note, Section, Table, remarks
+from sweeps.report.document import Cell, Column, Document, Note, Section, Table, remarks
 from sweeps.results.check_results import CheckResult
 from sweeps.results.comparison_results import Comparison, add_second_robot, compare_readings
 from sweeps.results.size_results import SizeResult
-
-RECORD = Path(__file__).parent / "record" / "pages"
-
-
-def as_text(document: Document) -> str:
-    """A document as lines of text: headings, notes, alternative texts of figures, and tables with their headings."""
-    lines = [f"# {document.title}", document.answer]
-    for section in (Section("", document.blocks), *document.sections):
-        lines += [f"## {section.heading}"] * bool(section.heading)
-        for block in section.blocks:
-            if isinstance(block, Note):
-                lines += [block.text] if isinstance(block.text, str) else [f"- {item}" for item in block.text]
-            elif isinstance(block, Figure):
-                lines += [f"[{block.name}] {block.alternative}", block.caption]
-            elif block.rows:
-                lines.append(f"{block.name}: " + " | ".join(c.full_title for c in block.columns))
-                lines += [
-                    " | ".join(c.text(v) for c, v in zip(block.columns, row, strict=True)) for row in block.rows
-                ]
-    return "\n".join(lines) + "\n"
 
 
 def outcomes() -> tuple[sheet.Outcome, ...]:
@@ -167,7 +143,8 @@ DOCUMENTS: dict[str, Callable[[], Document]] = {
 
 @pytest.mark.parametrize("name", DOCUMENTS)
 def test_a_document_reads_as_recorded(name):
-    assert as_text(DOCUMENTS[name]()) == (RECORD / f"{name}.txt").read_text(encoding="utf-8")
+    text = as_text(DOCUMENTS[name]())
+    assert text == recorded(name, text)
 
 
 SMALL = Document(
@@ -241,9 +218,3 @@ def test_the_page_of_check_shows_its_figure_with_its_finding(tmp_path):
     page = page_renderer.write_report_page(tmp_path, check()).read_text(encoding="utf-8")
     assert drawn(page) == {"margins"}
     assert 'aria-label="2 of 3 requirements are missed: ' in page
-
-
-if __name__ == "__main__":
-    RECORD.mkdir(exist_ok=True)
-    for key, made in DOCUMENTS.items():
-        (RECORD / f"{key}.txt").write_text(as_text(made()), encoding="utf-8")

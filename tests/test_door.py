@@ -7,6 +7,7 @@ import jax
 import jax.extend
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import mmrjax as mm
 from mmrjax import fidelities
@@ -47,15 +48,13 @@ def test_what_instruments_show_is_that_of_the_whole(robot, whole):
     whole_first = mm.simulate(robot, mm.Conditions(**MIXED))
     assert shown_first.statuses.tolist() == ["converged", "slides", "stalled", "converged", "converged", "reverses"]
     for name in ("total_current", "motor_speed", "speed"):
-        np.testing.assert_allclose(getattr(shown_first, name), whole.reading[name], rtol=1e-13, err_msg=name)
+        assert_allclose(getattr(shown_first, name), whole.reading[name], rtol=1e-13, err_msg=name)
     for output in outputs.output_table(robot.channels):
-        np.testing.assert_array_equal(
-            getattr(whole_first.result, output.name), getattr(whole, output.name), err_msg=output.name
-        )
-        np.testing.assert_allclose(
+        assert_array_equal(getattr(whole_first.result, output.name), getattr(whole, output.name), err_msg=output.name)
+        assert_allclose(
             getattr(shown_first.result, output.name), getattr(whole, output.name), rtol=1e-13, err_msg=output.name
         )
-    np.testing.assert_array_equal(whole_first.flags, whole.flags)
+    assert_array_equal(whole_first.flags, whole.flags)
     assert shown_first.reading["speed"] is shown_first.speed and shown_first.result.status is shown_first.status
     with pytest.raises(AttributeError, match="Results has no velocity"):
         _ = shown_first.velocity
@@ -66,10 +65,10 @@ def test_results_are_a_pytree_whole_or_not_yet(robot, whole):
     pending = mm.simulate(robot, mm.Conditions(**MIXED))
     half = jax.tree.map(lambda x: x[:3], pending)
     assert isinstance(half, mm.Results) and half.shape == (3,)
-    np.testing.assert_array_equal(half.slip, whole.slip[:3])
-    np.testing.assert_allclose(half.total_mass, whole.mass[:3], rtol=1e-15)
+    assert_array_equal(half.slip, whole.slip[:3])
+    assert_allclose(half.total_mass, whole.mass[:3], rtol=1e-15)
     again = pickle.loads(pickle.dumps(mm.simulate(robot, mm.Conditions(**MIXED))))
-    np.testing.assert_array_equal(again.status, whole.status)
+    assert_array_equal(again.status, whole.status)
 
 
 @pytest.mark.slow
@@ -98,7 +97,7 @@ def test_equal_fields_of_conditions_share_an_array():
     runs = mm.Conditions(voltage=np.full(5, 24.0), adhesion=0.5)
     assert runs.battery is runs.discharge is runs.order is runs.open is runs.slope_deg is runs.payload
     assert runs.duty is not runs.adhesion
-    np.testing.assert_array_equal(runs.adhesion, np.full(5, 0.5))
+    assert_array_equal(runs.adhesion, np.full(5, 0.5))
 
 
 def test_names_of_configurations_become_indices(robot):

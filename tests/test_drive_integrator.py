@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 
 from mmrjax.numerics.rodas import Rodas4
@@ -70,7 +71,7 @@ def _one(h, rate):
 def test_rodas4_forgets_stiff_transients_in_one_step(stiffness):
     # L-stable: R(∞) = 0, so one step far longer than the transient lands on the settled value.
     value, _ = _one(1.0, stiffness)
-    np.testing.assert_allclose(value, 1.0, atol=20 / stiffness)
+    assert_allclose(value, 1.0, atol=20 / stiffness)
 
 
 def test_rodas4_settles_at_every_step_size():
@@ -112,7 +113,7 @@ def test_rodas4_dense_output_meets_the_ends_of_a_step():
     ends = _between(0.3, decay, [1.0, 0.5], (0.0, 1.0))
     term = diffrax.ODETerm(decay)
     y1, *_ = Rodas4().step(term, 0.0, 0.3, jnp.asarray([1.0, 0.5]), None, None, False)
-    np.testing.assert_allclose(ends, [[1.0, 0.5], y1], rtol=1e-14)
+    assert_allclose(ends, [[1.0, 0.5], y1], rtol=1e-14)
 
 
 def test_rodas4_dense_output_does_not_swing_on_a_stiff_component():
@@ -121,4 +122,4 @@ def test_rodas4_dense_output_does_not_swing_on_a_stiff_component():
         return jnp.stack([1e-3 + 0 * y[0], -1e6 * (y[1] - 1.0 - y[0])])
 
     values = _between(100.0, rates, [0.0, 1.0 + 1e-8], np.linspace(0, 1, 21))
-    np.testing.assert_allclose(values[:, 1], 1.0 + values[:, 0], atol=1e-6)
+    assert_allclose(values[:, 1], 1.0 + values[:, 0], atol=1e-6)

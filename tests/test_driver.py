@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from mmrjax.effects import BY_NAME
 from mmrjax.fidelities.steady import steady_batch
@@ -71,7 +72,7 @@ def test_admitted_current_is_what_the_balance_of_a_winding_admits(duty, returns)
     resistance, source, wanted = 0.5, 12.0, np.linspace(-80.0, 80.0, 4001)
     current, held = driver.admitted(wanted, duty, source / resistance)
     left = driver.duty_limited(duty, current) * source - resistance * (current + held)
-    np.testing.assert_allclose(left, duty * source - resistance * wanted, atol=1e-9)
+    assert_allclose(left, duty * source - resistance * wanted, atol=1e-9)
     assert (np.diff(current) >= 0).all() and (returns or (np.asarray(current) * duty >= 0).all())
     assert returns or np.abs(current).max() < 2.0 * (1 + 1.01 * max(abs(duty), 1e-9) / STEEPNESS)
 
@@ -113,23 +114,23 @@ def test_between_the_pulses_of_fast_decay_the_motors_coast():
     runs = Conditions(voltage=8.0, duty=DUTIES)
     found = steady_batch(bench(FAST), runs)
     speed = np.sign(DUTIES) * (8.0 / 0.1 - 0.02 * 5.0 / (0.1**2 * np.abs(DUTIES)))
-    np.testing.assert_allclose(found.motor_speed, speed, rtol=1e-9)
-    np.testing.assert_allclose(found.motor_current, 0.2 * np.sign(DUTIES), rtol=1e-9)
-    np.testing.assert_allclose(found.total_current, 0.2, rtol=1e-9)
-    np.testing.assert_allclose(found.power_supply, 8.0 * 0.2, rtol=1e-9)
-    np.testing.assert_allclose(found.efficiency_motor, 0.1 * np.abs(speed) / 8.0, rtol=1e-9)
+    assert_allclose(found.motor_speed, speed, rtol=1e-9)
+    assert_allclose(found.motor_current, 0.2 * np.sign(DUTIES), rtol=1e-9)
+    assert_allclose(found.total_current, 0.2, rtol=1e-9)
+    assert_allclose(found.power_supply, 8.0 * 0.2, rtol=1e-9)
+    assert_allclose(found.efficiency_motor, 0.1 * np.abs(speed) / 8.0, rtol=1e-9)
     short = steady_batch(bench(SLOW), runs)
-    np.testing.assert_allclose(short.motor_speed, 80.0 * DUTIES - 10.0 * np.sign(DUTIES), rtol=1e-9)
+    assert_allclose(short.motor_speed, 80.0 * DUTIES - 10.0 * np.sign(DUTIES), rtol=1e-9)
     whole = np.abs(DUTIES) == 1
     for name in ("motor_speed", "power_supply", "total_current"):
-        np.testing.assert_allclose(getattr(found, name)[whole], getattr(short, name)[whole], rtol=1e-12)
+        assert_allclose(getattr(found, name)[whole], getattr(short, name)[whole], rtol=1e-12)
 
 
 def test_a_driver_in_fast_decay_is_the_effect_of_its_name():
     effect = dataclasses.replace(bench(SLOW), effects=(BY_NAME["coast_decay"](amplitude=1.0),))
     runs = Conditions(voltage=8.0, duty=DUTIES)
     speeds = [steady_batch(robot, runs).motor_speed for robot in (effect, bench(FAST))]
-    np.testing.assert_allclose(*speeds, rtol=1e-9)
+    assert_allclose(*speeds, rtol=1e-9)
 
 
 @pytest.mark.parametrize("decay", [SLOW, FAST])

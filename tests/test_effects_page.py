@@ -30,11 +30,3 @@ def same(page, other):
 @pytest.mark.slow
 def test_effects_page_is_what_the_library_gives(written):
     same((ROOT / "docs" / "reference" / "effects.md").read_text(encoding="utf-8"), written)
-
-
-@pytest.mark.slow
-def test_effects_page_comparison_can_fail(written):
-    with pytest.raises(AssertionError):
-        same(written.replace("`windage`", "`windig`", 1), written)
-    with pytest.raises(AssertionError):
-        same(written.replace("+53", "+58", 1), written)

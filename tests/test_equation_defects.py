@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import mmrjax as mm
 from calibration.inference.details import EquationDefects
@@ -56,7 +57,7 @@ def test_defects_that_readings_show_are_found():
     assert list(found) == list(EQUATIONS)
     for x, wanted, size in zip(found.values(), true[:, 0], SIZES.values(), strict=True):
         assert np.isnan(x[4]) and np.isfinite(x[included]).all()
-        np.testing.assert_allclose(x[included], wanted[included], atol=2e-3 * size)
+        assert_allclose(x[included], wanted[included], atol=2e-3 * size)
 
 
 @pytest.mark.parametrize("slope", [1e-3, 1e-6, 0.0])
@@ -86,7 +87,7 @@ def test_each_side_has_its_own_defects():
     assert list(found) == [f"{b}_{side}" for b in EQUATIONS for side in ("left", "right")]
     for name, x in found.items():
         wanted, size = (0.3, 20.0) if name == "electrical_right" else (0.0, SIZES[EQUATIONS[name.rpartition("_")[0]]])
-        np.testing.assert_allclose(x, wanted, atol=2e-3 * size)
+        assert_allclose(x, wanted, atol=2e-3 * size)
 
 
 def turns():

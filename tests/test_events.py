@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from worlds.events import Bench, through
 
 from mmrjax.fidelities.drive import drive_batch
@@ -97,10 +98,10 @@ def test_a_load_that_friction_holds_stands(simulated):
     bench = BENCHES["rest"]
     found, held = simulated(bench)[1], (SAMPLES > 0.7) & (SAMPLES < 0.8)
     for still in (found.speed_motor, found.speed, found.acceleration, found.torque_net):
-        np.testing.assert_array_equal(np.asarray(still)[held], 0.0)
+        assert_array_equal(np.asarray(still)[held], 0.0)
     torque = np.asarray(found.torque_output)[held]
     assert (torque > 0).all() and (torque <= bench.loss_coulomb).all()
-    np.testing.assert_allclose(np.asarray(found.current)[held], 1 / bench.resistance, rtol=1e-9)
+    assert_allclose(np.asarray(found.current)[held], 1 / bench.resistance, rtol=1e-9)
 
 
 @pytest.mark.slow

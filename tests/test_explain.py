@@ -8,6 +8,7 @@ from mmrjax.errors import allowed_words, similar_words
 from mmrjax.model import channels, paper_robots, params
 from sweeps.commands import explain
 from sweeps.pages import words
+from tests.commands import ends
 
 EVERY = effects.BY_NAME | effects.OF_TURNS | effects.OF_CHANNELS
 
@@ -72,14 +73,12 @@ def test_parameters_and_channels_are_explained_by_their_rows():
 
 
 def test_the_command_prints_80_columns_and_every_meaning_of_a_name(mmrjax):
-    code, out, _ = mmrjax("explain", "cut_off")
-    assert code == 0 and "cut_off: status" in out and "cut_off: flag" in out
+    _, out, _ = ends(mmrjax("explain", "cut_off"), "cut_off: status", "cut_off: flag", code=0)
     assert words.FLAGS["cut_off"] in " ".join(out.split())
     assert max(map(len, out.splitlines())) <= 80
-    code, out, _ = mmrjax("explain", "held", "out")
-    assert code == 0 and words.GLOSSARY["held out"] in " ".join(out.split())
-    code, out, _ = mmrjax("explain")
-    assert code == 0 and "series_resistance" in out and "motor.resistance" in out and "converged" in out
+    _, out, _ = ends(mmrjax("explain", "held", "out"), code=0)
+    assert words.GLOSSARY["held out"] in " ".join(out.split())
+    ends(mmrjax("explain"), "series_resistance", "motor.resistance", "converged", code=0)
 
 
 @pytest.mark.parametrize(
@@ -91,8 +90,7 @@ def test_the_command_prints_80_columns_and_every_meaning_of_a_name(mmrjax):
     ],
 )
 def test_an_unknown_name_is_answered_by_what_is_near(name, says, mmrjax):
-    code, _, err = mmrjax("explain", name)
-    assert code == 2 and says in err
+    ends(mmrjax("explain", name), says)
 
 
 def test_near_words_have_the_word_as_a_part_whatever_its_capitals():

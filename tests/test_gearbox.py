@@ -3,6 +3,7 @@
 import jax
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from worlds import paper
 
 from mmrjax.model.gearbox import Gearbox
@@ -17,13 +18,11 @@ def test_gearbox_laws_match_reference():
         idle = paper.gear_idle(w, M0, K, 1.0)
         eta_r = paper.gear_efficiency(torque, idle, eta)
         loss = paper.gear_loss(torque, i, eta_r)
-        np.testing.assert_allclose(loss, paper.gear_loss_split(torque, idle, i, eta), rtol=1e-9)  # (21) = (22)
-        np.testing.assert_allclose(gear.torque_idle(w, 1.0), idle, rtol=1e-9)
-        np.testing.assert_allclose(gear.efficiency(torque, w), eta_r, rtol=1e-9)
-        np.testing.assert_allclose(gear.torque_loss(torque, w), loss, rtol=1e-9)
-        np.testing.assert_allclose(
-            gear.torque_output(torque - idle, 1.0), paper.gear_output(torque, loss, i), rtol=1e-9
-        )
+        assert_allclose(loss, paper.gear_loss_split(torque, idle, i, eta), rtol=1e-9)  # (21) = (22)
+        assert_allclose(gear.torque_idle(w, 1.0), idle, rtol=1e-9)
+        assert_allclose(gear.efficiency(torque, w), eta_r, rtol=1e-9)
+        assert_allclose(gear.torque_loss(torque, w), loss, rtol=1e-9)
+        assert_allclose(gear.torque_output(torque - idle, 1.0), paper.gear_output(torque, loss, i), rtol=1e-9)
 
 
 def test_gearbox_without_losses_is_a_lever():
@@ -37,7 +36,7 @@ def test_gearbox_efficiency_rises_to_its_maximum_with_load():
     gear = Gearbox()
     efficiency = np.array([float(gear.efficiency(m, 800.0)) for m in (0.003, 0.01, 0.05, 10.0)])
     assert (np.diff(efficiency) > 0).all()
-    np.testing.assert_allclose(efficiency[-1], 0.74, rtol=1e-3)
+    assert_allclose(efficiency[-1], 0.74, rtol=1e-3)
 
 
 def test_gearbox_efficiency_at_zero_torque_is_finite_with_its_gradient():
@@ -59,9 +58,9 @@ def test_gearbox_without_torque_has_the_efficiency_of_a_load_about_to_grow(direc
     """Whichever sign rounding leaves: nothing but a torque that is transmitted sends power back."""
     gear = Gearbox()
     efficiency = [float(gear.efficiency_flow(torque, direction)) for torque in (0.0, 1e-15, -1e-15)]
-    np.testing.assert_allclose(efficiency, 0.74, rtol=1e-12)
-    np.testing.assert_allclose(float(gear.efficiency_flow(-1e-9 * direction, direction)), 1 / 0.74, rtol=1e-12)
+    assert_allclose(efficiency, 0.74, rtol=1e-12)
+    assert_allclose(float(gear.efficiency_flow(-1e-9 * direction, direction)), 1 / 0.74, rtol=1e-12)
 
 
 def test_gearbox_ratio_is_planetary_times_belt():
-    np.testing.assert_allclose(Gearbox().ratio, 576 / 25 * 25 / 12, rtol=1e-12)
+    assert_allclose(Gearbox().ratio, 576 / 25 * 25 / 12, rtol=1e-12)

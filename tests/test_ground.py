@@ -3,6 +3,7 @@
 import jax
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from worlds import paper
 
 from mmrjax.model import chassis, ground, paper_robots
@@ -18,24 +19,20 @@ def test_ground_forces_match_reference():
         f, mu, m, alpha, v, ratio = RNG.uniform((0, 0.1, 2, -0.5, -0.5, 0.3), (0.2, 1, 20, 0.5, 0.5, 2))
         surface = Ground(Friction(static=mu, dynamic=0.8 * mu), rolling_resistance=f)
         normal = chassis.normal_load(2 * m, alpha, G, 2)
-        np.testing.assert_allclose(surface.force_resistance(normal, 1.0), paper.rolling_force(m, alpha, f), rtol=1e-9)
-        np.testing.assert_allclose(
-            surface.force_adhesion(normal, ratio), paper.adhesion_force(m, alpha, ratio * mu), rtol=1e-9
-        )
+        assert_allclose(surface.force_resistance(normal, 1.0), paper.rolling_force(m, alpha, f), rtol=1e-9)
+        assert_allclose(surface.force_adhesion(normal, ratio), paper.adhesion_force(m, alpha, ratio * mu), rtol=1e-9)
         expected = paper.friction(v, mu, 0.8 * mu, 0.02, 0.2) * ratio * m * G * np.cos(alpha)
-        np.testing.assert_allclose(surface.traction(v, normal, ratio), expected, rtol=1e-9)
+        assert_allclose(surface.traction(v, normal, ratio), expected, rtol=1e-9)
         demand = RNG.uniform(-0.99, 0.99) * ratio * mu * normal
         expected = paper.friction_speed(demand / normal / ratio, mu, 0.02)
-        np.testing.assert_allclose(surface.speed_creep(demand, normal, ratio), expected, rtol=1e-9)
-        np.testing.assert_allclose(ground.force_gravity(m, alpha, G), m * G * np.sin(alpha), rtol=1e-9)
+        assert_allclose(surface.speed_creep(demand, normal, ratio), expected, rtol=1e-9)
+        assert_allclose(ground.force_gravity(m, alpha, G), m * G * np.sin(alpha), rtol=1e-9)
 
 
 def test_slip_matches_reference():
     for V, w, r in RNG.uniform((0.1, 1, 0.01), (1, 20, 0.1), (50, 3)):
         theoretical = paper.theoretical_speed(w, r)
-        np.testing.assert_allclose(
-            ground.slip_ratio(V, theoretical), paper.slip(V, theoretical), rtol=1e-9, atol=1e-12
-        )
+        assert_allclose(ground.slip_ratio(V, theoretical), paper.slip(V, theoretical), rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize(("speed", "theoretical", "slip"), [(0.0, 0.0, 0.0), (0.0, 1.0, 1.0), (1.0, 1.0, 0.0)])
@@ -48,7 +45,7 @@ def test_ground_traction_equals_adhesion_at_its_largest():
     surface = paper_robots.nominal().configurations["6T2A"].ground
     speeds = np.linspace(0, 0.5, 2001)
     largest = np.max(surface.traction(speeds, 60.0, 1.0))
-    np.testing.assert_allclose(largest, surface.force_adhesion(60.0, 1.0), rtol=1e-9)
+    assert_allclose(largest, surface.force_adhesion(60.0, 1.0), rtol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -67,14 +64,14 @@ def test_adhesion_ratio_restores_table5(robot, surface, tracked, wheeled):
         (False, robot.configurations["4W2T"], wheeled),
     ):
         ratio = paper_robots.adhesion_ratio(surface, on_tracks)
-        np.testing.assert_allclose(body.ground.force_adhesion(1.0, ratio), phi, rtol=1e-12)
+        assert_allclose(body.ground.force_adhesion(1.0, ratio), phi, rtol=1e-12)
 
 
 def test_traction_rise_is_the_derivative_of_traction():
     surface = paper_robots.nominal().configurations["6T2A"].ground
     for speed in (-0.05, 0.003, 0.1):
         difference = (surface.traction(speed + 1e-7, 60.0, 1.3) - surface.traction(speed - 1e-7, 60.0, 1.3)) / 2e-7
-        np.testing.assert_allclose(surface.traction_rise(speed, 60.0, 1.3), difference, rtol=1e-5)
+        assert_allclose(surface.traction_rise(speed, 60.0, 1.3), difference, rtol=1e-5)
 
 
 def test_a_robot_on_a_wall_creeps_at_v_s_with_derivatives_of_zero():

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from test_shaft import DRIVE, bench
 
 import mmrjax as mm
@@ -38,8 +39,8 @@ def test_a_clamp_carries_what_current_and_friction_leave():
     current, held = np.array([*AMPERES, 0.03, 5.0]), np.array([1.0, 1, 1, 1, 1, 0])
     conditions = Conditions(motor_current=current, held=held, load_torque=np.array([0.0, 0, 0, 0, 0, 0.4]))
     found = steady_batch(clamped(), conditions)
-    np.testing.assert_allclose(found.output_torque[:5], torque_of(current[:5]), rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(found.motor_voltage[:5], 3.0 * current[:5], rtol=1e-9)
+    assert_allclose(found.output_torque[:5], torque_of(current[:5]), rtol=1e-9, atol=1e-9)
+    assert_allclose(found.motor_voltage[:5], 3.0 * current[:5], rtol=1e-9)
     assert not np.any(found.motor_speed[:5]) and float(found.motor_speed[5]) > 100
     assert [STATUSES[s] for s in np.asarray(found.status)] == ["converged"] * 6
 
@@ -55,17 +56,17 @@ def test_a_locked_rotor_draws_voltage_over_resistance():
 
     at = jnp.array([3.0, 0.05])
     current, slopes = volts / 3.0, jax.jacfwd(read)(at)
-    np.testing.assert_allclose(read(at), [current, torque_of(current)], rtol=1e-9)
-    np.testing.assert_allclose(slopes[0, :, 0], -current / 3.0, rtol=1e-8)
-    np.testing.assert_allclose(slopes[1, :, 1], RATIO * EFFICIENCY * current, rtol=1e-8)
-    np.testing.assert_allclose(jax.jacrev(read)(at), slopes, rtol=1e-8, atol=1e-12)
+    assert_allclose(read(at), [current, torque_of(current)], rtol=1e-9)
+    assert_allclose(slopes[0, :, 0], -current / 3.0, rtol=1e-8)
+    assert_allclose(slopes[1, :, 1], RATIO * EFFICIENCY * current, rtol=1e-8)
+    assert_allclose(jax.jacrev(read)(at), slopes, rtol=1e-8, atol=1e-12)
 
 
 def test_a_shaft_at_rest_pushes_against_its_load():
     """At an imposed speed of 0, current follows from the torque in either direction."""
     torque = torque_of(AMPERES)
     found = steady_batch(clamped(), Conditions(motor_speed=0.0, load_torque=torque))
-    np.testing.assert_allclose(found.motor_current, AMPERES, rtol=1e-9)
+    assert_allclose(found.motor_current, AMPERES, rtol=1e-9)
     assert [STATUSES[s] for s in np.asarray(found.status)] == ["converged"] * 4
 
 

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import settings as effort
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
 from pages import Tables
 from synthetic import calibrated
 
@@ -59,15 +60,15 @@ def test_what_the_data_do_not_narrow_is_held(seed, parameters, readings, dead, a
         one, other = rng.integers(0, parameters, 2)
         jacobian[:, one] = rng.choice([-1.0, 1.0, 3.0]) * jacobian[:, other]
     about, expected = linear(jacobian), posterior_sd(jacobian)
-    np.testing.assert_allclose(about.sd, expected, rtol=1e-6)
+    assert_allclose(about.sd, expected, rtol=1e-6)
     sure = np.abs(expected - HELD) > 1e-6
-    np.testing.assert_array_equal(about.held_by_prior[sure], (expected > HELD)[sure])
+    assert_array_equal(about.held_by_prior[sure], (expected > HELD)[sure])
     assert about.held_by_prior[np.all(jacobian == 0, 0)].all()
 
 
 def test_rule_is_a_ratio_of_sds_and_holds_what_is_not_known():
     assert HELD == 0.9
-    np.testing.assert_array_equal(held_by_prior(np.array([0.0, 0.71, 0.9, 0.90001, 1.0, np.nan, np.inf])), [0, 0, 0, 1, 1, 1, 1])  # fmt: skip
+    assert_array_equal(held_by_prior(np.array([0.0, 0.71, 0.9, 0.90001, 1.0, np.nan, np.inf])), [0, 0, 0, 1, 1, 1, 1])  # fmt: skip
 
 
 def stated(noise):

@@ -5,6 +5,7 @@ import re
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from calibration.data import input_files, robot_file
 from calibration.data import runs as records
@@ -105,8 +106,8 @@ def test_words_for_no_reading_are_empty_cells(tmp_path, word):
     text = "supply_voltage_V,motor_current_A,output_speed_rpm,room_C\n4,0.3,700,20\n6,{},1100,{}\n8,0.5,1500,22\n"
     named, empty = (table(tmp_path, text.format(x, x), robot) for x in (word, ""))
     assert named.notes == empty.notes and "1 of 3 cells of motor_current_A are empty" in named.notes[0]
-    np.testing.assert_array_equal(named.measured(), empty.measured())
-    np.testing.assert_array_equal(named.extras["room_C"], empty.extras["room_C"])
+    assert_array_equal(named.measured(), empty.measured())
+    assert_array_equal(named.extras["room_C"], empty.extras["room_C"])
     with pytest.raises(BadData, match=f"row 1, supply_voltage_V: got {word}; expected "):
         table(tmp_path, f"supply_voltage_V,output_speed_rpm\n{word},700\n", robot)
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy import stats
 from synthetic import table
-from test_loop_command import mmrjax, written
 from worlds import settled, tables
 
 from calibration.data.runs import Runs
@@ -196,16 +195,3 @@ def test_calibration_says_whether_it_is_adequate():
     for made in (lacking.table, {k: v for k, v in lacking.table.items() if "_sd_" not in k}):
         found = calibrate(table(made), climbing, **few).adequacy
         assert found.adequate is False and "mmrjax loop" in found.statement
-
-
-@pytest.mark.slow
-def test_command_opens_with_it(tmp_path):
-    written(tmp_path / "runs.csv", tables.narrow(["churning"], 12.0, seed=3, free=settled.FRICTION).table)
-    answer = mmrjax(
-        tmp_path, "calibrate", "runs.csv", "--out", "x", "--starts", "4", "--no-profiles", "--no-hold-out",
-        *(a for c in ("6T2A", "4W2T") for a in ("--prior", f"{c}.ground.friction.static=0.6±0.09")),
-    )  # fmt: skip
-    assert answer.code == 0 and answer.out.startswith("The fit is not adequate; rms error before → after on ")
-    page = (tmp_path / "x" / "report.html").read_text(encoding="utf-8")
-    assert page.index("The fit is not adequate; ") < page.index("Not adequate: ") < page.index("maximum a posteriori")
-    assert '<p id="search">' in page  # converged, so no warning

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal, assert_array_max_ulp
 from test_log_kinds import servo, written
 
 from calibration.data import runs as records
@@ -34,8 +35,8 @@ def test_equations_are_solved_as_by_numpy_whatever_the_pivots():
     matrices[20:30] *= 10.0 ** rng.uniform(-8, 8, (10, 5, 1))
     b = rng.standard_normal((40, 5, 2))
     found, inverse = jax.vmap(solve)(matrices, b), jax.vmap(invert)(matrices)
-    np.testing.assert_allclose(found, np.linalg.solve(matrices, b), rtol=1e-9)
-    np.testing.assert_allclose(inverse, np.linalg.inv(matrices), rtol=1e-9, atol=1e-12)
+    assert_allclose(found, np.linalg.solve(matrices, b), rtol=1e-9)
+    assert_allclose(inverse, np.linalg.inv(matrices), rtol=1e-9, atol=1e-12)
     assert np.asarray(solve(matrices[0], b[0, :, 0])) == pytest.approx(found[0, :, 0])
     assert not np.isfinite(solve(jnp.ones((3, 3)), jnp.arange(3.0))).any()
 
@@ -44,7 +45,7 @@ def test_half_of_a_solution_is_that_of_a_cholesky_factor():
     rng = np.random.default_rng(0)
     a = rng.standard_normal((9, 5))
     lower = np.linalg.cholesky(a.T @ a)
-    np.testing.assert_allclose(solve_lower(a.T @ a, a.T), np.linalg.solve(lower, a.T), rtol=1e-9, atol=1e-12)
+    assert_allclose(solve_lower(a.T @ a, a.T), np.linalg.solve(lower, a.T), rtol=1e-9, atol=1e-12)
     assert np.isnan(solve_lower(-a.T @ a, a.T)).any()
 
 
@@ -71,10 +72,10 @@ def eliminate(matrix, vector):
 def test_elimination_and_inverse_match_numpy(n):
     matrices, vectors = 3 * np.eye(n) + RNG.uniform(-1, 1, (200, n, n)), RNG.normal(size=(200, n))
     expected = np.linalg.solve(matrices, vectors[..., None])[..., 0]
-    np.testing.assert_allclose(jax.vmap(eliminate)(matrices, vectors), expected, rtol=1e-10, atol=1e-13)
+    assert_allclose(jax.vmap(eliminate)(matrices, vectors), expected, rtol=1e-10, atol=1e-13)
     found, determinant = jax.vmap(inverse)(jnp.asarray(matrices))
-    np.testing.assert_allclose(found, np.linalg.inv(matrices), rtol=1e-10, atol=1e-13)
-    np.testing.assert_allclose(determinant, np.linalg.det(matrices), rtol=1e-10)
+    assert_allclose(found, np.linalg.inv(matrices), rtol=1e-10, atol=1e-13)
+    assert_allclose(determinant, np.linalg.det(matrices), rtol=1e-10)
 
 
 def test_elimination_leaves_out_zeros_that_are_stated():
@@ -83,10 +84,10 @@ def test_elimination_leaves_out_zeros_that_are_stated():
     sparse = [[None if x == 0 else jnp.asarray(x) for x in row] for row in matrix]
     vector = [jnp.asarray(x) for x in (0.3, -1.2, 0.7)]
     found = substitute(factorise(sparse), vector)
-    np.testing.assert_allclose(found, np.linalg.solve(matrix, np.asarray(vector)), rtol=1e-14)
+    assert_allclose(found, np.linalg.solve(matrix, np.asarray(vector)), rtol=1e-14)
     alone = substitute(factorise(sparse), [vector[0], None, None])
     assert alone[1] is None and alone[2] is None  # the slip moves neither current nor motor speed
-    np.testing.assert_allclose(alone[0], -0.3, rtol=1e-14)
+    assert_allclose(alone[0], -0.3, rtol=1e-14)
 
 
 def test_elimination_without_a_pivot_in_its_place_gives_no_number():
@@ -97,23 +98,23 @@ def test_elimination_without_a_pivot_in_its_place_gives_no_number():
 def test_regular_leaves_a_regular_matrix_alone():
     matrix, vector = DIAGONAL + RNG.uniform(-1, 1, (3, 3)), RNG.normal(size=3)
     # Two programs of the same equations, whose products and sums a compiler may fuse or not: an ulp.
-    np.testing.assert_array_max_ulp(implicit(matrix, vector), eliminate(matrix, vector), maxulp=1)
+    assert_array_max_ulp(implicit(matrix, vector), eliminate(matrix, vector), maxulp=1)
 
 
 def test_regular_gives_zero_for_a_singular_matrix_and_spoils_no_neighbour():
     batch = np.stack([np.eye(3), np.zeros((3, 3)), np.full((3, 3), np.nan), EXCHANGE, 2 * np.eye(3)])
     answers = jax.vmap(implicit, (0, None))(batch, np.ones(3))
-    np.testing.assert_array_equal(answers[:, 0], [1.0, 0.0, 0.0, 0.0, 0.5])
+    assert_array_equal(answers[:, 0], [1.0, 0.0, 0.0, 0.0, 0.5])
     for direction in (jax.jacfwd, jax.jacrev):
         by_vector = jax.vmap(direction(implicit, argnums=1), (0, None))(batch, np.ones(3))
-        np.testing.assert_array_equal(by_vector, [np.eye(3), *np.zeros((3, 3, 3)), np.eye(3) / 2])
+        assert_array_equal(by_vector, [np.eye(3), *np.zeros((3, 3, 3)), np.eye(3) / 2])
 
 
 def test_regular_reverse_derivative_matches_numpy():
     matrix, vector = DIAGONAL + RNG.uniform(-1, 1, (3, 3)), RNG.normal(size=3)
     got = jax.grad(lambda a: implicit(a, vector)[0])(jnp.asarray(matrix))
     x, back = np.linalg.solve(matrix, vector), np.linalg.inv(matrix)
-    np.testing.assert_allclose(got, -np.outer(back[0], x), rtol=1e-9)
+    assert_allclose(got, -np.outer(back[0], x), rtol=1e-9)
 
 
 # --- programs ---------------------------------------------------------------------------------------------------------

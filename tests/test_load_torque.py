@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from test_shaft import SPEEDS, bench, current_of
 from test_worlds_rigs import steady
 from worlds import logs, rigs
@@ -41,12 +42,12 @@ def test_current_at_an_imposed_speed_follows_from_a_brake():
 
     torque = jnp.asarray([-0.1, 1.0, 0.3, 2.0])
     found, slope = jax.jit(lambda x: jax.jvp(shown, (x,), (jnp.ones(4),)))(torque)
-    np.testing.assert_allclose(found["motor_current"], current_of(SPEEDS, np.asarray(torque)), rtol=1e-9)
-    np.testing.assert_allclose(
+    assert_allclose(found["motor_current"], current_of(SPEEDS, np.asarray(torque)), rtol=1e-9)
+    assert_allclose(
         found["output_torque"], np.sign(SPEEDS) * 0.2 + 0.01 * SPEEDS / 16 + np.asarray(torque), rtol=1e-9
     )
     drives = np.array([False, True, False, False])
-    np.testing.assert_allclose(slope["motor_current"], np.where(drives, 0.8, 1 / 0.8) / 16 / 0.05, rtol=1e-9)
+    assert_allclose(slope["motor_current"], np.where(drives, 0.8, 1 / 0.8) / 16 / 0.05, rtol=1e-9)
 
 
 @pytest.mark.parametrize("loose", [False, True])
@@ -58,7 +59,7 @@ def test_a_brake_enters_as_a_constant_torque_of_the_load(loose):
     braked = moving(bench(rig, **load), Conditions(load_torque=0.3), state)
     stated = moving(bench(rig, torque_constant=0.3, **load), Conditions(), state)
     free = moving(bench(rig, **load), Conditions(), state)
-    jax.tree.map(np.testing.assert_allclose, dataclasses.replace(braked, load_torque=None), stated)
+    jax.tree.map(assert_allclose, dataclasses.replace(braked, load_torque=None), stated)
     assert float(braked.acceleration) < float(free.acceleration)
 
 
@@ -80,7 +81,7 @@ def test_settled_rigs_with_a_brake_are_those_of_another_implementation():
         free, _ = rigs.solve(w.rig, dataclasses.replace(w.conditions, load_torque=0 * torque), w.constants)
         assert sound.all()
         scale = np.abs(s.shown).max(1, keepdims=True)
-        np.testing.assert_allclose(found / scale, s.shown / scale, atol=1e-6)
+        assert_allclose(found / scale, s.shown / scale, atol=1e-6)
         assert (
             np.abs(free.shown - s.shown).max(1) > 1e-2 * scale[:, 0]
         ).any()  # a brake without effect would be seen
@@ -108,11 +109,11 @@ def _driven(torque):
 def test_every_fidelity_settles_alike_under_a_brake():
     at, run = _steady(TORQUE), _driven(TORQUE)
     for name in ("motor_speed", "total_current", "output_torque"):
-        np.testing.assert_allclose(run.reading[name], at.reading[name], rtol=1e-6)
+        assert_allclose(run.reading[name], at.reading[name], rtol=1e-6)
     assert [STATUSES[s] for s in np.asarray(at.status)] == ["converged", "converged", "reverses", "converged"]
     without = steady_batch(bench(), Conditions(voltage=VOLTS))
     assert (np.abs(at.motor_speed)[:3] < np.abs(without.motor_speed)[:3]).all()  # it brakes either way
-    np.testing.assert_array_equal(at.motor_speed[3], without.motor_speed[3])
+    assert_array_equal(at.motor_speed[3], without.motor_speed[3])
     times = time_grid(np.linspace(0, 4.0, 9))
     shown = jax.jit(history_signals)(bench(), Conditions(voltage=24.0, load_torque=0.5), jnp.asarray(times))
     assert float(shown.speed_motor[-1]) == pytest.approx(float(at.motor_speed[0]), rel=1e-6)
@@ -124,7 +125,7 @@ def test_derivatives_by_a_brake_are_differences():
     for settles in (_steady, _driven):
         by_torque = jax.jvp(lambda x: settles(x).motor_speed, (jnp.asarray(TORQUE),), (jnp.ones(4),))[1]  # noqa: B023
         less, more = (settles(TORQUE + h).motor_speed for h in (-1e-4, 1e-4))
-        np.testing.assert_allclose(by_torque, (more - less) / 2e-4, rtol=1e-4)
+        assert_allclose(by_torque, (more - less) / 2e-4, rtol=1e-4)
     times = jnp.asarray(time_grid(np.linspace(0, 0.6, 13)))
 
     @jax.jit
@@ -136,7 +137,7 @@ def test_derivatives_by_a_brake_are_differences():
 
     torque = 0.3 + 0.2 * jnp.sin(8 * times)
     less, more = (both(torque + h)[0] for h in (-1e-4, 1e-4))
-    np.testing.assert_allclose(both(torque)[1], (more - less) / 2e-4, rtol=1e-3, atol=1e-3)
+    assert_allclose(both(torque)[1], (more - less) / 2e-4, rtol=1e-3, atol=1e-3)
 
 
 @pytest.mark.nightly
@@ -202,7 +203,7 @@ def read(tmp_path, lines, head=""):
 def test_the_torque_of_a_row_is_read_in_its_unit(tmp_path, column, head, factor):
     lines = [f"supply_voltage_V,motor_speed_rpm,{column}", "24,4000,0.2", "12,2000,0"]
     runs, rig = read(tmp_path, lines, head)
-    np.testing.assert_allclose(runs.conditions(rig).load_torque, [0.2 * factor, 0.0])
+    assert_allclose(runs.conditions(rig).load_torque, [0.2 * factor, 0.0])
     assert "load_torque_Nm" in runs.axes
 
 
@@ -274,7 +275,7 @@ def test_a_log_holds_the_torque_of_every_sample(tmp_path, between):
     middle = 0.5 * (times[1:] + times[:-1])
     at = np.interp(middle, time, torque) if between == "linear" else torque[np.searchsorted(time, middle) - 1]
     moving = np.diff(times) > 0
-    np.testing.assert_allclose(held[:-1][moving], at[moving])
+    assert_allclose(held[:-1][moving], at[moving])
     assert observe.driven.load_torque.min() >= torque.min()
 
 
@@ -316,7 +317,7 @@ def test_a_torque_in_another_unit_is_doubted(tmp_path):
 def test_a_profile_and_a_sweep_state_the_torque(tmp_path):
     (tmp_path / "p.csv").write_text("time_s,duty,load_torque_mNm\n0,1,0\n1,1,300\n2,,\n")
     table = profiles.read_profile(tmp_path / "p.csv")
-    np.testing.assert_allclose(table.values["load_torque"], [0.0, 0.3, 0.3])
+    assert_allclose(table.values["load_torque"], [0.0, 0.3, 0.3])
     assert table.stated == ("load_torque_Nm",)
     (tmp_path / "bad.csv").write_text("time_s,duty,load_torque_Nm\n0,1,0\n1,1,\n2,1,0\n")
     with pytest.raises(BadData, match=r"bad\.csv row 2, load_torque_Nm: got an empty cell; expected a number"):

@@ -25,6 +25,7 @@ from sweeps import config
 from sweeps import stage_files as kept_stages
 from sweeps.commands import loop as command
 from sweeps.store import RunFolder, open_folder
+from tests.commands import ends
 
 
 def refuse():
@@ -90,8 +91,8 @@ def rig(tmp_path):
     return ["loop", "table.csv", "--robot", "rig.toml", "--no-report", "--out", "found"]
 
 
-@pytest.mark.parametrize(("end", "ends"), [(KeyboardInterrupt, 130), (OutOfTime, 3)])
-def test_an_interrupted_loop_goes_on_after_its_last_stage(rig, mmrjax, monkeypatch, tmp_path, end, ends):
+@pytest.mark.parametrize(("end", "code"), [(KeyboardInterrupt, 130), (OutOfTime, 3)])
+def test_an_interrupted_loop_goes_on_after_its_last_stage(rig, mmrjax, monkeypatch, tmp_path, end, code):
     def first(*_, keep, **__):
         keep("verdict", lambda: room.LoopStages("class", None, None, None))
         raise end
@@ -107,10 +108,13 @@ def test_an_interrupted_loop_goes_on_after_its_last_stage(rig, mmrjax, monkeypat
     monkeypatch.setattr(
         command.loop_words, "verdict_line", lambda found: f"verdict: {found.verdict}, iron_loss or windage"
     )
-    code, _, err = mmrjax(*rig, "--within", "5min")
-    assert at_once == [ends]
+    _, _, err = ends(
+        mmrjax(*rig, "--within", "5min"),
+        "kept: verdict; to continue, run the same command with --out found",
+        code=code,
+    )
+    assert at_once == [code]
     assert ("no verdict within 300 s\n" in err) == (end is OutOfTime)
-    assert code == ends and "kept: verdict; to continue, run the same command with --out found" in err
     assert "s  verdict: class, iron_loss or windage; next, errors held out and other noises\n" in err  # at once
     assert "verdict: class, iron_loss or windage; errors held out and other noises are outstanding" in err
     assert not (tmp_path / "found").exists()
@@ -120,8 +124,7 @@ def test_an_interrupted_loop_goes_on_after_its_last_stage(rig, mmrjax, monkeypat
         raise BadConfiguration("as far as this test goes")
 
     monkeypatch.setattr(command, "discover", again)
-    code, _, err = mmrjax(*rig, "--within", "5min")  # which is no other command
-    assert code == 2 and "as far as this test goes" in err
+    ends(mmrjax(*rig, "--within", "5min"), "as far as this test goes")
 
 
 def test_what_cannot_be_kept_is_not_said_to_be(rig, mmrjax, monkeypatch, tmp_path):
@@ -131,8 +134,7 @@ def test_what_cannot_be_kept_is_not_said_to_be(rig, mmrjax, monkeypatch, tmp_pat
 
     monkeypatch.setattr(command, "discover", first)
     monkeypatch.setattr(command.loop_words, "verdict_line", lambda found: found.verdict)
-    code, _, err = mmrjax(*rig)
-    assert code == 130 and "nothing could be kept of verdict; the same command begins anew" in err
+    _, _, err = ends(mmrjax(*rig), "nothing could be kept of verdict; the same command begins anew", code=130)
     assert "kept: verdict" not in err and not (tmp_path / "found.partial").exists()
 
 

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 from worlds import events, paper
 
@@ -107,11 +108,9 @@ def test_mission_matches_scipy_through_a_reversal(robot):
     p = dataclasses.replace(p, voltage=p.voltage.at[3:].set(20.0))
     got = run(robot, asked(), p, tolerance=1e-8)
     distance = np.cumsum(np.asarray(got.segments.of["distance"][0, :3]))
-    np.testing.assert_allclose(
-        distance, found[:, 3], rtol=2e-4, atol=2e-5
-    )  # it begins by standing, SciPy's by creeping
+    assert_allclose(distance, found[:, 3], rtol=2e-4, atol=2e-5)  # it begins by standing, SciPy's by creeping
     taken = np.cumsum(np.asarray(got.segments.energy[0, :3]))
-    np.testing.assert_allclose(taken, found[:, 7], rtol=1e-4)
+    assert_allclose(taken, found[:, 7], rtol=1e-4)
 
 
 #: Driven, braked to rest, driven backward and to the other side again, the current limited at each start.
@@ -235,8 +234,8 @@ def test_standing_and_breaking_away_agree_with_steady(robot):
     settled = np.asarray(steady.reading["speed"])
     stalled = np.asarray(steady.status) == STATUSES.index("stalled")
     assert stalled.any() and (~stalled).any()
-    np.testing.assert_allclose(speed[stalled], 0.0, atol=1e-12)
-    np.testing.assert_allclose(speed[~stalled], settled[~stalled], rtol=2e-3, atol=1e-4)  # 6 s of heat
+    assert_allclose(speed[stalled], 0.0, atol=1e-12)
+    assert_allclose(speed[~stalled], settled[~stalled], rtol=2e-3, atol=1e-4)  # 6 s of heat
 
 
 # --- heat -------------------------------------------------------------------------------------------
@@ -450,7 +449,7 @@ def test_linear_rows_ramp(robot):
     found = run(robot, asked(), ramp, tolerance=1e-6)
     t, source = np.asarray(found.course.time), np.asarray(found.course.signals.voltage_source)
     there = np.isfinite(t) & (t < 2)
-    np.testing.assert_allclose(source[there], 12 * t[there], rtol=1e-9, atol=1e-9)
+    assert_allclose(source[there], 12 * t[there], rtol=1e-9, atol=1e-9)
     assert float(found.peaks["current"]) < 10.0  # no inrush
 
 

@@ -14,16 +14,14 @@ from scipy.integrate import solve_ivp
 import mmrjax as mm
 from calibration.data import robot_file
 from calibration.data.input_errors import BadConfiguration
-from mmrjax import derived
-from mmrjax.fidelities import outputs
 from mmrjax.missions import mission_batch
 from mmrjax.missions.mission import mission
 from mmrjax.missions.mission_steps import MARKS
 from mmrjax.missions.profile import profile
-from mmrjax.model import channels, paper_robots, params
+from mmrjax.model import paper_robots, params
 from mmrjax.model.signals import STATUSES
 from sweeps import cli
-from tests.commands import rows
+from tests.commands import ends, rows
 
 HOUR = profile([0.0, 3600.0], "voltage", duty=1.0, slope_deg=10.0, payload=5.0)
 #: Room for the steps of a mission, as the command keeps; one program serves all with the same cut-off.
@@ -237,8 +235,9 @@ def folder(tmp_path_factory):
 @pytest.fixture
 def run_folder(folder, capsys, monkeypatch):
     if not (folder / "a").exists():
-        code, out, err = command(capsys, monkeypatch, folder, *written(folder, 3.3), "--no-report", "--out", "a")
-        assert code == 0, err
+        _, out, err = ends(
+            command(capsys, monkeypatch, folder, *written(folder, 3.3), "--no-report", "--out", "a"), code=0
+        )
         (folder / "out.txt").write_text(out)
         (folder / "err.txt").write_text(err)
     return folder / "a"
@@ -256,35 +255,6 @@ def test_words_and_files_say_cut_off_and_the_charge_that_is_left(run_folder):
     )
     history = rows(run_folder / "history.csv")
     assert history[-1]["event"] == "cut_off" and "below_cut_off" in [row["event"] for row in history]
-
-
-@pytest.mark.slow
-def test_a_name_is_one_quantity_in_every_file_of_a_mission(run_folder):
-    """Current of one motor; of all motors as peak; distance either way; forward less backward."""
-    result = json.loads((run_folder / "result.json").read_text())
-    (run,), history = rows(run_folder / "runs.csv"), rows(run_folder / "history.csv")
-    segments = rows(run_folder / "segments.csv")
-    for row in history[:: len(history) // 20]:
-        duty = float(row["duty"])
-        assert 2 * duty * float(row["motor_current_A"]) == pytest.approx(float(row["total_current_A"]), rel=1e-6)
-    peak = max(2 * abs(float(row["motor_current_A"])) for row in history)
-    assert 0.98 * peak < float(run["peak_current_A"]) < 1.02 * peak
-    shared = set(run) & set(segments[0]) & set(mission_batch.mission_columns())
-    for name in sorted(shared & set(result)):
-        if run[name] and result[name] is not None:
-            assert float(run[name]) == pytest.approx(result[name], rel=1e-6, abs=1e-9), name
-    for name in ("distance_m", "displacement_m", "energy_Wh", "state_of_charge"):
-        assert float(history[-1][name]) == pytest.approx(float(run[name]), rel=1e-6), name
-
-
-def test_a_column_of_several_registries_has_one_unit_and_one_meaning():
-    """Outputs of runs (with every channel), of missions and of what is derived: what shares a name is listed here."""
-    several: dict[str, list[tuple[str, float, str]]] = {}
-    for output in (*outputs.output_table(channels.EVERY), *mission_batch.OUTPUTS, *derived.TABLE):
-        several.setdefault(output.column, []).append((output.unit, output.factor, output.label))
-    shared = {column: said for column, said in several.items() if len(said) > 1}
-    assert set(shared) == {"peak_current_A"}
-    assert all(said[:2] == ("A", 1.0) and "all motors" in said[2] for said in shared["peak_current_A"])
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import zarr
+from numpy.testing import assert_allclose
 
 import mmrjax as mm
 from mmrjax.fidelities.drive import drive
@@ -17,6 +18,7 @@ from mmrjax.missions.mission_batch import simulate_batch
 from mmrjax.missions.mission_steps import BREAKS_AWAY, event_functions
 from mmrjax.missions.profile import profile
 from mmrjax.model import params
+from tests.commands import ends
 
 ROWS = [0.0, 1.0, 4.0, 5.0, 6.0]
 RAMP = dict(demand=[0, 0.3, 0.3, 0, 0], linear=True)
@@ -103,10 +105,10 @@ def test_numbers_of_either_side_follow_from_their_totals():
 def test_equal_sides_are_a_mission_of_straight_travel(robot, demanded):
     straight = jax.device_get(simulate_batch(robot, conditions(1), profile(ROWS, MODES, **RAMP), None, 512))
     for name, value in straight.total.of.items():
-        np.testing.assert_allclose(demanded.total.of[name][0], value[0], rtol=1e-9, atol=1e-9, err_msg=name)
+        assert_allclose(demanded.total.of[name][0], value[0], rtol=1e-9, atol=1e-9, err_msg=name)
     for name, value in straight.peaks.items():
         if name != "cell_low":
-            np.testing.assert_allclose(demanded.peaks[name][0], value[0], rtol=1e-9, err_msg=name)
+            assert_allclose(demanded.peaks[name][0], value[0], rtol=1e-9, err_msg=name)
     assert (demanded.status[0] == straight.status[0]).all() and (demanded.flags[0] == straight.flags[0]).all()
     assert int(demanded.steps[0]) == int(straight.steps[0])
     for name in ("place_y", "turned"):
@@ -121,7 +123,7 @@ def test_sides_exchanged_mirror(driven, demanded):
             sign = -1.0 if name in ("place_y", "turned") else 1.0
             swapped = name.replace("_left", "_x").replace("_right", "_left").replace("_x", "_right")
             swapped = swapped if swapped in found.total.of else name
-            np.testing.assert_allclose(found.total.of[swapped][other], sign * values[one], rtol=1e-8, atol=1e-9)
+            assert_allclose(found.total.of[swapped][other], sign * values[one], rtol=1e-8, atol=1e-9)
         assert found.total.of["turned"][one] > 0.3
 
 
@@ -139,8 +141,8 @@ def test_demanded_speed_and_yaw_rate_are_met(demanded):
     course = demanded.course
     held = (course.time[1] > 2.0) & (course.time[1] < 4.0)
     signals = jax.tree.map(lambda x: x[1], course.signals)
-    np.testing.assert_allclose(np.asarray(signals.speed)[held].mean(1), 0.3, rtol=1e-4)
-    np.testing.assert_allclose(np.asarray(signals.yaw_rate)[held], 0.5, rtol=1e-3)
+    assert_allclose(np.asarray(signals.speed)[held].mean(1), 0.3, rtol=1e-4)
+    assert_allclose(np.asarray(signals.yaw_rate)[held], 0.5, rtol=1e-3)
     turned = np.asarray(signals.heading)[np.isfinite(course.time[1])][-1, 0]
     assert turned == pytest.approx(float(demanded.total.of["turned"][1]), rel=1e-5)
     first, last = np.asarray(signals.heading)[held][[0, -1], 0]
@@ -208,13 +210,12 @@ def test_sweep_of_missions_has_the_numbers_of_both_sides(robot, mmrjax, tmp_path
         'profile = "turn.csv"\nmodel = "drive"\nreport = false\noutputs = ["energy_Wh", "turned_deg"]\n'
         "[conditions]\nvoltage = 24\n[axes]\npayload = [0, 4, 8]\n"
     )
-    code, _, err = mmrjax("sweep", "plan.toml", "--out", "run")
-    assert code == 0, err
+    ends(mmrjax("sweep", "plan.toml", "--out", "run"), code=0)
     store = zarr.open_group(tmp_path / "run" / "results.zarr", mode="r")
     of = dict(demand=[0.0, 0.3, 0.3, 0.3, 0.0], yaw_rate=[0.0, 0.8, 0.8, 0.0, 0.0], linear=True)
     asks = profile([0.0, 0.2, 0.4, 0.5, 0.6], "speed", **of)
     own = conditions(3, configuration=np.zeros(3, int), payload=np.array([0.0, 4.0, 8.0])).resolved(robot)
     found = missions.numbers_by_column(missions.mission_numbers(robot, own, demanding(robot, own, *[asks] * 3)))
     for name in ("energy_Wh", "turned_deg"):
-        np.testing.assert_allclose(store[name][:], found[name], rtol=1e-9)
+        assert_allclose(store[name][:], found[name], rtol=1e-9)
     assert store["turned_deg"][0] > 1

@@ -6,6 +6,7 @@ import zipfile
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from calibration.data import delimited, presets_file, runs
 from calibration.data.input_errors import BadData
@@ -53,9 +54,9 @@ def test_sysid_log_of_wpilib_becomes_one_run_for_each_test(tmp_path):
     columns = dict(zip(table.arrays.header, table.arrays.values, strict=True))
     names = {mine: columns[theirs] for mine, theirs, _ in table.mapped}
     assert list(dict.fromkeys(names["run_id"])) == ["quasistatic-forward", "dynamic-reverse"]
-    np.testing.assert_array_equal(names["supply_voltage_V"], [*range(20, 30)] * 2)
-    np.testing.assert_array_equal(names["output_speed_turns_s"], [*range(40, 50)] * 2)
-    np.testing.assert_allclose(np.diff(columns["time_s"])[:9], 0.02)
+    assert_array_equal(names["supply_voltage_V"], [*range(20, 30)] * 2)
+    assert_array_equal(names["output_speed_turns_s"], [*range(40, 50)] * 2)
+    assert_allclose(np.diff(columns["time_s"])[:9], 0.02)
 
 
 @pytest.mark.parametrize(("change", "words"), [
@@ -110,7 +111,7 @@ def test_sheet_is_a_table_with_a_row_of_units(tmp_path):
     write_xlsx(tmp_path / "bench.xlsx", Bench=[[None] * 3, *ROWS], Notes=[["made by hand"]])
     signals = signals_of(tmp_path / "bench.xlsx")
     assert [*signals] == ["supply_voltage_V", "I_mot", "n"] and signals["I_mot"].unit == "mA"
-    np.testing.assert_array_equal(signals["I_mot"].load(), [410.5, np.nan])
+    assert_array_equal(signals["I_mot"].load(), [410.5, np.nan])
 
 
 def test_sheets_of_a_workbook_are_chosen_by_name(tmp_path):
@@ -162,7 +163,7 @@ def test_records_of_lists_are_runs_of_their_own():
     signals = content_signals({"rate_hz": 50, "data": data})
     assert {*signals} == {"data.u", "data.q", "data.kind", "data.mass", "data.run_id", "data.time_s"}
     assert signals["data.run_id"].load().tolist() == ["step"] * 3 + ["sine"] * 4
-    np.testing.assert_allclose(signals["data.time_s"].load(), 0.02 * np.array([0, 1, 2, 0, 1, 2, 3]))
+    assert_allclose(signals["data.time_s"].load(), 0.02 * np.array([0, 1, 2, 0, 1, 2, 3]))
     assert presets_file.recognise_preset([*signals]) == ""
 
 
@@ -202,4 +203,4 @@ def test_json_of_episodes_is_read_from_a_file(tmp_path):
     file = tmp_path / "log.json"
     file.write_text(json.dumps({"dt": 0.1, "data": [{"u": [1.0, 2.0]}, {"u": [3.0, None]}]}))
     signals = signals_of(file)
-    np.testing.assert_array_equal(signals["data.u"].load(), [1, 2, 3, np.nan])
+    assert_array_equal(signals["data.u"].load(), [1, 2, 3, np.nan])

@@ -3,6 +3,7 @@
 import jax
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 from worlds import paper
 
@@ -19,18 +20,18 @@ def test_motor_laws_match_reference(sign):
         w = sign * size
         motor = Motor(resistance=R, inductance=L, torque_constant=C, friction_coulomb=M0, friction_viscous=K)
         loss = paper.motor_loss(w, M0, K, sign)
-        np.testing.assert_allclose(motor.torque_loss(w, sign), loss, rtol=1e-9)
-        np.testing.assert_allclose(motor.voltage_back(w), paper.motor_back(w, C), rtol=1e-9)
+        assert_allclose(motor.torque_loss(w, sign), loss, rtol=1e-9)
+        assert_allclose(motor.voltage_back(w), paper.motor_back(w, C), rtol=1e-9)
         torque = motor.torque_electromagnetic(current) - motor.torque_loss(w, sign)
         expected = paper.motor_torque(current, w, C, M0, K, sign)
-        np.testing.assert_allclose(torque, expected, rtol=1e-9, atol=1e-12)
+        assert_allclose(torque, expected, rtol=1e-9, atol=1e-12)
         rate = (24.0 - motor.voltage_back(w) - motor.voltage_winding(current)) / motor.inductance
         expected = paper.motor_current_rate(24.0, current, w, R, L, C)
-        np.testing.assert_allclose(rate, expected, rtol=1e-9, atol=1e-6)
+        assert_allclose(rate, expected, rtol=1e-9, atol=1e-6)
 
 
 def test_motor_speed_constant_is_369_rpm_per_volt():
-    np.testing.assert_allclose(1 / Motor().torque_constant * 60 / (2 * np.pi), 369, rtol=1e-3)
+    assert_allclose(1 / Motor().torque_constant * 60 / (2 * np.pi), 369, rtol=1e-3)
 
 
 def test_motor_without_friction_loses_no_torque():
@@ -74,7 +75,7 @@ def test_temperatures_in_closed_form_match_scipy(current):
         return [(power - flow) * 1.7 / 16.3, (flow - (y[1] - 25) / 6.0) * 6.0 / 593.0]
 
     end = solve_ivp(rates, [0, time], [40.0, 30.0], method="DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
-    np.testing.assert_allclose(motor.temperatures_after(current, time, 40.0, 30.0), end, rtol=1e-9)
+    assert_allclose(motor.temperatures_after(current, time, 40.0, 30.0), end, rtol=1e-9)
 
 
 @pytest.mark.slow

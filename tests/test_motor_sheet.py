@@ -14,6 +14,7 @@ from calibration.data import robot_file
 from calibration.data.input_errors import BadConfiguration
 from sweeps.commands import rig_from_sheet
 from sweeps.commands.rig_new import write_new_rig
+from tests.commands import ends
 
 #: maxon RE30 310007, as printed.
 RE30 = {
@@ -77,8 +78,7 @@ def test_viscous_friction_of_a_motor_does_not_look_like_a_missing_effect(mmrjax,
         "resistance": "0.62 ohm",
     }
     write_new_rig(tmp_path / "rig.toml", "dyno", False, sheet=sheet)
-    code, _, err = mmrjax("loop", "runs.csv", "--robot", "rig.toml", "--out", "out", "--no-report")
-    assert code == 0, err
+    ends(mmrjax("loop", "runs.csv", "--robot", "rig.toml", "--out", "out", "--no-report"), code=0)
     assert json.loads((tmp_path / "out/result.json").read_text())["verdict"] == "none"
     fitted = robot_file.read_robot(tmp_path / "out/fitted.toml").motor
     assert float(fitted.friction_viscous) == pytest.approx(viscous, rel=0.1)
@@ -127,8 +127,10 @@ def test_sheets_that_contradict_themselves_or_lack_numbers_are_refused(change, m
 
 
 def test_sheet_without_numbers_leaves_no_file(mmrjax, tmp_path):
-    code, _, err = mmrjax("rig", "new", "r.toml", "--from-sheet")
-    assert code == 2 and "--from-sheet: no numbers; expected --no-load-current and three or more of" in err
+    ends(
+        mmrjax("rig", "new", "r.toml", "--from-sheet"),
+        "--from-sheet: no numbers; expected --no-load-current and three or more of",
+    )
     assert not list(tmp_path.iterdir())
 
 

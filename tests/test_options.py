@@ -11,6 +11,7 @@ import typer
 
 from calibration.data.input_errors import BadConfiguration
 from sweeps import cli, config, config_campaign, options
+from tests.commands import ends
 
 KINDS = {
     "simulate": (config.Simulate, config.OneRun),
@@ -184,13 +185,11 @@ def test_a_file_runs_no_code_unless_it_is_trusted(mmrjax, tmp_path, command, tex
     (tmp_path / "own.py").write_text(HARM)
     (tmp_path / "plan.toml").write_text(text)
     asks = (*command, "--config", "plan.toml", "--out", "x")
-    code, out, err = mmrjax(*asks)
-    assert code == 2 and f"would run code, which a file cannot ask for; state {option} on the command" in err
+    _, out, _ = ends(mmrjax(*asks), f"would run code, which a file cannot ask for; state {option} on the command")
     assert not out and sorted(p.name for p in tmp_path.iterdir()) == ["own.py", "plan.toml"]
     if option == "--effects":
         for how in (("--trust",), ("--effects", "own.py")):
-            code, _, err = mmrjax(*asks, *how)
-            assert code == 2 and "own.py: holds no effect" in err
+            ends(mmrjax(*asks, *how), "own.py: holds no effect")
             (tmp_path / "harmed").unlink()
 
 

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from synthetic import SETTLED, STATED
 
 from calibration.data import own_mass, robot_file
@@ -113,9 +114,9 @@ def shown(name):
 @pytest.mark.parametrize("name", [shown(n) for n in ("", *SEEN)])
 def test_robot_that_the_loop_writes_is_the_one_that_it_fitted(name, fits):
     reading, status, again, status_again = fits(name)
-    np.testing.assert_array_equal(status_again, status)
+    assert_array_equal(status_again, status)
     assert np.isfinite(reading).all()
-    np.testing.assert_allclose(again, reading, rtol=1e-9)
+    assert_allclose(again, reading, rtol=1e-9)
 
 
 @pytest.mark.parametrize("effect", [e for e in ALL if shape_of(e()) is not None], ids=lambda e: e.name)
@@ -126,7 +127,7 @@ def test_shape_that_a_fit_reaches_is_one_that_a_file_may_state(effect):
     low, high = shape.spec.bounds
     assert low <= value.min() and value.max() <= high
     if shape.name == "phase":
-        np.testing.assert_allclose(np.exp(1j * value), np.exp(1j * shape.spec.prior_sd(0.0) * z), atol=1e-12)
+        assert_allclose(np.exp(1j * value), np.exp(1j * shape.spec.prior_sd(0.0) * z), atol=1e-12)
     else:
         assert np.all(np.diff(value) >= 0) and value[30] == pytest.approx(float(shape.value))
 
@@ -139,7 +140,7 @@ def test_comparison_can_fail(tmp_path):
     conditions = runs.conditions(robot)
     before, _ = jax.device_get(_swept(params.without_weak_types(robot), conditions))
     assert np.abs(written(robot)[0] / before - 1).max() > 0.02
-    np.testing.assert_allclose(written(own_mass.with_table_mass(robot, runs))[0], before, rtol=1e-9)
+    assert_allclose(written(own_mass.with_table_mass(robot, runs))[0], before, rtol=1e-9)
 
 
 @pytest.mark.nightly
@@ -147,7 +148,7 @@ def test_comparison_can_fail(tmp_path):
 @pytest.mark.parametrize("name", list(UNNAMED))
 def test_robot_with_a_curve_is_written_as_it_was_fitted(name, curves):
     reading, again = curves(name)
-    np.testing.assert_allclose(again, reading, rtol=1e-9)
+    assert_allclose(again, reading, rtol=1e-9)
 
 
 @pytest.fixture(scope="module")
@@ -246,4 +247,4 @@ def test_calibrated_robot_is_its_fit(tmp_path):
     again = robot_file.read_robot(tmp_path / "robot.toml")
     shown = steady_batch(again, unweighed(runs).conditions(again))
     for name, reading in found.readings.items():
-        np.testing.assert_allclose(np.asarray(shown.reading[name]), reading.after, rtol=1e-8)
+        assert_allclose(np.asarray(shown.reading[name]), reading.after, rtol=1e-8)

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from mmrjax.model import masses, params
 from mmrjax.model.conditions import Conditions
@@ -107,8 +108,8 @@ def test_each_part_payload_and_posture_count_in_every_member_with_derivatives(ro
     ends = jax.jit(jax.vmap(of))(jnp.concatenate([at + step * jnp.eye(len(at)), at - step * jnp.eye(len(at))]))
     differences = (ends[: len(at)] - ends[len(at) :]) / (2 * step)
     forward, reverse = jax.jit(jax.jacfwd(of))(at), jax.jit(jax.grad(of))(at)
-    np.testing.assert_allclose(forward, differences, rtol=1e-6, atol=1e-9)
-    np.testing.assert_allclose(reverse, forward, rtol=1e-12, atol=1e-14)
+    assert_allclose(forward, differences, rtol=1e-6, atol=1e-9)
+    assert_allclose(reverse, forward, rtol=1e-12, atol=1e-14)
     assert (np.abs(forward) > 1e-6).all(), dict(zip((*PARTS, "payload"), forward, strict=True))
 
 

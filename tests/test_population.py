@@ -8,6 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration
@@ -19,6 +20,7 @@ from calibration.inference.population import Members, Rows
 from calibration.inference.problem import Observation
 from mmrjax.model import channels, paper_robots
 from mmrjax.model.signals import FAILED, FLAGS, SLIDES, TIPS
+from tests.commands import ends
 
 NAMES = ("motor.resistance", "6T2A.track.loss_coulomb", "6T2A.track.loss_viscous", "6T2A.ground.rolling_resistance")
 SIZE = 48
@@ -87,8 +89,8 @@ def test_generations_come_down_to_the_truth(found, truth):
 @pytest.mark.slow
 def test_same_seed_same_members_and_another_seed_others(posed, known, found):
     again = evolve(posed, known)
-    np.testing.assert_array_equal(again.z, found.z)
-    np.testing.assert_array_equal(again.cost, found.cost)
+    assert_array_equal(again.z, found.z)
+    assert_array_equal(again.cost, found.cost)
     assert not np.array_equal(evolve(posed, known, 1, seed=4).z, found.z[:SIZE])
 
 
@@ -152,8 +154,8 @@ def test_kept_members_are_not_run_again_and_an_ended_search_goes_on(posed, known
     true = population._observed
     monkeypatch.setattr(population, "_observed", lambda *a: run.append(1) or true(*a))
     whole = evolve(posed, known, len(found.generations), file)
-    np.testing.assert_array_equal(whole.z, found.z)
-    np.testing.assert_array_equal(whole.cost, found.cost)
+    assert_array_equal(whole.z, found.z)
+    assert_array_equal(whole.cost, found.cost)
     together = population.TOGETHER[0]
     assert len(run) == (len(found.generations) - 2) * -(-SIZE // together)
     run.clear()
@@ -198,8 +200,10 @@ def test_damaged_members_are_refused_before_the_first_search(tmp_path, monkeypat
             members=tmp_path / "kept.npz",
         )
     monkeypatch.setattr("sweeps.commands.loop.discover", never)
-    code, _, err = mmrjax("loop", "measured", "--resolve", "--members", "kept.npz", "--out", "x")
-    assert code == 2 and "--members kept.npz: not a readable file of members" in err
+    ends(
+        mmrjax("loop", "measured", "--resolve", "--members", "kept.npz", "--out", "x"),
+        "--members kept.npz: not a readable file of members",
+    )
     assert [p.name for p in tmp_path.iterdir()] == ["kept.npz"]
 
 

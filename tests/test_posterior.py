@@ -7,6 +7,7 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from synthetic import calibrated
 
 from calibration.data import posterior_file as room
@@ -44,8 +45,8 @@ def fitted(robot, posterior):
 
 def test_coordinates_of_a_posterior_are_those_of_the_fit(coordinates, posterior):
     z = np.random.default_rng(0).normal(size=(20, 4)) * 2
-    np.testing.assert_allclose(posterior.at(z)[:, :4], coordinates.value(jnp.asarray(z)), rtol=1e-14)
-    np.testing.assert_allclose(posterior.at(z)[:, 4], 0.8 * posterior.at(z)[:, 2], rtol=1e-12)  # μ_d follows μ_s
+    assert_allclose(posterior.at(z)[:, :4], coordinates.value(jnp.asarray(z)), rtol=1e-14)
+    assert_allclose(posterior.at(z)[:, 4], 0.8 * posterior.at(z)[:, 2], rtol=1e-12)  # μ_d follows μ_s
     assert posterior.names[4:] == ("6T2A.ground.friction.dynamic", "6T2A.ground.friction.speed_dynamic")[:1]
 
 
@@ -55,7 +56,7 @@ def test_file_holds_all_of_a_posterior(posterior, tmp_path):
     for field in dataclasses.fields(Posterior):
         a, b = getattr(posterior, field.name), getattr(again, field.name)
         if isinstance(a, np.ndarray):
-            np.testing.assert_array_equal(a, b)
+            assert_array_equal(a, b)
         else:
             assert a == b, field.name
 
@@ -80,7 +81,7 @@ def test_draws_have_mean_and_covariance_of_the_posterior(posterior):
     assert z.mean() == pytest.approx(0.4, abs=0.01) and z.std() == pytest.approx(0.3, rel=0.02)
     guide = (values[:, 1] - 0.3) / 0.2
     assert np.corrcoef(z, guide)[0, 1] == pytest.approx(-0.06 / (0.3 * 0.32), abs=0.02)
-    np.testing.assert_array_equal(values, posterior.draw(20_000, 0))
+    assert_array_equal(values, posterior.draw(20_000, 0))
 
 
 @pytest.mark.slow
@@ -99,9 +100,9 @@ def test_draws_reproduce_the_linear_standard_error_of_readings(posterior, fitted
     slopes = (np.array(sides[0]) - np.array(sides[1])).T / (2 * step)
     linear = np.sqrt(np.einsum("ij,jk,ik->i", slopes, posterior.covariance, slopes))
     column = "total_current_A"
-    np.testing.assert_allclose(found.sd(column), linear, rtol=0.1)
+    assert_allclose(found.sd(column), linear, rtol=0.1)
     middle = np.asarray(readings(jnp.asarray(posterior.mean)))
-    np.testing.assert_allclose(found.columns[column + "_upper"] - middle, 1.96 * linear, rtol=0.2)
+    assert_allclose(found.columns[column + "_upper"] - middle, 1.96 * linear, rtol=0.2)
     assert np.all(found.columns[uncertainty.SHARE] == 1)
 
 

@@ -13,6 +13,7 @@ from mmrjax.model import paper_robots, params
 from sweeps.inputs import one_run
 from sweeps.report.words import posture_words
 from sweeps.results import posture_results
+from tests.commands import ends
 
 
 @pytest.fixture(scope="module")
@@ -104,8 +105,11 @@ def test_a_table_states_levers_by_row(robot, tmp_path):
 @pytest.mark.slow
 def test_simulate_leaves_posture_and_page(tmp_path, mmrjax):
     folder = tmp_path / "run"
-    code, out, _ = mmrjax("simulate", "--levers-front", "30", "--levers-rear", "-8", "--out", str(folder))
-    assert code == 0 and "steps up to 236 mm" in out
+    ends(
+        mmrjax("simulate", "--levers-front", "30", "--levers-rear", "-8", "--out", str(folder)),
+        "steps up to 236 mm",
+        code=0,
+    )
     with (folder / "posture.csv").open(newline="") as file:
         (row,) = csv.DictReader(file)
     assert float(row["highest_step_mm"]) == pytest.approx(236, abs=1)

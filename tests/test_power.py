@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from worlds import paper
 
 from mmrjax.model.power import Battery, curve_remark, voltage_source
@@ -21,23 +22,23 @@ def test_battery_voltage_matches_reference():
             capacity=capacity, capacity_curve=float(of_curve),
         )  # fmt: skip
         expected = paper.battery_voltage(current, discharge, A, B, U0, R, I_p, capacity, of_curve)
-        np.testing.assert_allclose(battery.voltage(current, discharge), expected, rtol=1e-9)
+        assert_allclose(battery.voltage(current, discharge), expected, rtol=1e-9)
 
 
 def test_battery_voltage_full_without_load_is_eight_cells():
     battery = Battery(current_other=0.0)
-    np.testing.assert_allclose(battery.voltage(0.0, 0.0), 33.36, rtol=1e-12)  # Table A4 rounds to 33.4
+    assert_allclose(battery.voltage(0.0, 0.0), 33.36, rtol=1e-12)  # Table A4 rounds to 33.4
 
 
 def test_battery_table1_units_are_per_mah():
     # Table 1 in its own units: 2000 mAh taken from a cell leave 4.17 - 1.0 + 0.28 V.
-    np.testing.assert_allclose(Battery().voltage_no_load(2000 * 3.6), 3.45, rtol=1e-12)
+    assert_allclose(Battery().voltage_no_load(2000 * 3.6), 3.45, rtol=1e-12)
 
 
 def test_battery_parabola_turns_beyond_capacity():
     battery = Battery()
     lowest = -battery.slope / (2 * battery.curvature)
-    np.testing.assert_allclose(lowest / 3.6, 3571.43, rtol=1e-5)
+    assert_allclose(lowest / 3.6, 3571.43, rtol=1e-5)
     assert lowest > battery.capacity and curve_remark(battery) is None
     assert [bool(battery.rises(lowest * share)) for share in (0.999, 1.001)] == [False, True]
 
@@ -45,7 +46,7 @@ def test_battery_parabola_turns_beyond_capacity():
 def test_battery_of_the_papers_capacity_has_table1_to_the_last_digit():
     battery, charge = Battery(), np.linspace(0.0, 7920.0, 12)
     table1 = battery.curvature * charge**2 + battery.slope * charge + battery.voltage_full
-    np.testing.assert_array_equal(battery.voltage_no_load(charge), table1)
+    assert_array_equal(battery.voltage_no_load(charge), table1)
 
 
 @pytest.mark.parametrize("capacity", [1000.0, 30_670.0, 1e6])
@@ -53,9 +54,7 @@ def test_battery_of_any_capacity_falls_as_the_papers_over_its_own(capacity):
     """30 670 C (8519 mAh) once rose to 4.76 V a cell on the way to empty."""
     share = np.linspace(0.0, 1.0, 101)
     own, other = Battery(), Battery(capacity=capacity)
-    np.testing.assert_allclose(
-        other.voltage_no_load(share * capacity), own.voltage_no_load(share * 7920.0), rtol=1e-12
-    )
+    assert_allclose(other.voltage_no_load(share * capacity), own.voltage_no_load(share * 7920.0), rtol=1e-12)
     assert (np.diff(np.asarray(other.voltage_no_load(share * capacity))) < 0).all()
     assert not bool(other.rises(capacity)) and curve_remark(other) is None
 
@@ -94,4 +93,4 @@ def test_battery_energy_is_the_integral_of_its_voltage_over_the_charge():
     for battery in (Battery(), Battery(capacity=12_000.0)):
         charge = np.linspace(0.0, 6000.0, 3001)
         volts = 8 * np.asarray(battery.voltage_no_load(charge))
-        np.testing.assert_allclose(battery.energy(6000.0), np.sum((volts[1:] + volts[:-1]) / 2) * 2.0, rtol=1e-7)
+        assert_allclose(battery.energy(6000.0), np.sum((volts[1:] + volts[:-1]) / 2) * 2.0, rtol=1e-7)

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from test_public_api import python
 
 import mmrjax as mm
@@ -59,7 +60,7 @@ def test_results_are_those_of_double_precision_where_jax_is_single(robot):
     for leaves in each:
         for a, b in zip(leaves, jax.tree.leaves(double), strict=True):
             assert isinstance(a, np.ndarray)
-            np.testing.assert_array_equal(a, b)
+            assert_array_equal(a, b)
     assert later is found.slip and found.table() == double.table()
     assert all(isinstance(p.value, np.ndarray) and p.value.dtype == float for p in walk_parameters(plain))
 
@@ -96,8 +97,8 @@ def test_within_a_trace_the_precision_is_the_users(way, single):
     inside = jax.jit(lambda x: x * outside.total_current)(1.0)  # computed there, but not traced
     value = WAYS[way](robot, runs)
     assert value.dtype == inside.dtype == jnp.float32
-    np.testing.assert_allclose(value, current(robot, 24.1), rtol=1e-6)
-    np.testing.assert_allclose(inside, current(robot, 24.1), rtol=1e-7)
+    assert_allclose(value, current(robot, 24.1), rtol=1e-6)
+    assert_allclose(inside, current(robot, 24.1), rtol=1e-7)
 
 
 @pytest.mark.slow
@@ -111,7 +112,7 @@ def test_gradients_in_single_precision_are_those_in_double():
     with jax.enable_x64(False):
         rough = slope()
     assert rough.dtype == jnp.float32
-    np.testing.assert_allclose(rough, slope(), rtol=1e-5)
+    assert_allclose(rough, slope(), rtol=1e-5)
 
 
 def test_strong_numbers_keep_their_digits(single):

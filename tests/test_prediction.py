@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy import stats
 
 from calibration.data import robot_file
@@ -43,7 +44,7 @@ def test_score_is_the_log_density_and_what_is_not_reached_counts(runs):
     for kind in reading:
         off = np.where(np.isfinite(reading[kind]), reading[kind], measured + prediction.UNREACHED * sd)
         wanted = stats.t.logpdf((off - measured) / sd, prediction.FREEDOM) - np.log(sd)
-        np.testing.assert_allclose(found.by_kind[kind], np.where(counts, wanted, np.nan), rtol=1e-12)
+        assert_allclose(found.by_kind[kind], np.where(counts, wanted, np.nan), rtol=1e-12)
     assert [len(set(found.blocks[kind])) for kind in ("slope", "voltage")] == [3, 2]
 
 
@@ -128,8 +129,8 @@ def test_what_candidates_predict_is_kept_and_not_fitted_again(monkeypatch, runs)
     known = predicted[prediction.candidate_key(candidates[0])]
     found = findings.readings_of_rows(runs, np.ones((12, 2)), before, after, known)
     assert fitted == [1.0]
-    np.testing.assert_array_equal(found.held_out["slope"][0], known["slope"])
-    np.testing.assert_array_equal(found.held_out["slope"][1], -1.0)
+    assert_array_equal(found.held_out["slope"][0], known["slope"])
+    assert_array_equal(found.held_out["slope"][1], -1.0)
 
 
 def test_nothing_is_chosen_where_nothing_can_be_held_out(runs):
@@ -172,7 +173,7 @@ def test_measured_runs_show_a_voltage_drop_and_a_slip_that_rests_on_a_row(tmp_pa
     unweighed = {k: v for k, v in runs.columns.items() if k != "total_mass_kg"}
     shown = steady_batch(again, dataclasses.replace(runs, columns=unweighed).conditions(again)).reading
     swept = np.stack([np.asarray(shown[c.name]) for c in channels.usual_channels()], -1)
-    np.testing.assert_allclose(swept, found.readings_of_rows.after, rtol=1e-7)
+    assert_allclose(swept, found.readings_of_rows.after, rtol=1e-7)
 
 
 @pytest.mark.parametrize(

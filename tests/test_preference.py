@@ -1,18 +1,13 @@
 """What held-out data say: errors that rise are told first, and they may choose the leader of a class."""
 
 import dataclasses
-import json
-from pathlib import Path
 
-import jsonschema
 import numpy as np
 import pytest
-from pages import Tables
 from synthetic import SETTLED, known, table
 from worlds import tables
 
 from calibration.data.input_errors import BadConfiguration
-from calibration.data.writing import finite_or_null
 from calibration.discovery import discover, preference
 from calibration.discovery.loop_notes import DRAW
 from calibration.discovery.result import HeldOutAlternative, Worse
@@ -20,8 +15,6 @@ from calibration.discovery.settings import HELD_OUT, settings_for
 from calibration.inference.fit_notes import Remark
 from calibration.inference.observers import SettledRuns
 from mmrjax.model import channels, paper_robots
-from sweeps.report import loop_report, page_renderer
-from sweeps.report.terminal_renderer import print_document
 
 NAMES = channels.USUAL
 
@@ -173,37 +166,3 @@ def test_what_follows_is_of_the_leader_that_was_chosen(traced, monkeypatch):
         assert [next(iter(e.members)) for e in found.effects] == list(other.best.effects)
         assert {e.name for e in found.robot.effects} == set(other.best.effects)
         assert any("comes first in its class by errors held out" in n for n in found.notes)
-
-
-@pytest.mark.slow
-def test_what_gets_worse_stands_before_effects_on_page_and_terminal(traced, tmp_path, capsys):
-    found = finished(traced)
-    rise = Worse("slope", "motor_speed", found.errors_held_out["slope"][1]["motor_speed"]["rows"], 4.3, 4.7)
-    found = dataclasses.replace(found, held_out_worse=(rise,))
-    said = f"Predicts worse on held-out rows: by slope motor speed 4.3 → 4.7 % (same {rise.rows} rows)."
-    schema = json.loads((Path(__file__).parents[1] / "docs" / "schemas" / "loop.schema.json").read_text("utf-8"))
-    document = finite_or_null(found.to_json())
-    jsonschema.validate(document, schema)
-    assert document["held_out_worse"] == [dataclasses.asdict(rise)]
-    assert [a["effects"] for a in document["alternatives_held_out"]] == [list(a.effects) for a in traced.held_out]
-    stated = document["errors"]["as_stated"]["fitted"]
-    before = document["errors"]["before"]["fitted"]
-    assert stated["total_current"]["rms_sigma"] > before["total_current"]["rms_sigma"]
-
-    print_document(loop_report.loop_document(found, "nominal", {}))
-    printed = capsys.readouterr().out
-    assert said in " ".join(printed.split()) and printed.index("Predicts worse") < printed.index("effect ")
-    assert printed.index("as stated") < printed.index("fitted again")
-
-    document_shown = loop_report.loop_document(found, "nominal", {})
-    text = page_renderer.write_report_page(tmp_path, document_shown).read_text("utf-8")
-    page = Tables(text)
-    assert said in page.text
-    assert text.index('id="summary"') < text.index('id="worse"') < text.index('id="advice"')
-    assert [row[0] for row in page.tables["summary"][1:3]] == ["as stated", "fitted again"]
-    assert len(page.tables["alternatives_held_out"]) == 1 + len(traced.held_out)
-
-    found = dataclasses.replace(found, held_out_worse=())
-    assert "worse" not in {
-        getattr(block, "name", "") for block in loop_report.loop_document(found, "nominal", {}).blocks
-    }

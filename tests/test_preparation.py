@@ -6,7 +6,7 @@ from test_rig_histories import ARM, DRIVE
 
 from calibration.data import robot_file
 from calibration.data import runs as records
-from calibration.data.input_errors import BadConfiguration, BadData
+from calibration.data.input_errors import BadData
 from calibration.data.runs import Runs
 from calibration.discovery import discover
 from calibration.inference.calibration import calibrate
@@ -29,13 +29,6 @@ def test_a_table_whose_masses_have_another_unit_is_refused_by_all(who):
     runs = Runs("runs.csv", {**runs.columns, "total_mass_kg": 6 * runs["total_mass_kg"]})
     with pytest.raises(BadData, match=r"runs.csv, total_mass_kg: about 6\.2 times too large for this robot"):
         ALL[who](runs, paper_robots.nominal())
-
-
-def test_a_prior_of_a_mass_that_the_table_states_is_refused_by_the_loop_too():
-    with pytest.raises(BadConfiguration, match=r"--prior 4W2T\.mass: .* states total_mass_kg"):
-        discover.prepare_loop(
-            records.read_runs("measured"), paper_robots.nominal(), stated={"4W2T.mass": (11.0, 0.5)}
-        )
 
 
 @pytest.mark.slow

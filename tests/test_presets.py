@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pandas as pd
 import pytest
+from numpy.testing import assert_allclose
 
 from calibration.data import presets_file, robot_file
 from calibration.data import runs as records
@@ -52,10 +53,10 @@ def test_vesc_counts_electrical_turns_and_has_two_clocks(tmp_path):
     pd.DataFrame(VESC).to_csv(tmp_path / "log.csv", index=False, sep=";")
     rig = robot(tmp_path, "total_current", "motor_current", "motor_speed")
     found = records.read_runs(tmp_path / "log.csv", rig, columns="vesc,pole_pairs=7")
-    np.testing.assert_allclose(found["motor_speed_rpm"], [100, 200, 300])
-    np.testing.assert_allclose(found["time_s"], [0, 0.14, 0.28])
-    np.testing.assert_allclose(found["duty"], [0.1, 0.2, 0.3])
-    np.testing.assert_allclose(found["motor_current_A"], np.sqrt(0.75) * np.array(VESC["current_motor"]))
+    assert_allclose(found["motor_speed_rpm"], [100, 200, 300])
+    assert_allclose(found["time_s"], [0, 0.14, 0.28])
+    assert_allclose(found["duty"], [0.1, 0.2, 0.3])
+    assert_allclose(found["motor_current_A"], np.sqrt(0.75) * np.array(VESC["current_motor"]))
     assert any("erpm, read as motor_speed_rpm, is electrical" in note for note in found.notes)
     with pytest.raises(
         BadConfiguration, match=r"pole_pairs is missing, the pairs of poles .* --columns vesc,pole_pairs=7"
@@ -75,10 +76,10 @@ def test_a_three_phase_motor_is_the_dc_motor_of_the_same_power_and_torque(tmp_pa
     rig = robot(tmp_path, "total_current", "motor_current", "motor_speed")
     found = records.read_runs(log, rig, columns=f"vesc,pole_pairs={poles}")
     current, constant = found["motor_current_A"], np.sqrt(3) * flux * poles
-    np.testing.assert_allclose(found["total_current_A"], duty * current, rtol=1e-6)
-    np.testing.assert_allclose(constant * current, 1.5 * poles * flux * amplitude, rtol=1e-6)  # torque
+    assert_allclose(found["total_current_A"], duty * current, rtol=1e-6)
+    assert_allclose(constant * current, 1.5 * poles * flux * amplitude, rtol=1e-6)  # torque
     at_motor = 2 * resistance * current + constant * found["motor_speed_rpm"] * np.pi / 30
-    np.testing.assert_allclose(at_motor, duty * supply, rtol=1e-6)
+    assert_allclose(at_motor, duty * supply, rtol=1e-6)
     assert any("equivalent DC motor" in note for note in found.notes)
 
 
@@ -95,9 +96,9 @@ def test_simplefoc_prints_milliamperes_and_no_header(tmp_path):
     found = records.read_runs(
         tmp_path / "log.txt", robot(tmp_path, "motor_current", "motor_speed"), columns="simplefoc"
     )
-    np.testing.assert_allclose(found["motor_current_A"], np.sqrt(0.75) * np.array([0.15, 0.25]))
-    np.testing.assert_allclose(found["motor_speed_rpm"], np.array([10.0, 15.0]) * 30 / np.pi)
-    np.testing.assert_allclose(found["supply_voltage_V"], np.sqrt(3) * np.array([2, 3]))
+    assert_allclose(found["motor_current_A"], np.sqrt(0.75) * np.array([0.15, 0.25]))
+    assert_allclose(found["motor_speed_rpm"], np.array([10.0, 15.0]) * 30 / np.pi)
+    assert_allclose(found["supply_voltage_V"], np.sqrt(3) * np.array([2, 3]))
 
 
 def test_sysid_has_a_run_for_each_test(tmp_path):
@@ -105,7 +106,7 @@ def test_sysid_has_a_run_for_each_test(tmp_path):
     (tmp_path / "log.json").write_text(json.dumps({"sysid": True, "slow-forward": test, "fast-forward": test}))
     found = records.read_runs(tmp_path / "log.json", robot(tmp_path, "output_speed"), columns="sysid")
     assert dict.fromkeys(found["run_id"].tolist()).keys() == {"slow-forward", "fast-forward"}
-    np.testing.assert_allclose(found["output_speed_rpm"], np.tile([0.0, 60, 120, 180], 2))
+    assert_allclose(found["output_speed_rpm"], np.tile([0.0, 60, 120, 180], 2))
 
 
 def test_bam_has_entries_with_a_duty(tmp_path):
@@ -115,8 +116,8 @@ def test_bam_has_entries_with_a_duty(tmp_path):
     ]
     (tmp_path / "log.json").write_text(json.dumps({"mass": 0.5, "entries": entries}))
     found = records.read_runs(tmp_path / "log.json", robot(tmp_path, "output_speed"), columns="bam,load_limit=1023")
-    np.testing.assert_allclose(found["duty"], [0, 0.1, 0.2, 0.3])
-    np.testing.assert_allclose(found["output_speed_rpm"], np.arange(4) * 30 / np.pi)
+    assert_allclose(found["duty"], [0, 0.1, 0.2, 0.3])
+    assert_allclose(found["output_speed_rpm"], np.arange(4) * 30 / np.pi)
 
 
 def test_lerobot_has_a_run_for_each_episode(tmp_path):
@@ -127,7 +128,7 @@ def test_lerobot_has_a_run_for_each_episode(tmp_path):
         tmp_path / "file-000.parquet", robot(tmp_path, "output_angle"), columns="lerobot,joint=1"
     )
     assert found["run_id"].tolist() == ["0", "0", "1", "1"]
-    np.testing.assert_allclose(found["output_angle_deg"], [0, 10, 20, 30])
+    assert_allclose(found["output_angle_deg"], [0, 10, 20, 30])
 
 
 def test_an_optical_speed_without_readings_gives_way_to_the_electrical(tmp_path):
@@ -137,14 +138,14 @@ def test_an_optical_speed_without_readings_gives_way_to_the_electrical(tmp_path)
     }  # fmt: skip
     pd.DataFrame(columns).to_csv(tmp_path / "log.csv", index=False)
     found = records.read_runs(tmp_path / "log.csv", robot(tmp_path, "motor_speed"), columns="rcbenchmark")
-    np.testing.assert_allclose(found["motor_speed_rpm"], [1000, 2000])
+    assert_allclose(found["motor_speed_rpm"], [1000, 2000])
 
 
 def test_columns_of_ones_own_win_over_those_of_the_robots_file(tmp_path):
     rig = robot(tmp_path, "motor_speed")
     mine = {"supply_voltage_V": "u", "motor_speed_rad_s": {"column": "w", "factor": -1.0}}
     found = records.read_runs({"u": [1.0, -2.0], "w": [-3.0, 4.0], "speed": [1.0, 1.0]}, rig, columns=mine)
-    np.testing.assert_allclose(found["motor_speed_rpm"], np.array([3.0, -4.0]) * 30 / np.pi)
+    assert_allclose(found["motor_speed_rpm"], np.array([3.0, -4.0]) * 30 / np.pi)
 
 
 WRONG = {

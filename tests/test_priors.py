@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from calibration.data import robot_file
 from calibration.data.input_errors import BadConfiguration
@@ -51,12 +52,12 @@ def test_amplitudes_have_a_full_gradient_at_zero(every):
     slope, spread = np.asarray(every.slope(jnp.zeros(len(every)))), np.asarray(every.spread)
     amplitudes = [k for k, name in enumerate(every.names) if name.endswith(".amplitude")]
     assert len(amplitudes) == len(ALL)
-    np.testing.assert_allclose(slope[amplitudes], spread[amplitudes], rtol=1e-4)
+    assert_allclose(slope[amplitudes], spread[amplitudes], rtol=1e-4)
 
 
 def test_slope_on_a_bound_is_half(robot):
     c = priors.parameter_coordinates(robot, ["4W2T.track.guide_share"])
-    np.testing.assert_allclose(c.slope(jnp.zeros(1)) / c.spread, 0.5, rtol=1e-6)
+    assert_allclose(c.slope(jnp.zeros(1)) / c.spread, 0.5, rtol=1e-6)
     assert c.beyond(np.array([-1.0])) == -1 and c.beyond(np.array([1.0])) == 0 and c.beyond(np.array([9.0])) == 1
 
 
@@ -74,8 +75,8 @@ def test_relative_prior_is_log_normal_with_that_spread(robot):
     c = priors.parameter_coordinates(robot, ["6T2A.ground.rolling_resistance", "6T2A.track.guide_share"])
     assert c.scale == (True, False)
     draws = np.asarray(jax.vmap(c.value)(jax.random.normal(jax.random.key(0), (200_000, 2))))
-    np.testing.assert_allclose(draws[:, 0].std() / 0.06, 0.15 * np.sqrt(1.0225), rtol=0.01)
-    np.testing.assert_allclose(np.median(draws, 0), [0.06, 0.3], rtol=0.01)
+    assert_allclose(draws[:, 0].std() / 0.06, 0.15 * np.sqrt(1.0225), rtol=0.01)
+    assert_allclose(np.median(draws, 0), [0.06, 0.3], rtol=0.01)
 
 
 def test_friction_pairs_keep_their_ratio_unless_freed(robot):
@@ -86,7 +87,7 @@ def test_friction_pairs_keep_their_ratio_unless_freed(robot):
         .configurations["6T2A"]
         .ground.friction
     )
-    np.testing.assert_allclose(moved.dynamic / moved.static, 0.8)
+    assert_allclose(moved.dynamic / moved.static, 0.8)
     assert moved.static > 0.4
     both = ["6T2A.ground.friction.static", "6T2A.ground.friction.dynamic"]
     assert priors.parameter_coordinates(robot, both).tied == ()
@@ -168,8 +169,8 @@ def test_stated_prior_moves_the_centre(robot):
     c = priors.parameter_coordinates(
         robot, ["6T2A.ground.friction.static"], {"6T2A.ground.friction.static": (0.5, 0.05)}
     )
-    np.testing.assert_allclose(c.value(jnp.zeros(1)), 0.5)
-    np.testing.assert_allclose(c.slope(jnp.zeros(1)), 0.05, rtol=0.01)
+    assert_allclose(c.value(jnp.zeros(1)), 0.5)
+    assert_allclose(c.slope(jnp.zeros(1)), 0.05, rtol=0.01)
 
 
 # --- priors of another robot ------------------------------------------------------------------------

@@ -6,6 +6,7 @@ import re
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from calibration.data import profiles
 from calibration.data.input_errors import BadConfiguration, BadData
@@ -68,8 +69,8 @@ def test_columns_and_settings(read):
     )
     assert (table.cycles, table.linear, table.duration) == (40, True, 200)
     assert table.modes == ("voltage",) * 3
-    np.testing.assert_allclose(table.values["voltage"], [24, -12, 0])  # negative: backward
-    np.testing.assert_allclose(table.values["payload"], [0, 3, 3])
+    assert_allclose(table.values["voltage"], [24, -12, 0])  # negative: backward
+    assert_allclose(table.values["payload"], [0, 3, 3])
     assert table.stated == ("supply_voltage_V", "slope_deg", "payload_kg")
 
 
@@ -93,7 +94,7 @@ def test_units_in_names(read, column, cell, field, value):
     table = read(f"time_min,{column}\n0,{cell}\n0.5,{cell}\n")
     assert table.duration == 30
     found = table.demand if field == "demand" else table.values[field]
-    np.testing.assert_allclose(found, value, rtol=1e-12)
+    assert_allclose(found, value, rtol=1e-12)
 
 
 def test_units_of_a_channel_are_those_of_its_row():
@@ -108,7 +109,7 @@ def test_mode_is_that_of_the_demand_that_is_filled_in(read):
         "time_s,duty,motor_speed_rpm,speed_mm_s,mode\n0,0.5,,,\n1,,3000,,\n2,,,400,\n3,,,,brake\n4,,,,coast\n5,,,,\n"
     )
     assert table.modes == ("voltage", "motor_speed", "speed", "brake", "coast", "coast")
-    np.testing.assert_allclose(table.demand[:3], [0, 100 * np.pi, 0.4])
+    assert_allclose(table.demand[:3], [0, 100 * np.pi, 0.4])
     assert table.values["duty"][0] == 0.5
 
 
@@ -120,23 +121,23 @@ def test_sides_and_yaw_rates_are_read(read):
         "# between_rows = 'linear'\ntime_s,speed_mm_s,yaw_rate_deg_s,mode\n0,0,0,\n1,300,90,\n2,0,0,brake\n3,,,\n"
     )
     assert found.modes == ("speed", "speed", "brake", "brake") and "duty" not in found.values
-    np.testing.assert_allclose(found.values["yaw_rate"], [0, np.pi / 2, 0, 0])
+    assert_allclose(found.values["yaw_rate"], [0, np.pi / 2, 0, 0])
     assert not read("time_s,speed_mm_s\n0,300\n5,300\n").turns
 
 
 def test_ramp_ends_at_the_cell_of_the_row_that_brakes_or_else_is_held(read):
     head = "# between_rows = 'linear'\ntime_s,speed_mm_s,mode\n0,0,\n1,400,\n"
-    np.testing.assert_allclose(read(head + "2,0,brake\n3,,brake\n").demand[:3], [0, 0.4, 0])
-    np.testing.assert_allclose(read(head + "2,,brake\n3,,brake\n").demand[:3], [0, 0.4, 0.4])
+    assert_allclose(read(head + "2,0,brake\n3,,brake\n").demand[:3], [0, 0.4, 0])
+    assert_allclose(read(head + "2,,brake\n3,,brake\n").demand[:3], [0, 0.4, 0.4])
     duties = read("# between_rows = 'linear'\ntime_s,duty,mode\n0,0,\n1,0.8,\n2,,coast\n3,,coast\n").values["duty"]
-    np.testing.assert_allclose(duties[:3], [0, 0.8, 0.8])
+    assert_allclose(duties[:3], [0, 0.8, 0.8])
 
 
 def test_surface_scales_the_adhesion_of_each_runs_movers(read):
     table = read("time_s,speed_mm_s,surface\n0,400,asphalt\n5,400,linoleum\n9,,\n")
     made = table.profile(paper_robots.nominal(), Conditions(configuration=np.array([0, 1, 0])))
     wanted = [[adhesion_ratio(s, t) for s in ("asphalt", "linoleum", "linoleum")] for t in (True, False, True)]
-    np.testing.assert_allclose(made.adhesion, wanted)
+    assert_allclose(made.adhesion, wanted)
 
 
 def test_supply_voltage_beside_the_battery_is_refused(read):

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
+from numpy.testing import assert_allclose, assert_array_equal
 
 from mmrjax import effects
 from mmrjax.compile import programs
@@ -51,11 +52,11 @@ def named(function, *args):
 def test_a_second_process_finds_a_program_without_tracing(folder, compilations):
     first = programs.Programs(sine).of(((MATRIX,), {}))
     answer = first(((MATRIX,), {}))
-    np.testing.assert_allclose(answer, np.sin(MATRIX), rtol=1e-12, atol=1e-15)
+    assert_allclose(answer, np.sin(MATRIX), rtol=1e-12, atol=1e-15)
     made = len(compilations)
     again = programs.Programs(untraceable(sine)).of(((2 * MATRIX,), {}))  # as a new process, with other numbers
-    np.testing.assert_allclose(again(((2 * MATRIX,), {})), np.sin(2 * MATRIX), rtol=1e-12, atol=1e-15)
-    np.testing.assert_array_equal(again(((MATRIX,), {})), answer)
+    assert_allclose(again(((2 * MATRIX,), {})), np.sin(2 * MATRIX), rtol=1e-12, atol=1e-15)
+    assert_array_equal(again(((MATRIX,), {})), answer)
     assert len(compilations) == made
 
 
@@ -73,7 +74,7 @@ def test_results_come_back_with_what_is_no_array(folder):
         found = programs.Programs(function).of(((robot,), {}))(((robot,), {}))
         assert found.configurations.names == robot.configurations.names and found.rig == robot.rig
         assert jax.tree.structure(found) == jax.tree.structure(robot)
-        np.testing.assert_array_equal(found.motor.resistance, robot.motor.resistance)
+        assert_array_equal(found.motor.resistance, robot.motor.resistance)
 
 
 @pytest.mark.parametrize(
@@ -168,7 +169,7 @@ def test_programs_that_call_back_into_python_are_used_and_not_kept(folder):
 
     found = programs.Programs(watched).of(((MATRIX,), {}))(((MATRIX,), {}))
     jax.effects_barrier()
-    np.testing.assert_allclose(found, np.sin(MATRIX), rtol=1e-12, atol=1e-15)
+    assert_allclose(found, np.sin(MATRIX), rtol=1e-12, atol=1e-15)
     assert seen == [4.0] and not list(folder.iterdir())
 
 
@@ -178,7 +179,7 @@ def test_broken_files_are_made_again(folder, ending):
     (broken,) = folder.glob(f"*.{ending}")
     broken.write_bytes(b"nonsense")
     again = programs.Programs(sine).of(((MATRIX,), {}))(((MATRIX,), {}))
-    np.testing.assert_array_equal(made, again)
+    assert_array_equal(made, again)
 
 
 def test_nothing_is_kept_unless_a_folder_is_stated(folder, monkeypatch):
@@ -186,4 +187,4 @@ def test_nothing_is_kept_unless_a_folder_is_stated(folder, monkeypatch):
     assert programs.Programs(sine).of(((MATRIX,), {})) is None
     monkeypatch.setenv(programs.VARIABLE, str(folder / "is not there"))
     found = programs.Programs(sine).of(((MATRIX,), {}))  # cannot be written to: the program is used all the same
-    np.testing.assert_allclose(found(((MATRIX,), {})), np.sin(MATRIX), rtol=1e-12, atol=1e-15)
+    assert_allclose(found(((MATRIX,), {})), np.sin(MATRIX), rtol=1e-12, atol=1e-15)

@@ -5,6 +5,7 @@ import tomllib
 import numpy as np
 import pytest
 import samples
+from numpy.testing import assert_allclose
 
 from calibration.data import contents, robot_file, runs
 
@@ -91,10 +92,10 @@ def test_proposals_of_a_generated_file_are_read_as_they_are(rig, seed):
         "time [s]", *signal_of.values()
     }  # fmt: skip
     read = runs.read_runs(table, rig, columns=columns)
-    np.testing.assert_allclose(np.asarray(read.conditions(rig).voltage), TRUTH["supply_voltage"], rtol=1e-9)
+    assert_allclose(np.asarray(read.conditions(rig).voltage), TRUTH["supply_voltage"], rtol=1e-9)
     for quantity in ("motor_current", "motor_speed", "output_angle"):
         k = [c.name for c in rig.channels].index(quantity)
-        np.testing.assert_allclose(read.measured()[:, k], TRUTH[quantity], rtol=1e-9)
+        assert_allclose(read.measured()[:, k], TRUTH[quantity], rtol=1e-9)
 
 
 def test_a_current_of_the_supply_is_told_from_the_motors_by_the_power():

@@ -10,6 +10,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from calibration.data import effect_file
 
@@ -77,8 +78,8 @@ def test_the_tutorial_about_a_log_finds_the_fan(tmp_path, mmrjax):
     bench = DOCS / "start" / "bench"
     made = runpy.run_path(str(bench / "make.py"))["log"]()
     packed = np.loadtxt(bench / "log.csv", delimiter=",", skiprows=1)
-    np.testing.assert_allclose(packed, made, atol=0.51, rtol=0)
-    np.testing.assert_allclose(packed[:, 2], made[:, 2], atol=6e-4)
+    assert_allclose(packed, made, atol=0.51, rtol=0)
+    assert_allclose(packed[:, 2], made[:, 2], atol=6e-4)
     assert mmrjax("rig", "new", "rig.toml", "--kind", "bench")[0] == 0
     assert mmrjax("settle", bench / "log.csv", "--robot", "rig.toml", "--out", "settled", "--no-report")[0] == 0
     assert len((tmp_path / "settled" / "settled.csv").read_text().splitlines()) == 25

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from calibration.data import runs as tables
 from calibration.discovery.discover import discover
@@ -45,11 +46,11 @@ def test_table8_is_as_recorded(name):
     ).resolved(robot)
     fidelity = fidelities.get_fidelity(name)
     result = fidelity.run(robot, conditions, fidelity.facts.resolved(), lambda share: None).result
-    np.testing.assert_array_equal(result.status, was[f"{name}_status"])
+    assert_array_equal(result.status, was[f"{name}_status"])
     for quantity in NUMBERS:
         expected = was[f"{name}_{quantity}"]
         size = np.nanmax(np.abs(expected))
-        np.testing.assert_allclose(
+        assert_allclose(
             getattr(result, quantity), expected, rtol=EQUAL[name], atol=EQUAL[name] * size, err_msg=quantity
         )
 
@@ -97,7 +98,7 @@ def test_loop_is_as_recorded(name):
     where = None if found.unnamed is None else [found.unnamed.balance, found.unnamed.variable]
     assert where == was["unnamed"]
     assert list(found.outliers) == was["outliers"]
-    np.testing.assert_allclose(found.chi2, was["chi2"], rtol=1e-3)
+    assert_allclose(found.chi2, was["chi2"], rtol=1e-3)
     for parameter, (value, sd) in was["base"].items():
         assert abs(found.base_shift[parameter].after - value) < 0.05 * sd, parameter
     for effect in found.effects:

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from calibration.data import robot_file
 from calibration.data.runs import Runs
@@ -38,8 +39,8 @@ def test_noise_that_repeats_contradict_is_enlarged():
     known, larger, notes = enlarged(table(0.2), "current=0.02A,motor_speed=0.5%")
     (note,) = notes
     assert note.channel == "total_current" and 6 < note.factor < 16 and note.pairs == 9
-    np.testing.assert_allclose(larger.sd[:, 0], note.factor * known.sd[:, 0])
-    np.testing.assert_array_equal(larger.sd[:, 1], known.sd[:, 1])
+    assert_allclose(larger.sd[:, 0], note.factor * known.sd[:, 0])
+    assert_array_equal(larger.sd[:, 1], known.sd[:, 1])
 
 
 def test_noise_as_stated_is_rarely_enlarged():

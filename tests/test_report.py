@@ -12,6 +12,7 @@ jax.config.update("jax_enable_x64", True)
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from pages import Tables, drawn, outside
 
 from calibration.data import runs as records
@@ -171,7 +172,7 @@ def test_runs_that_share_a_cell_of_a_map_are_shown_by_their_median():
     cell, values = rng.integers(0, 7, 40) * 2, rng.normal(size=40)
     shown, medians = sweep_figures._medians(cell, values)
     assert shown.tolist() == sorted(set(cell.tolist())) and len(set(np.bincount(cell)[shown] % 2)) == 2
-    np.testing.assert_allclose(medians, [np.median(values[cell == k]) for k in shown], rtol=1e-15)
+    assert_allclose(medians, [np.median(values[cell == k]) for k in shown], rtol=1e-15)
 
 
 def test_report_of_a_file_names_it_without_its_folder_and_lists_what_changed(tmp_path):
@@ -216,10 +217,10 @@ def test_power_chain_sums_to_what_supply_and_slope_give():
     runs = {key: value[keep] for key, value in runs.items()}
     assert power_figures.drawable_runs(runs).all() and keep.sum() >= 14
     parts, (supply, slope) = power_figures.power_by_item(runs), power_figures.power_sources(runs)
-    np.testing.assert_allclose(sum(parts.values()), supply + slope, rtol=1e-9)
+    assert_allclose(sum(parts.values()), supply + slope, rtol=1e-9)
     downhill = runs["slope_deg"] < 0
     fall = runs["total_mass_kg"] * GRAVITY * np.sin(np.radians(-runs["slope_deg"])) * runs["speed_mm_s"] / 1e3
-    np.testing.assert_allclose(slope[downhill], fall[downhill], rtol=1e-9)
+    assert_allclose(slope[downhill], fall[downhill], rtol=1e-9)
     assert (parts["back to the supply"] > 0).any() and (slope[~downhill] == 0).all()
 
 

@@ -6,6 +6,7 @@ import re
 import jax
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from calibration.data import runs as records
 from calibration.data.robot_file import RobotFile
@@ -95,40 +96,15 @@ def gears(robot, written):
 
 
 @pytest.mark.slow
-def test_figure_25_draws_the_current_and_it_repeats_with_the_pitch(gears, written, period):
-    run = written[2]
-    figure, _ = gear_figures.current_ripple(gears)
-    time, current = figure.axes[0].lines[0].get_data()
-    np.testing.assert_allclose(current, run.signals.total_current[0, -len(current) :])
-    spacing = (time[1] - time[0]) / 1e3
-
-    def agreement(lag):
-        shift = round(lag / spacing)
-        return np.corrcoef(current[shift:], current[:-shift])[0, 1]
-
-    assert agreement(period) > 0.98
-    assert max(agreement(period * share) for share in (1 / 4, 1 / 3, 1 / 2, 2 / 3)) < 0.8
-
-
-@pytest.mark.slow
 def test_figure_26_marks_a_touchdown_each_pitch(gears, written, period):
     upper, lower = gear_figures.draw_touchdowns(gears[0]).axes
     for axes in (upper, lower):
         marks = sorted(line.get_xdata()[0] for line in axes.lines if line.get_linestyle() == ":")
         assert len(marks) >= 3
-        np.testing.assert_allclose(np.diff(marks), 1e3 * period, rtol=0.04)  # to a sample
+        assert_allclose(np.diff(marks), 1e3 * period, rtol=0.04)  # to a sample
     loads = [np.asarray(line.get_ydata()) for line in lower.lines if line.get_linestyle() == "-"]
     total = np.nansum(loads, axis=0)
-    np.testing.assert_allclose(total, written[2].reactions.grouser[0, -len(total) :].sum(-1))
-
-
-@pytest.mark.slow
-def test_figure_27_ripples_on_tracks_and_not_on_wheels(gears):
-    tracked, wheeled = gear_figures.draw_reactions(gears).axes
-    swing = [np.ptp(axes.lines[0].get_ydata()) / np.mean(axes.lines[0].get_ydata()) for axes in (tracked, wheeled)]
-    assert swing[0] > 0.05 and swing[0] > 100 * swing[1]
-    half = 6.0 * 9.80665  # roughly what one side bears [N]
-    assert all(0.8 * half < np.mean(axes.lines[0].get_ydata()) < 1.2 * half for axes in (tracked, wheeled))
+    assert_allclose(total, written[2].reactions.grouser[0, -len(total) :].sum(-1))
 
 
 @pytest.mark.slow

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from worlds import paper
 
 from mmrjax.effects import BY_NAME
@@ -88,7 +89,7 @@ def test_where_travel_asks_for_too_much_steady_says_what_an_independent_sum_says
     belt = of_kind(values, runs, "track.loss_coulomb") + of_kind(values, runs, "track.loss_viscous") * wheel
     spins = ratio * values["gearbox.efficiency_load"] * torque > belt + radius * (guide + limit)
     expected = np.where(falls | spins, "slides", "stalled")
-    np.testing.assert_array_equal(found[beyond], expected[beyond])
+    assert_array_equal(found[beyond], expected[beyond])
     assert "slides" not in found[~beyond] and "failed" not in found
     held = beyond & ~falls
     assert min((held & spins).sum(), (held & ~spins).sum(), falls.sum()) > 100
@@ -103,8 +104,8 @@ def test_a_robot_that_its_drive_and_the_ground_hold_stands():
     assert (np.asarray(found.speed)[:4] == 0).all() and (np.asarray(found.motor_speed)[:2] == 0).all()
     used = np.asarray(found.adhesion_used)
     assert (used[:4] <= 1).all() and (used[4:] > 1).all()  # the ground carries no more than it can
-    np.testing.assert_allclose(found.total_current[1], 2 * 0.5 / 0.611, rtol=1e-9)
-    np.testing.assert_allclose(found.traction[1], 13.1 * paper.G * np.sin(np.radians(17.0)), rtol=1e-9)
+    assert_allclose(found.total_current[1], 2 * 0.5 / 0.611, rtol=1e-9)
+    assert_allclose(found.traction[1], 13.1 * paper.G * np.sin(np.radians(17.0)), rtol=1e-9)
 
 
 #: Voltage, slope [deg] and payload [kg] of a 6T2A that stands: parked on level ground and on slopes either way, with
@@ -133,12 +134,12 @@ def test_a_robot_that_stands_is_in_static_equilibrium():
     torque = np.clip(0.0, least, most)
     assert (np.abs(traction - pull) > 1).sum() == 1 and (torque == 0).sum() == 2  # each part of the formula counts
     scale = dict(rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(found.traction, 2 * traction, **scale)
-    np.testing.assert_allclose(found.adhesion_used, np.abs(traction) / (0.32 * normal), **scale)
-    np.testing.assert_allclose(found.output_torque, torque, **scale)
-    np.testing.assert_allclose(found.power_supply, 2 * 0.611 * current**2, rtol=1e-9, atol=1e-12)
+    assert_allclose(found.traction, 2 * traction, **scale)
+    assert_allclose(found.adhesion_used, np.abs(traction) / (0.32 * normal), **scale)
+    assert_allclose(found.output_torque, torque, **scale)
+    assert_allclose(found.power_supply, 2 * 0.611 * current**2, rtol=1e-9, atol=1e-12)
     for name in ("power_motor", "power_gear", "power_ground", "power_lift", "slip", "speed", "efficiency_motor"):
-        np.testing.assert_array_equal(getattr(found, name), 0.0)
+        assert_array_equal(getattr(found, name), 0.0)
 
 
 def agree(values, runs, effects, seconds=12.0):
@@ -164,16 +165,16 @@ def test_statuses_agree_over_random_robots_slopes_and_voltages(effects):
     terms = tuple(params.replace(BY_NAME[name](), {"amplitude": a}) for name, a in effects.items())
     values, runs = draw(300, 5)
     (still, driven, done), (speed, covered) = agree(values, runs, terms)
-    np.testing.assert_array_equal(driven, done)
+    assert_array_equal(driven, done)
     moves = ~np.isin(driven, ("stalled", "slides"))
-    np.testing.assert_allclose(covered[moves], speed[moves], rtol=2e-3, atol=2e-4)
+    assert_allclose(covered[moves], speed[moves], rtol=2e-3, atol=2e-4)
     normal, pull, rolling, sense = asked(values, runs)
     share = np.abs(pull + sense * rolling) / normal
     static, dynamic = (of_kind(values, runs, f"ground.friction.{k}") for k in ("static", "dynamic"))
     # Between μ_d and μ_s steady travel exists, to which a start that slides does not find.
     either = (share > 0.97 * dynamic) & (share < 1.03 * static) & np.isin(still, ("converged", "reverses"))
     assert set(driven[either]) <= {"slides", "not_settled", "converged", "reverses"}
-    np.testing.assert_array_equal(still[~either], driven[~either])
+    assert_array_equal(still[~either], driven[~either])
     counted = {
         word: int((still == word).sum()) for word in ("stalled", "slides", "converged", "reverses", "rolls_back")
     }

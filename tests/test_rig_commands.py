@@ -20,6 +20,7 @@ from sweeps import capabilities
 from sweeps.commands import rig_new
 from sweeps.points import imposed
 from sweeps.report import fit_tables
+from tests.commands import ends
 from tests.commands import rows as rows_of
 
 #: Words of the paper's robot, its parts, its tables and its surfaces; none is a rig's.
@@ -125,8 +126,9 @@ SIMULATED = {
 ])  # fmt: skip
 def test_simulate_takes_what_a_rig_imposes_and_shows_its_channels(mmrjax, tmp_path, case):
     kind, speed, options, columns = SIMULATED[case]
-    code, out, err = mmrjax("simulate", "--robot", of_kind(tmp_path, kind, speed), *options, "--out", "run")
-    assert code == 0, err
+    _, out, err = ends(
+        mmrjax("simulate", "--robot", of_kind(tmp_path, kind, speed), *options, "--out", "run"), code=0
+    )
     (row,) = rows_of(tmp_path / "run" / "runs.csv")
     assert columns <= set(row) and row["status"] in ("converged", "reverses")
     on_ground = {"slip", "adhesion_used", "slope_deg", "total_mass_kg", "power_ground_W"}
@@ -141,10 +143,10 @@ def test_simulate_takes_what_a_rig_imposes_and_shows_its_channels(mmrjax, tmp_pa
 )
 def test_simulate_over_time_draws_the_channels_of_the_rig(mmrjax, tmp_path, kind):
     rig = of_kind(tmp_path, kind)
-    code, out, err = mmrjax(
-        "simulate", "--robot", rig, "--voltage", "3", "--model", "drive", "--duration", "0.5", "--out", "run"
-    )  # fmt: skip
-    assert code == 0, err  # an arm still moves
+    _, out, err = ends(
+        mmrjax("simulate", "--robot", rig, "--voltage", "3", "--model", "drive", "--duration", "0.5", "--out", "run"),
+        code=0,
+    )  # an arm still moves
     history = rows_of(tmp_path / "run" / "history.csv")
     shafts = {"motor_speed_rpm", "output_angle_deg"}
     assert (shafts <= set(history[0])) == (kind != "wheeled") and len(history) > 100
@@ -155,10 +157,9 @@ def test_simulate_over_time_draws_the_channels_of_the_rig(mmrjax, tmp_path, kind
 @pytest.mark.slow
 def test_a_profile_turns_a_bench(mmrjax, tmp_path):
     (tmp_path / "turn.csv").write_text("time_s,motor_speed_rpm,supply_voltage_V\n0,0,24\n1,2000,24\n2,2000,24\n")
-    code, out, err = mmrjax(
-        "simulate", "--robot", of_kind(tmp_path, "bench"), "--profile", "turn.csv", "--out", "run"
-    )  # fmt: skip
-    assert code == 0, err
+    _, out, err = ends(
+        mmrjax("simulate", "--robot", of_kind(tmp_path, "bench"), "--profile", "turn.csv", "--out", "run"), code=0
+    )
     course = rows_of(tmp_path / "run" / "history.csv")
     assert (
         "demanded_motor_speed_rpm" in course[0]
@@ -244,10 +245,7 @@ def test_what_a_rig_does_not_have_is_refused_in_one_sentence(mmrjax, tmp_path, c
 @pytest.mark.slow
 def test_a_single_run_takes_the_limit_of_the_file(mmrjax, tmp_path):
     rig = of_kind(tmp_path, "bench")
-    code, _, err = mmrjax(
-        "simulate", "--robot", rig, "--set", "motor.voltage_limit=18", "--out", "run", "--no-report"
-    )  # fmt: skip
-    assert code == 0, err
+    ends(mmrjax("simulate", "--robot", rig, "--set", "motor.voltage_limit=18", "--out", "run", "--no-report"), code=0)
     assert float(rows_of(tmp_path / "run" / "runs.csv")[0]["supply_voltage_V"]) == 18.0
 
 
@@ -270,8 +268,11 @@ def test_levels_are_thirds_of_the_limit_to_two_digits(tmp_path):
 @pytest.mark.slow
 def test_a_sweep_of_a_bench_has_one_axis(mmrjax, tmp_path):
     rig = of_kind(tmp_path, "bench")
-    code, out, err = mmrjax("sweep", "--robot", rig, "--set", "motor.voltage_limit=24", "--out", "run")
-    assert code == 0 and "thirds of the voltage_limit of the robot's file are taken: 8,16,24" in err
+    _, out, err = ends(
+        mmrjax("sweep", "--robot", rig, "--set", "motor.voltage_limit=24", "--out", "run"),
+        "thirds of the voltage_limit of the robot's file are taken: 8,16,24",
+        code=0,
+    )
     table = rows_of(tmp_path / "run" / "runs.csv")
     assert [float(row["supply_voltage_V"]) for row in table] == [8.0, 16.0, 24.0]
     assert words_of_others(out, err, *left_in(tmp_path / "run")) == []
@@ -280,10 +281,9 @@ def test_a_sweep_of_a_bench_has_one_axis(mmrjax, tmp_path):
 @pytest.mark.slow
 def test_a_sweep_of_a_vehicle_with_imposed_speed_varies_its_slopes(mmrjax, tmp_path):
     rig = of_kind(tmp_path, "wheeled", speed=True)
-    code, out, err = mmrjax(
-        "sweep", "--robot", rig, "--motor-speeds", "1000,-1000", "--slopes", "0,5", "--out", "run"
-    )  # fmt: skip
-    assert code == 0, err
+    _, out, err = ends(
+        mmrjax("sweep", "--robot", rig, "--motor-speeds", "1000,-1000", "--slopes", "0,5", "--out", "run"), code=0
+    )
     table = rows_of(tmp_path / "run" / "runs.csv")
     assert len(table) == 4 and {row["payload_kg"] for row in table} == {"0"}
     assert words_of_others(out, err, *left_in(tmp_path / "run")) == []
@@ -292,31 +292,39 @@ def test_a_sweep_of_a_vehicle_with_imposed_speed_varies_its_slopes(mmrjax, tmp_p
 @pytest.mark.slow
 def test_a_sweep_into_a_store_knows_what_is_imposed(mmrjax, tmp_path):
     rig = of_kind(tmp_path, "bench", speed=True)
-    code, out, err = mmrjax(
-        "sweep", "--robot", rig, "--motor-speeds", "600,1200", "--zarr", "--export", "csv", "--out", "run"
-    )  # fmt: skip
-    assert code == 0, err
+    _, out, _ = ends(
+        mmrjax("sweep", "--robot", rig, "--motor-speeds", "600,1200", "--zarr", "--export", "csv", "--out", "run"),
+        code=0,
+    )
     assert words_of_others(out, *left_in(tmp_path / "run")) == []
     plan = tmp_path / "plan.toml"
     plan.write_text(f'robot = "{rig.name}"\n[axes]\n"bench.loss_coulomb" = [0.05, 0.07]\n')
-    code, _, err = mmrjax("sweep", plan)
-    assert code == 2 and "plan.toml, conditions.motor_speed: not stated" in err
+    ends(mmrjax("sweep", plan), "plan.toml, conditions.motor_speed: not stated")
     plan.write_text(f'robot = "{rig.name}"\n[axes]\nslope_deg = [0, 5]\n[conditions]\nmotor_speed = 100.0\n')
-    code, _, err = mmrjax("sweep", plan)
-    assert code == 2 and "plan.toml, slope_deg: the robot's load is a shaft" in err
+    ends(mmrjax("sweep", plan), "plan.toml, slope_deg: the robot's load is a shaft")
     plan.write_text(f'robot = "{rig.name}"\n[axes]\nvoltage = [9, 12]\n')
-    code, _, err = mmrjax("sweep", plan)
-    assert code == 2 and "the robot's file imposes the motor speed" in err
+    ends(mmrjax("sweep", plan), "the robot's file imposes the motor speed")
 
 
 @pytest.mark.slow
 def test_a_vehicle_is_drawn(mmrjax, tmp_path):
     rig = of_kind(tmp_path, "wheeled")
-    code, out, err = mmrjax(
-        "render", "x.png", "--robot", rig, "--voltage", "12", "--duration", "0.2",
-        "--begin", "0.1",
-    )  # fmt: skip
-    assert code == 0 and (tmp_path / "x.png").stat().st_size > 1000, err
+    _, out, err = ends(
+        mmrjax(
+            "render",
+            "x.png",
+            "--robot",
+            rig,
+            "--voltage",
+            "12",
+            "--duration",
+            "0.2",
+            "--begin",
+            "0.1",
+        ),
+        code=0,
+    )
+    assert (tmp_path / "x.png").stat().st_size > 1000
     assert "states no running_gear" in err and words_of_others(out, err) == []
 
 
@@ -326,12 +334,15 @@ def test_a_vehicle_is_drawn(mmrjax, tmp_path):
 @pytest.mark.slow
 def test_compare_and_calibrate_take_one_channel_both_ways(mmrjax, tmp_path, bench):
     rig, data = bench
-    code, out, err = mmrjax("compare", data, "--robot", rig, "--out", "compared")
-    assert code == 0, err
+    _, out, _ = ends(mmrjax("compare", data, "--robot", rig, "--out", "compared"), code=0)
     errors = json.loads((tmp_path / "compared" / "result.json").read_text())["errors"]["all"]["total_current"]
     assert errors["unit"] == "A" and 0.01 < errors["rms"] < 0.1 and " A " in out
-    code, said, err = mmrjax("calibrate", data, "--robot", rig, "--starts", "2", "--no-profiles", "--out", "fitted")
-    assert code == 0 and "rms error: before total current" in said and "motor and speed" not in said, err
+    _, said, err = ends(
+        mmrjax("calibrate", data, "--robot", rig, "--starts", "2", "--no-profiles", "--out", "fitted"),
+        "rms error: before total current",
+        code=0,
+    )
+    assert "motor and speed" not in said
     fitted = robot_file.read_robot(tmp_path / "fitted" / "robot.toml")
     assert float(fitted.configurations["bench"].loss_coulomb) == pytest.approx(0.07, rel=0.05)
     priors = json.loads((tmp_path / "fitted" / "result.json").read_text())["parameters"]
@@ -345,8 +356,11 @@ def test_compare_and_calibrate_take_one_channel_both_ways(mmrjax, tmp_path, benc
 @pytest.mark.slow
 def test_loop_takes_one_channel_both_ways(mmrjax, tmp_path, bench):
     rig, data = bench
-    code, told, err = mmrjax("loop", data, "--robot", rig, "--replicates", "250", "--out", "found")
-    assert code == 0 and "rms error: before total current" in told, err
+    _, told, err = ends(
+        mmrjax("loop", data, "--robot", rig, "--replicates", "250", "--out", "found"),
+        "rms error: before total current",
+        code=0,
+    )
     defects = (tmp_path / "found" / "figures" / "defects.svg").read_text()
     assert "torque missing at the output" in defects and "voltage missing" not in defects and "slip" not in defects
     page = (tmp_path / "found" / "report.html").read_text()
@@ -405,8 +419,7 @@ def test_what_explains_all_of_precise_readings_is_named(mmrjax, tmp_path):
     """170 σ of it: without the effect the fit is so far off that by its slopes another effect would explain more."""
     (tmp_path / "motor.toml").write_text(MOTOR, encoding="utf-8")
     data = precise_table(tmp_path / "runs.csv")
-    code, told, err = mmrjax("loop", data, "--robot", "motor.toml", "--replicates", "250", "--out", "found")
-    assert code == 0, err
+    _, told, _ = ends(mmrjax("loop", data, "--robot", "motor.toml", "--replicates", "250", "--out", "found"), code=0)
     found = json.loads((tmp_path / "found" / "result.json").read_text(encoding="utf-8"))
     assert found["verdict"] in ("named", "class"), told
     (effect,) = found["effects"]
@@ -419,8 +432,7 @@ def test_what_explains_all_of_precise_readings_is_named(mmrjax, tmp_path):
 def test_check_says_what_columns_of_an_own_table_are(mmrjax, tmp_path):
     (tmp_path / "motor.toml").write_text(MOTOR, encoding="utf-8")
     data = precise_table(tmp_path / "runs.csv")
-    code, told, err = mmrjax("rig", "check", "motor.toml", data)
-    assert code == 0, err
+    _, told, _ = ends(mmrjax("rig", "check", "motor.toml", data), code=0)
     assert re.search(r"supply_voltage_V, yours U \[V\] +imposed +18 +-23 +24", told)
     assert re.search(r"motor_current_A, yours Strom \[mA\] +channel motor_current", told)
 
@@ -428,8 +440,7 @@ def test_check_says_what_columns_of_an_own_table_are(mmrjax, tmp_path):
 @pytest.mark.slow
 def test_compare_shows_a_vehicles_conditions(mmrjax, tmp_path, rover):
     rig, data = rover
-    code, out, err = mmrjax("compare", data, "--robot", rig, "--out", "compared")
-    assert code == 0, err
+    _, out, err = ends(mmrjax("compare", data, "--robot", rig, "--out", "compared"), code=0)
     shown = (tmp_path / "compared" / "figures" / "errors.svg").read_text()
     assert "motor speed [rpm]" in shown and "slope" in shown and "supply voltage" not in shown
     assert words_of_others(out, err, *left_in(tmp_path / "compared")) == []
@@ -438,8 +449,9 @@ def test_compare_shows_a_vehicles_conditions(mmrjax, tmp_path, rover):
 @pytest.mark.slow
 def test_calibrate_shows_a_vehicles_conditions(mmrjax, tmp_path, rover):
     rig, data = rover
-    code, said, err = mmrjax("calibrate", data, "--robot", rig, "--starts", "2", "--no-profiles", "--out", "fitted")
-    assert code == 0, err
+    _, said, err = ends(
+        mmrjax("calibrate", data, "--robot", rig, "--starts", "2", "--no-profiles", "--out", "fitted"), code=0
+    )
     priors = json.loads((tmp_path / "fitted" / "result.json").read_text())["parameters"]
     assert {p["prior"]["source"] for p in priors.values()} <= {params.STATED, params.DEFAULT}
     assert words_of_others(said, err, *left_in(tmp_path / "fitted")) == []
@@ -451,8 +463,7 @@ def test_compare_takes_a_table_by_voltage(mmrjax, tmp_path, kind):
     rig = of_kind(tmp_path, kind)
     levels = [8, 12, 18, 24, 8, 12, 18, 24]
     data = table_of(rig, {}, levels, np.tile([0.0, 5.0], 4) if kind == "tracked" else None)
-    code, out, err = mmrjax("compare", data, "--robot", rig, "--out", "compared")
-    assert code == 0, err
+    _, out, err = ends(mmrjax("compare", data, "--robot", rig, "--out", "compared"), code=0)
     assert words_of_others(out, err, *left_in(tmp_path / "compared")) == []
 
 
@@ -464,8 +475,7 @@ def test_compare_takes_a_table_by_voltage(mmrjax, tmp_path, kind):
 def test_sensitivity_takes_what_a_rig_has(mmrjax, tmp_path, kind):
     rig = of_kind(tmp_path, kind, speed=kind == "bench")
     where = ["--motor-speeds", "1000,3000"] if kind == "bench" else ["--voltages", "12,24", "--slopes", "0,5"]
-    code, out, err = mmrjax("sensitivity", "--method", "local", "--robot", rig, *where, "--out", "run")
-    assert code == 0, err
+    _, out, err = ends(mmrjax("sensitivity", "--method", "local", "--robot", rig, *where, "--out", "run"), code=0)
     assert "next runs, of" in out and "the operating points" in out
     assert ("steepest slope" in out) == (kind == "wheeled")
     assert words_of_others(out, err, *left_in(tmp_path / "run")) == []

@@ -24,6 +24,7 @@ from mmrjax.model.rig import Instrument
 from mmrjax.model.shaft import Shaft
 from mmrjax.model.signals import FLAGS, GRAVITY
 from sweeps.commands import rig_check, rig_new
+from tests.commands import ends
 
 KINDS = tuple(rig_new.KINDS)
 
@@ -452,22 +453,18 @@ def test_rig_new_writes_a_file_that_reads(mmrjax, tmp_path, kind):
 
 def test_rig_new_keeps_a_file_unless_forced(mmrjax, tmp_path):
     (tmp_path / "my-rig.toml").write_text("mine")
-    code, _, err = mmrjax("rig", "new", "my-rig.toml")
-    assert code == 2 and "my-rig.toml: there already; --force replaces it" in err
+    ends(mmrjax("rig", "new", "my-rig.toml"), "my-rig.toml: there already; --force replaces it")
     assert (tmp_path / "my-rig.toml").read_text() == "mine"
     assert mmrjax("rig", "new", "my-rig.toml", "--force")[0] == 0
     assert not robot_file.load_robot(str(tmp_path / "my-rig.toml")).has_ground
 
 
 def test_rig_new_lists_the_kinds(mmrjax, tmp_path):
-    code, _, err = mmrjax("rig", "new", "my-rig.toml", "--kind", "bensh")
-    assert (
-        code == 2
-        and "--kind: got bensh; did you mean bench? allowed: bench, dyno, pendulum, servo, linear, carriage, wheeled, tracked"
-        in err
+    ends(
+        mmrjax("rig", "new", "my-rig.toml", "--kind", "bensh"),
+        "--kind: got bensh; did you mean bench? allowed: bench, dyno, pendulum, servo, linear, carriage, wheeled, tracked",
     )
-    code, _, err = mmrjax("rig", "new", "nowhere/my-rig.toml")
-    assert code == 2 and "no such folder as nowhere" in err
+    ends(mmrjax("rig", "new", "nowhere/my-rig.toml"), "no such folder as nowhere")
     assert not list(tmp_path.iterdir())
 
 
@@ -497,8 +494,7 @@ def test_rig_check_says_what_a_file_is(mmrjax, bench):
 @pytest.mark.slow
 def test_rig_check_says_what_a_table_can_determine(mmrjax, bench):
     """Friction of motor and load act alike on current and speed, as does the gear's loss: the wider prior gives way."""
-    code, out, _ = mmrjax("rig", "check", "my-rig.toml", "runs.csv", "--json")
-    assert code == 0
+    _, out, _ = ends(mmrjax("rig", "check", "my-rig.toml", "runs.csv", "--json"), code=0)
     found = json.loads(out)
     assert found["schema"] == "mmrjax.rig_check/1" and found["data"]["rows"] == 12
     columns = {c["column"]: c for c in found["data"]["columns"]}
@@ -516,23 +512,23 @@ def test_rig_check_says_what_a_table_can_determine(mmrjax, bench):
 
 
 def test_rig_check_of_data_says_the_same_in_words(mmrjax, bench):
-    code, out, _ = mmrjax("rig", "check", "my-rig.toml", "runs.csv")
-    assert code == 0 and "total_current_A, yours total_current_mA" in out
+    _, out, _ = ends(
+        mmrjax("rig", "check", "my-rig.toml", "runs.csv"), "total_current_A, yours total_current_mA", code=0
+    )
     assert re.search(r"total_current .*signed +(assumed, 2 %, as total_curr|estimated by how readings)", out)
     assert "gearbox.efficiency_load" in out and "not determined" in out
     assert "room: without a role" in out and "add output_torque to channels" in out
 
 
 def test_rig_check_ends_with_2_for_the_file_and_4_for_the_data(mmrjax, bench, tmp_path):
-    code, _, err = mmrjax("rig", "check", "mine.toml")
-    assert code == 2 and "mine.toml: no such file; mmrjax rig new mine.toml writes one to fill in" in err
+    ends(
+        mmrjax("rig", "check", "mine.toml"), "mine.toml: no such file; mmrjax rig new mine.toml writes one to fill in"
+    )
     text = (tmp_path / "my-rig.toml").read_text().replace("\nratio = 20.0", "")
     (tmp_path / "lacking.toml").write_text(text)
-    code, _, err = mmrjax("rig", "check", "lacking.toml")
-    assert code == 2 and "gearbox.ratio [-] is missing" in err
+    ends(mmrjax("rig", "check", "lacking.toml"), "gearbox.ratio [-] is missing")
     (tmp_path / "odd.csv").write_text("supply_voltage_V,total_current_A,motor_speed_rpm\n12,x,3000\n")
-    code, _, err = mmrjax("rig", "check", "my-rig.toml", "odd.csv")
-    assert code == 4 and "odd.csv row 1, total_current_A: got x" in err
+    ends(mmrjax("rig", "check", "my-rig.toml", "odd.csv"), "odd.csv row 1, total_current_A: got x", code=4)
 
 
 ODD = {

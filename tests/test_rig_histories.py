@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from calibration.data import robot_file
 from calibration.data import runs as records
@@ -24,6 +25,7 @@ from mmrjax.model import balances, channels, params, quantities
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.rig import Begin, Begins, Rig
 from mmrjax.model.signals import State
+from tests.commands import ends
 
 DRIVE = """
 schema = "mmrjax.robot/2"
@@ -101,8 +103,8 @@ def test_the_speed_at_which_a_run_begins_moves_with_the_robot(tmp_path):
         return jax.jacfwd(speed, has_aux=True)(shares)
 
     slope, speed = slopes(jnp.ones(2))
-    np.testing.assert_allclose(speed, 100.0 / 16 * 0.005 / (2 * np.pi), rtol=1e-9)
-    np.testing.assert_allclose(slope, speed[:, None] * np.array([1.0, -1.0]), rtol=1e-9)  # v = r ω / i
+    assert_allclose(speed, 100.0 / 16 * 0.005 / (2 * np.pi), rtol=1e-9)
+    assert_allclose(slope, speed[:, None] * np.array([1.0, -1.0]), rtol=1e-9)  # v = r ω / i
 
 
 @pytest.mark.parametrize("duty", [False, True])
@@ -228,7 +230,7 @@ def test_a_delay_reads_the_run_of_each_row_and_takes_memory_by_rows():
     made = Histories(Conditions(0, 1.0), jnp.asarray(times), run, instant, rows_of, rows_of)
     seen = jax.jit(lambda x: made.late(x, Rig(delay=0.1)))(steps)
     at = np.maximum(times[run, instant] - 0.1, 0.0)
-    np.testing.assert_allclose(seen, np.stack([10 * at, -at], -1), rtol=1e-12)
+    assert_allclose(seen, np.stack([10 * at, -at], -1), rtol=1e-12)
 
     count = 3000
     along, of_first = jnp.asarray(np.arange(count)), jnp.asarray(np.arange(count)[None])
@@ -266,8 +268,8 @@ def test_a_defect_moves_the_current_of_an_imposed_speed_at_once(tmp_path):
 
     expected = np.asarray(jax.jit(jax.jacfwd(readings))(jnp.asarray(0.0)))[:, 0]
     found = np.asarray(jax.jit(lambda r: observer.defective(r, (effect,)))(robot))[0, 0]
-    np.testing.assert_allclose(found.sum(0)[:, 0], expected, rtol=1e-7)
-    np.testing.assert_allclose(np.diag(found[:, :, 0]), expected, rtol=1e-7)  # of the knot at each sample alone
+    assert_allclose(found.sum(0)[:, 0], expected, rtol=1e-7)
+    assert_allclose(np.diag(found[:, :, 0]), expected, rtol=1e-7)  # of the knot at each sample alone
     assert (np.abs(expected) > 0.9).all()  # 1 / (16 × 0.05 N·m/A), over or by an efficiency of 0.8
 
 
@@ -285,7 +287,7 @@ def test_curves_of_a_drive_that_reverses_count_along_its_travel(tmp_path):
         for (place, variable), columns_of in zip(basis.names, np.asarray(basis.columns), strict=True):
             if variable in ("speed_motor", "current"):
                 both = columns_of.reshape(2, 20, -1)
-                np.testing.assert_allclose(both[0], -both[1], atol=1e-9)
+                assert_allclose(both[0], -both[1], atol=1e-9)
                 assert np.abs(both[0][:, 0]).min() > 0.9, (place, variable)  # a loss as large at any speed
                 seen += 1
     assert seen >= 2
@@ -321,23 +323,26 @@ def test_every_row_of_an_imposed_speed_has_the_acceleration_of_its_line(tmp_path
     }
     rows = Histories.of(written(tmp_path, robot, columns, [0.01]), robot).of_rows
     expected = [200.0, 400.0, 0.0, -100.0, -100.0, -300.0, -300.0, -300.0, 0.0]
-    np.testing.assert_allclose(rows.motor_acceleration, expected, rtol=1e-9, atol=1e-9)
+    assert_allclose(rows.motor_acceleration, expected, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.slow
 def test_histories_are_compared_with_a_robot(tmp_path, mmrjax):
     imposed_speed(tmp_path, 2, lambda path, robot, *told: history(path, robot, robot, *told, 3))
-    code, _, err = mmrjax("compare", "table.csv", "--robot", "rig.toml", "--no-report", "--out", "found")
-    assert code == 0, err
+    ends(mmrjax("compare", "table.csv", "--robot", "rig.toml", "--no-report", "--out", "found"), code=0)
     with (tmp_path / "found" / "comparison.csv").open(encoding="utf-8") as file:
         table = list(csv.DictReader(file))
     error = [float(r["simulated_total_current_A"]) - float(r["total_current_A"]) for r in table]
     assert len(table) == 40 and np.std(error) == pytest.approx(0.01, rel=0.4) and table[20]["run_id"] == "1"
     assert table[21]["time_s"] == "0.05"
-    code, _, err = mmrjax("compare", "table.csv", "--robot", "rig.toml", "--own-mass", "--out", "other")
-    assert code == 2 and "--own-mass: table.csv holds time histories" in err
-    code, _, err = mmrjax("compare", "table.csv", "--robot", "rig.toml", "--model", "track", "--out", "other")
-    assert code == 2 and "they need --model drive" in err
+    ends(
+        mmrjax("compare", "table.csv", "--robot", "rig.toml", "--own-mass", "--out", "other"),
+        "--own-mass: table.csv holds time histories",
+    )
+    ends(
+        mmrjax("compare", "table.csv", "--robot", "rig.toml", "--model", "track", "--out", "other"),
+        "they need --model drive",
+    )
 
 
 @pytest.mark.parametrize(
@@ -386,7 +391,7 @@ def test_a_log_of_an_imposed_speed_soon_has_even_steps(tmp_path, faster, step):
     times = np.asarray(Histories.of(runs, robot).times)
     steps = np.diff(times, axis=1)
     late = (steps > 0) & (times[:, :-1] > 4.5 * step)
-    np.testing.assert_allclose(steps[late], step, rtol=1e-9)
+    assert_allclose(steps[late], step, rtol=1e-9)
     assert np.sum(steps > 0) - np.sum(late) < 2 * 50
 
 
@@ -509,8 +514,8 @@ def test_a_jump_of_the_voltage_is_exact_in_every_step(tmp_path):
         return np.append(6 * (1 - left[:2]), 9 - (3 + 6 * left[1]) * left[2:]) / resistance
 
     slope, shown = map(np.asarray, jax.jit(jax.jacfwd(of, has_aux=True))(3.0))
-    np.testing.assert_allclose(shown, exact(3.0), rtol=1e-4)
-    np.testing.assert_allclose(slope, (exact(3.003) - exact(2.997)) / 0.006, rtol=2e-3)
+    assert_allclose(shown, exact(3.0), rtol=1e-4)
+    assert_allclose(slope, (exact(3.003) - exact(2.997)) / 0.006, rtol=2e-3)
 
 
 THROUGH_REST = ("bench.inertia", "bench.loss_coulomb", "motor.friction_coulomb")

@@ -14,6 +14,7 @@ from mmrjax.model import params
 from mmrjax.model.signals import GRAVITY
 from sweeps.commands import rig_from_mujoco, rig_new
 from sweeps.commands.rig_template import example_numbers
+from tests.commands import ends
 
 DIFFBOT = Path(__file__).parent / "data" / "diffbot.urdf"
 FREE = """<mujoco>
@@ -190,5 +191,5 @@ def test_robots_with_a_mistake_are_refused_in_a_sentence(old, new, joint, messag
     ],
 )
 def test_rig_new_that_is_refused_leaves_nothing_behind(mmrjax, tmp_path, options, message):
-    code, _, err = mmrjax("rig", "new", "r.toml", *options)
-    assert code == 2 and message in err and not list(tmp_path.iterdir())
+    ends(mmrjax("rig", "new", "r.toml", *options), message)
+    assert not list(tmp_path.iterdir())

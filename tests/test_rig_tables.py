@@ -5,6 +5,7 @@ import re
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from calibration.data import instruments, rig_facts, robot_file, surfaces
 from calibration.data import runs as records
@@ -26,6 +27,7 @@ from mmrjax.model.signals import STALLED
 from mmrjax.model.track_friction import Track
 from sweeps import config as configuration
 from sweeps.points import run
+from tests.commands import ends
 
 DRIVE = {
     "motor.resistance": 2.0,
@@ -543,7 +545,7 @@ def test_curves_of_runs_both_ways_count_along_the_travel(tmp_path):
     over = set()
     for basis in observe.bases(seen, np.ones(2 * n, bool), robot):
         for (place, variable), shapes in zip(basis.names, np.asarray(basis.columns), strict=True):
-            np.testing.assert_allclose(shapes[:n], -shapes[n:], atol=1e-9, err_msg=f"{place} over {variable}")
+            assert_allclose(shapes[:n], -shapes[n:], atol=1e-9, err_msg=f"{place} over {variable}")
             over.add((bases.window_from_name(variable) and "window") or variable)
     assert {"voltage", "slope", "speed_motor", bases.CONDITIONS, "window"} <= over
 
@@ -621,10 +623,8 @@ def test_a_bench_is_compared_and_calibrated_from_two_files(mmrjax, tmp_path):
     rows = "".join(f"{n},{0.16 + n * 2.4e-5 + 1e-3 * (k % 3)}\n" for k, n in enumerate(range(500, 4500, 500)))
     (tmp_path / "runs.csv").write_text(BENCH + rows, encoding="utf-8")
     both = ("runs.csv", "--robot", "rig.toml", "--out")
-    code, _, said = mmrjax("compare", *both, "a")
-    assert code == 0, said
-    code, _, said = mmrjax("calibrate", *both, "b", "--starts", "2", "--no-profiles", "--noise", "current=2%")
-    assert code == 0, said
+    ends(mmrjax("compare", *both, "a"), code=0)
+    ends(mmrjax("calibrate", *both, "b", "--starts", "2", "--no-profiles", "--noise", "current=2%"), code=0)
     for page in (tmp_path / "a" / "report.html", tmp_path / "b" / "report.html"):
         text = page.read_text(encoding="utf-8")
         assert "n [rpm]" in text and "slope [°]" not in text and "6T2A" not in text
@@ -665,8 +665,8 @@ def test_an_instrument_left_free_is_what_its_table_shows(tmp_path):
     assert instruments.with_inferred_instruments(stated, runs) is stated
     size = np.ones((8, 1))
     sds = [noise.noise_from_table(records.read_runs(path, robot=r), size).sd for r in (free, stated)]
-    np.testing.assert_allclose(sds[0], sds[1], rtol=1e-9)
-    np.testing.assert_allclose(sds[0], np.hypot(0.01, 0.03 / np.sqrt(12)), rtol=1e-9)
+    assert_allclose(sds[0], sds[1], rtol=1e-9)
+    assert_allclose(sds[0], np.hypot(0.01, 0.03 / np.sqrt(12)), rtol=1e-9)
     with pytest.raises(BadData, match="negative backward; or signed = false"):
         records.read_runs(path, robot=bench())
     signed = re.sub(r"(-\d+),0", r"\1,-0", path.read_text(encoding="utf-8"))

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from calibration.data import cell_values
 from calibration.data import runs as records
@@ -68,7 +69,7 @@ def test_columns_without_a_name_are_nothing_or_called_by_their_place(tmp_path):
 def test_missing_readings_are_nan_and_counted(tmp_path):
     header = HEADER.replace(",motor_speed_rpm", "")
     runs = records.read_runs(write(tmp_path, f"{header}\n6T2A,15,13.1,0,5,2.75,400\n6T2A,15,13.1,0,5,,400\n"))
-    np.testing.assert_array_equal(np.isnan(runs.measured()), [[False, True, False], [True, True, False]])
+    assert_array_equal(np.isnan(runs.measured()), [[False, True, False], [True, True, False]])
     assert runs.missing() == [
         "total_current_A: 1 of 2 readings are missing (row 2)",
         "motor_speed_rpm: no readings; parameters that only they show are not fitted",
@@ -99,7 +100,7 @@ def test_cells_of_a_sound_table_are_read_at_once(tmp_path, monkeypatch):
     monkeypatch.setattr(cell_values, "refused_cell_sentence", refusal)
     runs = records.read_runs(write(tmp_path, f"{HEADER},speed_sd_mm_s\n{ROW},4\n{ROW[:-3]}n/a,\n"))
     assert runs["payload_kg"].tolist() == [0, 0] and runs["configuration"].tolist() == ["6T2A"] * 2
-    np.testing.assert_array_equal(runs["speed_mm_s"], [400, np.nan])
+    assert_array_equal(runs["speed_mm_s"], [400, np.nan])
     assert not looked_at
     with pytest.raises(BadData, match=r"row 2: refused; .*; and 12 more$"):
         records.read_runs(write(tmp_path, "\n".join([f"{HEADER},speed_sd_mm_s", f"{ROW},4", *[f"{ROW},0"] * 20])))
@@ -124,8 +125,8 @@ def test_arrays_of_numbers_are_read_as_their_texts_are(tmp_path):
     texts = records.read_runs(write(tmp_path, "\n".join([",".join(ARRAYS), *map(",".join, rows)])))
     assert numbers.unknown == texts.unknown == ("room_C",) and numbers.headings == texts.headings
     for column in texts.columns:
-        np.testing.assert_array_equal(numbers[column], texts[column], column)
-    np.testing.assert_array_equal(numbers.extras["room_C"], texts.extras["room_C"])
+        assert_array_equal(numbers[column], texts[column], column)
+    assert_array_equal(numbers.extras["room_C"], texts.extras["room_C"])
     assert numbers["slope_deg"] == pytest.approx([45.0, 0.0]) and numbers["total_mass_kg"].tolist() == [13.1, 21.1]
     assert [note.removeprefix("log.bag") for note in numbers.notes] == [
         n.removeprefix("runs.csv") for n in texts.notes
@@ -276,7 +277,7 @@ def test_semicolons_and_decimal_commas_are_taken_and_said(tmp_path):
     ):
         found = records.read_runs(written(tmp_path, text))
         for column in usual.columns:
-            np.testing.assert_array_equal(found[column], usual[column])
+            assert_array_equal(found[column], usual[column])
         assert len(found.notes) == 1 and f"runs.csv: columns are separated by {said}" in found.notes[0]
     assert usual.notes == ()
 
@@ -291,7 +292,7 @@ def test_tables_in_other_encodings_are_read_and_said(tmp_path, encoding, said):
     found = records.read_runs(tmp_path / "runs.csv")
     assert found.unknown == ("Öl [µm]",) and usual.notes == () and found.notes[0].endswith(said)
     for column in usual.columns:
-        np.testing.assert_array_equal(found[column], usual[column])
+        assert_array_equal(found[column], usual[column])
 
 
 def test_bytes_that_are_no_text_are_refused(tmp_path):

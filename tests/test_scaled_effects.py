@@ -21,6 +21,7 @@ from mmrjax.effects.scaled import amplitude_of, scaled_effect, shape_of
 from mmrjax.model import params
 from mmrjax.model.quantities import RPM
 from sweeps.commands import rig_new
+from tests.commands import ends
 
 #: Of rigs: kind and what is imposed; the largest and the smallest that a few draws give.
 RIGS = [("bench", "voltage"), ("linear", "motor_speed"), ("wheeled", "voltage")]
@@ -121,8 +122,7 @@ def test_a_robot_with_effects_of_its_size_is_compared_and_swept(tmp_path, mmrjax
     robot_file.write_robot(with_all(robot, some, 0.01), tmp_path / "robot.toml")
     options = ("--robot", tmp_path / "robot.toml", "--no-report")
     for command in (("compare", tmp_path / "table.csv"), ("sweep", "--voltages", 12)):
-        code, _, err = mmrjax(*command, *options, "--out", tmp_path / command[0])
-        assert code == 0, err
+        ends(mmrjax(*command, *options, "--out", tmp_path / command[0]), code=0)
     assert eqx.tree_equal(
         robot_file.read_robot(tmp_path / "compare" / "robot.toml").effects,
         robot_file.read_robot(tmp_path / "robot.toml").effects,

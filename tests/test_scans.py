@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from test_rig_histories import BENCH, DRIVE, history
 
 from calibration.data import robot_file
@@ -82,8 +83,8 @@ def test_a_scan_sees_the_misfit_of_runs_at_each_delay(coarse):
     at = np.array([-0.5, 0.3, 1.1, 1.6])
     cost, others = only.observe.scan(only, np.zeros(1), only.data, 0, at)
     alone = [0.5 * np.sum(np.asarray(evaluate_residuals(only, z, only.data)) ** 2) for z in at[:, None]]
-    np.testing.assert_allclose(cost, alone, rtol=1e-9)
-    np.testing.assert_array_equal(np.asarray(others)[:, 0], at)
+    assert_allclose(cost, alone, rtol=1e-9)
+    assert_array_equal(np.asarray(others)[:, 0], at)
 
 
 @pytest.mark.slow

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from synthetic import Analyst, table
 from worlds import histories, rigs
 
@@ -75,7 +76,7 @@ def test_a_regression_is_the_least_squares_fit_of_base_amplitudes_and_their_prio
     columns = np.concatenate([linear.jacobian[:40], width * linear.signatures[:, [m]]], 1)
     whole, left = np.concatenate([columns, np.eye(p + 1)]), np.concatenate([linear.residual[:40], np.zeros(p + 1)])
     step, *_ = np.linalg.lstsq(whole, -left, rcond=None)
-    np.testing.assert_allclose(found.z[:p], step[:p], atol=1e-9)
+    assert_allclose(found.z[:p], step[:p], atol=1e-9)
     assert found.z[p] == pytest.approx(step[p], rel=1e-9) and abs(found.amplitude[0] - 2.0) < 0.2
     shape = space.library.at[m]
     assert found.cost == pytest.approx(0.5 * np.sum((left + whole @ step) ** 2) + 0.5 * shape**2, rel=1e-9)
@@ -97,7 +98,7 @@ def test_a_regression_takes_an_effect_of_the_other_fit_away(space):
     after = SimpleNamespace(jacobian=wide, residual=residual, signatures=linear.signatures)
     back = screening.Regression(space, fitted, after, beside.scores, ANALYST.settings)(("", ""))
     assert back.cost == pytest.approx(beside(("", "")).cost, rel=1e-9)
-    np.testing.assert_allclose(back.z, beside(("", "")).z, atol=1e-9)
+    assert_allclose(back.z, beside(("", "")).z, atol=1e-9)
 
 
 def ranked_sets(space, **explained):
@@ -177,8 +178,8 @@ def test_a_refit_without_a_block_is_a_step_of_gauss_and_newton():
     kept = np.concatenate([(slopes[~block] / sd[~block][..., None]).reshape(-1, 3), np.eye(3)])
     wanted = np.concatenate([(measured[~block] / sd[~block]).ravel(), np.zeros(3)])
     z = np.linalg.lstsq(kept, wanted, rcond=None)[0]
-    np.testing.assert_allclose(found.z[0], z, rtol=1e-9)
-    np.testing.assert_allclose(found.reading[block], slopes[block] @ z, rtol=1e-9)
+    assert_allclose(found.z[0], z, rtol=1e-9)
+    assert_allclose(found.reading[block], slopes[block] @ z, rtol=1e-9)
     assert np.isnan(found.reading[~block]).all() and list(found.block) == [0] * 4 + [-1] * 8
 
 

@@ -6,6 +6,7 @@ import itertools
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from calibration.sensitivity import derivative, information, morris, sobol
 from calibration.sensitivity.replicates import REPLICATES, ratio_estimate
@@ -68,8 +69,8 @@ def test_sobol_indices_are_saltelli_estimates_of_salib(design):
     theirs = salib.analyze(problem, y, calc_second_order=True, num_resamples=2, seed=0)
     ours = sobol.indices_of_terms(sobol.sobol_terms(design, y))
     # SALib takes the mean of all points off, we that of the two independent samples
-    np.testing.assert_allclose(ours.first.value, theirs["S1"], atol=1e-4)
-    np.testing.assert_allclose(ours.total.value, theirs["ST"], atol=1e-4)
+    assert_allclose(ours.first.value, theirs["S1"], atol=1e-4)
+    assert_allclose(ours.total.value, theirs["ST"], atol=1e-4)
     pairs = np.triu_indices(3, 1)
     second = theirs["S2"][pairs]  # of one order, ours is the mean of both
     assert np.all((ours.second.low[pairs] < second) & (second < ours.second.high[pairs]))
@@ -83,7 +84,7 @@ def test_sobol_replicates_are_unlike_one_another(design):
     first = design.points.reshape(REPLICATES, -1, 3)[:, 0]
     assert len(np.unique(first, axis=0)) == REPLICATES
     again = sobol.sobol_design(3, 64, 1)
-    np.testing.assert_array_equal(again.points, design.points)
+    assert_array_equal(again.points, design.points)
     assert not np.array_equal(sobol.sobol_design(3, 64, 2).points, design.points)
 
 
@@ -191,10 +192,10 @@ def test_bounds_leave_out_points_without_numbers():
 def test_elementary_effects_of_a_linear_model_are_its_slopes():
     u = morris.morris_design(3, 40, 0)
     found = morris.elementary_effects(u, u @ np.array([1.0, -2.0, 0.0]))
-    np.testing.assert_allclose(found.mean, [1, -2, 0], atol=1e-12)
-    np.testing.assert_allclose(found.size.value, [1, 2, 0], atol=1e-12)
-    np.testing.assert_allclose(found.spread, 0, atol=1e-12)
-    np.testing.assert_allclose(found.size.high, [1, 2, 0], atol=1e-12)
+    assert_allclose(found.mean, [1, -2, 0], atol=1e-12)
+    assert_allclose(found.size.value, [1, 2, 0], atol=1e-12)
+    assert_allclose(found.spread, 0, atol=1e-12)
+    assert_allclose(found.size.high, [1, 2, 0], atol=1e-12)
 
 
 def test_elementary_effects_tell_what_is_not_linear_and_leave_out_whole_trajectories():
@@ -209,8 +210,8 @@ def test_morris_design_is_repeatable_and_leaves_the_global_generator_alone():
     np.random.seed(3)  # noqa: NPY002
     before = np.random.get_state()[1].copy()  # noqa: NPY002
     first = morris.morris_design(3, 10, 5)
-    np.testing.assert_array_equal(np.random.get_state()[1], before)  # noqa: NPY002
-    np.testing.assert_array_equal(first, morris.morris_design(3, 10, 5))
+    assert_array_equal(np.random.get_state()[1], before)  # noqa: NPY002
+    assert_array_equal(first, morris.morris_design(3, 10, 5))
 
 
 # --- information --------------------------------------------------------------------------------------------------
@@ -225,7 +226,7 @@ def test_chosen_runs_are_the_best_of_all_sets():
     best = max(itertools.combinations(range(9), 3), key=value)
     assert value(choice.rows) == pytest.approx(value(best))
     assert np.sum(choice.gain) * 2 * np.log(2) == pytest.approx(value(choice.rows))
-    np.testing.assert_allclose(choice.covariance[-1], np.linalg.inv(np.eye(3) + each[list(choice.rows)].sum(0)))
+    assert_allclose(choice.covariance[-1], np.linalg.inv(np.eye(3) + each[list(choice.rows)].sum(0)))
 
 
 def test_missing_readings_tell_nothing():

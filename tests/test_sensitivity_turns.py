@@ -15,6 +15,7 @@ from mmrjax.derived import turning_figures
 from mmrjax.model import paper_robots, params
 from sweeps import config
 from sweeps.commands import sensitivity as room
+from tests.commands import ends
 
 ROBOT = paper_robots.nominal()
 TURNS = ROBOT.showing_turns()
@@ -99,7 +100,6 @@ def test_radius_of_a_run_and_its_derivative():
 def test_the_yaw_rate_of_a_turn_is_studied(mmrjax, tmp_path):
     told = "--configurations", "6T2A", "--voltages", "24", "--payloads", "0", "--vary", "duty_left=0.4:0.8"
     more = "--method", "local", "--outputs", "yaw_rate,turning_radius", "--no-report", "--out", str(tmp_path / "s")
-    code, out, _ = mmrjax("sensitivity", *told, *more)
-    assert code == 0 and "yaw rate" in out and "turning radius" in out
+    ends(mmrjax("sensitivity", *told, *more), "yaw rate", "turning radius", code=0)
     with (tmp_path / "s" / "points.csv").open() as file:
         assert any(row["input"] == "6T2A.turning.lateral" for row in csv.DictReader(file))

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from calibration.data.instruments import display_step
 from calibration.data.runs import Runs
@@ -60,7 +61,7 @@ def test_estimates_are_right_on_average(share):
 
 def test_both_parts_of_the_noise_add_as_squares():
     mixed = series_noise.SeriesNoise(channels.find_channel("total_current"), 0.03, 0.04, 7.4, "slope_deg", 4)
-    np.testing.assert_allclose(mixed.sd(np.array([0.0, 1.0])), [0.03, 0.05])
+    assert_allclose(mixed.sd(np.array([0.0, 1.0])), [0.03, 0.05])
 
 
 def test_curvature_makes_it_larger_and_a_wrong_reading_does_not():
@@ -85,7 +86,7 @@ def test_uneven_steps_and_repeats_count_as_they_are():
     assert used == 4 and np.abs(weights @ straight).max() < 1e-12
     repeats = np.array([3.0, 3.0, 3.0])
     weights, _ = series_noise._differences(np.array([1.0, 2.0, 4.0]), repeats, [np.arange(3)])
-    np.testing.assert_allclose(weights.toarray(), [[-0.5, 1.0, -0.5]])
+    assert_allclose(weights.toarray(), [[-0.5, 1.0, -0.5]])
 
 
 def test_a_display_shows_nothing_finer_than_its_step():
@@ -119,7 +120,7 @@ def test_rows_without_series_are_assumed_as_usual_and_stated_ones_stay():
     assert np.all(np.isinf(known.freedom))
     assert mine.source == ("stated", "series", "no readings") and mine.word == "estimated"
     assert channels.channel_names(mine.silent) == ("motor_speed",)
-    np.testing.assert_allclose(mine.sd[:, 0], 0.2)
+    assert_allclose(mine.sd[:, 0], 0.2)
     assert mine.freedom[1] == mine.along_series[0].freedom
 
 
@@ -133,10 +134,10 @@ def test_series_that_go_backward_are_others():
 def test_voltages_that_differ_by_the_sag_of_the_supply_are_one_level():
     sagging = np.array([11.989, 11.408, 10.828, 17.988, 17.408, 16.827, 23.988, 23.407, 22.827])
     levels = np.repeat([11.989, 17.988, 23.988], 3)
-    np.testing.assert_array_equal(series_noise.without_sag(sagging), levels)
+    assert_array_equal(series_noise.without_sag(sagging), levels)
     for kept in (np.array([12.0, 12.0, 24.0, 24.0]), np.linspace(5, 24, 20)):
-        np.testing.assert_array_equal(series_noise.without_sag(kept), kept)
-    np.testing.assert_array_equal(series_noise.without_sag(np.array([36.5, 36.1, 35.6])), np.full(3, 36.5))
+        assert_array_equal(series_noise.without_sag(kept), kept)
+    assert_array_equal(series_noise.without_sag(np.array([36.5, 36.1, 35.6])), np.full(3, 36.5))
 
 
 @pytest.mark.parametrize("stated", [None, "current=2%,motor_speed=0.5%"])
@@ -148,7 +149,7 @@ def test_an_sd_in_per_cent_has_a_part_that_does_not_depend_on_the_reading(stated
     runs = dataclasses.replace(runs, columns={**runs.columns, **alone, "total_current_A": current})
     with np.errstate(invalid="ignore"):
         sd = noise.infer_noise(runs, SettledRuns.sizes(runs), stated).sd[:, 0]
-    np.testing.assert_allclose(sd, 0.02 * np.maximum(current, 0.2 * np.sqrt(np.mean(current**2))))
+    assert_allclose(sd, 0.02 * np.maximum(current, 0.2 * np.sqrt(np.mean(current**2))))
 
 
 def test_replicates_are_drawn_with_sds_that_an_estimate_might_have_been_of():

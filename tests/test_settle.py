@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from worlds import rigs
 from worlds.settled import write_table
 
@@ -23,6 +24,7 @@ from calibration.inference import noise as noises
 from calibration.inference.foresight import Foresight
 from calibration.words import settle_words as words
 from sweeps.commands import rig_check
+from tests.commands import ends
 
 
 def made(tmp_path, seed=1, kind="bench", imposed="voltage", **options):
@@ -504,8 +506,8 @@ def test_a_log_is_divided_where_the_torque_of_a_brake_changes(tmp_path):
     found = settled(tmp_path, bench(tmp_path, columns))
     table = found.table()
     assert len(found.kept) == 8 and found.scatter["motor_speed"] < 1.0
-    np.testing.assert_allclose(table["load_torque_Nm"], levels, atol=2e-3)
-    np.testing.assert_allclose(table["motor_speed_rpm"], 2160 - 300 * levels, atol=2.0)
+    assert_allclose(table["load_torque_Nm"], levels, atol=2e-3)
+    assert_allclose(table["motor_speed_rpm"], 2160 - 300 * levels, atol=2.0)
 
 
 def test_an_angle_shows_the_speed_of_its_shaft(tmp_path):
@@ -526,8 +528,7 @@ def test_an_angle_shows_the_speed_of_its_shaft(tmp_path):
 
 def test_the_command_leaves_a_table_that_is_read_as_settled_runs(tmp_path, mmrjax):
     _, world, robot = made(tmp_path)
-    code, out, err = mmrjax("settle", "log.csv", "--robot", "rig.toml", "--out", "found")
-    assert code == 0, err
+    _, out, _ = ends(mmrjax("settle", "log.csv", "--robot", "rig.toml", "--out", "found"), code=0)
     assert f"{len(world.conditions)} settled runs, " in " ".join(out.split())
     runs = records.read_runs(tmp_path / "found" / "settled.csv", robot=robot)
     assert not runs.sampled and len(runs) == len(world.conditions)
@@ -564,7 +565,7 @@ def test_a_column_without_a_role_may_be_empty_for_a_while(tmp_path):
     columns = stairs() | {"ambient_C": np.where(np.arange(600) < 250, "", "21.5")}
     robot = bench(tmp_path, columns)
     found = settled(tmp_path, robot).table()["ambient_C"]
-    np.testing.assert_array_equal(found, [np.nan, 21.5, 21.5])
+    assert_array_equal(found, [np.nan, 21.5, 21.5])
 
 
 def test_a_log_with_few_settled_runs_is_given_to_the_loop_itself(tmp_path):

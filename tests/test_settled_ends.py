@@ -5,6 +5,7 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 from synthetic import Analyst, table
 from worlds import histories, settled
 
@@ -102,7 +103,7 @@ def test_a_run_that_slides_is_not_taken_for_settled():
     """On a slope beyond its adhesion a robot spins its movers, and its steady state is none."""
     _, slides, _, sound = ends_of(*on_ground((0.12, 0.6), 0.02))
     assert not sound.all() and sound[3:].all()
-    np.testing.assert_array_equal(slides, ~sound)
+    assert_array_equal(slides, ~sound)
 
 
 @pytest.mark.slow
@@ -114,4 +115,4 @@ def test_a_reading_that_still_changes_has_no_settled_end(gripping):
     changed = dataclasses.replace(runs, columns=runs.columns | {"total_current_A": current})
     before, after = (settled_ends.settled_ends(ANALYST.space(r).bare).mean for r in (runs, changed))
     assert np.isfinite(before[4, 0]) and np.isnan(after[4, 0])
-    np.testing.assert_array_equal(np.delete(before, 4, 0), np.delete(after, 4, 0))
+    assert_array_equal(np.delete(before, 4, 0), np.delete(after, 4, 0))

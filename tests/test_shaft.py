@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from mmrjax.effects import BY_NAME
 from mmrjax.fidelities.drive import drive_batch
@@ -43,10 +44,10 @@ def current_of(w, load=0.0, coulomb=0.2, viscous=0.01):
 def test_current_at_an_imposed_speed_follows_from_torque(load):
     answer = steady_batch(bench(torque_constant=load), Conditions(motor_speed=SPEEDS))
     expected = current_of(SPEEDS, load)
-    np.testing.assert_allclose(answer.motor_current, expected, rtol=1e-9)
-    np.testing.assert_allclose(answer.total_current, 2 * expected, rtol=1e-9)
-    np.testing.assert_allclose(answer.motor_voltage, 0.05 * SPEEDS + 3.0 * expected, rtol=1e-9)
-    np.testing.assert_allclose(answer.output_speed, SPEEDS / 16, rtol=1e-12)
+    assert_allclose(answer.motor_current, expected, rtol=1e-9)
+    assert_allclose(answer.total_current, 2 * expected, rtol=1e-9)
+    assert_allclose(answer.motor_voltage, 0.05 * SPEEDS + 3.0 * expected, rtol=1e-9)
+    assert_allclose(answer.output_speed, SPEEDS / 16, rtol=1e-12)
     assert [STATUSES[s] for s in np.asarray(answer.status)] == ["reverses"] * 2 + ["converged"] * 2
 
 
@@ -55,7 +56,7 @@ def test_a_load_that_drives_the_motor_loses_in_the_gearbox_the_other_way():
     answer = steady_batch(bench(torque_constant=1.0), Conditions(motor_speed=np.full(4, -100.0)))
     net = 1.0 - 0.2 - 0.01 * 100 / 16
     expected = (net / 16 * 0.8 - 2e-3 - 1e-6 * 100) / 0.05
-    np.testing.assert_allclose(answer.motor_current, expected, rtol=1e-9)
+    assert_allclose(answer.motor_current, expected, rtol=1e-9)
 
 
 @pytest.mark.slow
@@ -66,7 +67,7 @@ def test_voltage_and_speed_impose_the_same_point():
         by_voltage = steady_batch(robot, Conditions(voltage=np.asarray(by_speed.motor_voltage), **more))
         for name in by_speed.reading:
             a, b = by_speed.reading[name], by_voltage.reading[name]
-            np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12, err_msg=name)
+            assert_allclose(a, b, rtol=1e-9, atol=1e-12, err_msg=name)
 
 
 @pytest.mark.slow
@@ -75,7 +76,7 @@ def test_a_run_settles_where_steady_says():
     steady = steady_batch(bench(torque_constant=0.1), conditions)
     run = drive_batch(bench(torque_constant=0.1), conditions, jnp.asarray([0.0, 2.0, 4.0])).result
     for name in ("motor_speed", "total_current", "output_torque"):
-        np.testing.assert_allclose(run.reading[name], steady.reading[name], rtol=1e-6)
+        assert_allclose(run.reading[name], steady.reading[name], rtol=1e-6)
     assert (np.asarray(run.status) == np.asarray(steady.status)).all()
 
 
@@ -84,8 +85,8 @@ def test_friction_holds_a_shaft_that_its_motors_cannot_turn():
     robot, conditions = bench(loss_coulomb=5.0), Conditions(voltage=np.array([1.0, -1.0, 0.5, -0.5]))
     run = drive_batch(robot, conditions, jnp.asarray([0.0, 0.5, 1.0])).result  # in the shapes of the test above
     assert [STATUSES[s] for s in np.asarray(run.status)] == ["stalled"] * 4
-    np.testing.assert_array_equal(run.motor_speed, 0.0)
-    np.testing.assert_allclose(run.motor_current, [1 / 3, -1 / 3, 1 / 6, -1 / 6], rtol=1e-6)
+    assert_array_equal(run.motor_speed, 0.0)
+    assert_allclose(run.motor_current, [1 / 3, -1 / 3, 1 / 6, -1 / 6], rtol=1e-6)
 
 
 def test_derivatives_at_an_imposed_speed_are_those_of_the_formula():
@@ -98,11 +99,11 @@ def test_derivatives_at_an_imposed_speed_are_those_of_the_formula():
 
     found = jax.jit(jax.jacrev(current))(at)["motor_current"]
     sign, out = np.sign(SPEEDS), SPEEDS / 16
-    np.testing.assert_allclose(found["bench.loss_coulomb"], sign / (16 * 0.8 * 0.05), rtol=1e-9)
-    np.testing.assert_allclose(found["bench.loss_viscous"], out / (16 * 0.8 * 0.05), rtol=1e-9)
+    assert_allclose(found["bench.loss_coulomb"], sign / (16 * 0.8 * 0.05), rtol=1e-9)
+    assert_allclose(found["bench.loss_viscous"], out / (16 * 0.8 * 0.05), rtol=1e-9)
     torque = 0.2 * sign + 0.01 * out
-    np.testing.assert_allclose(found["gearbox.efficiency_load"], -torque / (16 * 0.8**2 * 0.05), rtol=1e-9)
-    np.testing.assert_array_equal(found["motor.resistance"], 0.0)
+    assert_allclose(found["gearbox.efficiency_load"], -torque / (16 * 0.8**2 * 0.05), rtol=1e-9)
+    assert_array_equal(found["motor.resistance"], 0.0)
 
 
 @pytest.mark.slow
@@ -119,7 +120,7 @@ def test_a_pendulum_swings_as_the_textbook_says():
     angle = np.asarray(jax.jit(history_signals)(robot, conditions, jnp.asarray(times)).angle)
     omega = np.sqrt(0.5 / (0.02 + 16**2 * 2e-6))
     period = 2 * np.pi / omega * (1 + 0.05**2 / 16)
-    np.testing.assert_allclose(angle, 0.05 * np.cos(2 * np.pi / period * times), atol=5e-4)
+    assert_allclose(angle, 0.05 * np.cos(2 * np.pi / period * times), atol=5e-4)
 
 
 def test_an_imposed_history_takes_the_torque_of_its_acceleration():
@@ -131,10 +132,10 @@ def test_an_imposed_history_takes_the_torque_of_its_acceleration():
         Conditions(), motor_speed=jnp.asarray(speed), motor_acceleration=jnp.full(21, 80.0)
     )
     seen = jax.jit(history_signals)(robot, conditions, jnp.asarray(times))
-    np.testing.assert_allclose(seen.speed_motor, speed, rtol=1e-9)
+    assert_allclose(seen.speed_motor, speed, rtol=1e-9)
     expected = current_of(speed) + (0.01 * 80 / 16 / (16 * 0.8) + 2e-6 * 80) / 0.05
-    np.testing.assert_allclose(seen.current, expected, rtol=1e-6)
-    np.testing.assert_allclose(np.asarray(seen.angle)[-1], (100 + 40) / 16, rtol=1e-6)
+    assert_allclose(seen.current, expected, rtol=1e-6)
+    assert_allclose(np.asarray(seen.angle)[-1], (100 + 40) / 16, rtol=1e-6)
 
 
 @pytest.mark.slow
@@ -150,7 +151,7 @@ def test_derivatives_of_an_imposed_history_are_differences():
 
     slope = jax.jvp(current, (jnp.asarray(0.01),), (jnp.asarray(1.0),))[1]
     difference = (current(0.01 + 1e-6) - current(0.01 - 1e-6)) / 2e-6
-    np.testing.assert_allclose(slope, difference, rtol=1e-5, atol=1e-6)
+    assert_allclose(slope, difference, rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.slow
@@ -164,13 +165,13 @@ def test_the_beginning_of_a_history_has_derivatives():
     slope = np.asarray(both(50.0)[1])
     difference = np.asarray(both(50.0 + 1e-3)[0] - both(50.0 - 1e-3)[0]) / 2e-3
     assert slope[0] == 1.0 and abs(slope[-1]) > 1e-3
-    np.testing.assert_allclose(slope, difference, rtol=1e-4, atol=1e-6)
+    assert_allclose(slope, difference, rtol=1e-4, atol=1e-6)
 
 
 def test_an_instrument_without_sign_shows_magnitude():
     rig = Rig(instruments=(Instrument("total_current", signed=False),))
     signed, plain = (steady_batch(r, Conditions(motor_speed=SPEEDS)).total_current for r in (bench(), bench(rig)))
-    np.testing.assert_allclose(plain, np.abs(np.asarray(signed)), rtol=1e-12)
+    assert_allclose(plain, np.abs(np.asarray(signed)), rtol=1e-12)
     assert (np.asarray(signed) < 0).any()
 
 

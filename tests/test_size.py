@@ -22,7 +22,6 @@ from mmrjax.derived.requirements import QUANTITIES
 from mmrjax.model import params
 from sweeps.results.size_results import design_verdict
 from tests.commands import command
-from tests.pages import Tables, drawn, outside
 
 SCHEMA = json.loads((Path(__file__).parents[1] / "docs" / "schemas" / "size.schema.json").read_text("utf-8"))
 TEXT = """
@@ -209,17 +208,6 @@ def test_command_leaves_what_its_schema_says(folder):
         )
         == 0
     )
-
-
-@pytest.mark.slow
-def test_report_shows_designs_and_what_binds_where(folder):
-    page = (folder / "report.html").read_text()
-    tables = Tables(page)
-    assert drawn(page) == {"limits", "front"} and outside(folder) == []
-    result = json.loads((folder / "result.json").read_text())
-    assert [r[1] for r in tables.tables["by_motor"][1:]] == [m["motor"] for m in result["motors"]]
-    assert tables.tables["best"][1][1] == result["best"]["motor"]
-    assert "nan" not in tables.text.lower()
 
 
 @pytest.mark.slow

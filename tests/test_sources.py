@@ -13,6 +13,7 @@ import polars as pl
 import pytest
 import samples
 import xarray as xr
+from numpy.testing import assert_allclose, assert_array_equal
 
 from calibration.data import contents, delimited, input_files, profiles, robot_file, terrains
 from calibration.data import runs as records
@@ -73,7 +74,7 @@ def opened(path, within=""):
 
 def same(runs, table):
     for column, name in COLUMNS.items():
-        np.testing.assert_array_equal(runs[column], table[name])
+        assert_array_equal(runs[column], table[name])
 
 
 @pytest.mark.parametrize("file", TABLES)
@@ -92,7 +93,7 @@ def test_json_of_every_form_is_read_equal_to_its_arrays(tmp_path, robot, orient)
     (tmp_path / "log.json").write_text(text)
     runs = records.read_runs(tmp_path / "log.json", robot, columns=COLUMNS)
     for column, name in COLUMNS.items():
-        np.testing.assert_allclose(runs[column], table[name], rtol=1e-13, atol=1e-15)
+        assert_allclose(runs[column], table[name], rtol=1e-13, atol=1e-15)
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -113,9 +114,9 @@ def test_a_log_of_two_rates_is_read_equal_to_its_arrays(tmp_path, robot, file):
         (rpm, slow["rpm"], slow["t"]),
     ):
         signal = find_signal(signals, path, file)
-        np.testing.assert_allclose(signal.load(), values, rtol=0, atol=off)
+        assert_allclose(signal.load(), values, rtol=0, atol=off)
         elapsed = one_clock.clock_seconds(signal.clock).time
-        np.testing.assert_allclose(elapsed, time - time[0], rtol=0, atol=1e-9)
+        assert_allclose(elapsed, time - time[0], rtol=0, atol=1e-9)
     speed = "motor_speed_rad_s" if "velocity" in rpm else "motor_speed_rpm"
     one_rpm = 30 / np.pi if "velocity" in rpm else 1.0
     runs = records.read_runs(
@@ -123,8 +124,8 @@ def test_a_log_of_two_rates_is_read_equal_to_its_arrays(tmp_path, robot, file):
     )
     read = np.isfinite(runs["motor_speed_rpm"])
     line = np.interp(fast["t"], slow["t"], slow["rpm"]) * one_rpm
-    np.testing.assert_allclose(runs["motor_speed_rpm"][read], line[read], rtol=1e-6)
-    np.testing.assert_allclose(runs["supply_voltage_V"], fast["volts"])
+    assert_allclose(runs["motor_speed_rpm"][read], line[read], rtol=1e-6)
+    assert_allclose(runs["supply_voltage_V"], fast["volts"])
     assert len(slow["t"]) - 3 <= read.sum() <= len(slow["t"])  # each reading in one row
     assert any("each used once" in note for note in runs.notes)
 
@@ -141,24 +142,24 @@ def test_commands_are_held_and_readings_on_one_clock_stay_as_they_are():
         "slow": signal([1.25, 3.75], [10.0, 20.0]),
     }
     time, values, notes = one_clock.on_one_grid("log", chosen, lambda c: c == "command", lambda c: c != "command", "")
-    np.testing.assert_array_equal(time, np.arange(5.0))  # the row before the first command is left out
-    np.testing.assert_array_equal(values["current"], np.arange(1.0, 6) ** 2)
-    np.testing.assert_array_equal(values["command"], [7, 7, 8, 8, 8])
-    np.testing.assert_allclose(values["slow"], [np.nan] * 5)  # no sample lies on its line within two rows
+    assert_array_equal(time, np.arange(5.0))  # the row before the first command is left out
+    assert_array_equal(values["current"], np.arange(1.0, 6) ** 2)
+    assert_array_equal(values["command"], [7, 7, 8, 8, 8])
+    assert_allclose(values["slow"], [np.nan] * 5)  # no sample lies on its line within two rows
     assert "1 row" in notes[1] and "fast (1 Hz)" in notes[0]
 
 
 def test_a_slow_reading_is_on_the_straight_line_in_the_row_nearest_to_its_sample():
     rows, time = np.arange(9.0), np.array([0.9, 4.2, 7.9])
     found = one_clock.used_once(rows, time, 10 * time)
-    np.testing.assert_allclose(found, [np.nan, 10, np.nan, np.nan, 40, np.nan, np.nan, np.nan, np.nan])
+    assert_allclose(found, [np.nan, 10, np.nan, np.nan, 40, np.nan, np.nan, np.nan, np.nan])
 
 
 def test_samples_that_are_recorded_late_are_sorted_by_their_stamps():
     time = np.r_[0.0, 1, 2, 4, 3, 5, 6, 7]
     late = Signal("late", 8, lambda: 10 * time, clock=Clock("c", lambda: time, "s"))
     found, values, notes = one_clock.on_one_grid("log", {"late": late}, lambda c: False, lambda c: True, "")
-    np.testing.assert_array_equal(values["late"], 10 * np.arange(8.0))
+    assert_array_equal(values["late"], 10 * np.arange(8.0))
     assert found.tolist() == list(range(8)) and "1 sample of c recorded late" in notes[0]
     back = Signal("back", 60, lambda: np.zeros(60), clock=Clock("c", lambda: np.tile(np.arange(30.0), 2), "s"))
     with pytest.raises(BadData, match="log, c: goes back from 29 to 0 s at sample 31"):
@@ -182,13 +183,11 @@ def test_a_clock_of_its_own_may_wrap_and_start_at_boot(tmp_path, robot):
     ticks = np.round((fast["t"] + 4294.0) * 1e6).astype(np.int64) % 2**32
     samples.hdf5(tmp_path / "log.h5", {**fast, "t": ticks}, {**slow, "t": slow["t"] + 4294.0})
     runs = records.read_runs(tmp_path / "log.h5", robot, columns=COLUMNS)
-    np.testing.assert_allclose(runs["time_s"], fast["t"], rtol=0, atol=1e-6)
+    assert_allclose(runs["time_s"], fast["t"], rtol=0, atol=1e-6)
     assert any("/drive/t wraps at 4294967296" in note for note in runs.notes)
     assert any("/drive/t states no unit; its numbers are read as us (100 Hz)" in note for note in runs.notes)
     read = np.isfinite(runs["motor_speed_rpm"])
-    np.testing.assert_allclose(
-        runs["motor_speed_rpm"][read], np.interp(fast["t"], slow["t"], slow["rpm"])[read], rtol=1e-6
-    )
+    assert_allclose(runs["motor_speed_rpm"][read], np.interp(fast["t"], slow["t"], slow["rpm"])[read], rtol=1e-6)
 
 
 def test_a_missing_topic_is_named_with_the_nearest(tmp_path, robot):
@@ -237,7 +236,7 @@ def test_a_long_csv_file_is_read_as_a_short_one(tmp_path, monkeypatch):
     long = delimited.read_csv_columns(tmp_path / "log.csv", "log.csv")
     assert isinstance(long.values[1], np.ndarray) and long.header == short.header and long.digest == short.digest
     for mine, theirs in zip(long.values, short.values, strict=True):
-        np.testing.assert_array_equal(delimited_numbers(mine), delimited_numbers(theirs))
+        assert_array_equal(delimited_numbers(mine), delimited_numbers(theirs))
     assert list(long.values[4]) == short.values[4]
     (tmp_path / "log.csv").write_text(text + "1,2\n")
     with pytest.raises(BadData, match="row 4: got 2 cells; the header has 5 columns"):

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import jsonschema
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from worlds import paper
 
 from mmrjax.fidelities import start_stages
@@ -83,7 +84,7 @@ def test_slip_over_the_stages_is_that_of_an_independent_integration(written):
     # V_x, V_x_teor and s of every sample, as Fig. 24 plots them.
     rolling = history["theoretical_speed_mm_s"] > 1e-3
     expected = 1 - history["speed_mm_s"][rolling] / history["theoretical_speed_mm_s"][rolling]
-    np.testing.assert_allclose(history["slip"][rolling], expected, rtol=1e-6, atol=1e-8)
+    assert_allclose(history["slip"][rolling], expected, rtol=1e-6, atol=1e-8)
     assert (history["slip"][~rolling] == 0).all() and history["slip"].max() > 0.9
 
 
@@ -126,7 +127,7 @@ def test_a_history_is_written_by_the_rigs_clock(written, delay):
     assert late["time_s"][0] == 0 and (late["time_s"] >= 0).all()
     for name in set(late) - {"time_s", "voltage_V"}:
         expected = np.interp(late["time_s"] - delay, prompt["time_s"], prompt[name])
-        np.testing.assert_allclose(late[name], expected, rtol=1e-6, atol=1e-6 * np.abs(prompt[name]).max())
+        assert_allclose(late[name], expected, rtol=1e-6, atol=1e-6 * np.abs(prompt[name]).max())
     if delay > 0:  # the peak of the inrush is kept
         assert late["total_current_A"].max() == pytest.approx(prompt["total_current_A"].max(), rel=1e-6)
     assert np.abs(late["speed_mm_s"] - np.interp(late["time_s"], prompt["time_s"], prompt["speed_mm_s"])).max() > 10
@@ -145,7 +146,7 @@ def test_the_delay_of_histories_is_the_one_of_fits():
     at = np.array([0.0, 0.003, 0.004, 0.014, 0.02, 0.07, 0.2])
     ended = np.where(t > 0.02, np.nan, t)
     got, last = jax.jit(lambda: (late(delay, x, at), late(delay, ended, 0.01 + delay)))()
-    np.testing.assert_allclose(got, np.stack([np.interp(at - delay, t, c) for c in x.T], 1), rtol=1e-12, atol=1e-15)
+    assert_allclose(got, np.stack([np.interp(at - delay, t, c) for c in x.T], 1), rtol=1e-12, atol=1e-15)
     assert float(last) == pytest.approx(0.01)
     slope = jax.jit(jax.grad(lambda d: late(d, x[:, 1], 0.05)))(delay)
     assert float(slope) == pytest.approx(-(0.08**2 - 0.03**2) / 0.05)
@@ -157,9 +158,9 @@ def test_a_delay_that_is_none_changes_no_number():
     prompt = History.of(paper_robots.nominal(), t, t, signals)
     assert prompt.signals is signals and (np.asarray(prompt.time) == np.asarray(t)).all()
     late = History.of(replace(paper_robots.nominal(), {"rig.delay": 0.25}), t, t, signals)
-    np.testing.assert_allclose(late.time[0], [0, 0.5, 0.75, 1.0, 1.25])
-    np.testing.assert_allclose(late.reading["speed"][0], t[0])
-    np.testing.assert_allclose(late.signals.speed_theoretical[0], 2 * t[0])
+    assert_allclose(late.time[0], [0, 0.5, 0.75, 1.0, 1.25])
+    assert_allclose(late.reading["speed"][0], t[0])
+    assert_allclose(late.signals.speed_theoretical[0], 2 * t[0])
 
 
 def test_what_a_delay_moves_is_moved_by_one_program(compilations):
@@ -167,7 +168,7 @@ def test_what_a_delay_moves_is_moved_by_one_program(compilations):
     values = {str(k): t + k for k in range(30)}
     _, late = in_table_time(Rig(delay=0.1), t, values)
     assert len(compilations) < 10
-    np.testing.assert_allclose(late["7"][0, 2:], t[0, 2:] + 7)
+    assert_allclose(late["7"][0, 2:], t[0, 2:] + 7)
 
 
 def test_a_vehicle_whose_rig_shows_no_speed_has_that_of_the_robot_in_its_history():
@@ -186,5 +187,5 @@ def test_a_vehicle_whose_rig_shows_no_speed_has_that_of_the_robot_in_its_history
             return 1
 
     shown = simulate.history_table(paper_robots.nominal(), history, Runs())
-    np.testing.assert_allclose(shown["speed_mm_s"], np.asarray(0.5 * t[0]) / MM)
-    np.testing.assert_allclose(shown["slip"], [0, 0.5, 0.5, 0.5])
+    assert_allclose(shown["speed_mm_s"], np.asarray(0.5 * t[0]) / MM)
+    assert_allclose(shown["slip"], [0, 0.5, 0.5, 0.5])

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from mmrjax.model.conditions import Conditions
 
@@ -67,7 +68,7 @@ def test_steady_derivatives_are_central_differences(point, theta, derivatives):
 def test_steady_derivatives_without_an_answer_are_finite(conditions, theta, derivatives):
     _, forward, reverse, _ = derivatives(theta, Conditions(**{"voltage": 24.0, **conditions}))
     assert np.isfinite(forward).all() and np.isfinite(reverse).all()
-    np.testing.assert_allclose(forward, reverse, rtol=1e-9, atol=1e-9)
+    assert_allclose(forward, reverse, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.slow
@@ -94,4 +95,4 @@ def test_steady_second_derivatives_are_central_differences(rebuild, theta, free,
     hessian = jax.jit(jax.hessian(speed))(jnp.zeros(3))
     slope = jax.jit(jax.grad(speed))
     central = np.stack([(slope(1e-4 * e) - slope(-1e-4 * e)) / 2e-4 for e in np.eye(3)])
-    np.testing.assert_allclose(hessian, central, rtol=1e-5, atol=1e-8)
+    assert_allclose(hessian, central, rtol=1e-5, atol=1e-8)

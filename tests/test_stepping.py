@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import mmrjax as mm
 from mmrjax import fidelities
@@ -49,7 +50,7 @@ def test_states_hold_numbers_in_si_units_and_rates_are_those_of_drive(robot):
         wanted = drive.state_of_unknowns(one, rates_of_unknowns(one, conditions, y))
         assert float(found.distance) == 0.4 and float(found.current) != 0
         for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
-            np.testing.assert_allclose(a, b, rtol=1e-12)
+            assert_allclose(a, b, rtol=1e-12)
 
 
 def test_steps_are_runs_of_drive(robot):
@@ -68,8 +69,8 @@ def test_steps_are_runs_of_drive(robot):
     coarse = run(duties)
     times = jnp.arange(41) * DT
     of_drive = drive.drive(robot, conditions.resolved(robot), times, tolerance=1e-9)
-    np.testing.assert_allclose(coarse.speed[:40], of_drive.signals.speed[1:], atol=2e-4)
-    np.testing.assert_allclose(coarse.distance[:40], of_drive.distance[1:], atol=1e-4)
+    assert_allclose(coarse.speed[:40], of_drive.signals.speed[1:], atol=2e-4)
+    assert_allclose(coarse.distance[:40], of_drive.distance[1:], atol=1e-4)
     assert of_drive.signals.speed[-1] > 0.4 and (coarse.speed[100:] == 0).all()
     assert np.ptp(coarse.distance[100:]) == 0 and abs(coarse.current[-1]) < 1e-6
 
@@ -80,7 +81,7 @@ def test_starts_are_as_accurate_as_stated(dt, robot, in_steps):
     for conditions in (RUNS["tracked"], mm.Conditions("4W2T", voltage=33.0)):
         found, exact = (in_steps(conditions, length) for length in (dt, 1e-3))
         exact = exact[round(dt / 1e-3) - 1 :: round(dt / 1e-3)]
-        np.testing.assert_allclose(found, exact, rtol=3e-3)
+        assert_allclose(found, exact, rtol=3e-3)
 
 
 @pytest.fixture(scope="module")
@@ -155,11 +156,11 @@ def test_derivatives_of_a_step_are_differences(kind, robot, bench):
     h = 1e-5
     ahead, behind = (mm.step(one, state, 0.9 + d, DT, conditions).speed_motor for d in (h, -h))
     assert (np.asarray(slope) > 0).all()
-    np.testing.assert_allclose(slope[1], (ahead - behind) / (2 * h), rtol=1e-5)
+    assert_allclose(slope[1], (ahead - behind) / (2 * h), rtol=1e-5)
     with jax.enable_x64(False):
         (rough, _), rough_slope = mapped(mm.initial_state(one, conditions), jnp.asarray([0.3, 0.9]), conditions)
-    np.testing.assert_allclose(rough, speed, rtol=1e-4)
-    np.testing.assert_allclose(rough_slope, slope, rtol=1e-3)
+    assert_allclose(rough, speed, rtol=1e-4)
+    assert_allclose(rough_slope, slope, rtol=1e-3)
 
 
 def test_a_robot_rolls_at_first_as_steady_travels(robot):

@@ -20,6 +20,7 @@ from mmrjax.model.paper_robots import nominal
 from sweeps.config_campaign import Campaign, Obstacle
 from sweeps.pages.campaign_figures import Varied, draw_grid_statuses
 from sweeps.points import axes, climbs, scale
+from tests.commands import ends
 
 ROBOT = nominal()
 
@@ -164,10 +165,10 @@ def test_interrupted_map_goes_on_after_its_last_chunk(mmrjax, tmp_path, monkeypa
         return fetch(arrays, count)
 
     monkeypatch.setattr(scale, "fetch_values", later)
-    climbed, ends = [], iter([False, True, False, False])
+    climbed, interrupts = [], iter([False, True, False, False])
 
     def closed(of, variation, conditions, values, sizes, told):
-        if next(ends):
+        if next(interrupts):
             raise KeyboardInterrupt
         climbed.append(np.asarray(values)[:, 0].tolist())
         found = {name: np.asarray(values)[:, 0] + sizes for name in climbs.climb_attributes(of)}
@@ -177,8 +178,7 @@ def test_interrupted_map_goes_on_after_its_last_chunk(mmrjax, tmp_path, monkeypa
     (tmp_path / "map.toml").write_text(MAP)
     assert mmrjax("sweep", "map.toml", "--out", "map")[0] == 130
     assert climbed == [[0.0, 0.0]] and (tmp_path / "map.partial").is_dir()
-    code, out, err = mmrjax("sweep", "map.toml", "--out", "map")
-    assert code == 0 and "goes on after 2 of 6 points" in err and "came to a verdict" in out
+    ends(mmrjax("sweep", "map.toml", "--out", "map"), "goes on after 2 of 6 points", "came to a verdict", code=0)
     assert climbed == [[0.0, 0.0], [30.0, 30.0], [60.0, 60.0]]
     store = zarr.open_group(tmp_path / "map" / "results.zarr", mode="r")
     assert store["energy_J"][:].tolist() == [[60, 560 - 60], [90, 530], [120, 560]]
@@ -227,8 +227,7 @@ obstacle_mm = [60, 500]
 """
     )
     for share in ("1/2", "2/2"):
-        code, _, err = mmrjax("sweep", "map.toml", "--shard", share, "--out", "run")
-        assert code == 0, err
+        ends(mmrjax("sweep", "map.toml", "--shard", share, "--out", "run"), code=0)
         assert (tmp_path / "run").exists() == (share == "2/2")
     result = json.loads((tmp_path / "run" / "result.json").read_text("utf-8"))
     assert result["model"] == "climb" and result["statuses"]["converged"] == 4

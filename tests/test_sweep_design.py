@@ -4,6 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy import stats
 
 from calibration.data.input_errors import BadConfiguration
@@ -106,7 +107,7 @@ def test_distribution_is_that_of_scipy(kind, nominal):
     samples = sampled(nominal, "sobol", 4096, payload={"distribution": kind, **numbers}).samples
     quantile = samples.marginals["payload"]
     u = np.linspace(0.01, 0.99, 99)
-    np.testing.assert_allclose(quantile(u), expected.ppf(u), rtol=1e-9)
+    assert_allclose(quantile(u), expected.ppf(u), rtol=1e-9)
     assert stats.kstest(samples.values(0, 4096)[0], expected.cdf).pvalue > 0.01
 
 
@@ -118,11 +119,11 @@ def test_prior_is_the_one_of_calibrate_and_sensitivity(nominal):
     for each in (name, "motor.resistance"):
         values = sampled(nominal, **{each: "prior"}).samples.marginals[each](u)
         expected = priors.parameter_coordinates(nominal, [each]).value(stats.norm.ppf(u)[:, None])[:, 0]
-        np.testing.assert_allclose(values, expected, rtol=1e-14)
+        assert_allclose(values, expected, rtol=1e-14)
     median, sd = float(found[name].value), found[name].spec.prior_sd(float(found[name].value))
     quantile = sampled(nominal, **{name: "prior"}).samples.marginals[name]
     lognormal = stats.lognorm(np.sqrt(np.log1p((sd / median) ** 2)), scale=median)
-    np.testing.assert_allclose(quantile(u), lognormal.ppf(u), rtol=1e-6)
+    assert_allclose(quantile(u), lognormal.ppf(u), rtol=1e-6)
 
 
 def test_normal_is_cut_off_at_the_bounds(nominal):
@@ -167,7 +168,7 @@ def test_points_of_a_grid_are_every_combination_the_last_axis_fastest(nominal):
         },
     )
     found = plan.design.block(tuple(slice(0, n) for n in plan.design.shape))
-    np.testing.assert_allclose(found, list(itertools.product([0, 1], [0, 10, 20], [0.5, 1, 2])))
+    assert_allclose(found, list(itertools.product([0, 1], [0, 10, 20], [0.5, 1, 2])))
     assert np.array_equal(plan.design.at(np.array([17, 4])), found[[17, 4]])
 
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from calibration.data.input_errors import InputError
 from mmrjax.model import paper_robots, params
@@ -38,8 +39,8 @@ def test_posterior_is_sampled_with_its_correlation_whatever_the_chunk(folder):
     assert found.design.names == ("payload", *NAMES) and found.data == (str(folder / posteriors.FILE),)
     values = samples.values(0, 8192)
     centre = [found.axes[n].value for n in NAMES]
-    np.testing.assert_allclose(values[1:].mean(1), centre, rtol=2e-3)
-    np.testing.assert_allclose(values[1:].std(1) / centre, 0.05, rtol=2e-2)
+    assert_allclose(values[1:].mean(1), centre, rtol=2e-3)
+    assert_allclose(values[1:].std(1) / centre, 0.05, rtol=2e-2)
     assert np.corrcoef(values)[1, 2] == pytest.approx(0.8, abs=0.01)
     assert abs(np.corrcoef(values)[0, 1]) < 0.02
     for first, count in ((0, 1), (4095, 2), (5000, 3000)):

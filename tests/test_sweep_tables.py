@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from calibration.data.posterior_file import NORMAL, Posterior
 from calibration.data.runs import Runs
@@ -52,7 +53,7 @@ def same(one, other, rtol=0.0):
     assert list(one) == list(other)
     for name, values in other.items():
         if values.dtype.kind == "f":
-            np.testing.assert_allclose(one[name], values, rtol=rtol, err_msg=name)
+            assert_allclose(one[name], values, rtol=rtol, err_msg=name)
         else:
             assert np.array_equal(one[name], values), name
 
@@ -62,8 +63,8 @@ def test_points_of_a_table_are_its_runs_each_with_every_draw(robot, runs, poster
     job = run.job_of(robot, runs, chunked(5), drawn)
     assert job.plan.design.shape == (4, DRAWS) and job.blocks.size == (1, 4)
     points = job.plan.design.block((slice(1, 3), slice(2, 5)))
-    np.testing.assert_array_equal(points[:, 0], np.repeat([1.0, 2.0], 3))
-    np.testing.assert_array_equal(points[:, 1:], np.tile(posterior.draw(DRAWS, 0)[2:5], (2, 1)))
+    assert_array_equal(points[:, 0], np.repeat([1.0, 2.0], 3))
+    assert_array_equal(points[:, 1:], np.tile(posterior.draw(DRAWS, 0)[2:5], (2, 1)))
 
 
 @pytest.mark.slow
@@ -84,9 +85,9 @@ def test_draws_have_the_intervals_of_robots_simulated_one_by_one(robot, runs, po
         for theta in posterior.draw(DRAWS, uncertainty.SEED)
     ]
     speeds = np.array([table["speed_mm_s"] for table in each])
-    np.testing.assert_allclose(found.sd("speed_mm_s")[:3], speeds.std(0, ddof=1)[:3], rtol=1e-9)
+    assert_allclose(found.sd("speed_mm_s")[:3], speeds.std(0, ddof=1)[:3], rtol=1e-9)
     low = np.quantile(speeds[:, :3], uncertainty.QUANTILES[0], axis=0)
-    np.testing.assert_allclose(found.columns["speed_mm_s_lower"][:3], low, rtol=1e-12)
+    assert_allclose(found.columns["speed_mm_s_lower"][:3], low, rtol=1e-12)
     assert found.columns[uncertainty.SHARE].tolist() == [1, 1, 1, 0] and np.isnan(found.sd("speed_mm_s")[3])
 
 

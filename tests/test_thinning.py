@@ -5,6 +5,7 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from worlds import rigs
 
 from calibration.data import columns, input_files
@@ -69,7 +70,7 @@ def test_rows_of_a_table_are_taken_evenly_over_its_conditions():
     share = np.histogram(some["supply_voltage_V"], np.linspace(10, 30, 9))[0] / len(some)
     assert share.min() > 0.1 and share.max() < 0.15  # an eighth in each
     kept = np.flatnonzero(np.isin(table["supply_voltage_V"], some["supply_voltage_V"]))
-    np.testing.assert_array_equal(table["supply_voltage_V"][kept], some["supply_voltage_V"])  # in the file's order
+    assert_array_equal(table["supply_voltage_V"][kept], some["supply_voltage_V"])  # in the file's order
     notes = [
         n for n in SettledRuns.check(some, infer_noise(some, SettledRuns.sizes(some))) if n.code == "thinned_table"
     ]
@@ -93,10 +94,10 @@ def test_rows_are_taken_evenly_of_each_run():
     assert some.log is runs and some.whole is runs and runs.whole is runs
     for name in ("run0", "run1"):
         time = np.sort(some["time_s"][some.run_names == name])
-        np.testing.assert_allclose(time[:FIRST], EVERY * np.arange(FIRST), atol=1e-12)
-        np.testing.assert_allclose(time[FIRST:-1], EVERY * np.arange(6, ROWS - 1, 6), atol=1e-12)
+        assert_allclose(time[:FIRST], EVERY * np.arange(FIRST), atol=1e-12)
+        assert_allclose(time[FIRST:-1], EVERY * np.arange(6, ROWS - 1, 6), atol=1e-12)
         assert time[-1] == pytest.approx(EVERY * (ROWS - 1))
-    np.testing.assert_array_equal(some["total_current_A"], some["time_s"])
+    assert_array_equal(some["total_current_A"], some["time_s"])
 
 
 def test_channels_that_are_read_by_turns_are_all_kept():
@@ -133,13 +134,13 @@ def test_what_drives_a_run_is_that_of_the_log(drive):
         Histories.of(x, paper_robots.nominal()) for x in (whole, some, dataclasses.replace(some, log=None))
     )
     between = EVERY * (np.arange(ROWS - 1) + 0.5)
-    np.testing.assert_array_equal(held(few, between), held(every, between))
+    assert_array_equal(held(few, between), held(every, between))
     done = [float(np.asarray(o.conditions.voltage[0])[:-1] @ np.diff(np.asarray(o.times[0]))) for o in (every, few)]
     assert done[1] == pytest.approx(done[0], rel=1e-12)
     assert (held(alone, between) != held(every, between)).mean() > 0.05
     steps = [int((np.diff(np.asarray(o.times)) > 0).sum()) for o in (every, few)]
     assert steps[1] < (0.7 if drive == "a staircase" else 1.01) * steps[0] and len(few.run) == len(some) < 50
-    np.testing.assert_allclose(few.time, some["time_s"], atol=1e-12)
+    assert_allclose(few.time, some["time_s"], atol=1e-12)
 
 
 def test_a_slope_that_changes_between_readings_acts_from_its_row_on():
@@ -153,7 +154,7 @@ def test_a_slope_that_changes_between_readings_acts_from_its_row_on():
     columns = {**whole.columns, "slope_deg": np.where(row < change, 0.0, 5.0)}
     few = Histories.of(thin_rows(dataclasses.replace(whole, columns=columns), 40), paper_robots.nominal())
     times, slopes, at = np.asarray(few.times[0]), np.asarray(few.conditions.slope[0]), time[row == change]
-    np.testing.assert_allclose(np.rad2deg(slopes), np.where(times < at - 1e-9, 0.0, 5.0), atol=1e-9)
+    assert_allclose(np.rad2deg(slopes), np.where(times < at - 1e-9, 0.0, 5.0), atol=1e-9)
     assert np.abs(times - at).min() < 1e-9
 
 
@@ -219,7 +220,7 @@ def test_python_takes_as_many_rows_as_the_command_line(monkeypatch, way, rows):
         call(runs, paper_robots.nominal(), **({} if rows is None else {"rows": rows}))
     (used,) = seen
     wanted = thin_rows(runs, columns.ROWS if rows is None else rows)
-    np.testing.assert_array_equal(used["time_s"], wanted["time_s"])
+    assert_array_equal(used["time_s"], wanted["time_s"])
     assert len(used) < len(runs) == len(used.whole) == len(thin_rows(used, 50).whole)
     with pytest.raises(BadConfiguration, match="rows: got 0; expected 1 or more"):
         call(runs, paper_robots.nominal(), rows=0)

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from mmrjax.model import channels
 from sweeps import pages
@@ -37,13 +38,13 @@ def test_the_run_with_the_largest_residuals_comes_first():
     assert [c["label"] for c in data["channels"]] == [SPEED.label]  # a channel without readings is left out
     time, ((measured, simulated),) = data["runs"]["b"]["time"], data["runs"]["b"]["channels"]
     assert np.all(np.diff(time) > 0)
-    np.testing.assert_allclose(np.subtract(simulated, measured), 5.0, atol=1e-3)
+    assert_allclose(np.subtract(simulated, measured), 5.0, atol=1e-3)
 
 
 def test_static_figure_shows_simulated_less_measured():
     with figure_style.figure_settings():
         above, below = overlay().draw().axes
-    np.testing.assert_allclose(below.lines[-1].get_ydata(), 5.0)
+    assert_allclose(below.lines[-1].get_ydata(), 5.0)
     assert above.get_title(loc="left") == "run b" and above.get_ylabel() == figure_style.axis_label(SPEED)
 
 

@@ -15,6 +15,7 @@ from mmrjax.model import paper_robots, signals
 from sweeps.commands.simulate import PEAK, run_remarks
 from sweeps.pages import figure_style, history_figures, words
 from sweeps.report import runs_report
+from tests.commands import ends
 from tests.commands import rows as table
 
 SPEED_STATIC = 0.02  # V_s of the packaged robot [m/s]: within it contacts creep
@@ -57,44 +58,6 @@ def test_a_status_agrees_with_the_numbers(anywhere, model):
     assert (status[(voltage == 0) & (slope >= 0)] != "converged").all()
 
 
-@pytest.mark.slow
-def test_statuses_of_steady_and_drive_agree_where_both_settle(anywhere):
-    voltage, _, steady, drive = anywhere
-    settles = {"converged", "reverses", "rolls_back", "stalled"}
-    both = np.isin(steady.statuses, list(settles)) & np.isin(drive.statuses, list(settles))
-    assert both.sum() > 300
-    assert (steady.statuses[both] == drive.statuses[both]).all()
-    travels = both & (drive.statuses != "stalled") & (np.abs(drive.theoretical_speed) > SPEED_STATIC)
-    np.testing.assert_allclose(np.asarray(steady.speed)[travels], np.asarray(drive.speed)[travels], rtol=2e-3)
-    # What friction holds without voltage stands in both, exactly.
-    held = both & (voltage == 0) & (steady.statuses == "stalled")
-    assert held.any() and (np.asarray(drive.speed)[held] == 0).all() and (np.asarray(steady.speed)[held] == 0).all()
-
-
-@pytest.mark.slow
-def test_a_status_is_mirrored_with_voltage_and_slope():
-    rng, count = np.random.default_rng(3), 400  # whose program is that of `anywhere`
-    voltage, slope = rng.uniform(-20, 20, count), rng.uniform(-20, 20, count)
-    voltage[:60] = rng.uniform(-2, 2, 60)
-    robot, kind = paper_robots.nominal(), np.where(rng.random(count) < 0.5, "6T2A", "4W2T")
-    one = api.simulate(robot, api.Conditions(kind, voltage, slope))
-    other = api.simulate(robot, api.Conditions(kind, -voltage, -slope))
-    swapped = {"converged": "reverses", "reverses": "converged"}
-    assert [swapped.get(s, s) for s in one.statuses] == other.statuses.tolist()
-    np.testing.assert_allclose(np.asarray(one.speed), -np.asarray(other.speed), rtol=1e-6, atol=1e-9)
-
-
-@pytest.mark.slow
-def test_a_robot_held_on_a_slope_stands_for_an_hour():
-    kept = drive_batch(
-        paper_robots.nominal(), api.Conditions(0, [0.0, 0.3], [15.0, 15.0]), np.linspace(0.0, 3600.0, 5)
-    )
-    assert [signals.STATUSES[k] for k in np.asarray(kept.result.status)] == ["stalled"] * 2
-    assert (np.asarray(kept.distance) == 0).all()
-    assert float(kept.result.traction[0]) == pytest.approx(13.1 * signals.GRAVITY * np.sin(np.radians(15)), rel=1e-6)
-    assert float(kept.result.reading["total_current"][1]) == pytest.approx(2 * 0.3 / 0.611, rel=1e-4)
-
-
 def test_the_words_name_the_same_statuses_as_the_codes():
     assert tuple(signals.STATUSES[k] for k in signals.DONE) == words.SETTLED
     assert tuple(words.STATUSES) == signals.STATUSES and tuple(words.FLAGS) == signals.FLAGS
@@ -118,16 +81,17 @@ DOWNHILL = (
     ],
 )
 def test_charging_above_the_charge_voltage_is_flagged_with_the_voltage_of_a_cell(mmrjax, tmp_path, model):
-    code, out, _ = mmrjax(*DOWNHILL, *model, "--no-report", "--out", "a")
-    assert code == 0
+    _, out, _ = ends(mmrjax(*DOWNHILL, *model, "--no-report", "--out", "a"), code=0)
     (row,) = table(tmp_path / "a" / "runs.csv")
     assert "overvoltage" in row["flags"].split(";") and float(row["total_current_A"]) < -0.5
     assert float(row["voltage_cell_V"]) == pytest.approx(float(row["voltage_V"]) / 8, rel=1e-6)
     assert float(row["voltage_cell_V"]) > 4.2 and row["supply_voltage_V"] == ""
     (note,) = json.loads((tmp_path / "a" / "result.json").read_text())["notes"]
     assert note in " ".join(out.split()) and "A flow into the battery, a cell at 4." in note
-    code, out, _ = mmrjax(*DOWNHILL, *model, "--set", "battery.voltage_charge=4.9", "--no-report", "--out", "b")
-    assert code == 0 and "overvoltage" not in out
+    _, out, _ = ends(
+        mmrjax(*DOWNHILL, *model, "--set", "battery.voltage_charge=4.9", "--no-report", "--out", "b"), code=0
+    )
+    assert "overvoltage" not in out
 
 
 def test_a_cell_has_no_voltage_on_the_external_supply():
@@ -138,8 +102,7 @@ def test_a_cell_has_no_voltage_on_the_external_supply():
 
 def test_a_winding_that_no_temperature_settles_says_so(mmrjax, tmp_path):
     blocked = ("--configuration", "4W2T", "--slope", 20, "--payload", 200, "--surface", "concrete")
-    code, out, _ = mmrjax("simulate", *blocked, "--out", "a")
-    assert code == 0 and "none settles" in out
+    ends(mmrjax("simulate", *blocked, "--out", "a"), "none settles", code=0)
     text = (tmp_path / "a" / "result.json").read_text()
     assert "Infinity" not in text and "NaN" not in text
     (row,) = table(tmp_path / "a" / "runs.csv")
@@ -165,10 +128,8 @@ def test_a_voltage_beside_the_battery_is_refused(mmrjax, tmp_path):
         code, _, err = mmrjax(*command, "--battery", "--voltage", "15")
         assert code == 2
         assert err == ("mmrjax: --voltage: got 15 with --battery, whose charge sets the voltage; give one of them\n")
-    code, _, err = mmrjax("sweep", "--battery", "--voltages", "15,24")
-    assert code == 2 and "--voltages acts without --battery only" in err
-    code, _, err = mmrjax("sensitivity", "--battery", "--vary", "voltage=15:24")
-    assert code == 2 and "--vary voltage: acts without --battery only" in err
+    ends(mmrjax("sweep", "--battery", "--voltages", "15,24"), "--voltages acts without --battery only")
+    ends(mmrjax("sensitivity", "--battery", "--vary", "voltage=15:24"), "--vary voltage: acts without --battery only")
     (tmp_path / "plan.toml").write_text("[axes]\nvoltage = [15, 24]\n[conditions]\nbattery = true\n")
     code, _, err = mmrjax("sweep", "plan.toml")
     assert code == 2 and err.startswith("mmrjax: plan.toml, voltage: acts without battery only")
@@ -182,8 +143,7 @@ def test_a_voltage_beside_the_battery_is_refused(mmrjax, tmp_path):
 
 @pytest.mark.slow
 def test_a_sweep_on_the_battery_has_no_axis_of_voltages(mmrjax, tmp_path):
-    code, _, _ = mmrjax("sweep", "--battery", "--slopes", "0,5", "--payloads", "0,8", "--out", "a")
-    assert code == 0
+    ends(mmrjax("sweep", "--battery", "--slopes", "0,5", "--payloads", "0,8", "--out", "a"), code=0)
     rows = table(tmp_path / "a" / "runs.csv")
     assert len(rows) == 2 * 2 * 2 and {row["supply_voltage_V"] for row in rows} == {""}
     assert len({row["total_current_A"] for row in rows}) == len(rows)
@@ -201,31 +161,38 @@ def test_a_sweep_on_the_battery_has_no_axis_of_voltages(mmrjax, tmp_path):
 
 @pytest.mark.slow
 def test_the_command_line_reverses(mmrjax, tmp_path):
-    code, out, _ = mmrjax("simulate", "--voltage", "-15", "--no-report", "--out", "a")
-    assert code == 0 and "reverses: steady travel backward" in out
-    code, _, _ = mmrjax("simulate", "--voltage", "15", "--out", "b", "--no-report")
+    ends(
+        mmrjax("simulate", "--voltage", "-15", "--no-report", "--out", "a"),
+        "reverses: steady travel backward",
+        code=0,
+    )
+    mmrjax("simulate", "--voltage", "15", "--out", "b", "--no-report")
     (back,), (forth,) = table(tmp_path / "a" / "runs.csv"), table(tmp_path / "b" / "runs.csv")
     for column in ("total_current_A", "motor_speed_rpm", "speed_mm_s"):
         assert float(back[column]) == pytest.approx(-float(forth[column]), rel=1e-6)
-    code, out, _ = mmrjax(
-        "sweep",
-        "--voltages=-33,-15,15",
-        "--slopes",
-        "0,5",
-        "--payloads",
-        "0",
-        "--configurations",
-        "4W2T",
-        "--out",
-        "c",
+    ends(
+        mmrjax(
+            "sweep",
+            "--voltages=-33,-15,15",
+            "--slopes",
+            "0,5",
+            "--payloads",
+            "0",
+            "--configurations",
+            "4W2T",
+            "--out",
+            "c",
+        ),
+        code=0,
     )
-    assert code == 0
     assert json.loads((tmp_path / "c" / "result.json").read_text())["statuses"]["reverses"] == 4
     assert "-33 V" in (tmp_path / "c" / "report.html").read_text()
-    code, out, _ = mmrjax("simulate", "--voltage", 0, "--slope", 20, "--model", "drive", "--no-report", "--out", "d")
-    assert code == 0 and "rolls_back: gravity drives the robot" in out
-    code, _, err = mmrjax("simulate", "--voltage", "-10001")
-    assert code == 2 and "supply_voltage_V: got -10001; expected -10000 to 10000" in err
+    ends(
+        mmrjax("simulate", "--voltage", 0, "--slope", 20, "--model", "drive", "--no-report", "--out", "d"),
+        "rolls_back: gravity drives the robot",
+        code=0,
+    )
+    ends(mmrjax("simulate", "--voltage", "-10001"), "supply_voltage_V: got -10001; expected -10000 to 10000")
 
 
 COLUMNS = "configuration,supply_voltage_V,total_mass_kg,payload_kg,slope_deg,total_current_A,motor_speed_rpm"
@@ -247,8 +214,8 @@ def test_readings_without_a_sign_are_refused_backward(tmp_path, row, sentence):
 @pytest.mark.slow
 def test_compare_takes_readings_with_their_signs(mmrjax, tmp_path):
     (tmp_path / "mine.csv").write_text(f"{COLUMNS}\n6T2A,15,13.1,0,0,2.1,5292\n6T2A,-15,13.1,0,0,-2.1,-5292\n")
-    code, out, _ = mmrjax("compare", "mine.csv", "--no-report", "--out", "a")
-    assert code == 0 and "did not converge" not in out
+    _, out, _ = ends(mmrjax("compare", "mine.csv", "--no-report", "--out", "a"), code=0)
+    assert "did not converge" not in out
     rows = table(tmp_path / "a" / "comparison.csv")
     assert rows[0]["error_total_current_percent"] == pytest.approx(rows[1]["error_total_current_percent"])
     assert rows[1]["status"] == "reverses"
@@ -266,8 +233,8 @@ def test_a_history_has_the_peak_of_the_inrush(climb, mmrjax, tmp_path):
     fine = drive_batch(paper_robots.nominal(), api.Conditions(0, [33.0], 10.0), np.linspace(0.0, 2e-3, 2001))
     peak = float(np.max(np.asarray(fine.signals.total_current)))
     assert float(np.max(np.asarray(found.history.signals.total_current[0]))) == pytest.approx(peak, rel=2e-3)
-    code, out, _ = mmrjax("simulate", "--model", "drive", "--slope", 10, "--no-report", "--out", "a")
-    assert code == 0 and re.search(rf"peak current, all motors \[A\] +{peak:.1f}", out)
+    _, out, _ = ends(mmrjax("simulate", "--model", "drive", "--slope", 10, "--no-report", "--out", "a"), code=0)
+    assert re.search(rf"peak current, all motors \[A\] +{peak:.1f}", out)
     (row,) = table(tmp_path / "a" / "runs.csv")
     assert float(row[PEAK]) == pytest.approx(peak, rel=1e-4)
     kept = [float(r["total_current_A"]) for r in table(tmp_path / "a" / "history.csv")]
@@ -296,8 +263,7 @@ def test_a_start_is_drawn_of_the_run_that_was_asked_for(climb):
 @pytest.mark.slow
 def test_what_was_reached_is_shown_when_the_battery_ends(mmrjax, tmp_path):
     asked = ("simulate", "--battery", "--model", "drive", "--discharge", "2190", "--duration")
-    code, out, _ = mmrjax(*asked, "60", "--out", "a")
-    assert code == 0
+    _, out, _ = ends(mmrjax(*asked, "60", "--out", "a"), code=0)
     (row,) = table(tmp_path / "a" / "runs.csv")
     assert row["status"] == "battery_empty" and float(row["speed_mm_s"]) > 500 and float(row["total_current_A"]) > 1
     when, far = float(row["time_end_s"]), float(row["displacement_m"])
@@ -312,18 +278,22 @@ def test_what_was_reached_is_shown_when_the_battery_ends(mmrjax, tmp_path):
         [float(r["time_s"]) for r in table(tmp_path / "b" / "history.csv")],
     )
     assert charge == pytest.approx(0.01 * (float(row["total_current_A"]) + 1.5), abs=0.05)
-    code, out, _ = mmrjax("simulate", "--battery", "--model", "drive", "--discharge", "2300", "--no-report")
-    assert code == 0 and "battery_empty: empty before the start" in out
+    ends(
+        mmrjax("simulate", "--battery", "--model", "drive", "--discharge", "2300", "--no-report"),
+        "battery_empty: empty before the start",
+        code=0,
+    )
 
 
 @pytest.mark.slow
 def test_a_run_may_last_a_day(mmrjax):
     found = api.simulate(paper_robots.nominal(), api.Conditions(0, 33.0), "drive", duration=86_400.0, history=False)
     assert found.statuses == "converged"
-    code, _, err = mmrjax("simulate", "--model", "drive", "--duration", "86401")
-    assert code == 2 and "86400" in err
-    code, _, err = mmrjax("simulate", "--model", "track", "--duration", "3601")
-    assert code == 2 and "--duration: got 3601; --model track takes at most 3600 s" in err
+    ends(mmrjax("simulate", "--model", "drive", "--duration", "86401"), "86400")
+    ends(
+        mmrjax("simulate", "--model", "track", "--duration", "3601"),
+        "--duration: got 3601; --model track takes at most 3600 s",
+    )
 
 
 def test_remarks_name_the_run_they_are_of():
@@ -378,11 +348,10 @@ def test_bad_limits_and_switches_are_refused(values, sentence):
 
 @pytest.mark.slow
 def test_a_switch_can_be_set_on_the_command_line(mmrjax, tmp_path):
-    code, _, _ = mmrjax("simulate", "--set", "gearbox.mesh_theory=true", "--no-report", "--out", "a")
-    assert code == 0 and "mesh_theory = true" in (tmp_path / "a" / "robot.toml").read_text()
+    ends(mmrjax("simulate", "--set", "gearbox.mesh_theory=true", "--no-report", "--out", "a"), code=0)
+    assert "mesh_theory = true" in (tmp_path / "a" / "robot.toml").read_text()
     assert '"gearbox.mesh_theory" = true' in (tmp_path / "a" / "config.resolved.toml").read_text()
-    code, _, err = mmrjax("simulate", "--set", "gearbox.mesh_theory=2", "--out", "b")
-    assert code == 2 and "expected true or false" in err
+    ends(mmrjax("simulate", "--set", "gearbox.mesh_theory=2", "--out", "b"), "expected true or false")
 
 
 def test_rated_limits_stand_in_the_report():

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from mmrjax.model import balances, params
 from mmrjax.model.conditions import Conditions
@@ -36,8 +37,8 @@ def test_tip_rates_are_derivatives_of_its_place(path, recess):
         places
     )
     at = tips_on_path(path, places)
-    np.testing.assert_allclose(slope[:, 0], at.rate_forward, atol=1e-9)
-    np.testing.assert_allclose(slope[:, 1], at.rate_up, atol=1e-9)
+    assert_allclose(slope[:, 0], at.rate_forward, atol=1e-9)
+    assert_allclose(slope[:, 1], at.rate_up, atol=1e-9)
 
 
 @pytest.mark.slow
@@ -51,14 +52,14 @@ def test_tip_is_continuous_round_the_whole_path(path):
     # sliding speed, support and compliance too, where the ground can be: no force may jump
     for value in (at.rate_forward, at.rate_up, at.guided, at.compliance):
         assert float(jnp.max(jnp.abs(jnp.diff(value))[:3500])) < 0.02
-    np.testing.assert_allclose(at.up[lower], -(path.radius + path.gear.grouser_height))
+    assert_allclose(at.up[lower], -(path.radius + path.gear.grouser_height))
 
 
 def test_point_of_the_belt_follows_the_pulleys_by_its_weight(path):
     place, weight = path.place(jnp.asarray(0.4), jnp.asarray(0.4))
     moved, _ = path.place(jnp.asarray(0.4), jnp.asarray(0.4 + 1e-6))
     shift = (moved - place) / (path.radius * 1e-6)
-    np.testing.assert_allclose(shift, weight, atol=1e-6)
+    assert_allclose(shift, weight, atol=1e-6)
     assert ((weight >= 0) & (weight <= 1)).all()
 
 
@@ -66,7 +67,7 @@ def test_mesh_is_the_swing_of_a_polygon(path):
     angle = jnp.linspace(0.0, 0.5, 400)
     _, lever = jax.vmap(lambda a: belt_travel(path.radius, a))(angle)
     slope = jax.vmap(jax.grad(lambda a: belt_travel(path.radius, a)[0]))(angle)
-    np.testing.assert_allclose(lever, slope, rtol=1e-12)
+    assert_allclose(lever, slope, rtol=1e-12)
     apothem = float(path.radius) * np.cos(np.pi / 48)
     assert float(lever.max() - lever.min()) == pytest.approx(float(path.radius) - apothem, rel=1e-3)
     assert pytest.approx(0.00107, rel=1e-2) == POLYGON
@@ -83,7 +84,7 @@ def test_runs_pull_as_their_energy_falls(path):
     angles = jnp.asarray([0.3012, 0.3])
     torque = -jax.grad(energy)(angles)
     at = belt_runs(path, angles, jnp.zeros(2))
-    np.testing.assert_allclose(torque, jnp.stack([at.torque_front, at.torque_rear]), rtol=1e-9)
+    assert_allclose(torque, jnp.stack([at.torque_front, at.torque_rear]), rtol=1e-9)
 
 
 def test_slack_run_pulls_nothing(path):
@@ -100,7 +101,7 @@ def test_tension_jumps_by_the_force_on_the_belt(path):
     at = belt_runs(path, jnp.asarray([0.301, 0.3]), jnp.zeros(2))
     place, force = jnp.asarray([0.1, 0.2]), jnp.asarray([7.0, 11.0])
     along = tension_along(path, at, place, force, jnp.asarray([0.05, 0.15, 0.25, 0.6]))
-    np.testing.assert_allclose(jnp.diff(along)[:2], [7.0, 11.0], rtol=1e-9)
+    assert_allclose(jnp.diff(along)[:2], [7.0, 11.0], rtol=1e-9)
     lengths = jnp.asarray([0.1, 0.1, 0.1])
     assert float(jnp.sum(along[:3] * lengths) / 0.3) == pytest.approx(float(at.lower))  # the mean is the run's
     assert float(along[3]) == pytest.approx(float(at.upper))
@@ -138,7 +139,7 @@ def test_generalized_forces_do_the_work_of_the_contacts(path, robot, wheeled):
     work = work.at[4].add(-path.radius * jnp.sum(done.guide * at.weight) + at.belt.torque_rear)
     ours = jnp.insert(done.generalized, 3, -done.load)
     # The belt's own stretch (0.05 mm a run) shifts a grouser's share between the pulleys by parts in 1e4.
-    np.testing.assert_allclose(ours, work, rtol=2e-3, atol=2e-3)
+    assert_allclose(ours, work, rtol=2e-3, atol=2e-3)
 
 
 def test_contact_pairs_are_720_on_tracks_and_4_on_wheels(path, robot):

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from mmrjax.fidelities.track import track
 from mmrjax.model import paper_robots, params
@@ -105,7 +106,7 @@ def test_no_parameter_is_dead(forward):
 def test_reverse_derivatives_are_forward_ones(averages, commands, at, forward):
     slope = jax.jit(jax.vmap(jax.jacrev(averages, has_aux=True), in_axes=(None, 0)))
     reverse = np.asarray(slope(at, commands)[0])
-    np.testing.assert_allclose(reverse, forward, rtol=1e-6, atol=1e-9)
+    assert_allclose(reverse, forward, rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.slow
@@ -122,6 +123,6 @@ def test_robot_at_rest_is_borne_with_exact_derivatives():
     both = jax.jit(jax.vmap(lambda *given: (*borne(*given), jax.jacrev(borne)(*given)[0])))
     cases = jnp.asarray([3.0, 6.0]), jnp.asarray([12.0, -5.0]), jnp.asarray([0.0, 1.0])
     _, share, slope = both(*cases)
-    np.testing.assert_allclose(share, 1.0, rtol=1e-10)
+    assert_allclose(share, 1.0, rtol=1e-10)
     higher, lower = (both(cases[0] + step, *cases[1:])[0] for step in (0.01, -0.01))
-    np.testing.assert_allclose(slope, (higher - lower) / 0.02, rtol=1e-4)
+    assert_allclose(slope, (higher - lower) / 0.02, rtol=1e-4)

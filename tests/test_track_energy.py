@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from mmrjax.fidelities.track import track
 from mmrjax.model import params
@@ -113,19 +114,11 @@ def averages():
 @pytest.mark.slow
 def test_averages_do_not_depend_on_the_step(averages, robot):
     """Halved: less than 0.3 %."""
-    np.testing.assert_allclose(averages(robot, 5e-5), averages(robot, 1e-4), rtol=3e-3)
+    assert_allclose(averages(robot, 5e-5), averages(robot, 1e-4), rtol=3e-3)
 
 
 @pytest.mark.slow
 def test_averages_hardly_depend_on_the_contact_stiffness(averages, robot):
     """Doubled: less than 0.3 %."""
     stiffer = params.replace(robot, {"running_gear.contact_stiffness": 2 * robot.running_gear.contact_stiffness})
-    np.testing.assert_allclose(averages(stiffer, 1e-4), averages(robot, 1e-4), rtol=3e-3)
-
-
-@pytest.mark.slow
-def test_ledger_can_fail(ledger):
-    """Leaving out any one loss of a tracked run upsets the balance, damping of contact and belt apart."""
-    for name in set(ledger) - {"in", "contact", "belt"}:
-        spent = sum(value[0] for key, value in ledger.items() if key not in ("in", name))
-        assert abs(spent / ledger["in"][0] - 1) > 5e-3, name
+    assert_allclose(averages(stiffer, 1e-4), averages(robot, 1e-4), rtol=3e-3)

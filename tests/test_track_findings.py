@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from mmrjax.fidelities.track import _batch, track_batch
 from mmrjax.model import params
@@ -83,7 +84,7 @@ def test_robot_that_slips_on_average_and_goes_on_steadily_has_settled(robot):
     slips = 1 << FLAGS.index("slips")
     assert [bool(f & slips) for f in np.asarray(answer.result.flags)] == [False, True]
     # the slip of the search that found this gear, at the step and at half and a quarter of it
-    np.testing.assert_allclose(100 * np.asarray(answer.result.slip), [1.8, 5.04], atol=0.15)
+    assert_allclose(100 * np.asarray(answer.result.slip), [1.8, 5.04], atol=0.15)
 
 
 def test_too_steep_a_slope_slides_it_down(runs):
@@ -139,7 +140,7 @@ def test_current_peaks_when_a_grouser_touches_down(runs, robot, k):
     lands = touchdowns(time, runs.reactions.grouser[k, TAIL], runs.reactions.place[k, TAIL])
     wheel = series(runs, k, "speed_wheel")[TAIL].mean()
     period = period_pitch(0.035, wheel, float(robot.configurations["6T2A"].radius))
-    np.testing.assert_allclose(np.diff(lands), period, rtol=0.04)  # one touchdown a pitch, to a sample
+    assert_allclose(np.diff(lands), period, rtol=0.04)  # one touchdown a pitch, to a sample
     phase = (time - lands[0]) / period
     bins = ((phase % 1) * 10).astype(int)
     folded = np.array([series(runs, k, "total_current")[TAIL][bins == b].mean() for b in range(10)])
@@ -182,14 +183,14 @@ def test_reactions_carry_the_weight(runs, k):
     inside = runs.reactions.support[k, TAIL].sum(axis=1) + runs.reactions.guide[k, TAIL]
     outside = runs.reactions.grouser[k, TAIL].sum(axis=1)
     if k in TRACKED:
-        np.testing.assert_allclose(inside, outside, rtol=1e-9)
+        assert_allclose(inside, outside, rtol=1e-9)
 
 
 def test_guides_carry_nearly_all_of_the_weight_when_flush(runs):
     """An output. Calibration to Table A1 asks for about 0.3 at μ_t = 0.20, that is for μ_t = 0.06 here."""
     share = runs.steady.guide_share
     assert ((share[TRACKED] > 0.95) & (share[TRACKED] < 1.0)).all()
-    np.testing.assert_allclose(share[WHEELED], 0.0)
+    assert_allclose(share[WHEELED], 0.0)
 
 
 def test_belt_is_tight_above_and_slack_below(runs):
@@ -235,7 +236,7 @@ def test_fidelities_agree_over_the_climbable_rows_of_table_8(robot, grid):
     theirs = jax.jit(jax.vmap(lumped))(ours.steady.guide_share, commands)
     for name in ("total_current", "motor_speed", "speed"):
         a, b = (np.asarray(r.reading[name]) for r in (ours.result, theirs))
-        np.testing.assert_allclose(a, b, rtol=0.015, err_msg=name)
+        assert_allclose(a, b, rtol=0.015, err_msg=name)
     assert float(jnp.max(jnp.abs(ours.result.reading["total_current"] / theirs.reading["total_current"] - 1))) < 0.005
 
 
@@ -247,7 +248,7 @@ def test_batch_is_its_members(robot):
     twin = jax.tree.map(lambda x: x[::-1], two)
     a = _batch(robot, two, 0.05, 1e-4, 1e-3, False)
     b = _batch(robot, twin, 0.05, 1e-4, 1e-3, False)
-    np.testing.assert_allclose(a.q, b.q[::-1], rtol=1e-9, atol=1e-12)
+    assert_allclose(a.q, b.q[::-1], rtol=1e-9, atol=1e-12)
 
 
 def test_batch_compiles_once(robot, compilations):
@@ -270,4 +271,4 @@ def test_run_in_parts_is_the_run_in_one(robot):
     assert shares[-1] == 1.0 and len(shares) <= PARTS and (np.diff(shares) > 0).all()
     assert jax.tree.structure(whole) == jax.tree.structure(parts)
     for a, b in zip(jax.tree.leaves(whole), jax.tree.leaves(parts), strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12)
+        assert_allclose(a, b, rtol=1e-9, atol=1e-12)

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_array_less
 
 from mmrjax.fidelities.track import track
 from mmrjax.model import params
@@ -53,7 +54,7 @@ def test_derivatives_of_averages_are_differences(found):
     slopes, differences = found[0][0], found[1][0]
     size = np.abs(differences).max(axis=0)
     assert (size > 1e-3).all()
-    np.testing.assert_array_less(np.abs(slopes - differences) / size, 1e-4)
+    assert_array_less(np.abs(slopes - differences) / size, 1e-4)
 
 
 @pytest.mark.slow
@@ -62,4 +63,4 @@ def test_derivatives_of_the_path_are_differences(found):
     slopes, differences = found[0][1], found[1][1]
     size = np.abs(differences).max(axis=0)
     assert (size > 1e-7).all()
-    np.testing.assert_array_less(np.abs(slopes - differences) / size, 1e-4)
+    assert_array_less(np.abs(slopes - differences) / size, 1e-4)

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from worlds import turning as world
 
 import mmrjax as mm
@@ -17,6 +18,7 @@ from calibration.inference import optimizers as fit
 from calibration.inference.calibration import calibrate
 from calibration.inference.observers.turns import SettledTurns
 from mmrjax.model import balances, channels, paper_robots, params
+from tests.commands import ends
 
 CURRENTS = ("motor_current_left", "motor_current_right")
 MOTION = ("motor_speed_left", "motor_speed_right", "yaw_rate")
@@ -121,8 +123,8 @@ def test_one_evaluation_of_turns_has_the_derivatives_of_the_root(robot, of_world
     apart = fit.with_roots(posed, z)
     r, jacobian = jax.jit(lambda z: apart.linearised(apart.robot, z, apart.data)[:2])(z)
     wanted, value = jax.jit(jax.jacfwd(through, has_aux=True))(z)
-    np.testing.assert_allclose(r, value, rtol=1e-6, atol=1e-6)
-    np.testing.assert_allclose(jacobian, wanted, rtol=1e-5, atol=1e-6 * np.abs(wanted).max())
+    assert_allclose(r, value, rtol=1e-6, atol=1e-6)
+    assert_allclose(jacobian, wanted, rtol=1e-5, atol=1e-6 * np.abs(wanted).max())
 
 
 def test_turns_free_what_turns_show(robot):
@@ -182,8 +184,7 @@ def test_truth_of_a_simulated_table_is_found_from_the_command_line(tmp_path, mmr
     (tmp_path / "robot.toml").write_text(f'base = "nominal"\nchannels = [{", ".join(map(repr, SHOWN))}]\n')
     free = ",".join(f"4W2T.{n}" for n in (LATERAL, WIDTH, "ground.friction.static"))
     told = ("--robot", str(tmp_path / "robot.toml"), "--free", free, "--noise", NOISE)
-    code, out, err = mmrjax("calibrate", str(table), *told, "--out", str(tmp_path / "run"))
-    assert code == 0, err
+    _, out, _ = ends(mmrjax("calibrate", str(table), *told, "--out", str(tmp_path / "run")), code=0)
     assert "held out" in out
     held = json.loads((tmp_path / "run" / "result.json").read_text())["held_out_by"]["turn"]
     assert held["all"]["yaw_rate"]["rows"] == len(DUTIES)

@@ -7,6 +7,7 @@ import types
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import mmrjax as mm
 from calibration.data import runs as records
@@ -28,13 +29,12 @@ from sweeps.points.job import showing_turns
 from sweeps.report import run_tables, turn_report
 from sweeps.report.words import turn_words
 from sweeps.results import check_results
-from tests.commands import rows
+from tests.commands import ends, rows
 
 
 @pytest.mark.slow
 def test_settled_turn_leaves_its_folder(tmp_path, mmrjax):
-    code, out, _ = mmrjax("simulate", "--left", "33", "--right", "15", "--out", str(tmp_path / "run"))
-    assert code == 0
+    _, out, _ = ends(mmrjax("simulate", "--left", "33", "--right", "15", "--out", str(tmp_path / "run")), code=0)
     assert "Turns to the right: a circle of 442 mm radius at 642 mm/s ahead" in out
     folder = tmp_path / "run"
     (row,) = rows(folder / "runs.csv")
@@ -48,30 +48,6 @@ def test_settled_turn_leaves_its_folder(tmp_path, mmrjax):
     rates = np.array([float(t["yaw_rate_rad_s"]) for t in turns[1:]])
     assert abs(rates[0]) < 1e-9 and (np.diff(np.abs(rates)) > 0).all()
     assert "442 mm radius" in (folder / "report.html").read_text()
-
-
-@pytest.mark.slow
-def test_turn_over_time_leaves_its_path(tmp_path, mmrjax):
-    told = (
-        "--left",
-        "24",
-        "--right",
-        "-24",
-        "--slope",
-        "10",
-        "--heading",
-        "30",
-        "--model",
-        "drive",
-        "--duration",
-        "1",
-    )
-    assert mmrjax("simulate", *told, "--out", str(tmp_path / "run"))[0] == 0
-    first, *_, last = rows(tmp_path / "run" / "history.csv")
-    assert float(first["yaw_deg"]) == pytest.approx(30.0)
-    assert float(last["yaw_deg"]) < -60.0
-    assert float(last["x_mm"]) < 0  # it slips downhill
-    assert "yaw_rate_rad_s" in first and "motor_current_left_A" in first
 
 
 @pytest.mark.slow
@@ -231,9 +207,9 @@ def test_radius_is_that_of_the_circle_on_which_the_centre_of_mass_moves():
     reading |= {f"motor_{what}_{side}": np.ones(3) for what in ("speed", "current", "voltage") for side in SIDES}
     found = derived.turning_columns(paper_robots.nominal(), reading, np.full(3, 0.04))
     size = 1000 * np.hypot(0.3, 0.1) / 2
-    np.testing.assert_allclose(found["turning_radius_mm"], [-size, -size, np.inf], rtol=1e-12)
+    assert_allclose(found["turning_radius_mm"], [-size, -size, np.inf], rtol=1e-12)
     away = np.hypot(found["centre_x_mm"][:2], found["centre_y_mm"][:2])
-    np.testing.assert_allclose(away, size, rtol=1e-12)
+    assert_allclose(away, size, rtol=1e-12)
 
 
 def test_runs_of_a_table_whose_sides_are_driven_apart_show_both_sides(tmp_path, mmrjax, monkeypatch):
@@ -257,8 +233,10 @@ def test_options_of_one_run_are_refused_beside_a_table(tmp_path, mmrjax):
     path = tmp_path / "turns.csv"
     path.write_text(f"{HEADER}{SIDED}\n6T2A,33,0,0,1,0.5\n")
     for more in ((), ("--profile", "patrol", "--battery")):
-        code, _, err = mmrjax("simulate", "--runs", path, "--voltage", "4", "--mass", "12", *more)
-        assert code == 2 and "--voltage, --mass: not allowed with --runs" in err
+        ends(
+            mmrjax("simulate", "--runs", path, "--voltage", "4", "--mass", "12", *more),
+            "--voltage, --mass: not allowed with --runs",
+        )
 
 
 @pytest.mark.parametrize(
@@ -270,8 +248,7 @@ def test_options_of_one_run_are_refused_beside_a_table(tmp_path, mmrjax):
 )
 def test_a_sweep_refuses_what_leaves_open_what_drives_a_side(tmp_path, mmrjax, told, said):
     (tmp_path / "plan.toml").write_text(PLAN.replace("[axes]", f"{told}\n[axes]"))
-    code, _, err = mmrjax("sweep", "plan.toml", "--no-report", "--out", "run")
-    assert code == 2 and said in err
+    ends(mmrjax("sweep", "plan.toml", "--no-report", "--out", "run"), said)
 
 
 def test_a_robot_that_cannot_turn_is_refused_wherever_it_is_asked_to(tmp_path, mmrjax):
@@ -279,8 +256,7 @@ def test_a_robot_that_cannot_turn_is_refused_wherever_it_is_asked_to(tmp_path, m
     narrow = "--set", "6T2A.turning.width=0", "--no-report"
     told = ("sweep", "plan.toml"), ("sensitivity", "--configurations", "6T2A", "--vary", "duty_left=0.5:1")
     for words in told:
-        code, _, err = mmrjax(*words, *narrow)
-        assert code == 2 and "duty_left: the robot's file lacks 6T2A.turning.width [m]" in err
+        ends(mmrjax(*words, *narrow), "duty_left: the robot's file lacks 6T2A.turning.width [m]")
 
 
 def test_results_of_turns_show_both_sides():
@@ -293,8 +269,10 @@ def test_results_of_turns_show_both_sides():
 
 def test_a_surface_of_which_nothing_is_known_is_refused(mmrjax):
     for more in ((), ("--left", "24", "--right", "10"), ("--model", "drive")):
-        code, _, err = mmrjax("simulate", "--surface", "ice", *more)
-        assert code == 2 and "--surface: got ice, whose friction is not known; allowed: linoleum" in err
+        ends(
+            mmrjax("simulate", "--surface", "ice", *more),
+            "--surface: got ice, whose friction is not known; allowed: linoleum",
+        )
 
 
 def test_one_imposed_speed_of_two_sides_is_refused():
@@ -304,8 +282,10 @@ def test_one_imposed_speed_of_two_sides_is_refused():
 
 def test_a_sweep_refuses_turns_on_a_slope_which_have_no_steady_state(tmp_path, mmrjax):
     (tmp_path / "plan.toml").write_text(PLAN.replace("[axes]", "slope_deg = 10\n[axes]"))
-    code, _, err = mmrjax("sweep", "plan.toml", "--no-report", "--out", "run")
-    assert code == 2 and "duty_left -1: got a slope of 10 deg for a robot that turns" in err
+    ends(
+        mmrjax("sweep", "plan.toml", "--no-report", "--out", "run"),
+        "duty_left -1: got a slope of 10 deg for a robot that turns",
+    )
     assert not (tmp_path / "run").exists()
 
 
@@ -372,8 +352,8 @@ def test_a_sweep_over_duties_leaves_yaw_rates(tmp_path, mmrjax):
 def test_currents_of_a_turn_on_the_spot_do_not_cancel_on_the_page_of_a_mission():
     sides = {f"motor_current_{side}_A": np.array([sign * 1.6, 1.0]) for side, sign in (("left", -1), ("right", 1))}
     rows = {"motor_current_A": np.array([0.0, 1.0])}
-    np.testing.assert_allclose(mission_figures.of_motors(rows | sides, "motor_current", "_A"), [1.6, 1.0])
-    np.testing.assert_allclose(mission_figures.of_motors(rows, "motor_current", "_A"), [0.0, 1.0])
+    assert_allclose(mission_figures.of_motors(rows | sides, "motor_current", "_A"), [1.6, 1.0])
+    assert_allclose(mission_figures.of_motors(rows, "motor_current", "_A"), [0.0, 1.0])
 
 
 @pytest.mark.slow
@@ -443,7 +423,7 @@ def test_a_path_between_places_that_turn_is_an_arc():
     """A quarter of a circle of 2 m, and a metre straight on, from three rows."""
     x, y, yaw = np.array([0.0, 2.0, 2.0]), np.array([0.0, 2.0, 3.0]), np.array([0.0, np.pi / 2, np.pi / 2])
     ahead, aside = turn_figures.path_arcs(x, y, yaw)
-    np.testing.assert_allclose(np.hypot(ahead[:-1], aside[:-1] - 2.0), 2.0, rtol=1e-12)
+    assert_allclose(np.hypot(ahead[:-1], aside[:-1] - 2.0), 2.0, rtol=1e-12)
     assert np.max(np.diff(aside[:-1])) < 0.11 and (ahead[-1], aside[-1], len(ahead)) == (2.0, 3.0, 34)
 
 

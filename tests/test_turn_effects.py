@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from test_turn_calibration import DUTIES, NOISE, SHOWN, written
 from test_turning import flat, of_world
 from worlds import turning as world
@@ -54,7 +55,7 @@ def amplitudes(**some):
 def test_effect_moves_the_turn_and_mirrors(name):
     y = flat(MOTION)
     plain = circling.turning_rates(paper_robots.nominal(), RUN, y)
-    np.testing.assert_allclose(rates(amplitudes(), RUN, y), plain, rtol=1e-12, atol=1e-12)
+    assert_allclose(rates(amplitudes(), RUN, y), plain, rtol=1e-12, atol=1e-12)
     size = amplitude(name)
     moved = np.asarray(rates(amplitudes(**{name: size}), RUN, y))
     assert (np.abs(moved - plain) > 0.01 * np.abs(plain)).any()
@@ -62,7 +63,7 @@ def test_effect_moves_the_turn_and_mirrors(name):
     sign = np.array([1, 1, 1, 1, 1, -1, -1, -1, 1, -1, 1])
     other = -size if name in OF_SIDES else size
     mirrored = np.asarray(rates(amplitudes(**{name: other}), MIRRORED, (y * sign)[swap]))
-    np.testing.assert_allclose(mirrored, (moved * sign)[swap], rtol=1e-9, atol=1e-9)
+    assert_allclose(mirrored, (moved * sign)[swap], rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.slow
@@ -76,7 +77,7 @@ def test_friction_of_a_side_is_that_of_a_second_implementation():
         other, world.Inputs(0.9, -0.2, kind="duty", supply=33.0), 0.0, (y * np.asarray(circling._UNITS))[PLACES]
     )
     mine = np.asarray(rates(amplitudes(side_friction=more), RUN, jnp.asarray(y))) * np.asarray(circling._UNITS)
-    np.testing.assert_allclose(mine[PLACES][:10], theirs[:10], rtol=1e-8, atol=1e-8)
+    assert_allclose(mine[PLACES][:10], theirs[:10], rtol=1e-8, atol=1e-8)
 
 
 #: Of the second implementation's state in ours.
@@ -93,17 +94,17 @@ def test_terms_are_their_equations():
         terms[name] = np.asarray(jax.vmap(lambda s, effect=effect: effect.term(robot, s))(signals))
     side, current, turned = np.array([1.0, -1.0]), np.array([2.0, -0.7]), np.array([900.0, -150.0])
     constant, resistance = float(robot.motor.torque_constant), float(robot.motor.resistance)
-    np.testing.assert_allclose(terms["side_friction"], values["side_friction"] * side * np.sign(turned), rtol=1e-9)
-    np.testing.assert_allclose(terms["side_torque"], values["side_torque"] * side * constant * current, rtol=1e-9)
+    assert_allclose(terms["side_friction"], values["side_friction"] * side * np.sign(turned), rtol=1e-9)
+    assert_allclose(terms["side_torque"], values["side_torque"] * side * constant * current, rtol=1e-9)
     given = constant * turned + resistance * current
-    np.testing.assert_allclose(terms["side_voltage"], values["side_voltage"] * side * given, rtol=1e-9)
+    assert_allclose(terms["side_voltage"], values["side_voltage"] * side * given, rtol=1e-9)
     rolled = float(robot.configurations["6T2A"].radius) * turned / float(robot.gearbox.ratio)
-    np.testing.assert_allclose(terms["side_radius"], values["side_radius"] * side * rolled, rtol=1e-9)
+    assert_allclose(terms["side_radius"], values["side_radius"] * side * rolled, rtol=1e-9)
     resisted = values["turning_resistance"] * np.asarray(signals.normal) * -1.1
-    np.testing.assert_allclose(terms["turning_resistance"], resisted, rtol=1e-9)
+    assert_allclose(terms["turning_resistance"], resisted, rtol=1e-9)
     assert float(jnp.sum(grip.moment)) > 0.5  # against a turn to the right
     dug = values["lateral_grip"] * 1.1 * -np.asarray(grip.moment)
-    np.testing.assert_allclose(terms["lateral_grip"], dug, rtol=1e-9)
+    assert_allclose(terms["lateral_grip"], dug, rtol=1e-9)
 
 
 @pytest.mark.slow
@@ -139,7 +140,7 @@ def test_straight_travel_shows_none_of_them():
         with_amplitudes(robot, {n: amplitude(n) for n in effects.OF_TURNS}), run, state, 1.0
     )[0]
     for mine, theirs in zip(jax.tree.leaves(plain), jax.tree.leaves(moved), strict=True):
-        np.testing.assert_array_equal(mine, theirs)
+        assert_array_equal(mine, theirs)
 
 
 def test_robot_files_know_them_and_the_library_of_straight_travel_does_not(tmp_path):

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from worlds import turns as planted
 
 import mmrjax as mm
@@ -18,6 +19,7 @@ from calibration.inference.observers.turns import TurnLinearization
 from mmrjax import effects
 from mmrjax.effects.curve import ordinate_weights
 from mmrjax.model import params
+from tests.commands import ends
 
 pytestmark = pytest.mark.slow
 
@@ -90,7 +92,7 @@ def test_signature_is_what_the_effect_does(posed, linear, shown, name):
         effect = params.replace(effect, {space.library.scored[k].shape: values[at]})
     wanted = size * shown(effect, 1e-3 * size)
     assert np.abs(wanted).max() > 0.1
-    np.testing.assert_allclose(mine[:, at], wanted, rtol=1e-3, atol=1e-4 * np.abs(wanted).max())
+    assert_allclose(mine[:, at], wanted, rtol=1e-3, atol=1e-4 * np.abs(wanted).max())
 
 
 @pytest.mark.parametrize("name", CURVES)
@@ -108,7 +110,7 @@ def test_column_of_a_curve_is_what_the_curve_does(linear, shown, name):
     size = 1e-4 * float(effect.amplitude or 1.0)
     wanted = shown(effect, size)
     assert np.abs(wanted).max() > 1.0
-    np.testing.assert_allclose(columns, wanted, rtol=2e-3, atol=1e-3 * np.abs(wanted).max())
+    assert_allclose(columns, wanted, rtol=2e-3, atol=1e-3 * np.abs(wanted).max())
 
 
 def test_points_are_each_side_of_each_row(posed, linear):
@@ -147,8 +149,7 @@ FOUND = {
 def test_command_finds_what_a_second_implementation_planted(tmp_path, mmrjax, case):
     table, robot = planted.write(tmp_path, case)
     told = ("--robot", str(robot), "--noise", planted.NOISE, "--replicates", "250")
-    code, out, err = mmrjax("loop", str(table), *told, "--out", str(tmp_path / "run"))
-    assert code == 0, err
+    _, out, _ = ends(mmrjax("loop", str(table), *told, "--out", str(tmp_path / "run")), code=0)
     found = json.loads((tmp_path / "run" / "result.json").read_text())
     if FOUND[case] is None:
         assert found["verdict"] == "none" and "nothing" in out.lower()

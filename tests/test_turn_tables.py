@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import mmrjax as mm
 from calibration.data import runs as records
@@ -88,8 +89,8 @@ def test_speeds_of_both_sides_are_conditions(rig, table):
     runs = table(f"{SPEEDS},{READ}", *SOUND, robot=robot)
     assert runs.turns and runs.axes[:1] == ("motor_speed_rpm",) and set(SPEEDS.split(",")) < set(runs.axes)
     conditions = runs.conditions(robot)
-    np.testing.assert_allclose(conditions.motor_speed_left, RPM * np.array([row[0] for row in SOUND]))
-    np.testing.assert_allclose(conditions.motor_speed_right, RPM * np.array([row[1] for row in SOUND]))
+    assert_allclose(conditions.motor_speed_left, RPM * np.array([row[0] for row in SOUND]))
+    assert_allclose(conditions.motor_speed_right, RPM * np.array([row[1] for row in SOUND]))
     assert conditions.turns and conditions.duty_left is None
 
 
@@ -158,18 +159,18 @@ def test_voltages_of_both_sides_are_shares_of_the_larger_or_of_the_supply(rig, t
     runs = table(f"voltage_left_V,voltage_right_V,{SPEEDS},{READ}", *VOLTS, robot=robot)
     volts = np.array(VOLTS)[:, :2]
     supply = np.abs(volts).max(1)
-    np.testing.assert_allclose(runs["supply_voltage_V"], supply)
+    assert_allclose(runs["supply_voltage_V"], supply)
     duties = np.stack([runs["duty_left"], runs["duty_right"]], 1)
-    np.testing.assert_allclose(duties, volts / supply[:, None])
+    assert_allclose(duties, volts / supply[:, None])
     assert np.abs(duties).max() == 1.0 and runs.turns and not runs.has("voltage_left_V")
     assert any("voltage_left_V and voltage_right_V are read as duty_left" in n for n in runs.notes)
     rows = [(-24, *row) for row in VOLTS]
     stated = table(f"supply_voltage_V,voltage_left_V,voltage_right_V,{SPEEDS},{READ}", *rows, robot=robot)
-    np.testing.assert_allclose(stated["duty_left"], volts[:, 0] / -24)
+    assert_allclose(stated["duty_left"], volts[:, 0] / -24)
     assert (stated["supply_voltage_V"] == -24).all()
     renamed = rig(DRIVEN.replace("[motor]", '[columns]\nvoltage_left_V = "Ul"\nvoltage_right_V = "Ur"\n[motor]', 1))
     theirs = table(f"Ul,Ur,{SPEEDS},{READ}", *VOLTS, robot=renamed)
-    np.testing.assert_array_equal(theirs["duty_right"], runs["duty_right"])
+    assert_array_equal(theirs["duty_right"], runs["duty_right"])
 
 
 def test_a_supply_of_either_sign_drives_the_sides(rig, table):
@@ -177,7 +178,7 @@ def test_a_supply_of_either_sign_drives_the_sides(rig, table):
     robot, header = rig(DRIVEN), f"supply_voltage_V,duty_left,duty_right,{SPEEDS},{READ}"
     rows = [(-24, -a / 2000, -b / 2000, a, b, abs(i), abs(k), w) for a, b, i, k, w in SOUND * 2]
     unsigned = table(header, *rows, robot=robot)
-    np.testing.assert_allclose(unsigned.of_sides[0], [0.012 * a for a, *_ in SOUND * 2])
+    assert_allclose(unsigned.of_sides[0], [0.012 * a for a, *_ in SOUND * 2])
     assert [i.channel for i in unsigned.layout.instruments] == ["motor_current_left", "motor_current_right"]
     with pytest.raises(
         BadData, match=r"got -1500 and 1500 where left and right side are driven at 18 and -18 V, and"
@@ -191,8 +192,8 @@ def test_the_packaged_robot_turns_by_voltages_of_its_sides_without_a_supply(tmp_
     path.write_text(f"{header}\n6T2A,13.1,0,0,6000,24000\n6T2A,13.1,0,0,-12000,12000\n")
     runs = records.read_runs(path, measured=False)
     conditions = runs.conditions(mm.nominal())
-    np.testing.assert_allclose(conditions.voltage, [24.0, 12.0])
-    np.testing.assert_allclose(conditions.duty_left, [0.25, -1.0])
+    assert_allclose(conditions.voltage, [24.0, 12.0])
+    assert_allclose(conditions.duty_left, [0.25, -1.0])
     with pytest.raises(BadData, match=r"voltage_left_V together with --battery, .* state duty_left and duty_right"):
         records.read_runs(path, measured=False, battery=True)
 
@@ -243,13 +244,13 @@ def test_readings_of_turns_on_a_slope_are_refused_with_what_follows_them(tmp_pat
 def test_yaw_rate_in_degrees_is_converted(rig, table):
     robot = rig(KINEMATIC)
     runs = table(f"{SPEEDS},yaw_rate_deg_s", *[(a, b, np.degrees(w)) for a, b, _, _, w in SOUND], robot=robot)
-    np.testing.assert_allclose(runs["yaw_rate_rad_s"], [row[-1] for row in SOUND])
+    assert_allclose(runs["yaw_rate_rad_s"], [row[-1] for row in SOUND])
 
 
 def test_yaw_rate_to_the_right_is_turned_in_the_file(rig, table):
     robot = rig(KINEMATIC.replace("[motor]", '[columns]\nyaw_rate_rad_s = {column = "w", factor = -1}\n[motor]', 1))
     runs = table(f"{SPEEDS},w", *[(a, b, -w) for a, b, _, _, w in SOUND], robot=robot)
-    np.testing.assert_allclose(runs["yaw_rate_rad_s"], [row[-1] for row in SOUND])
+    assert_allclose(runs["yaw_rate_rad_s"], [row[-1] for row in SOUND])
 
 
 @pytest.mark.slow

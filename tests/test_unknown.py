@@ -21,6 +21,7 @@ from sweeps.config_campaign import Campaign
 from sweeps.inputs import load_robot
 from sweeps.points import axes
 from sweeps.points.job import prepare_job
+from tests.commands import ends
 
 MOTOR = "[motor]\ntorque_constant = 0.03\n{more}[gearbox]\nratio = 20\nefficiency_load = 0.8\n"
 BENCH = (
@@ -160,8 +161,7 @@ def test_a_study_of_what_is_unknown_is_refused(tmp_path):
 @pytest.mark.slow
 def test_commands_leave_out_what_is_unknown_and_say_so(mmrjax, tmp_path):
     read(tmp_path, BENCH, "motor_speed")
-    code, out, err = mmrjax("simulate", "--robot", "rig.toml", "--motor-speed", "3000", "--out", "run")
-    assert code == 0, err
+    _, out, _ = ends(mmrjax("simulate", "--robot", "rig.toml", "--motor-speed", "3000", "--out", "run"), code=0)
     (head, _) = (tmp_path / "run" / "runs.csv").read_text(encoding="utf-8").splitlines()
     columns = {"voltage_V", "power_supply_W", "efficiency_motor", "winding_settled_C", "permissible_time_s"}
     assert columns.isdisjoint(head.split(",")) and "power_motor_W" in head

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from synthetic import Analyst
 
 from calibration.data import runs as records
@@ -158,11 +159,9 @@ def test_grid_is_fine_after_every_change_and_bounded():
     for begin, first in ((0.0, START[0]), (0.5, CHANGE[0] / 2), (1.2, CHANGE[0])):
         assert 0.5 * first < step[np.searchsorted(found, begin)] <= 1.5 * first
     assert step[np.searchsorted(found, 1.21)] > 0.8 * LONGEST  # after a small one they are long at once
-    np.testing.assert_array_equal(
-        time_grid(times), time_grid(times, np.array([0.0, 2.5]), np.ones(2))
-    )  # no change within
+    assert_array_equal(time_grid(times), time_grid(times, np.array([0.0, 2.5]), np.ones(2)))  # no change within
     before = time_grid(times)
-    np.testing.assert_array_equal(found[found < 0.5], before[before < 0.5])
+    assert_array_equal(found[found < 0.5], before[before < 0.5])
     # one small change a sample takes no more steps than none
     often = np.arange(1, 4000) * 0.005
     assert len(time_grid(often, often, np.full(len(often), 0.01))) <= len(time_grid(often)) + 3
@@ -175,7 +174,7 @@ def test_constant_values_at_every_instant_are_those_of_a_constant_run():
     many = Conditions(0, jnp.full(len(g), 24.0), 5.0, 2.0)
     a, b = (history_signals(robot, c, g) for c in (one, many))
     for name in ("current", "speed_motor", "speed"):
-        np.testing.assert_allclose(getattr(b, name), getattr(a, name), rtol=1e-12, atol=1e-15)
+        assert_allclose(getattr(b, name), getattr(a, name), rtol=1e-12, atol=1e-15)
 
 
 @pytest.mark.slow
@@ -244,15 +243,15 @@ def test_only_what_changes_has_a_value_an_instant(observer, runs):
     assert c.voltage.shape == c.duty.shape == c.open.shape == instants
     assert c.slope_deg.shape == c.payload.shape == c.configuration.shape == instants[:1]
     rows = observer.of_rows
-    np.testing.assert_array_equal(rows.voltage, runs["supply_voltage_V"])
-    np.testing.assert_array_equal(rows.slope_deg, runs["slope_deg"])
-    np.testing.assert_array_equal(rows.duty, runs["mode"] == "voltage")
-    np.testing.assert_array_equal(rows.open, 1.0 * (runs["mode"] == "coast") - (runs["mode"] == "brake"))
+    assert_array_equal(rows.voltage, runs["supply_voltage_V"])
+    assert_array_equal(rows.slope_deg, runs["slope_deg"])
+    assert_array_equal(rows.duty, runs["mode"] == "voltage")
+    assert_array_equal(rows.open, 1.0 * (runs["mode"] == "coast") - (runs["mode"] == "brake"))
     # held from its sample on, also between samples
     k = int(np.unique(runs["run_id"]).tolist().index("stair"))
     t = np.asarray(observer.times[k])
     expected = np.array([12.0, 24.0, 33.0, 18.0])[np.clip(np.searchsorted(SEGMENTS, t + 1e-9, "right") - 1, 0, 3)]
-    np.testing.assert_array_equal(c.voltage[k], expected)
+    assert_array_equal(c.voltage[k], expected)
 
 
 @pytest.mark.slow
@@ -271,7 +270,7 @@ def test_defects_of_all_knots_are_a_constant_defect(observer):
         found, expected = defects[k].sum(1), derivative[..., k]
         got = np.zeros_like(expected)
         got[rows[rows >= 0]] = found[rows >= 0]
-        np.testing.assert_allclose(got, expected, rtol=1e-7, atol=1e-9 * np.abs(expected).max())
+        assert_allclose(got, expected, rtol=1e-7, atol=1e-9 * np.abs(expected).max())
         assert (np.abs(expected).max(0) > 0).all()
 
 
@@ -286,7 +285,7 @@ def test_stretches_are_the_segments(runs, observer):
     for found in (course_stretches(runs), observer.stretches()):
         assert [len(run) for run in found] == [4, 4, 4]
         for run in found:
-            np.testing.assert_allclose([s.begin for s in run], SEGMENTS[:4], atol=1e-12)
+            assert_allclose([s.begin for s in run], SEGMENTS[:4], atol=1e-12)
             assert [len(s.rows) for s in run] == [20, 21, 21, 17] and not any(s.whole for s in run)
         assert [s.driven for s in found[1]] == [True, False, False, True]
     assert applied_drive(runs)[runs["mode"] == "brake"].tolist() == [0.0] * 21
@@ -441,5 +440,5 @@ def test_payload_that_changes_acts_from_its_sample_on(runs):
         for o in (heavier, Histories.of(runs, paper_robots.nominal()))
     )
     early = runs["time_s"] <= 1.25
-    np.testing.assert_allclose(seen[early], before[early], rtol=1e-9, atol=1e-12)
+    assert_allclose(seen[early], before[early], rtol=1e-9, atol=1e-12)
     assert np.abs(seen - before)[runs["time_s"] > 1.4].max() > 0.1  # [A]

@@ -3,6 +3,7 @@
 import dataclasses
 
 import pytest
+from pages import recorded
 
 from calibration.discovery import menu
 from calibration.discovery.experiments import denser_runs_instruction
@@ -32,21 +33,46 @@ def on(reach):
     return {e.name: words.experiment_sentences(e) for e in menu.experiment_menu(reach)}
 
 
-def test_acts_say_what_to_set_and_to_read():
-    said = on(REACH)
-    assert said["weigh"] == (
-        "Weigh the robot in both configurations, unladen and with the payload of 8 kg, on scales that are good to 20 g; "
-        "read the total mass, and take the stated one from it"
+#: Who asks for experiments → what is within reach.
+REACHES = {
+    "robot": REACH, "rover": ONE, "level": LEVEL, "bench": BENCH, "driven": DRIVEN, "braked": BRAKED, "held": HELD,
+    "three configurations": dataclasses.replace(REACH, used=(TRACKED, WHEELED, dataclasses.replace(TRACKED, index=2))),
+    "bench with duties": dataclasses.replace(BENCH, duties=(0.3, 0.9)), "rover with duties": dataclasses.replace(ONE, duties=(0.3, 0.9)),
+}  # fmt: skip
+#: Variables over which more runs are asked for, windows of them and waves among them.
+OVER = (
+    "voltage", "speed", "speed_motor", "slope", "payload", "current", "time", "air_humidity", "order 2 of the driving shaft",
+    "order 3 to 17", "slope 0.17453 to 0.17453", "time 0.1 to 0.45",
+)  # fmt: skip
+WATCHED = (
+    Heat("held", 90.0, 125.0, 1.58), Heat("braked", float("inf"), None), Heat("run", 118.2, 125.0),
+    Overspeed(1250.0, 1290.0, 32.0), Overvoltage(18.0, 12.0),
+)  # fmt: skip
+
+
+def told():
+    """Lines of all that is said: each experiment, more runs over each variable, what to watch, what else there is."""
+    crawl, reverse = (e for e in menu.experiment_menu(ONE) if e.name in ("crawl, rover", "reverse, rover"))
+    for name, reach in REACHES.items():
+        yield from (f"{name}, {e}: {sentence}" for e, sentence in on(reach).items())
+        for variable in OVER:
+            more = denser_runs_instruction("slip", variable, reach, by_duty=bool(reach.duties))
+            yield f"{name}, over {variable}: {words.experiment_instruction(more)}"
+    for part in WATCHED:
+        yield f"watch: {words.part_to_watch(part)}"
+    yield words.experiment_sentences(dataclasses.replace(crawl, watch=WATCHED[-1:]))
+    instructions = (
+        CarryOut((crawl, reverse)),
+        NothingPossible(),
+        NothingTells(("a", "b"), 2.0),
+        TooWeak("slope", 1.23),
     )
-    assert said["zero current"] == "Switch the motors off; read the ammeter"
-    assert said["shunt"] == (
-        "Put a precision shunt and a load in the place of the robot, set 0.6 and 3 A by the shunt; read the ammeter"
-    )
-    assert said["strobe"] == "Set the motor to 190 and 490 rad/s by a stroboscope; read the tachometer"
-    assert said["timing"].endswith("measured with a tape, at 0.25 and 0.57 m/s; read the speed that the bench shows")
-    assert on(LEVEL)["weigh"].startswith("Weigh the robot unladen, on scales")
-    three = dataclasses.replace(REACH, used=(TRACKED, WHEELED, dataclasses.replace(TRACKED, index=2)))
-    assert on(three)["weigh"].startswith("Weigh the robot in each configuration, unladen and")
+    yield from map(words.experiment_instruction, instructions)
+
+
+def test_what_to_do_next_is_said_as_recorded():
+    text = "\n".join(told()) + "\n"
+    assert text == recorded("experiments", text)
 
 
 def test_the_zero_of_every_meter_is_read_at_rest():
@@ -59,37 +85,6 @@ def test_the_zero_of_every_meter_is_read_at_rest():
     }
 
 
-def test_a_brake_is_set_where_there_is_one():
-    said = on(BRAKED)
-    assert said["other torques, rover"] == (
-        "rover: run at 12 V against a brake of 0.1, 0.2, 0.6 and 0.8 N·m; read motor current and motor speed"
-    )
-    assert said["reverse, rover"] == (
-        "rover: run the other way round at -12 V against a brake of 0 and -0.2 N·m; read motor current and motor speed"
-    )
-    assert "brake" not in said["other voltages, rover"]
-    assert not any("brake" in text for text in on(BENCH).values())
-    assert "other torques, rover" not in on(dataclasses.replace(BRAKED, torques=(0.0,)))
-    assert on(HELD)["other torques, rover"].startswith(
-        "rover: run at 500 and 2000 rpm of the motor against a brake of 10, 21, 31 and 41 mN·m; read"
-    )
-
-
-def test_runs_follow_their_conditions():
-    said = on(REACH)
-    read = "read total current, motor speed and speed"
-    assert said["payload 12 kg, 4W2T"] == (
-        f"4W2T: travel with 12 kg on the level and up 10 and 20 deg at 15 and 33 V; {read}"
-    )
-    assert said["downhill, 6T2A"] == (
-        "6T2A: turn the slope about by the same inclinometer and travel forwards down 10 deg at 15 and 33 V; " + read
-    )
-    assert said["one motor, 6T2A"].startswith("6T2A: put it on stands, the other motor disconnected, and run at 6.5")
-    assert said["stall"].startswith("Hold both motor shafts in a vice and switch on for a moment, at ")
-    assert said["bare motor"].startswith("Uncouple the gearboxes and run the motors alone at ")
-    assert "put a brake of 30 mN·m on each motor shaft, and run at" in said["braked motor"]
-
-
 def test_runs_of_one_motor_and_of_many_name_the_shafts():
     one = dataclasses.replace(ONE, measured=("total_current", "motor_speed"))
     assert on(one)["stall"].startswith("Hold the motor's shaft in a vice") and "stall, one motor" not in on(one)
@@ -97,150 +92,6 @@ def test_runs_of_one_motor_and_of_many_name_the_shafts():
     four = on(dataclasses.replace(REACH, motors=4))
     assert four["stall"].startswith("Hold all 4 motor shafts in a vice")
     assert "all motors but one disconnected" in four["stall, one motor"]
-
-
-def test_runs_of_a_shaft_are_at_what_is_imposed():
-    assert on(BENCH)["reverse, rover"] == "rover: run the other way round on the level at -12 V; read speed"
-    assert (
-        on(DRIVEN)["reverse, rover"]
-        == "rover: run the other way round at -500 and -2000 rpm of the motor; read speed"
-    )
-
-
-@pytest.mark.parametrize(
-    ("about", "said"),
-    [
-        (
-            Heat("held", 90.0, 125.0, 1.58),
-            "current × time: 1.6 A in a motor that does not turn, and so is not cooled; a winding left on would reach "
-            "90 °C (125 °C is allowed), so switch off within seconds and let it cool between readings",
-        ),
-        (
-            Heat("braked", float("inf"), None),
-            "the brake and the winding's temperature: a winding left on would burn: no temperature settles; seconds are "
-            "enough for a reading",
-        ),
-        (
-            Heat("run", 118.2, 125.0),
-            "the winding's temperature: a winding left on would reach 118 °C (125 °C is allowed); keep the runs short",
-        ),
-        (
-            Overspeed(1250.0, 1290.0, 32.0),
-            "the motor speed: about 11937 rpm without load at 32 V, and no more than 12319 rpm; raise the voltage slowly",
-        ),
-        (Overvoltage(18.0, 12.0), "the supply: 18 V is more than the table's 12 V"),
-    ],
-)
-def test_what_can_do_damage_is_said(about, said):
-    assert words.part_to_watch(about) == said
-    run = dataclasses.replace(next(e for e in menu.experiment_menu(ONE) if e.name == "crawl, rover"), watch=(about,))
-    assert words.experiment_sentences(run).endswith(f"; read speed. Watch {said}")
-
-
-def test_instructions_are_said():
-    crawl, reverse = (
-        next(e for e in menu.experiment_menu(ONE) if e.name == f"{n}, rover") for n in ("crawl", "reverse")
-    )
-    both = f"{words.experiment_sentences(crawl)}. And: {words.experiment_sentences(reverse)}"
-    assert words.experiment_instruction(CarryOut((crawl, reverse))) == both
-    assert (
-        words.experiment_instruction(NothingPossible()) == "Every experiment of the menu is forbidden or beyond reach"
-    )
-    assert words.experiment_instruction(NothingTells(("a", "b"), 2.0)) == (
-        "No experiment of the menu tells a and b apart by 2 sigma"
-    )
-    assert (
-        words.experiment_instruction(TooWeak("slope", 1.23))
-        == "A series in slope would show what is missing by 1.2 sigma"
-    )
-
-
-#: Reach, variable, and what is said of more runs along it.
-MORE = [
-    (ONE, "voltage", "Repeat at one slope and payload with the supply voltage from 6 to 12 V in steps of 0.5 V"),
-    (
-        ONE,
-        "slope",
-        "Repeat at one voltage and payload with the slope from 0 to 8 deg in steps of 0.5 deg, and downhill",
-    ),
-    (ONE, "payload", "Repeat at one voltage and slope with the payload from 0 to 1 kg in steps of 0.1 kg"),
-    (
-        ONE,
-        "current",
-        "Repeat at 12 V with a payload up to 1 kg and a slope up to 8 deg, raised in small steps, so that the current "
-        "rises evenly from no load to its largest, some 0.9 A",
-    ),
-    (
-        LEVEL,
-        "current",
-        "Repeat at 12 V with a brake or a drawbar pull, raised in small steps, so that the current rises evenly from no "
-        "load to its largest, some 0.9 A",
-    ),
-    (
-        ONE,
-        "time",
-        "Record one condition from a cold start for ten minutes, at 6 V rather than more, and again at once while "
-        "everything is warm; watch the winding's temperature (125 °C is allowed)",
-    ),
-    (ONE, "air_humidity", "Repeat with air humidity in even small steps from its least to its largest"),
-    (BENCH, "voltage", "Repeat with the supply voltage up to 12 V in steps of 1 V"),
-    (BENCH, "speed", "Repeat with the supply voltage from crawl to 12 V in steps of 1 V"),
-    (BENCH, "current", "Repeat with the supply voltage from crawl to 12 V in steps of 1 V"),  # it has no brake
-    (BRAKED, "current", "Repeat at 12 V with the brake's torque up to 0.8 N·m in steps of 0.05 N·m"),
-    (DRIVEN, "speed_motor", "Repeat with the motor speed up to 2000 rpm in steps of 100 rpm"),
-    (DRIVEN, "current", "Repeat with the motor speed up to 2000 rpm in steps of 100 rpm"),
-    (HELD, "current", "Repeat at one motor speed with the brake's torque up to 40 mN·m in steps of 2.5 mN·m"),
-    (
-        ONE,
-        "order 2 of the driving shaft",
-        "Mark the driving shaft, start every run from the mark, and record steady travel at 6, 9 and 12 V with at least "
-        "20 samples a wave: what keeps its order 2 of the driving shaft at every speed turns with that part",
-    ),
-    (
-        ONE,
-        "order 3 to 17",
-        "Make runs 3 to 17 again, and as many before and after them, in another order: what comes back with them hangs "
-        "on their conditions, what does not happened then",
-    ),
-    (
-        ONE,
-        "slope 0.17453 to 0.17453",
-        "Make the runs at 10 deg of slope again, on another day, and as many a little below and above that",
-    ),
-    (
-        ONE,
-        "time 0.1 to 0.45",
-        "Make two of the runs again, sampled as finely as the instruments allow from 0.1 to 0.45 s, one of them with "
-        "all that is switched in that time left as it is",
-    ),
-]
-
-
-@pytest.mark.parametrize(("reach", "variable", "said"), MORE, ids=[v for _, v, _ in MORE])
-def test_more_runs_are_said_within_reach(reach, variable, said):
-    assert words.experiment_instruction(denser_runs_instruction("slip", variable, reach)) == (
-        f"{said}; read every channel. What the slip balance lacks then shows its shape"
-    )
-
-
-@pytest.mark.parametrize(
-    ("reach", "variable", "said"),
-    [
-        (BENCH, "voltage", "Repeat with the duty up to 0.9 in steps of 0.05 at 12 V"),
-        (BENCH, "speed", "Repeat with the duty from crawl to 0.9 in steps of 0.05 at 12 V"),
-        (ONE, "voltage", "Repeat at one slope and payload with the duty up to 0.9 in steps of 0.05 at 12 V"),
-        (
-            ONE,
-            "speed_motor",
-            "Repeat on the level, unladen, with the duty from crawl to 0.9 in steps of 0.05 at 12 V",
-        ),
-    ],
-)
-def test_runs_that_a_duty_drives_are_repeated_over_the_duty(reach, variable, said):
-    reach = dataclasses.replace(reach, duties=(0.3, 0.9))
-    assert words.experiment_instruction(denser_runs_instruction("slip", variable, reach, by_duty=True)).startswith(
-        f"{said}; "
-    )
 
 
 def test_every_kind_of_runs_has_words():

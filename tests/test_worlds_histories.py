@@ -5,6 +5,7 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from worlds import histories, laws, machines, settled
 from worlds.histories import EVENTS, SERIES, samples, shown_by, simulated
 from worlds.settled import CLIMBING, of_rows, remainder
@@ -146,7 +147,7 @@ def test_runs_of_another_robot_end_where_settled_travel_is():
     for variety in range(3):
         w = brief(world("robots", variety, seed=2), 1.6)
         _, y = simulated(w, w.constants, w.conditions)
-        np.testing.assert_allclose(y[:, :, -1], settled.readings(w.conditions, w.constants)[0], rtol=1e-6)
+        assert_allclose(y[:, :, -1], settled.readings(w.conditions, w.constants)[0], rtol=1e-6)
 
 
 @pytest.mark.slow
@@ -190,7 +191,7 @@ def test_samples_are_those_of_the_design(stratum, variety):
         times = np.flatnonzero(shown[k]) * histories.BASE
         assert times[0] == 0 and times[-1] == pytest.approx(duration)
         gaps = np.diff(times) / (every * histories.BASE)
-        np.testing.assert_allclose(gaps, np.round(gaps), atol=1e-9)
+        assert_allclose(gaps, np.round(gaps), atol=1e-9)
         assert (gaps.max() > 1.5) == (w.dropped > 0) and every in (1, 2, 4) and 0.6 <= duration <= 3.0
     assert w.variety == histories.STRATA[stratum][variety]
     assert (shown == samples(world(stratum, variety, seed=5))).all()  # so that programs serve all

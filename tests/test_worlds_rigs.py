@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from worlds import laws, rigs
 
 from mmrjax.effects import BY_NAME
@@ -81,16 +82,7 @@ def test_readings_are_those_of_the_simulator(worlds, kind):
             assert sound.all()
             assert set(names) <= {"converged", "reverses", "rolls_back"}, (w.rig, names)
             size = np.abs(s.shown).max(1, keepdims=True)
-            np.testing.assert_allclose(found / size, s.shown / size, atol=1e-6, err_msg=str(w.rig))
-
-
-@pytest.mark.slow
-def test_comparison_with_the_simulator_can_fail(worlds):
-    w = next(w for w in worlds if w.rig.kind == "winch" and w._driven())
-    with jax.enable_x64(True):
-        found, _ = steady(dataclasses.replace(w, constants=dict(w.constants) | {"torque_constant": 0.0}))
-    s, _ = rigs.solve(w.rig, w.conditions, w.constants)
-    assert (np.abs(found - s.shown).max(1) > 1e-3 * np.abs(s.shown).max(1)).any()
+            assert_allclose(found / size, s.shown / size, atol=1e-6, err_msg=str(w.rig))
 
 
 def test_rigs_span_what_they_should(worlds):
@@ -199,7 +191,7 @@ def test_slopes_are_derivatives_of_the_readings(worlds):
         for k, name in enumerate(w.rig.tolerances):
             ends = [w.readings(p=dict(w.constants) | {name: further(w, name, z)})[0] for z in (-1e-2, 1e-2)]
             found = ((ends[1] - ends[0]) / 2e-2 / w.stated).ravel()
-            np.testing.assert_allclose(found, slopes[:, k], atol=2e-3 * (1 + np.abs(slopes[:, k]).max()))
+            assert_allclose(found, slopes[:, k], atol=2e-3 * (1 + np.abs(slopes[:, k]).max()))
 
 
 @pytest.mark.slow
@@ -276,4 +268,4 @@ def test_laws_are_those_of_the_library(worlds, names):
                 if channel == "output_torque" and term.law.balance == "gearbox":
                     continue  # what a torque meter at the output shows is without the gear's own loss
                 size = np.abs(s.shown[k]).max()
-                np.testing.assert_allclose(found[k][sound] / size, s.shown[k][sound] / size, atol=1e-6, err_msg=name)
+                assert_allclose(found[k][sound] / size, s.shown[k][sound] / size, atol=1e-6, err_msg=name)

@@ -8,6 +8,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from worlds import laws, machines, settled, tables
 from worlds.machines import PAPER, ROLES, TRACKS, WHEELS
 from worlds.settled import CLIMBING, Instruments, readings, remainder
@@ -110,14 +111,14 @@ def test_library_is_of_every_effect_that_steady_runs_show():
 @pytest.mark.slow
 def test_clean_tables_agree_with_steady(package):
     assert CLEAN.shape[1] == 180
-    np.testing.assert_allclose(package(), CLEAN, rtol=1e-9)
+    assert_allclose(package(), CLEAN, rtol=1e-9)
     p = settled.perturbed(np.random.default_rng(5))
     y, sound = readings(GRID, p)
     assert sound.all()
-    np.testing.assert_allclose(package({n: p[n] for n in p if p[n] != CLIMBING[n]}), y, rtol=1e-9)
+    assert_allclose(package({n: p[n] for n in p if p[n] != CLIMBING[n]}), y, rtol=1e-9)
     y, _ = readings(GRID, CLIMBING | {"motor.resistance": 0.6111})
     with pytest.raises(AssertionError):
-        np.testing.assert_allclose(package(), y, rtol=1e-6)
+        assert_allclose(package(), y, rtol=1e-6)
 
 
 @pytest.mark.parametrize("name", laws.LIBRARY)
@@ -126,7 +127,7 @@ def test_library_effect_agrees_with_steady(package, name):
     term = dataclasses.replace(drawn, amplitude=drawn.amplitude * drawn.law.size)
     y, sound = readings(GRID, CLIMBING, [term])
     assert sound.all()
-    np.testing.assert_allclose(package(term=term), y, rtol=1e-8)
+    assert_allclose(package(term=term), y, rtol=1e-8)
     assert np.abs(y / CLEAN - 1).max() > 1e-4
 
 
@@ -180,12 +181,12 @@ def test_remainder_of_what_the_constants_can_do_is_small():
     other = p | {name: p[name] * (1 + 0.5 * settled.TOLERANCES[name])}
     change = ((readings(GRID, other)[0] - CLEAN) * settled.SHOWN / show.stated[:, None]).ravel()
     column = slopes[:, list(settled.TOLERANCES).index(name)]
-    np.testing.assert_allclose(change, 0.5 * column, rtol=0.02, atol=0.02 * np.abs(change).max())
+    assert_allclose(change, 0.5 * column, rtol=0.02, atol=0.02 * np.abs(change).max())
     # a half sigma of the prior at most
     assert np.linalg.norm(remainder(change, slopes)) <= 0.51
     name = "4W2T.ground.friction.speed_static"  # slopes take the sds that they are given
     wide = settled.base_slopes(GRID, p, show, (name,), {name: p[name]})
-    np.testing.assert_allclose(wide, settled.base_slopes(GRID, p, show, (name,)) / 0.3, rtol=1e-6)
+    assert_allclose(wide, settled.base_slopes(GRID, p, show, (name,)) / 0.3, rtol=1e-6)
 
 
 def test_each_of_three_leaves_its_sigmas_beside_the_others():
@@ -225,14 +226,14 @@ def test_clean_table_differs_from_its_physics_by_the_stated_noise():
     left = np.concatenate([residuals(c) for c in cases], 1)
     assert np.abs(left.std(1) - 1).max() < 0.08 and np.abs(left.mean(1)).max() < 0.1
     shown = np.stack([cases[-1].table[n] for n in READINGS]) / np.array(Instruments().step)[:, None]
-    np.testing.assert_allclose(shown, np.round(shown), atol=1e-6)
+    assert_allclose(shown, np.round(shown), atol=1e-6)
 
 
 def test_cases_are_reproducible_and_their_labels_tell_them_apart():
     a, b, c = (narrow(["churning"], seed=s) for s in (4, 4, 5))
     assert a.label == b.label and a.label != c.label
     for name in a.table:
-        np.testing.assert_array_equal(a.table[name], b.table[name])
+        assert_array_equal(a.table[name], b.table[name])
     clean = narrow(seed=1).label
     assert clean["sigmas_together"] == 0.0 and clean["kind"] == "clean" and clean["effects"] == []
     both = narrow(["brush_drop", "resonance_bump"], sigmas=10.0, seed=2).label
@@ -261,7 +262,7 @@ def test_noise_is_as_large_as_stated_by_any_law(law):
     w = tables.world(np.random.default_rng(3), "plain", law=law)
     truth = readings(w.conditions, w.constants)[0] * settled.SHOWN
     off = np.array([residuals(tables.case(w, seed=seed)) for seed in range(200)])
-    np.testing.assert_allclose(off.std((0, 2)), 1.0, rtol=0.12 if law == "heavy" else 0.03)
+    assert_allclose(off.std((0, 2)), 1.0, rtol=0.12 if law == "heavy" else 0.03)
     large = np.abs(truth) > np.median(np.abs(truth), 1, keepdims=True)
     ratio = [off[:, k, large[k]].std() / off[:, k, ~large[k]].std() for k in range(3)]
     assert min(ratio) > 1.2 if law == "uneven" else law == "heavy" or np.allclose(ratio, 1.0, atol=0.06)
@@ -273,9 +274,9 @@ def test_coarse_displays_state_their_steps():
         made, show = tables.case(w, seed=k), w.instruments
         assert (np.array(show.step) > 2.5 * np.array(show.sd)).all()
         shown = np.stack([made.table[n] for n in READINGS]) / np.array(show.step)[:, None]
-        np.testing.assert_allclose(shown, np.round(shown), atol=1e-4)
+        assert_allclose(shown, np.round(shown), atol=1e-4)
         stated = np.stack([made.table[n] for n in tables.DEVIATIONS])
-        np.testing.assert_allclose(stated[:, 0], np.hypot(show.sd, np.array(show.step) / np.sqrt(12)), atol=1e-6)
+        assert_allclose(stated[:, 0], np.hypot(show.sd, np.array(show.step) / np.sqrt(12)), atol=1e-6)
         assert 0.8 < residuals(made).std() < 1.2
 
 
@@ -364,7 +365,7 @@ def test_surfaces_span_adhesion_and_creep(plain):
         assert hold.min() < 0.23 and hold.max() > 0.97 and abs(np.median(hold) - 0.6) < 0.08
         assert creep.min() < 0.0025 and creep.max() > 0.05 and 0.007 < np.median(creep) < 0.017
         share = [w.constants[f"{role}.ground.friction.dynamic"] for w in plain] / hold
-        np.testing.assert_allclose(share, 0.8)
+        assert_allclose(share, 0.8)
 
 
 @pytest.mark.quick(1)
@@ -415,7 +416,7 @@ def test_robot_file_is_read_and_runs_agree_with_steady(tmp_path, roles):
     ours = np.stack([r["total_current"], r["motor_speed"], r["speed"]])
     theirs, sound = readings(w.conditions, w.constants)
     assert sound.all()
-    np.testing.assert_allclose(ours, theirs, rtol=1e-6)
+    assert_allclose(ours, theirs, rtol=1e-6)
     other = dict(m.constants) | {"gearbox.efficiency_load": m.constants["gearbox.efficiency_load"] * 1.001}
     assert np.abs(ours / readings(w.conditions, other)[0] - 1).max() > 1e-5
 
@@ -437,7 +438,7 @@ def test_laws_follow_the_size_of_the_robot():
         here, there = (machines.reference_run(x) for x in (m, PAPER))
         unit = getattr(there, machines.UNITS[law.balance]) / getattr(here, machines.UNITS[law.balance])
         if name in ("slope_rolling", "guide_binding", "commutation_step"):  # of conditions or forces alone
-            np.testing.assert_allclose(law.of(here, shapes) * unit, own.of(there, shapes), rtol=1e-6)
+            assert_allclose(law.of(here, shapes) * unit, own.of(there, shapes), rtol=1e-6)
         assert machines.fitted_to(own, PAPER) is own
 
 
@@ -459,7 +460,7 @@ def test_priors_are_those_of_the_fields_and_truths_are_where_the_package_has_the
     for seed in range(50):
         p, z = tables.drawn_from_priors(np.random.default_rng(seed), PAPER)
         value = np.asarray(c.value(np.array([z[n] for n in c.names])))
-        np.testing.assert_allclose(value, [p[n] for n in c.names], rtol=1e-6, atol=1e-9)
+        assert_allclose(value, [p[n] for n in c.names], rtol=1e-6, atol=1e-9)
 
 
 def test_truths_from_the_priors_have_their_medians_and_spreads():

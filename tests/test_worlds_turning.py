@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy.optimize import brentq
 from worlds import paper, turning
 from worlds.turning import LENGTH, REACH, STATES, SURFACES, WIDTH, Inputs, circling, paper_robot, simulate, straight
@@ -122,8 +123,8 @@ def test_equal_voltages_travel_straight(wheeled, voltage, slope):
     found = straight(robot, voltage, slope, 0.0)
     assert found.steer == pytest.approx(0.0, abs=1e-9)
     assert found.v_y == pytest.approx(0.0, abs=1e-12)
-    np.testing.assert_allclose(found.I, current, rtol=1e-9)
-    np.testing.assert_allclose(found.w, w, rtol=1e-9)
+    assert_allclose(found.I, current, rtol=1e-9)
+    assert_allclose(found.w, w, rtol=1e-9)
     assert found.v_x == pytest.approx(speed, rel=1e-9)
 
 
@@ -132,10 +133,10 @@ def test_run_of_equal_voltages_is_the_half_robots():
     times = np.linspace(0.0, 0.3, 4)
     history = simulate(paper_robot(True), Inputs(15.0, 15.0, slope=0.05), times, rtol=1e-8, atol=1e-10)
     half = paper.Side(15.0, 0.05, 0.0, True).drive(times, rtol=1e-8, atol=1e-10)
-    np.testing.assert_allclose(history["I_left"][1:], half[1:, 0], rtol=1e-5)
-    np.testing.assert_allclose(history["w_right"][1:], half[1:, 1], rtol=1e-5)
-    np.testing.assert_allclose(history["x"][1:], half[1:, 3], rtol=1e-5)
-    np.testing.assert_allclose(history["omega"], 0.0, atol=1e-12)
+    assert_allclose(history["I_left"][1:], half[1:, 0], rtol=1e-5)
+    assert_allclose(history["w_right"][1:], half[1:, 1], rtol=1e-5)
+    assert_allclose(history["x"][1:], half[1:, 3], rtol=1e-5)
+    assert_allclose(history["omega"], 0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize("wheeled", [False, True])
@@ -151,8 +152,8 @@ def test_sides_swapped_mirror_and_voltages_reversed_reverse(wheeled):
         assert other.v_x == pytest.approx(along * turn.v_x, rel=1e-9)
         assert other.v_y == pytest.approx(across * turn.v_y, rel=1e-9)
         assert other.omega == pytest.approx(yaw * turn.omega, rel=1e-9)
-    np.testing.assert_allclose(mirror.I[::-1], turn.I, rtol=1e-9)
-    np.testing.assert_allclose(-back.I, turn.I, rtol=1e-9)
+    assert_allclose(mirror.I[::-1], turn.I, rtol=1e-9)
+    assert_allclose(-back.I, turn.I, rtol=1e-9)
     assert turn.omega < 0 and turn.instant.ground.N[0] > turn.instant.ground.N[1]  # to the right: the left bears more
 
 
@@ -195,14 +196,14 @@ def test_force_is_on_the_ellipse_and_takes_power(rule):
     F_x, F_y = turning.friction_share(robot, *u)
     phi_x, fall, V_s, V_d = robot.law
     used = turning.adhesion_used(np.hypot(*u), fall, V_s, V_d)
-    np.testing.assert_allclose(np.hypot(F_x / phi_x, F_y / (phi_x * robot.ratio)), used, rtol=1e-12)
+    assert_allclose(np.hypot(F_x / phi_x, F_y / (phi_x * robot.ratio)), used, rtol=1e-12)
     assert np.all(F_x * u[0] + F_y * u[1] > 0)
     along = turning.friction_share(robot, u[0], 0 * u[1])[0]
     expected = [
         [paper.friction(v, s.mu_s, s.mu_d, s.V_s, s.V_d) for v in row]
         for s, row in zip(robot.sides, u[0], strict=True)
     ]
-    np.testing.assert_allclose(along, expected, rtol=1e-12)
+    assert_allclose(along, expected, rtol=1e-12)
     if rule == 2:  # no force of the ellipse takes more
         angle = np.linspace(0, 2 * np.pi, 721)[:, None, None]
         taken = used * (phi_x * np.cos(angle) * u[0] + phi_x * robot.ratio * np.sin(angle) * u[1])
@@ -243,7 +244,7 @@ def test_slope_drives_where_the_heading_says():
         state = np.zeros(len(STATES))
         state[2] = heading
         d = turning.rates(robot, Inputs(0.0, 0.0, slope=0.1), 0.0, state)
-        np.testing.assert_allclose(robot.mass * d[3:5], (pull * along, pull * across), atol=1e-9)
+        assert_allclose(robot.mass * d[3:5], (pull * along, pull * across), atol=1e-9)
 
 
 @pytest.mark.parametrize("wheeled", [False, True])

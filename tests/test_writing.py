@@ -5,6 +5,7 @@ import json
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from calibration.data import frames, writing
 from calibration.data import runs as records
@@ -36,7 +37,7 @@ def test_a_table_is_parquet_too_with_every_digit(tmp_path):
     columns = {"a": np.array([1 / 3, np.nan]), "word": np.array(["x", "y"])}
     writing.write_table(tmp_path / "t.csv", columns, "parquet")
     found = parquet.read_table(tmp_path / "t.parquet")
-    np.testing.assert_array_equal(found["a"].to_numpy(), columns["a"])
+    assert_array_equal(found["a"].to_numpy(), columns["a"])
     assert found["word"].to_pylist() == ["x", "y"] and (tmp_path / "t.csv").read_text().startswith(
         "a,word\n0.333333333,x"
     )
@@ -50,6 +51,6 @@ def test_results_are_frames_of_every_library():
     runs = records.read_runs("measured")
     assert frames.to_pandas(runs)["supply_voltage_V"].tolist() == runs["supply_voltage_V"].tolist()
     again = records.read_runs(frames.to_polars(runs))
-    np.testing.assert_array_equal(again.measured(), runs.measured())
+    assert_array_equal(again.measured(), runs.measured())
     with pytest.raises(TypeError, match="expected a result with a table, got int"):
         frames.to_pandas(3)

@@ -14,6 +14,7 @@ from calibration.described import describe
 from calibration.inference import observers
 from calibration.inference.conduct import conduct_notes
 from calibration.inference.fit_notes import Remark
+from calibration.inference.lost_motion import lost_motion_notes
 from calibration.inference.noise import Noise
 from calibration.inference.ranges import check_ranges
 from calibration.inference.uninformative import computed_load, copied_channels, nothing_varies
@@ -41,7 +42,8 @@ def check_data(runs: Runs, robot: Robot, names: Sequence[str], noise: Noise) -> 
         *_constant_conditions(runs),
     ]
     said += [*unused_notes(runs), *unexplained_torque_notes(runs)]
-    return [*said, *check_ranges(runs, robot), *_uninformative(runs, robot, noise), *conduct_notes(runs, robot)]
+    said += [*check_ranges(runs, robot), *_uninformative(runs, robot, noise)]
+    return [*said, *conduct_notes(runs, robot), *lost_motion_notes(runs, robot)]
 
 
 #: Scatter of a speed over the scatter of its changes from row to row, up to which the speed is only noise.

@@ -189,6 +189,9 @@ SAID: dict[str, str | Callable[..., str]] = {
     "stiff_supply": "{column} is {value:g} in every row: taken for a stiff supply; if it is "
     "no reading, remove "
     "the column",
+    "lost_motion": "{source}, {column}: each of {reversals} reversals loses about {width:.2g} {unit} that friction, "
+    'inertia and delay do not explain: backlash, play or a soft coupling; state backlash = "{angle:.2g} ± 30 %" [rad '
+    "at the output] of the load in the robot's file",
     "ends_early": ends_early,
     "never_grips": never_grips,
     "thinned": "{source}: readings of {kept} of {rows} rows are used, evenly in time, and "

@@ -525,6 +525,15 @@ def world(
     raise ValueError("no such rig whose rows are all sound")
 
 
+def rising(w: World) -> World:
+    """The same world with rows in the order of rising drive, whatever its direction."""
+    c = w.conditions
+    drive = np.abs(c.motor_speed if w.rig.wide else c.supply * c.duty)
+    rows = np.lexsort((c.payload, c.slope, c.direction, drive))
+    kept = {f.name: getattr(c, f.name)[rows] for f in dataclasses.fields(c)}
+    return dataclasses.replace(w, conditions=Conditions(**kept))
+
+
 def left_over(w: World, terms: Sequence[Term], slopes: np.ndarray) -> float:
     """Root of what a fit of the constants leaves of readings without noise [σ], their tolerances around the truth:
     steps of Levenberg and Marquardt, the first ones on the slopes at the truth."""

@@ -1,0 +1,100 @@
+"""Lost motion of an output: how much of its angle each reversal of a log loses."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calibration.data.columns import SUPPLY
+from calibration.data.courses import applied_drive
+from calibration.data.runs import Runs
+from calibration.inference.fit_notes import Remark
+from mmrjax.model.robot import Robot
+
+#: Samples on each side of one for its smoothed angle and speed.
+AROUND = 4
+#: Speed below which the direction is that of the samples before, and above which a flank is in contact, as shares of
+#: the rms speed.
+SLOW, IN_CONTACT = 0.1, 0.2
+#: Voltages that the motor's dry friction may take, as quantiles of the applied ones.
+FRICTIONS = np.linspace(0.0, 0.9, 12)
+#: Least ratio of the lost motion to its sd, least number of reversals, and least share of the variance of the changes
+#: of angle that it explains beyond drive, friction, inertia and delay.
+SURE, REVERSALS, EXPLAINED = 6.0, 6, 0.3
+
+
+def lost_motion_notes(runs: Runs, robot: Robot) -> list[Remark]:
+    """Note on an angle that each reversal loses, of a log whose robot states no backlash."""
+    placed = [k for k, c in enumerate(runs.channels) if c.name in ("output_angle", "position") and runs.has(c.column)]
+    turning = [k for k, c in enumerate(runs.channels) if c.name == "motor_speed" and runs.has(c.column)]
+    if not runs.sampled or not placed or robot.has_ground or robot.loose:
+        return []
+    if not turning and runs.layout.imposed_column != SUPPLY:
+        return []
+    channel, shown = runs.channels[placed[0]], runs.measured()
+    drive = shown[:, turning[0]] if turning else applied_drive(runs)
+    changes = [
+        _changes_between_contacts(runs["time_s"][rows], shown[rows, placed[0]], drive[rows])
+        for rows in map(runs.in_order, np.unique(runs.run_names))
+    ]
+    moved, integral, clipped, faster, driven, reversed_ = (np.concatenate(x, -1) for x in zip(*changes, strict=True))
+    reversals = int(np.sum(np.abs(reversed_)))
+    if reversals < REVERSALS or len(moved) < 2 * REVERSALS:
+        return []
+    sets = [[integral]] if turning else [[integral, taken, faster, driven] for taken in clipped]
+    _, width, sd, explained = min(_lost(moved, reversed_, np.stack(x, 1)) for x in sets)
+    if not (width > SURE * sd and explained > EXPLAINED):
+        return []
+    radius = float(robot.configurations.members[0].radius) if channel.name == "position" else 1.0
+    return [
+        Remark(
+            "lost_motion", source=runs.source, column=channel.column, reversals=reversals,
+            width=width / channel.factor, unit=channel.unit, angle=width / radius,
+        )
+    ]  # fmt: skip
+
+
+def _changes_between_contacts(time: np.ndarray, angle: np.ndarray, drive: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Changes between instants at which one flank surely carries: three of each stroke, from its fastest to its end.
+
+    Returns:
+        Of the angle; of the time integral of the drive, and of the drive clipped to each of `FRICTIONS`; of the
+        speed; of the drive; and of the direction, 1 or -1 for a reversal.
+    """
+    known = np.isfinite(angle) & np.isfinite(drive)
+    time, angle, drive = time[known], angle[known], drive[known]
+    count = len(time)
+    if count < 4 * AROUND:
+        return tuple(np.zeros((*shape, 0)) for shape in ((), (), FRICTIONS.shape, (), (), ()))
+    steps = np.arange(-AROUND, AROUND + 1)
+    around = np.clip(np.arange(count)[:, None] + steps, 0, count - 1)
+    smooth = angle[around].mean(1)
+    speed = angle[around] @ steps / np.maximum(time[around] @ steps, 1e-12)
+    usual = np.sqrt(np.mean(speed**2))
+    way = np.where(np.abs(speed) > SLOW * usual, np.sign(speed), 0.0)
+    way = way[np.maximum.accumulate(np.where(way != 0, np.arange(count), 0))]
+    points: list[int] = []
+    for stroke in np.split(np.arange(count), np.flatnonzero(np.diff(way)) + 1):
+        fast = stroke[np.abs(speed[stroke]) > IN_CONTACT * usual]
+        if way[stroke[0]] != 0 and len(stroke) > 2 * AROUND and len(fast) > 2:
+            top = stroke[np.argmax(np.abs(speed[stroke]))]
+            points += sorted({int(top), int(top + fast[-1]) // 2, int(fast[-1])})
+    integral = lambda x: np.append(0.0, np.cumsum((x[1:] + x[:-1]) / 2 * np.diff(time)))  # noqa: E731
+    levels = np.maximum(np.quantile(np.abs(drive), FRICTIONS), 1e-9 * np.max(np.abs(drive), initial=1e-300))
+    clipped = np.array([integral(np.clip(drive / level, -1, 1)) for level in levels])
+    every = smooth, integral(drive), clipped, speed, drive, way / 2
+    return tuple(np.diff(x[..., points]) for x in every)
+
+
+def _lost(moved: np.ndarray, reversed_: np.ndarray, others: np.ndarray) -> tuple[float, float, float, float]:
+    """Angle that a reversal loses next to other causes.
+
+    Returns:
+        The sum of squares that is left, the angle, its sd, and the share of the sum of squares that it explains.
+    """
+    terms = np.column_stack([others / np.maximum(np.linalg.norm(others, axis=0), 1e-300), -reversed_])
+    with_it, without = (moved - x @ np.linalg.lstsq(x, moved)[0] for x in (terms, terms[:, :-1]))
+    variance = float(with_it @ with_it) / max(len(moved) - terms.shape[1], 1)
+    width = float(np.linalg.lstsq(terms, moved)[0][-1])
+    sd = np.sqrt(variance * np.linalg.pinv(terms.T @ terms)[-1, -1])
+    left, before = float(with_it @ with_it), float(without @ without)
+    return left, width, float(sd), 1 - left / max(before, 1e-300)

@@ -1,0 +1,97 @@
+"""Backlash, play and soft couplings are noticed in a log by the angle that each reversal loses."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calibration.data import robot_file
+from calibration.data import runs as records
+from calibration.inference.lost_motion import lost_motion_notes
+from mmrjax.model.quantities import RPM
+
+RIG = """base = "none"
+channels = [{channels}]
+start = "rest"
+[motor]
+resistance = "3.1 ± 10 %"
+torque_constant = "0.0072 ± 10 %"
+friction_coulomb = "4e-4 ± 50 %"
+inertia = "3e-7 ± 30 %"
+[gearbox]
+ratio = 210.0
+efficiency_load = "0.75 ± 10 %"
+[wheel]
+load = "shaft"
+inertia = "6e-4 ± 20 %"
+loss_coulomb = "0.02 ± 50 %"
+{backlash}
+"""
+STEP, RATIO = 2e-3, 210.0
+
+
+def servo(play=0.0, friction=0.17, delay=0, seconds=16.0):
+    """Log of a servo: a motor with a lag of 20 ms and dry friction, worth so many volts, a play [deg] behind it.
+
+    Returns:
+        Time [s], duty, motor speed [rad/s] and angle of the output [deg] in steps of 0.088, at 100 Hz.
+    """
+    count, every = round(seconds / STEP), round(0.01 / STEP)
+    speed = turned = output = 0.0
+    rows, duties = [], [0.0] * (delay + 1)
+    for k in range(count):
+        if k % every == 0:
+            wanted = 25 * np.sin(2 * np.pi * 0.23 * k * STEP) + 14 * np.sin(2 * np.pi * 0.71 * k * STEP)
+            shown = 0.088 * round(np.degrees(output) / 0.088)
+            duties.append(round(float(np.clip(6 * np.radians(wanted - shown), -1, 1)), 3))
+            rows.append((k * STEP, duties[-1], speed, shown))
+        volts = 12 * duties[-1 - delay]
+        push = volts - 0.0072 * speed
+        free = push - friction * np.sign(speed) if speed else np.sign(push) * max(abs(push) - friction, 0.0)
+        after = speed + STEP * free / 0.0072 / 0.02
+        speed = 0.0 if speed * after < 0 else after
+        turned += STEP * speed / RATIO
+        half = np.radians(play) / 2
+        output = float(np.clip(output, turned - half, turned + half))
+    return np.array(rows).T
+
+
+def read(tmp_path, log, channels='"output_angle"', backlash=""):
+    time, duty, speed, angle = log
+    (tmp_path / "rig.toml").write_text(RIG.format(channels=channels, backlash=backlash))
+    motor = "motor_speed" in channels
+    lines = [f"time_s,supply_voltage_V,duty,output_angle_deg{',motor_speed_rpm' * motor}"]
+    lines += [
+        f"{t:.3f},12,{d},{a:.3f}" + f",{w / RPM:.1f}" * motor
+        for t, d, w, a in zip(time, duty, speed, angle, strict=True)
+    ]
+    (tmp_path / "log.csv").write_text("\n".join(lines) + "\n")
+    robot = robot_file.read_robot(tmp_path / "rig.toml")
+    return records.read_runs(tmp_path / "log.csv", robot=robot), robot
+
+
+@pytest.mark.parametrize(
+    ("channels", "off"), [('"output_angle"', 0.3), ('"output_angle", "motor_speed"', 0.05)], ids=["output", "both"]
+)
+def test_play_is_found_and_measured(tmp_path, channels, off):
+    runs, robot = read(tmp_path, servo(play=1.0), channels)
+    (note,) = lost_motion_notes(runs, robot)
+    assert note.width == pytest.approx(1.0, rel=off) and note.angle == pytest.approx(np.radians(note.width))
+    assert note.reversals >= 10 and note.column == "output_angle_deg"
+
+
+@pytest.mark.parametrize("log", [{}, {"friction": 0.5}, {"delay": 1}], ids=["plain", "friction", "delay"])
+def test_friction_and_delay_are_no_play(tmp_path, log):
+    for channels in ('"output_angle"', '"output_angle", "motor_speed"'):
+        assert lost_motion_notes(*read(tmp_path, servo(**log), channels)) == []
+
+
+def test_stated_backlash_needs_no_note(tmp_path):
+    assert lost_motion_notes(*read(tmp_path, servo(play=1.0, seconds=8.0), backlash='backlash = "0.01 ± 30 %"')) == []
+
+
+def test_check_of_a_log_reports_lost_motion(tmp_path):
+    from calibration.inference.preparation import prepare
+
+    runs, robot = read(tmp_path, servo(play=1.0))
+    assert "lost_motion" in [getattr(note, "code", "") for note in prepare(runs, robot).checked]
