@@ -28,7 +28,6 @@ from mmrjax.model.channels import Channel
 from mmrjax.model.quantities import VOLTAGE
 from mmrjax.model.rig import Instrument
 from mmrjax.model.robot import Robot
-from mmrjax.model.shaft import Shaft
 
 #: Excess of a reading beyond zero by its noise, in stated sds, and as a share of the channel's rms.
 SIGN_SDS, SIGN_SHARE = 4.0, 0.05
@@ -218,9 +217,9 @@ def time_constant(robot: Robot) -> float:
     if not robot.knows(VOLTAGE):
         return math.inf
     for load in robot.configurations.members:
-        if float(load.torque_gravity if isinstance(load, Shaft) else 0.0) > 0:
+        if not robot.has_ground and float(load.torque_gravity) > 0:
             return math.inf
-        moved = 0.0 if isinstance(load, Shaft) else float(load.mass) * float(load.radius) ** 2 / sides
+        moved = float(load.mass) * float(load.radius) ** 2 / sides if robot.has_ground else 0.0
         carried = (float(load.inertia) + moved) / float(robot.gearbox.ratio) ** 2
         found = max(found, float(motor.inertia) + carried)
     return found * float(motor.resistance) / float(motor.torque_constant) ** 2
