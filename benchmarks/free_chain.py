@@ -41,7 +41,7 @@ from mmrjax.model.paper_robots import nominal
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import GRAVITY, State
 from mmrjax.undercarriage import mjcf
-from mmrjax.undercarriage.ripple import period_pitch, ripple
+from mmrjax.undercarriage.ripple_peaks import period_pitch, ripple
 from mmrjax.undercarriage.running_gear import GROUSERS, TEETH_BELT, TEETH_PULLEY, RunningGear
 
 # [s]; half of it changes the share by less than the scatter of two windows. Explicit: the damping of a grouser on the

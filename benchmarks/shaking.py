@@ -37,7 +37,7 @@ from mmrjax.undercarriage.half_robot import (  # noqa: E402
     resistance,
     roll,
 )
-from mmrjax.undercarriage.ripple import period_pitch, touchdowns  # noqa: E402
+from mmrjax.undercarriage.ripple_peaks import period_pitch, touchdowns  # noqa: E402
 from mmrjax.undercarriage.running_gear import GROUSERS, TEETH_BELT  # noqa: E402
 
 SET_S = {

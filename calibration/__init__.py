@@ -6,10 +6,10 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from calibration.data.frames import to_pandas, to_polars, to_xarray
     from calibration.data.robot_file import load_robot as read_robot
     from calibration.data.runs import read_runs as read_runs
     from calibration.data.runs import read_runs as runs
+    from calibration.data.writing import to_pandas, to_polars, to_xarray
     from calibration.discovery.discover import discover
     from calibration.inference.calibration import calibrate
 
@@ -24,9 +24,9 @@ _HOMES = {
     "read_robot": ("calibration.data.robot_file", "load_robot"),
     "read_runs": ("calibration.data.runs", "read_runs"),
     "runs": ("calibration.data.runs", "read_runs"),
-    "to_pandas": ("calibration.data.frames", "to_pandas"),
-    "to_polars": ("calibration.data.frames", "to_polars"),
-    "to_xarray": ("calibration.data.frames", "to_xarray"),
+    "to_pandas": ("calibration.data.writing", "to_pandas"),
+    "to_polars": ("calibration.data.writing", "to_polars"),
+    "to_xarray": ("calibration.data.writing", "to_xarray"),
 }
 
 

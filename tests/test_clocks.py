@@ -8,7 +8,7 @@ import pytest
 import samples
 from numpy.testing import assert_allclose, assert_array_equal
 
-from calibration.data import counters, repeated_readings, robot_file
+from calibration.data import clock, robot_file, row_checks
 from calibration.data import runs as records
 
 RIG = """
@@ -67,7 +67,7 @@ def test_a_clock_is_counted_from_the_first_row(tmp_path, robot, case, as_text):
 
 def test_each_recording_has_wraps_of_its_own():
     once = (np.arange(60.0) * 1000 + 2**32 - 20_000) % 2**32
-    found, period = counters.unwrap_counter(np.concatenate([once, once]), np.repeat([0, 1], 60))
+    found, period = clock.unwrap_counter(np.concatenate([once, once]), np.repeat([0, 1], 60))
     assert period == 2**32 and found[60] == once[0]
     for part in (found[:60], found[60:]):
         assert_array_equal(part - part[0], np.arange(60) * 1000)
@@ -80,12 +80,12 @@ def test_each_recording_has_wraps_of_its_own():
 )
 def test_a_clock_that_does_not_wrap_stays_as_it_is(time):
     run = np.zeros(len(time), int)
-    assert counters.unwrap_counter(time, run)[1] == 0 and counters.spread_shared_stamps(time, run)[1] == 0
+    assert clock.unwrap_counter(time, run)[1] == 0 and clock.spread_shared_stamps(time, run)[1] == 0
 
 
 def test_stamps_that_are_rarely_shared_are_not_spread():
     time = np.sort(np.r_[np.arange(100.0), 40.0])
-    assert counters.spread_shared_stamps(time, np.zeros(101, int))[1] == 0
+    assert clock.spread_shared_stamps(time, np.zeros(101, int))[1] == 0
 
 
 def test_a_row_that_stands_twice_is_left_out(robot):
@@ -123,20 +123,20 @@ EVERY_ROW = {
 
 @pytest.mark.parametrize("rows", [2, 2.5, 15, 40.4])
 def test_the_period_of_a_slow_sensor_is_found(rows):
-    assert repeated_readings.reading_period(held(WALK, rows)) == pytest.approx(rows, rel=0.02)
+    assert row_checks.reading_period(held(WALK, rows)) == pytest.approx(rows, rel=0.02)
 
 
 @pytest.mark.parametrize("case", EVERY_ROW)
 def test_coarse_readings_are_no_repeats(case):
     values = EVERY_ROW[case]
-    found, rows = repeated_readings.used_once(values, np.arange(len(values)))
+    found, rows = row_checks.used_once(values, np.arange(len(values)))
     assert rows == 0 and found is values
 
 
 def test_each_reading_of_a_slow_sensor_is_used_once():
     walk = WALK.copy()
     walk[50] = walk[49]  # the same reading twice is two readings
-    found, rows = repeated_readings.used_once(held(walk, 15), np.arange(3000))
+    found, rows = row_checks.used_once(held(walk, 15), np.arange(3000))
     assert rows == 15
     assert_array_equal(np.flatnonzero(np.isfinite(found)), np.arange(0, 3000, 15))
     assert_array_equal(found[::15], walk)

@@ -20,10 +20,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from calibration.data.effect_file import readable_signals
 from calibration.discovery import setups
 from mmrjax import effects
 from mmrjax.effects import ALL, BY_NAME, Effect, base
-from mmrjax.effects.contract import readable_signals
 from mmrjax.effects.periodic import Periodic
 from mmrjax.effects.scaled import scaled_effect
 from mmrjax.fidelities.drive import drive, drive_rates, drive_start, state_of_unknowns

@@ -7,8 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from worlds.events import Bench, through
+from worlds.events import STEEP, Bench, through
 
+from calibration.data import runs
+from calibration.inference.preparation import prepare
 from mmrjax.fidelities.drive import drive_batch
 from mmrjax.fidelities.histories import CHANGE, history_signals, time_grid
 from mmrjax.model import paper_robots, params
@@ -16,6 +18,7 @@ from mmrjax.model.conditions import Conditions
 from mmrjax.model.rig import Rig
 from mmrjax.model.robot import Configurations
 from mmrjax.model.shaft import Shaft
+from sweeps.points.run import follow_histories
 
 #: Forward, braked to rest, held by friction, back from rest, and forward through rest [V].
 VOLTS, CHANGES = np.array([6.0, 0.0, 1.0, -6.0, 6.0]), np.array([0.0, 0.4, 0.6, 0.8, 1.1])
@@ -102,6 +105,20 @@ def test_a_load_that_friction_holds_stands(simulated):
     torque = np.asarray(found.torque_output)[held]
     assert (torque > 0).all() and (torque <= bench.loss_coulomb).all()
     assert_allclose(np.asarray(found.current)[held], 1 / bench.resistance, rtol=1e-9)
+
+
+def test_compare_follows_reversals_within_a_thousandth_of_scipys_rms():
+    """The steps of a fit would be off by 0.5 % of the second bench's current."""
+    every, volts, changes = np.arange(0, 2, 0.01), np.array([12.0, -12.0, 12.0, -12.0]), np.arange(0, 2, 0.5)
+    imposed = volts[np.searchsorted(changes, every + 1e-9, side="right") - 1]
+    for bench in (Bench(), Bench(inductance=1e-4, inertia=0.002), Bench(current_limit=2.0)):
+        (current, motor), robot = through(bench, volts, changes, every)[0].T, robot_of(bench)
+        over = np.maximum(np.abs(current) / bench.current_limit - 1, 0) * np.sign(current * imposed)
+        exact = {"total_current_A": current * (1 - STEEP * over), "motor_speed_rpm": motor * 30 / np.pi}
+        log = runs.read_runs({"time_s": every, "supply_voltage_V": imposed, **exact}, robot=robot)
+        shown = follow_histories(prepare(log, robot).robot, log, None)
+        for column, readings in exact.items():
+            assert np.abs(shown[column] - readings).max() < 1e-3 * np.sqrt(np.mean(readings**2)), (bench, column)
 
 
 @pytest.mark.slow

@@ -120,7 +120,7 @@ def few_effects():
         def library(paths):
             return some | {e.name: e for path in paths for e in effect_file.read_effect_file(Path(path))}
 
-        patch.setattr(room, "effect_file", SimpleNamespace(library=library))
+        patch.setattr(room, "effect_file", SimpleNamespace(effect_library=library))
         yield
 
 

@@ -8,12 +8,12 @@ import pytest
 
 from mmrjax.model.signals import CONVERGED, FAILED, SLIDES
 from mmrjax.undercarriage.modes import Mode
-from mmrjax.undercarriage.ripple import fluctuation
 from mmrjax.undercarriage.ripple_peaks import (
     SIGNALS,
     Peak,
     confirm_peaks,
     find_crossings,
+    fluctuation,
     group_resonances,
     passing_parts,
     peaks_over_speed,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from calibration.data import cell_values
+from calibration.data import column_names
 from calibration.data import runs as records
 from calibration.data.input_errors import BadData
 from calibration.data.named_arrays import NamedArrays
@@ -97,7 +97,7 @@ def test_cells_of_a_sound_table_are_read_at_once(tmp_path, monkeypatch):
         looked_at.append(where)
         return f"{where}: refused"
 
-    monkeypatch.setattr(cell_values, "refused_cell_sentence", refusal)
+    monkeypatch.setattr(column_names, "refused_cell_sentence", refusal)
     runs = records.read_runs(write(tmp_path, f"{HEADER},speed_sd_mm_s\n{ROW},4\n{ROW[:-3]}n/a,\n"))
     assert runs["payload_kg"].tolist() == [0, 0] and runs["configuration"].tolist() == ["6T2A"] * 2
     assert_array_equal(runs["speed_mm_s"], [400, np.nan])

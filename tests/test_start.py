@@ -12,7 +12,7 @@ import pytest
 from numpy.testing import assert_allclose
 from worlds import paper
 
-from mmrjax.fidelities import start_stages
+from mmrjax.derived import start_figures
 from mmrjax.fidelities.base import History, in_table_time
 from mmrjax.model import paper_robots
 from mmrjax.model.params import replace
@@ -90,13 +90,13 @@ def test_slip_over_the_stages_is_that_of_an_independent_integration(written):
 
 def test_mean_slip_is_the_share_of_the_way_that_is_lost():
     t = np.linspace(0, 2, 201)
-    assert start_stages.mean_slip(t, 0.8 * t, 1.0 * t, 0.0, 2.0) == pytest.approx(0.2)
-    assert start_stages.mean_slip(t, t**2 / 4, np.ones_like(t), 0.005, 2.0) == pytest.approx(
+    assert start_figures.mean_slip(t, 0.8 * t, 1.0 * t, 0.0, 2.0) == pytest.approx(0.2)
+    assert start_figures.mean_slip(t, t**2 / 4, np.ones_like(t), 0.005, 2.0) == pytest.approx(
         2 / 3, abs=2e-3
     )  # mean of 1 - t²/4
-    assert start_stages.mean_slip(t, -0.8 * t, -1.0 * t, 0.35, 1.234) == pytest.approx(0.2)
-    assert np.isnan(start_stages.mean_slip(t, t, t, 1.0, 1.0)) and np.isnan(
-        start_stages.mean_slip(t, 0 * t, 0 * t, 0.0, 1.0)
+    assert start_figures.mean_slip(t, -0.8 * t, -1.0 * t, 0.35, 1.234) == pytest.approx(0.2)
+    assert np.isnan(start_figures.mean_slip(t, t, t, 1.0, 1.0)) and np.isnan(
+        start_figures.mean_slip(t, 0 * t, 0 * t, 0.0, 1.0)
     )
 
 
@@ -106,12 +106,12 @@ def test_stages_are_seen_through_the_ripple_of_a_running_gear():
     rolled = 1 - np.exp(-t / 0.003)
     gone = np.minimum(2 * t, 0.99)
     swing = 0.03 * np.cos(2 * np.pi * t / 0.035)
-    even = start_stages.stages_of_start(t, gone, rolled, rolled - gone, V_S, 0.035)
-    uneven = start_stages.stages_of_start(t, gone + swing, rolled, rolled - gone - swing, V_S, 0.035)
+    even = start_figures.stages_of_start(t, gone, rolled, rolled - gone, V_S, 0.035)
+    uneven = start_figures.stages_of_start(t, gone + swing, rolled, rolled - gone - swing, V_S, 0.035)
     assert uneven.slipping == pytest.approx(even.slipping, abs=0.012) and 0.47 < uneven.slipping < 0.51
     assert uneven.settled == pytest.approx(even.settled, abs=0.02)
     assert uneven.slip == pytest.approx(even.slip, abs=0.01)
-    blind = start_stages.stages_of_start(t, gone + swing, rolled, rolled - gone - swing, V_S)
+    blind = start_figures.stages_of_start(t, gone + swing, rolled, rolled - gone - swing, V_S)
     assert blind.slipping > 1.4 and blind.settled > 1.4
 
 

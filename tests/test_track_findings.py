@@ -11,7 +11,7 @@ from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.signals import FLAGS, STATUSES
 from mmrjax.undercarriage.belt import Path
-from mmrjax.undercarriage.ripple import period_pitch, ripple, touchdowns
+from mmrjax.undercarriage.ripple_peaks import period_pitch, ripple, touchdowns
 
 pytestmark = pytest.mark.slow
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from calibration.data import frames, writing
 from calibration.data import runs as records
+from calibration.data import writing
 
 
 def test_numbers_keep_nine_digits_and_what_is_not_finite_is_left_empty(tmp_path):
@@ -45,12 +45,12 @@ def test_a_table_is_parquet_too_with_every_digit(tmp_path):
 
 def test_results_are_frames_of_every_library():
     table = {"a": np.array([0.5, 2.0]), "word": np.array(["x", "y"])}
-    for frame in (frames.to_pandas(table), frames.to_polars(table)):
+    for frame in (writing.to_pandas(table), writing.to_polars(table)):
         assert list(frame.columns) == ["a", "word"] and frame["a"].to_numpy().tolist() == [0.5, 2.0]
-    assert frames.to_xarray(table)["a"].values.tolist() == [0.5, 2.0]
+    assert writing.to_xarray(table)["a"].values.tolist() == [0.5, 2.0]
     runs = records.read_runs("measured")
-    assert frames.to_pandas(runs)["supply_voltage_V"].tolist() == runs["supply_voltage_V"].tolist()
-    again = records.read_runs(frames.to_polars(runs))
+    assert writing.to_pandas(runs)["supply_voltage_V"].tolist() == runs["supply_voltage_V"].tolist()
+    again = records.read_runs(writing.to_polars(runs))
     assert_array_equal(again.measured(), runs.measured())
     with pytest.raises(TypeError, match="expected a result with a table, got int"):
-        frames.to_pandas(3)
+        writing.to_pandas(3)

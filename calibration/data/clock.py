@@ -1,4 +1,4 @@
-"""Clocks of loggers, counted from the first row of each recording."""
+"""Clocks of loggers, counted from the first row of each recording, and faults of clocks that count."""
 
 from __future__ import annotations
 
@@ -9,11 +9,85 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from calibration.data import counters
+from calibration.data import Names
 from calibration.data.columns import TIME, Column
 from calibration.data.input_errors import bound_text
 from calibration.data.named_arrays import NamedArrays, Raw, column_numbers, missing_readings
 from mmrjax.errors import count_noun
+
+#: Numbers of binary digits after which counters wrap; of a 32-bit counter also in seconds, from ms, µs and ns.
+DIGITS = (15, 16, 24, 31, 32)
+PERIODS = (*(2.0**n for n in DIGITS), *(2.0**32 * one for one in (1e-3, 1e-6, 1e-9)))
+#: Usual steps that a counter may lack across its wrap.
+LACKING = 5.0
+#: Least share of rows that share their stamp with the row before, and largest share of stamps with other numbers of
+#: rows than the usual one or the next: beyond these the rows are no samples of an even clock.
+SHARED, ODD = 0.1, 0.1
+
+
+def unwrap_counter(count: np.ndarray, run: np.ndarray) -> tuple[np.ndarray, float]:
+    """Returns a counter that goes on past its end, and its period; 0 where it does not.
+
+    A counter wraps where it falls from its last numbers to its first ones, within `LACKING` usual steps, and never
+    goes back otherwise.
+
+    Args:
+        count: as logged, shape (rows,); run: index of the recording of each row, shape (rows,).
+    """
+    same = np.diff(run) == 0
+    step = np.where(same, np.diff(count), 0.0)
+    back = np.flatnonzero(step < 0)
+    if not back.size or not (step > 0).any():
+        return count, 0.0
+    usual = float(np.median(step[step > 0]))
+    for period in PERIODS:
+        across = step[back] + period
+        whole = period < 2**15 or not (count % 1).any()
+        if (
+            whole
+            and count.min() >= 0
+            and count.max() < period
+            and (np.abs(across) <= LACKING * usual).all()
+            and (across >= 0).all()
+        ):
+            wraps = np.zeros(len(count))
+            wraps[back + 1] = 1.0
+            total = np.cumsum(wraps)
+            first = np.zeros(len(count), int)
+            first[1:][~same] = np.flatnonzero(~same) + 1
+            begins = total[np.maximum.accumulate(first)]  # wraps before the recording of each row began
+            return count + period * (total - begins), period
+    return count, 0.0
+
+
+def spread_shared_stamps(time: np.ndarray, run: np.ndarray) -> tuple[np.ndarray, float]:
+    """Returns times with rows that share a stamp set evenly between it and the next, and the rows of a stamp.
+
+    The number of rows is 0 where nothing is changed.
+
+    Args:
+        time: of rows in order, shape (rows,); run: index of the recording of each row, shape (rows,).
+    """
+    if len(time) < 3:
+        return time, 0.0
+    begins = np.flatnonzero(np.concatenate([[True], (np.diff(time) != 0) | (np.diff(run) != 0)]))
+    rows = np.diff(np.append(begins, len(time)))
+    if (rows - 1).sum() < SHARED * len(time) or (np.diff(time)[np.diff(run) == 0] < 0).any():
+        return time, 0.0
+    stamps, recording = time[begins], run[begins]
+    step = np.diff(stamps)
+    step = np.append(step, np.nan)
+    step[np.append(np.diff(recording) != 0, True)] = np.nan
+    usual = float(np.nanmedian(step)) if np.isfinite(step).any() else np.nan
+    each = float(np.median(rows))
+    inner = rows[1:-1] if len(rows) > 4 else rows
+    if not np.isfinite(usual) or (np.abs(inner - each) > 1).mean() > ODD:
+        return time, 0.0
+    apart = np.where(np.isfinite(step), step, usual) / rows
+    apart = np.minimum(apart, usual / np.maximum(each, 1.0) * 1.5)
+    index = np.arange(len(time)) - np.repeat(begins, rows)
+    return np.repeat(stamps, rows) + index * np.repeat(apart, rows), float(rows.mean())
+
 
 #: Day of a cell with a time alone, and length of a day [s].
 _SOME_DAY, _DAY = "1970-01-01T", 86400.0
@@ -51,7 +125,7 @@ def recorded_rows(arrays: NamedArrays, meanings: Sequence[Column | None]) -> Nam
     return arrays.rows(kept, note)
 
 
-def from_the_first(name: str, meaning: Column, raw: Raw, runs: Sequence[str] | None) -> tuple[Raw, tuple[str, ...]]:
+def from_the_first(name: str, meaning: Column, raw: Raw, runs: Sequence[str] | None) -> tuple[Raw, Names]:
     """Returns a column of time as the time since the first row of each run, and notes on the changes.
 
     A run begins at its first row, whatever its clock shows there: the time since a controller started, or a time of
@@ -70,7 +144,7 @@ def from_the_first(name: str, meaning: Column, raw: Raw, runs: Sequence[str] | N
     )
     of_day = bool(np.isfinite(clock).all())
     names, run = (np.array([""]), None) if runs is None else np.unique(runs, return_inverse=True)
-    notes: tuple[str, ...] = ()
+    notes: Names = ()
     if not of_day:
         low, high = (limit * factor for limit in meaning.limits())
         count, notes = _counted(name, meaning, column_numbers(raw), run)
@@ -106,19 +180,17 @@ def from_the_first(name: str, meaning: Column, raw: Raw, runs: Sequence[str] | N
     )
 
 
-def _counted(
-    name: str, meaning: Column, count: np.ndarray, run: np.ndarray | None
-) -> tuple[np.ndarray, tuple[str, ...]]:
+def _counted(name: str, meaning: Column, count: np.ndarray, run: np.ndarray | None) -> tuple[np.ndarray, Names]:
     """Numbers of a clock without wraps and without stamps that rows share, and notes on these."""
     step = np.diff(count)
     if not len(step) or (step > 0).all() or not np.isfinite(step).all():
         return count, ()
     notes = []
     recording = np.zeros(len(count), int) if run is None else run
-    count, period = counters.unwrap_counter(count, recording)
+    count, period = unwrap_counter(count, recording)
     if period:
         notes.append(f"{name}: {meaning.shown} wraps at {period:.10g}; counted on from there")
-    count, rows = counters.spread_shared_stamps(count, recording)
+    count, rows = spread_shared_stamps(count, recording)
     if rows:
         notes.append(f"{name}: {meaning.shown} repeats, {rows:.3g} rows a stamp; rows are set evenly between stamps")
     return count, tuple(notes)

@@ -7,6 +7,7 @@ import difflib
 from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING
 
+from calibration.data import Names
 from calibration.data.input_errors import BadData
 from mmrjax.model import channels, quantities
 from mmrjax.model.channels import Channel
@@ -116,7 +117,7 @@ class Layout:
     has_ground: bool = True
     weight: bool = False
     inherits: bool = True
-    configurations: tuple[str, ...] = ()
+    configurations: Names = ()
     instruments: tuple[Instrument, ...] = ()
     mapped: tuple[tuple[str, str, float], ...] = ()
     channels: tuple[Channel, ...] = dataclasses.field(default_factory=channels.usual_channels)
@@ -150,7 +151,7 @@ class Layout:
         return not self.table8 or not set(channels.OF_TURNS).isdisjoint(self.channels)
 
     @property
-    def idle(self) -> tuple[str, ...]:
+    def idle(self) -> Names:
         """Columns of conditions that do not act on its load."""
         return ON_SHAFT if self.has_ground else (*_conditions(GROUND, VEHICLE), "surface")
 
@@ -160,23 +161,23 @@ class Layout:
         return IMPOSED[self.imposed][0]
 
     @property
-    def sides(self) -> tuple[str, ...]:
+    def sides(self) -> Names:
         """Columns of the drive of the left and the right side; none for a robot that cannot turn."""
         imposed = {"voltage": tuple(SIDES), "motor_speed": SPEEDS}.get(self.imposed, ())
         return imposed if self.has_ground else ()
 
     @property
-    def axes(self) -> tuple[str, ...]:
+    def axes(self) -> Names:
         """Columns of the conditions of its runs, the imposed quantity first."""
         return (self.imposed_column, *(c for c in ON_GROUND if c not in self.idle))
 
     @property
-    def measured_columns(self) -> tuple[str, ...]:
+    def measured_columns(self) -> Names:
         """Columns of the channels, in the order of arrays."""
         return tuple(c.column for c in self.channels)
 
     @property
-    def deviation_columns(self) -> tuple[str, ...]:
+    def deviation_columns(self) -> Names:
         """Columns of the channels' sds, in the order of arrays."""
         return tuple(c.sd_column for c in self.channels)
 
@@ -188,7 +189,7 @@ class Layout:
         """Returns the variance of the error by the step of a channel's instrument [SI²]."""
         return sum(i.variance for i in self.instruments if i.channel == channel)
 
-    def known(self) -> tuple[str, ...]:
+    def known(self) -> Names:
         """Every column with a meaning."""
         read = (SUPPLY, *self.measured_columns, *self.deviation_columns)
         labels = [word for word in WORDS if word != "mode" or self.imposed == "voltage"]
@@ -196,7 +197,7 @@ class Layout:
         every = ("configuration", *self.axes, *read, *labels, "time_s", *self.sides, *set_)
         return tuple(dict.fromkeys(c for c in every if c not in self.idle))
 
-    def required(self, *, measured: bool, battery: bool) -> tuple[str, ...]:
+    def required(self, *, measured: bool, battery: bool) -> Names:
         """Columns that a table has to have, besides channels."""
         if self.complete:
             own = (() if measured else ("total_mass_kg",)) + ((SUPPLY,) if battery else ())
@@ -248,7 +249,7 @@ class Layout:
         held = self.quantities().values()
         return {name: Column(quantity, name, unit) for quantity in held for name, unit in quantity.columns().items()}
 
-    def spellings(self) -> tuple[str, ...]:
+    def spellings(self) -> Names:
         """Every name of a column with a meaning, in any unit."""
         return (*self._by_name(), *(column for _, column, _ in self.mapped))
 

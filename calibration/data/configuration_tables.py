@@ -9,7 +9,7 @@ from typing import Any
 
 import equinox as eqx
 
-from calibration.data import rig_file
+from calibration.data import Json, Names, rig_file
 from calibration.data.input_errors import BadConfiguration, allowed_words
 from mmrjax.model import params
 from mmrjax.model.chassis import Chassis
@@ -43,10 +43,10 @@ class Loads:
     by_name: dict[str, Load]
     travels: bool
     linear: frozenset[str]
-    missing: tuple[str, ...]
+    missing: Names
 
 
-def loads_from_tables(base: Robot | None, content: dict[str, Any], sds: dict[str, float], where: str) -> Loads:
+def loads_from_tables(base: Robot | None, content: Json, sds: dict[str, float], where: str) -> Loads:
     """Returns the loads that the file's content states, in its order.
 
     Takes `configurations` and every configuration's `load`, `like` and `movers` out of `content`, and replaces linear
@@ -105,7 +105,7 @@ def loads_from_tables(base: Robot | None, content: dict[str, Any], sds: dict[str
     return Loads(by_name, not shafts or bool(linear), frozenset(linear), tuple(missing))
 
 
-def resolved_likes(content: dict[str, Any], where: str) -> None:
+def resolved_likes(content: Json, where: str) -> None:
     """Replace each `like` of a file that starts from nothing by the other table of the file that it names.
 
     Raises:
@@ -121,7 +121,7 @@ def resolved_likes(content: dict[str, Any], where: str) -> None:
             content[name] = _over(tables[like], table)
 
 
-def _over(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
+def _over(below: Mapping[str, Any], above: Mapping[str, Any]) -> Json:
     """Two tables as one; `above` wins."""
     both = {
         key: value for key, value in below.items() if isinstance(value, dict) and isinstance(above.get(key), dict)
@@ -129,7 +129,7 @@ def _over(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
     return {**below, **above, **{key: _over(value, above[key]) for key, value in both.items()}}
 
 
-def _kind(table: dict[str, Any], where: str) -> str:
+def _kind(table: Json, where: str) -> str:
     """Load that a table states; by default a vehicle."""
     if "load" not in table:
         return "vehicle"
@@ -160,7 +160,7 @@ def _shaft(table: Mapping[str, Any]) -> tuple[Shaft, list[str]]:
     return Shaft(inertia=0.0, loss_coulomb=0.0), missing
 
 
-def _vehicle(table: dict[str, Any], where: str, sides: float) -> tuple[Chassis, list[str]]:
+def _vehicle(table: Json, where: str, sides: float) -> tuple[Chassis, list[str]]:
     """A vehicle before the parameters of its table apply, and the required parameters that the table lacks."""
     if "movers" not in table:
         raise BadConfiguration(
@@ -207,7 +207,7 @@ def _names(stated: Any, where: str) -> list[str]:
     return stated
 
 
-def _chassis(robot: Robot, name: str, table: dict[str, Any], where: str) -> Chassis:
+def _chassis(robot: Robot, name: str, table: Json, where: str) -> Chassis:
     """Configuration of a robot with a base, before the parameters of its table apply."""
     like, movers = table.pop("like", None), table.pop("movers", None)
     have = robot.configurations

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from calibration.data import delimited, presets_file, proposals
+from calibration.data import Json, Names, delimited, presets_file, proposals
 from calibration.data.columns import Layout
 from calibration.data.input_errors import BadData
 from calibration.data.named_arrays import NamedArrays, column_numbers
@@ -46,7 +46,7 @@ class SignalFacts:
     least: float = np.nan
     greatest: float = np.nan
     missing: int = 0
-    words: tuple[str, ...] = ()
+    words: Names = ()
     clock: str = ""
 
 
@@ -63,11 +63,11 @@ class Contents:
     name: str
     kind: str
     signals: tuple[SignalFacts, ...]
-    notes: tuple[str, ...]
+    notes: Names
     preset: str
-    proposed: tuple[str, ...]
+    proposed: Names
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Json:
         """The contents as JSON-able data."""
         return {"schema": "mmrjax.inspect/1", **dataclasses.asdict(self)}
 

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
+from calibration.data import Names
 from calibration.data.columns import LOAD, SUPPLY
 from calibration.data.runs import Runs
 
@@ -41,7 +42,7 @@ class Stretch:
         return self.rows[time[self.rows] >= self.begin + share * (self.end - self.begin)]
 
 
-def changing_columns(runs: Runs) -> tuple[str, ...]:
+def changing_columns(runs: Runs) -> Names:
     """Columns of a table that are among `CHANGING` or are imposed."""
     return tuple(c for c in dict.fromkeys((runs.layout.imposed_column, *CHANGING)) if runs.has(c))
 
@@ -59,7 +60,7 @@ def applied_drive(runs: Runs) -> np.ndarray:
     return np.where(runs["mode"] == "voltage", voltage, 0.0) if runs.has("mode") else voltage
 
 
-def rows_of_varying_runs(runs: Runs, columns: tuple[str, ...] | None = None) -> np.ndarray:
+def rows_of_varying_runs(runs: Runs, columns: Names | None = None) -> np.ndarray:
     """True for rows in whose run one of these columns changes, shape (rows,); by default the columns that may."""
     columns = changing_columns(runs) if columns is None else columns
     found = np.zeros(len(runs), bool)

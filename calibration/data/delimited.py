@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.data import input_files
+from calibration.data import Names, input_files
 from calibration.data.columns import WORDS
 from calibration.data.input_errors import BadData
 from calibration.data.named_arrays import MISSING, NamedArrays, Raw, cell_number
@@ -121,7 +121,7 @@ def _plain(name: str, content: bytes) -> NamedArrays | None:
     return NamedArrays(name, tuple(header), tuple(values), digest=hashlib.sha256(content).hexdigest())
 
 
-def row_of_units(header: Sequence[str], first: Sequence[str]) -> tuple[str, ...]:
+def row_of_units(header: Sequence[str], first: Sequence[str]) -> Names:
     """Returns the units that the first row below a header states, empty where it states none; () if it is a run: a
     cell of it is a number, or no cell of a column of numbers is a unit."""
     if len(first) != len(header) or any(math.isfinite(cell_number(cell)) for cell in first):
@@ -132,7 +132,7 @@ def row_of_units(header: Sequence[str], first: Sequence[str]) -> tuple[str, ...]
     return units if stated else ()
 
 
-def decode_text(name: str, content: bytes) -> tuple[str, tuple[str, ...]]:
+def decode_text(name: str, content: bytes) -> tuple[str, Names]:
     """Returns the text of a file in UTF-8, in UTF-16 that begins with its mark, or in Windows-1252; and a note if it
     is not in UTF-8.
 
@@ -174,7 +174,7 @@ def below_comments(lines: Sequence[str]) -> list[str]:
     return [*alike[-1 - has_units :], *below]
 
 
-def split_cells(name: str, lines: Sequence[str]) -> tuple[list[list[str]], tuple[str, ...]]:
+def split_cells(name: str, lines: Sequence[str]) -> tuple[list[list[str]], Names]:
     """Returns rows of cells without blanks around them, numbers with points; and notes on separators and marks.
 
     Semicolons or tabs separate cells where the header has no comma; numbers may have decimal commas then.

@@ -14,21 +14,54 @@ import sys
 import types
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from calibration.data import Json
 from calibration.data.input_errors import BadConfiguration, allowed_words, is_number
 from mmrjax import effects
-from mmrjax.effects import Effect
-from mmrjax.effects.base import THE_SIDE
-from mmrjax.effects.contract import readable_signals
-from mmrjax.model import channels, paper_robots, params
+from mmrjax.effects.base import THE_SIDE, Effect
+from mmrjax.model import balances, channels, paper_robots, params
 from mmrjax.model.balances import BALANCES, ROUND, effects_sum, moving_signals
 from mmrjax.model.conditions import Conditions
+from mmrjax.model.params import Scalar
+from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Signals, State
+
+
+def _witness(place: str, whose: str, seen: list[Signals]) -> Effect:
+    """An effect with a zero term that records the signals its balance passes to it."""
+
+    class Witness(Effect):
+        balance = place
+        channel = whose
+        amplitude: Scalar = 0.0
+
+        def term(self, robot: Robot, signals: Signals) -> Scalar:
+            seen.append(signals)
+            return 0.0
+
+    return Witness()
+
+
+def readable_signals(
+    robot: Robot, conditions: Conditions, state: State, balance: str, channel: str = "", *, settled: bool = False
+) -> Signals:
+    """The signals that an effect of this balance may read: those computed before it; the others are `UNSET`.
+
+    Args:
+        conditions, state: one run at one instant, scalars; not traced.
+        settled: in steady forward travel (`balances.settled_signals`), else in motion (`balances.moving_signals`).
+    """
+    seen: list[Signals] = []
+    watched = dataclasses.replace(robot, effects=(_witness(balance, channel, seen),))
+    order = balances.settled_signals if settled else balances.moving_signals
+    signals = order(watched, conditions, state)
+    balances.sensor(watched, signals[0] if isinstance(signals, tuple) else signals)
+    return seen[0]
+
 
 #: Effects by their name in robot files and on the command line.
 Library = Mapping[str, type[Effect]]
@@ -54,7 +87,7 @@ _STATED = {
 }
 _MOVERS = ("tracks", "wheels")
 #: Signals of the left side in a turn that are zero in straight travel; they change sign in the mirror image.
-TURN: dict[str, Any] = {
+TURN: Json = {
     "side": 1.0,
     "yaw_rate": 0.8,
     "speed_lateral": 0.1,

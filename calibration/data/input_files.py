@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from calibration.data import Json
 from calibration.data.input_errors import BadConfiguration, BadData, InputError
 from mmrjax.errors import count_noun
 
@@ -171,7 +172,7 @@ def toml_text(path: Path, where: str | Path) -> str:
         raise BadConfiguration(f"{where}: not a readable TOML file ({error}); save it in UTF-8") from error
 
 
-def toml_content(text: str, where: str | Path, kind: type[InputError] = BadConfiguration) -> dict[str, Any]:
+def toml_content(text: str, where: str | Path, kind: type[InputError] = BadConfiguration) -> Json:
     """Returns the keys and tables of a TOML text.
 
     Args:
@@ -188,7 +189,7 @@ def toml_content(text: str, where: str | Path, kind: type[InputError] = BadConfi
     except RecursionError as error:
         raise kind(f"{where}: tables or lists are nested too deep; expected at most {DEEPEST} levels") from error
     keys = 0
-    left: list[tuple[dict[str, Any] | list[Any], int]] = [(found, 1)]
+    left: list[tuple[Json | list[Any], int]] = [(found, 1)]
     while left:
         value, depth = left.pop()
         if depth > DEEPEST:

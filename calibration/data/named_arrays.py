@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 
+from calibration.data import Names
 from calibration.data.input_errors import parse_number
 
 #: Raw values of a column: a list of texts as written, or an array of numbers with NaN for a missing reading.
@@ -32,11 +33,11 @@ class NamedArrays:
     """
 
     name: str
-    header: tuple[str, ...]
+    header: Names
     values: tuple[Raw, ...]
-    units: tuple[str, ...] = ()
+    units: Names = ()
     units_from: str = "the row of units below the header"
-    notes: tuple[str, ...] = ()
+    notes: Names = ()
     digest: str = ""
 
     def __len__(self) -> int:

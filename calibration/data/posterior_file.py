@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from calibration.data import Names
 from calibration.data.input_errors import BadData, allowed_words
 
 if TYPE_CHECKING:
@@ -37,8 +38,8 @@ class Posterior:
         tied: (follower, index of the coordinate that it follows, ratio).
     """
 
-    coordinates: tuple[str, ...]
-    units: tuple[str, ...]
+    coordinates: Names
+    units: Names
     mean: np.ndarray
     covariance: np.ndarray
     location: np.ndarray
@@ -46,7 +47,7 @@ class Posterior:
     low: np.ndarray
     high: np.ndarray
     softness: np.ndarray
-    kinds: tuple[str, ...]
+    kinds: Names
     tied: tuple[tuple[str, int, float], ...] = ()
 
     def __len__(self) -> int:
@@ -54,7 +55,7 @@ class Posterior:
         return len(self.coordinates)
 
     @property
-    def names(self) -> tuple[str, ...]:
+    def names(self) -> Names:
         """Every parameter that it sets: the parameters of its coordinates, then parameters tied to a coordinate."""
         return (*self.coordinates, *(follower for follower, _, _ in self.tied))
 
@@ -155,7 +156,7 @@ def write_posterior(posterior: Posterior, path: Path | str) -> None:
         file.schema = SCHEMA
         file.title = "posterior of a calibrated robot, normal in z: u = location + spread z"
 
-        def put(name: str, values: Any, kind: str, dimensions: tuple[str, ...], words: str | None) -> None:
+        def put(name: str, values: Any, kind: str, dimensions: Names, words: str | None) -> None:
             texts = kind == "S"  # rows of letters
             values = np.asarray([x.encode() for x in values] if texts else values, kind)
             if texts:
@@ -215,7 +216,7 @@ def read_posterior(path: Path | str) -> Posterior:
     return found
 
 
-def _words(values: Any) -> tuple[str, ...]:
+def _words(values: Any) -> Names:
     return tuple(v.decode() if isinstance(v, bytes) else str(v) for v in np.asarray(values).tolist())
 
 

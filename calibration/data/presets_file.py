@@ -11,7 +11,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from calibration.data import input_files
+from calibration.data import Names, input_files
 from calibration.data.columns import Layout
 from calibration.data.input_errors import BadConfiguration, BadData, allowed_words, parse_number, stated_number
 from mmrjax.model import channels
@@ -43,7 +43,7 @@ class PresetColumn:
     """
 
     mine: str
-    theirs: tuple[str, ...]
+    theirs: Names
     factor: float = 1.0
     note: str = ""
     needs: str = ""
@@ -61,11 +61,11 @@ class Preset:
 
     name: str
     columns: tuple[PresetColumn, ...]
-    header: tuple[str, ...] = ()
+    header: Names = ()
 
     def mapped(
         self, found: Callable[[str], str | None], has_readings: Callable[[str], bool] | None = None
-    ) -> tuple[tuple[tuple[str, str, float], ...], tuple[str, ...]]:
+    ) -> tuple[tuple[tuple[str, str, float], ...], Names]:
         """Returns columns of a source in the form of `Layout.mapped`, and notes on their meaning.
 
         Args:
@@ -165,7 +165,7 @@ def _among(theirs: str, names: set[str]) -> bool:
     return bool(fnmatch.filter(names, theirs)) if "*" in theirs else theirs in names
 
 
-def numbers_to_state(name: str) -> tuple[str, ...]:
+def numbers_to_state(name: str) -> Names:
     """Returns names of the numbers that a packaged preset asks for and has no usual value for."""
     numbers = input_files.toml_content(_packaged(name), name).get("ask", {})
     return tuple(key for key, stated in numbers.items() if isinstance(stated, str) or "usual" not in stated)
@@ -282,7 +282,7 @@ def _filled(name: str, where: str, numbers: Mapping[str, float]) -> str:
     return name
 
 
-def _texts(stated: Any, where: str, form: str = "expected a list of names") -> tuple[str, ...]:
+def _texts(stated: Any, where: str, form: str = "expected a list of names") -> Names:
     if not isinstance(stated, list) or not all(isinstance(each, str) and each for each in stated):
         raise BadConfiguration(f"{where}: got {stated!r}; {form}")
     return tuple(stated)

@@ -10,13 +10,13 @@ import tomllib
 from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from calibration.data import delimited, input_files
+from calibration.data import Columns, Json, Names, delimited, input_files
 from calibration.data.columns import LOAD, SUPPLY
 from calibration.data.input_errors import BadConfiguration, BadData, allowed_words, bound_text, is_number
 from calibration.data.named_arrays import column_texts
@@ -92,15 +92,15 @@ class ProfileTable:
 
     source: str
     time: np.ndarray
-    modes: tuple[str, ...]
+    modes: Names
     demand: np.ndarray
-    values: dict[str, np.ndarray]
-    surface: tuple[str, ...] | None
+    values: Columns
+    surface: Names | None
     linear: bool
     cycles: int
     digest: str
     begins: dict[str, float] = dataclasses.field(default_factory=dict)
-    notes: tuple[str, ...] = ()
+    notes: Names = ()
 
     @property
     def start(self) -> Start | None:
@@ -123,7 +123,7 @@ class ProfileTable:
         return any(name in self.values for name in APART)
 
     @property
-    def stated(self) -> tuple[str, ...]:
+    def stated(self) -> Names:
         """Columns of conditions that it states, as a table of runs names them."""
         names = {"voltage": SUPPLY, "slope_deg": "slope_deg", "payload": "payload_kg", "load_torque": LOAD}
         return (
@@ -191,13 +191,6 @@ class ProfileTable:
         return dataclasses.replace(made, adhesion=of(adhesion_ratio), adhesion_lateral=lateral)
 
 
-def known_columns() -> dict[str, tuple[str, str]]:
-    """Every column of numbers: field that it becomes, and unit."""
-    return {
-        column: (field, unit) for field, quantity in QUANTITIES.items() for column, unit in quantity.columns().items()
-    }
-
-
 def read_profile(source: str | Path) -> ProfileTable:
     """Returns a packaged profile, by its name, or the profile of a file in any format of a table.
 
@@ -229,9 +222,7 @@ def _of_text(content: bytes, name: str) -> ProfileTable:
     return _parsed(name, settings, rows, hashlib.sha256(content).hexdigest(), (*encoded, *notes))
 
 
-def _parsed(
-    name: str, settings: dict[str, Any], rows: list[list[str]], digest: str, notes: tuple[str, ...]
-) -> ProfileTable:
+def _parsed(name: str, settings: Json, rows: list[list[str]], digest: str, notes: Names) -> ProfileTable:
     if not rows:
         raise BadData(f"{name}: the file is empty; expected a header with time_s and rows")
     header, body = rows[0], rows[1:]
@@ -260,9 +251,9 @@ def _parsed(
     )  # fmt: skip
 
 
-def _settings(name: str, comments: list[str]) -> dict[str, Any]:
+def _settings(name: str, comments: list[str]) -> Json:
     """Settings in the comment lines at the top: `cycles = 40`, `between_rows = "linear"`; other lines are remarks."""
-    stated: dict[str, Any] = {}
+    stated: Json = {}
     for line in comments:
         text = line.lstrip("#").strip()
         if not re.match(r"[\w-]+\s*=", text):
@@ -299,7 +290,9 @@ def _columns(name: str, header: list[str]) -> dict[str, tuple[str, str]]:
     Raises:
         BadData: an unknown column or unit, a field twice, no time.
     """
-    known: dict[str, tuple[str, str]] = known_columns()
+    known: dict[str, tuple[str, str]] = {
+        column: (field, unit) for field, quantity in QUANTITIES.items() for column, unit in quantity.columns().items()
+    }
     found: dict[str, tuple[str, str]] = {}
     for column in header:
         if column in (MODE, SURFACE):
@@ -384,7 +377,7 @@ class _Cells:
             found.append(found[-1] if ends else self.value(field, row))
         return np.array(found)
 
-    def surfaces(self) -> tuple[str, ...] | None:
+    def surfaces(self) -> Names | None:
         if not self.has(SURFACE):
             return None
         found: list[str] = []
@@ -405,7 +398,7 @@ def _time(cells: _Cells) -> np.ndarray:
     return time
 
 
-def _driven(cells: _Cells) -> tuple[tuple[str, ...], dict[str, np.ndarray]]:
+def _driven(cells: _Cells) -> tuple[Names, Columns]:
     """Mode of each row, and by field of `Profile` its demand, and the duties, voltages and yaw rates that are stated.
 
     A cell of a demand column in a row of another mode ends the ramp that leads to this row, where values are linear

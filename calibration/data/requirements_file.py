@@ -9,6 +9,7 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
+from calibration.data import Json
 from calibration.data.input_errors import BadConfiguration, allowed_words, stated_number
 from calibration.data.input_files import toml_content, toml_text
 from mmrjax.derived.requirements import QUANTITIES
@@ -214,7 +215,7 @@ def _range(value: Any, where: str, low: float, high: float, unit: str) -> Range:
 
 def _envelope(base: Envelope, stated: Mapping[str, Any], where: str) -> Envelope:
     """`base` with the stated values in place of its own."""
-    found: dict[str, Any] = {}
+    found: Json = {}
     for key, value in stated.items():
         place = f"{where}.{key}"
         if key not in KEYS:
@@ -249,7 +250,7 @@ def _envelope(base: Envelope, stated: Mapping[str, Any], where: str) -> Envelope
 def _requirements(name: str, value: Any, envelope: Envelope, where: str) -> list[Requirement]:
     """The one or two requirements (least, most) of one entry."""
     quantity = QUANTITIES[name]
-    table = dict(value) if isinstance(value, dict) else {quantity_key(quantity): value}
+    table = dict(value) if isinstance(value, dict) else {"least" if quantity.least else "most": value}
     limits = {s: _limit(table.pop(s), where, quantity) for s in ("least", "most") if s in table}
     source, duty, share = table.pop("source", ""), table.pop("duty", None), table.pop("share", None)
     tread = table.pop(TREAD) if TREAD in table and name == STAIRS else None
@@ -294,11 +295,6 @@ def _limit(value: Any, where: str, quantity: Quantity) -> float | None:
         return None
     limits = RANGES["slope_deg"][:2] if quantity.unit == "deg" else STATED
     return stated_number(value, where, *limits, quantity.unit)
-
-
-def quantity_key(quantity: Quantity) -> str:
-    """`least` or `most`: the meaning of a number alone."""
-    return "least" if quantity.least else "most"
 
 
 def _share(duty: Any, share: Any, where: str) -> float:

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from calibration.data import rig_file
+from calibration.data import Names, rig_file
 from calibration.data.columns import CURRENT, LOAD, SPEED, SUPPLY
 from calibration.data.courses import applied_drive, changing_columns, course_stretches
 from calibration.data.input_errors import three_digits
@@ -477,7 +477,7 @@ def swapped_sentence(runs: Runs) -> str:
     return ""
 
 
-def log_doubts(runs: Runs, robot: Robot) -> tuple[str, ...]:
+def log_doubts(runs: Runs, robot: Robot) -> Names:
     """Sentences on a log's times, its levels and limits, and on units that do not fit the robot."""
     every = (
         gap_sentence(runs),

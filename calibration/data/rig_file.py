@@ -8,6 +8,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+from calibration.data import Json, Names
 from calibration.data.columns import Layout
 from calibration.data.input_errors import BadConfiguration, allowed_words, is_number
 from calibration.data.writing import toml_value
@@ -79,7 +80,7 @@ FOLLOWS = {
 }
 
 
-def linear_to_shaft(table: dict[str, Any], name: str, where: str, sds: dict[str, float], sides: float) -> None:
+def linear_to_shaft(table: Json, name: str, where: str, sds: dict[str, float], sides: float) -> None:
     """Converts the table of a linear unit, and its sds, into the table of the shaft of one of its drives.
 
     Travel r per radian is lead / 2π or the drum's radius. With n drives, each drive has
@@ -164,7 +165,7 @@ def vehicle_defaults(on_tracks: bool, table: Mapping[str, Any], sides: float) ->
     return found | {DYNAMIC: DYNAMIC_SHARE * stated(*DYNAMIC.split(".")[:-1], "static"), "inertia": wheels}
 
 
-def parse_rig(content: dict[str, Any], where: str, loads: Sequence[str], *, travels: bool, inherits: bool) -> Rig:
+def parse_rig(content: Json, where: str, loads: Sequence[str], *, travels: bool, inherits: bool) -> Rig:
     """The rig that a file's content states; takes the `KEYS` out of it.
 
     Args:
@@ -204,7 +205,7 @@ def _one_of(word: Any, known: Sequence[str], where: str) -> str:
     return str(word)
 
 
-def _channels(stated: Any, where: str) -> tuple[str, ...]:
+def _channels(stated: Any, where: str) -> Names:
     every = channels.channel_names(channels.EVERY)
     if not isinstance(stated, list) or not stated or not all(isinstance(name, str) for name in stated):
         raise BadConfiguration(
@@ -286,7 +287,7 @@ def _columns(stated: Any, where: str) -> tuple[tuple[str, str, float], ...]:
     return tuple(found)
 
 
-def needed_parameters(rig: Rig, values: Iterable[tuple[str, Any]] = ()) -> tuple[str, ...]:
+def needed_parameters(rig: Rig, values: Iterable[tuple[str, Any]] = ()) -> Names:
     """Required parameters of a robot that starts from nothing: of its drive, and of its turns if it turns.
 
     Args:

@@ -11,7 +11,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from calibration.data import rig_file, stated
+from calibration.data import Json, Names, rig_file, stated
 from calibration.data.configuration_tables import loads_from_tables, resolved_likes
 from calibration.data.effect_file import Library
 from calibration.data.input_errors import BadConfiguration, allowed_words, bound_text, is_number
@@ -79,7 +79,7 @@ class RobotFile:
     stated: frozenset[str] = frozenset()
     linear: frozenset[str] = frozenset()
     text: str = ""
-    remarks: tuple[str, ...] = ()
+    remarks: Names = ()
 
     @property
     def name(self) -> str:
@@ -189,7 +189,7 @@ def parse_robot_file(path: Path, library: Library = effects.BY_NAME, notes: list
 
 
 def _without_parameters(
-    base: Robot | None, content: dict[str, Any], where: str
+    base: Robot | None, content: Json, where: str
 ) -> tuple[Robot, dict[str, float], frozenset[str]]:
     """The robot of a file's content before the parameters that it states, the sds stated of those, its linear units.
 
@@ -281,7 +281,7 @@ def change_robot(robot: Robot, values: Mapping[str, Any], where: str, notes: lis
     """
     stated = dict(values)
     counts = {name: _count(where, name, stated.pop(name)) for name in COUNTS if name in stated}
-    ratings: dict[str, Any] = {name: _rating(where, name, stated.pop(name)) for name in RATINGS if name in stated}
+    ratings: Json = {name: _rating(where, name, stated.pop(name)) for name in RATINGS if name in stated}
     if CURVE & stated.keys() and "battery.capacity" in stated:  # all of one cell, unless stated otherwise
         ratings.setdefault("battery.capacity_curve", stated["battery.capacity"])
     ratings |= {name: _switch(where, name, stated.pop(name)) for name in SWITCHES if name in stated}
@@ -474,6 +474,7 @@ def _lines_of_parameters(robot: Robot, nothing: Robot) -> Iterator[tuple[str, st
         was = start.get(parameter.name, 0.0 if table.startswith("effects.") else None)
         same = value == was and not parameter.name.startswith(always) and parameter.name not in needed
         same &= parameter.name not in nothing.rig.unknown or parameter.name in robot.rig.unknown
+        same &= whole or parameter.name not in robot.rig.stated
         if same and (not whole or table == "rig"):
             continue
         origin = f"; nominal {was:g}: {spec.source}" if was is not None and value != was else ""
@@ -520,7 +521,7 @@ def _start(robot: Robot) -> Robot:
     return params.replace(nothing, {name: jnp.asarray(value) for name, (value, _) in rig_file.DEFAULTS.items()})
 
 
-def _flatten(content: dict[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
+def _flatten(content: Json, prefix: str = "") -> list[tuple[str, Any]]:
     flat: list[tuple[str, Any]] = []
     for key, value in content.items():
         name = f"{prefix}{key}"

@@ -1,14 +1,14 @@
-"""Checks of rows: values of columns that contradict each other, and missing columns with a default."""
+"""Checks of rows: contradictions between columns, missing columns with a default, and repeated readings."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
-from calibration.data import surfaces
+from calibration.data import Columns, Names, surfaces
 from calibration.data.columns import (
     DEFAULTS,
     DRIVEN,
@@ -29,17 +29,86 @@ from mmrjax.model.quantities import VOLTAGE
 from mmrjax.model.rig import Instrument
 from mmrjax.model.robot import Robot
 
+#: Least rows between two readings of a slow sensor, and least number of its readings.
+APART, FEWEST = 2, 12
+#: Share of changes that may come sooner than a period, and least share that comes after a whole number of periods.
+SOONER, REGULAR = 0.02, 0.8
+#: Least share of rows that repeat the row before, and least ratio of the periods of recordings.
+LEAST, ALIKE = 0.3, 0.8
+#: Least share of changes by one smallest step for which a channel's repeats are attributed to its display.
+STEPS = 0.5
+
+
+def reading_period(values: np.ndarray) -> float:
+    """Rows of a log between two readings of a slow sensor; 0 for a channel that is read in every row.
+
+    A slow sensor changes at even distances of two rows or more, and rarely sooner. An instrument of coarse steps
+    repeats numbers too, but changes by its smallest step, or at any distance.
+
+    Args:
+        values: readings of a channel in one recording, in the order of time; NaN if missing.
+    """
+    values = values[np.isfinite(values)]
+    changed = np.flatnonzero(np.diff(values) != 0)
+    gaps = np.diff(changed)
+    if len(gaps) < FEWEST:
+        return 0.0
+    size = np.abs(np.diff(values)[changed])
+    smallest = size.min()
+    if (size <= 1.5 * smallest).mean() > STEPS:
+        return 0.0
+    usual = float(np.median(gaps))
+    near = gaps[gaps <= 1.5 * usual]
+    rows = usual if abs(near.mean() - usual) < 0.25 and (near == usual).mean() > 0.5 else float(near.mean())
+    if usual < APART or (gaps < usual - 1.5).mean() > SOONER or (usual < 3 and (gaps < APART).mean() > SOONER):
+        return 0.0
+    off = np.abs(gaps - rows * np.maximum(np.round(gaps / rows), 1))
+    return rows if (off <= np.maximum(1.0, 0.1 * gaps)).mean() >= REGULAR and len(near) >= 0.5 * len(gaps) else 0.0
+
+
+def used_once(values: np.ndarray, time: np.ndarray, run: np.ndarray | None = None) -> tuple[np.ndarray, float]:
+    """Returns a channel's values with one row for each reading of a slow sensor, NaN in the rows that repeat it, and
+    the rows between readings; the unchanged values and 0 if no reading is repeated.
+
+    Args:
+        values: NaN for a missing reading, shape (rows,); time: of the rows; run: name of the recording of each row;
+            None: all are of one.
+    """
+    if (np.diff(values) == 0).sum() < LEAST * len(values):
+        return values, 0.0
+    names = np.zeros(len(values), int) if run is None else np.unique(run, return_inverse=True)[1]
+    order = np.lexsort((time, names))
+    recordings = np.split(order, np.flatnonzero(np.diff(names[order])) + 1)
+    periods = [reading_period(values[rows]) for rows in recordings]
+    of_period = sum(len(rows) for rows, p in zip(recordings, periods, strict=True) if p)
+    found = [p for p in periods if p]
+    if not found or min(found) < ALIKE * max(found) or of_period < 0.5 * len(values):
+        return values, 0.0
+    rows_apart = float(np.median(found))
+    kept = np.full(len(values), np.nan)
+    for rows in recordings:
+        shown = rows[np.isfinite(values[rows])]
+        begins = np.flatnonzero(np.concatenate([[True], np.diff(values[shown]) != 0]))[: len(shown)]
+        lengths = np.diff(np.append(begins, len(shown)))
+        times = np.maximum(np.floor(lengths / rows_apart + 0.5), 1).astype(int)  # a reading may be the same again
+        first = np.repeat(begins, times)
+        again = np.arange(len(first)) - np.repeat(np.cumsum(times) - times, times)
+        at = shown[np.minimum(first + np.round(again * rows_apart).astype(int), len(shown) - 1)]
+        kept[at] = values[at]
+    return kept, rows_apart
+
+
 #: Excess of a reading beyond zero by its noise, in stated sds, and as a share of the channel's rms.
 SIGN_SDS, SIGN_SHARE = 4.0, 0.05
 #: Fewest levels of the drive that show whether readings have signs.
 LEVELS_OF_SIGN = 3
 #: Least time between settled points [s], and in time constants of the motors with their load.
-APART, SETTLED = 0.5, 5.0
+SECONDS_APART, CONSTANTS_APART = 0.5, 5.0
 #: Share of the largest reading of a speed below which an undriven motor counts as at rest.
 STILL = 0.02
 
 
-def complete_columns(name: str, columns: dict[str, np.ndarray], rows: int, layout: Layout) -> None:
+def complete_columns(name: str, columns: Columns, rows: int, layout: Layout) -> None:
     """Fills columns that a table may leave out, and refuses values that contradict each other."""
     _fill(name, columns, rows, layout)
     _check_driving(name, columns)
@@ -49,7 +118,7 @@ def complete_columns(name: str, columns: dict[str, np.ndarray], rows: int, layou
     _check_deviations(name, columns, layout.channels)
 
 
-def without_copies(name: str, columns: dict[str, np.ndarray]) -> tuple[np.ndarray, tuple[str, ...]]:
+def without_copies(name: str, columns: Columns) -> tuple[np.ndarray, Names]:
     """Returns False for rows of a log that are the row before once more, shape (rows,), and a sentence on them."""
     rows = len(next(iter(columns.values()), []))
     kept = np.full(rows, True)
@@ -76,7 +145,7 @@ def without_copies(name: str, columns: dict[str, np.ndarray]) -> tuple[np.ndarra
     return kept, (said,) if again.size else ()
 
 
-def _fill(name: str, columns: dict[str, np.ndarray], rows: int, layout: Layout) -> None:
+def _fill(name: str, columns: Columns, rows: int, layout: Layout) -> None:
     """Adds columns that a table of a rig may leave out: its only configuration, and conditions with a usual value."""
     if layout.complete:
         return
@@ -88,7 +157,7 @@ def _fill(name: str, columns: dict[str, np.ndarray], rows: int, layout: Layout) 
         columns.setdefault(column, np.full(rows, value))
 
 
-def _only(name: str, columns: dict[str, np.ndarray], layout: Layout) -> str:
+def _only(name: str, columns: Columns, layout: Layout) -> str:
     """Returns the configuration of a table without that column: the only one, or the only one with its surfaces."""
     labels = np.unique(columns.get("surface", np.zeros(0, str)))
     found = surfaces.common_configuration(layout.configurations, labels)
@@ -99,7 +168,7 @@ def _only(name: str, columns: dict[str, np.ndarray], layout: Layout) -> str:
     return found
 
 
-def _check_driving(name: str, columns: dict[str, np.ndarray]) -> None:
+def _check_driving(name: str, columns: Columns) -> None:
     if "mode" in columns and not set(TIME) <= set(columns):  # settled runs are driven
         raise BadData(f"{name}: column mode is for time histories; add {', '.join(TIME)}, or remove it")
     if "duty" not in columns:
@@ -117,7 +186,7 @@ def _check_driving(name: str, columns: dict[str, np.ndarray]) -> None:
     columns["duty"] = np.nan_to_num(duty)
 
 
-def _check_sides(name: str, columns: dict[str, np.ndarray], layout: Layout) -> None:
+def _check_sides(name: str, columns: Columns, layout: Layout) -> None:
     stated = [c for c in layout.sides if c in columns]
     if len(stated) == 1:
         (other,) = set(layout.sides) - set(stated)
@@ -129,7 +198,7 @@ def _check_sides(name: str, columns: dict[str, np.ndarray], layout: Layout) -> N
         )
 
 
-def _check_held(name: str, columns: dict[str, np.ndarray]) -> None:
+def _check_held(name: str, columns: Columns) -> None:
     """Refuses a clamp in a log, and a load torque beside it: what the clamp carries is a reading."""
     held = columns.get("held", np.zeros(1)) > 0.5
     if held.any() and set(TIME) <= set(columns):
@@ -141,7 +210,7 @@ def _check_held(name: str, columns: dict[str, np.ndarray]) -> None:
         )
 
 
-def _check_mass(name: str, columns: dict[str, np.ndarray]) -> None:
+def _check_mass(name: str, columns: Columns) -> None:
     if "total_mass_kg" not in columns:
         return
     total, payload = columns["total_mass_kg"], columns["payload_kg"]
@@ -154,7 +223,7 @@ def too_light(where: str, total: float, payload: float) -> str:
     return f"{where}, total_mass_kg: got {bound_text(total)}; expected {included}"
 
 
-def _check_deviations(name: str, columns: dict[str, np.ndarray], shown: tuple[Channel, ...]) -> None:
+def _check_deviations(name: str, columns: Columns, shown: tuple[Channel, ...]) -> None:
     for channel in shown:
         if channel.column in columns and channel.sd_column in columns:
             lost = np.isfinite(columns[channel.column]) & ~np.isfinite(columns[channel.sd_column])
@@ -165,22 +234,22 @@ def _check_deviations(name: str, columns: dict[str, np.ndarray], shown: tuple[Ch
                 )
 
 
-def settled_points(
-    name: str, columns: Mapping[str, np.ndarray], layout: Layout, robot: Robot
-) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
+def settled_points(name: str, columns: Columns, layout: Layout, robot: Robot) -> tuple[Columns, Names]:
     """Returns columns without the time if each row is a settled run, and a note that says so.
 
-    Rows are `APART` and `SETTLED` time constants of the motors after one another, and half of them have another
-    setting than the row before. Readings follow the setting of their own row as well as that of the row before, as
-    they do not if a setting begins at its row.
+    Rows are `SECONDS_APART` and `CONSTANTS_APART` time constants of the motors after one another, and half of them
+    have another setting than the row before. Readings follow the setting of their own row as well as that of the
+    row before. They do not if a setting begins at its row.
     """
     kept, time = dict(columns), columns.get("time_s")
-    if time is None or len(time) < 3 or layout.imposed != "voltage" or "held" in columns:
+    if time is None or len(time) < 3 or layout.imposed != "voltage" or SUPPLY not in columns:
+        return kept, ()
+    if {"held", "mode", *layout.sides} & set(columns):
         return kept, ()
     shown = [c for c in layout.channels if c.column in columns]
     constant, step = time_constant(robot), np.diff(time)
     apart = float(step[step > 0].min(initial=math.inf))
-    if not all(c.settled for c in shown) or not math.inf > apart >= max(APART, SETTLED * constant):
+    if not all(c.settled for c in shown) or not math.inf > apart >= max(SECONDS_APART, CONSTANTS_APART * constant):
         return kept, ()
     settings = [c for c in (SUPPLY, "duty", LOAD, "slope_deg", "payload_kg") if c in columns]
     changed = np.any([np.diff(columns[c]) != 0 for c in settings], 0) if settings else np.zeros(1, bool)
@@ -197,7 +266,7 @@ def settled_points(
             return kept, ()
     kept = {column: values for column, values in kept.items() if column not in ("time_s", "run_id")}
     said = f"rows are {three_digits(apart)} s apart or more, most at another setting"
-    settle = f", and the motors settle in about {three_digits(SETTLED * constant)} s" if constant > 0 else ""
+    settle = f", and the motors settle in about {three_digits(CONSTANTS_APART * constant)} s" if constant > 0 else ""
     return kept, (f"{name}: {said}{settle}: each row is read as a settled run, without its time",)
 
 
@@ -225,9 +294,7 @@ def time_constant(robot: Robot) -> float:
     return found * float(motor.resistance) / float(motor.torque_constant) ** 2
 
 
-def driven_rows(
-    name: str, columns: dict[str, np.ndarray], layout: Layout
-) -> tuple[dict[str, np.ndarray], np.ndarray, tuple[str, ...]]:
+def driven_rows(name: str, columns: Columns, layout: Layout) -> tuple[Columns, np.ndarray, Names]:
     """Returns the columns of settled runs in rows where something drives the motors, True for these rows, and a note
     on the other ones.
 
@@ -244,7 +311,7 @@ def driven_rows(
     return columns, driven, (note,) if note else ()
 
 
-def _driven(name: str, columns: dict[str, np.ndarray], layout: Layout) -> tuple[np.ndarray, str]:
+def _driven(name: str, columns: Columns, layout: Layout) -> tuple[np.ndarray, str]:
     """True for rows of settled runs in which something drives the motors; a sentence on the other rows.
 
     Raises:
@@ -282,7 +349,7 @@ def _driven(name: str, columns: dict[str, np.ndarray], layout: Layout) -> tuple[
     )
 
 
-def _check_level(name: str, columns: dict[str, np.ndarray]) -> None:
+def _check_level(name: str, columns: Columns) -> None:
     """Refuses readings of turns on a slope, since no turn is settled there."""
     slope = columns["slope_deg"]
     if slope.any():
@@ -295,7 +362,7 @@ def _check_level(name: str, columns: dict[str, np.ndarray]) -> None:
         )
 
 
-def _check_signs(name: str, columns: dict[str, np.ndarray], layout: Layout) -> None:
+def _check_signs(name: str, columns: Columns, layout: Layout) -> None:
     """Refuses readings without a sign in rows that drive the robot backward."""
     column = layout.imposed_column
     imposed, unit = columns[column], column.split("_")[-1]
@@ -357,14 +424,14 @@ def _rises_through_zero(imposed: np.ndarray, readings: np.ndarray, backward: np.
     return bool(slope * np.ptp(levels) > 2 * scatter)
 
 
-def _doubt(columns: dict[str, np.ndarray], channel: Channel) -> np.ndarray | float:
+def _doubt(columns: Columns, channel: Channel) -> np.ndarray | float:
     """Largest excess of a reading beyond zero by noise: SIGN_SDS of its sd, or a share of the channel's rms."""
     readings = columns[channel.column]
     share = SIGN_SHARE * float(np.sqrt(np.nanmean(readings**2))) if np.isfinite(readings).any() else 0.0
     return np.fmax(share, SIGN_SDS * np.nan_to_num(columns.get(channel.sd_column, np.zeros(len(readings)))))
 
 
-def missing_data_notes(name: str, columns: dict[str, np.ndarray], layout: Layout) -> Iterator[str]:
+def missing_data_notes(name: str, columns: Columns, layout: Layout) -> Iterator[str]:
     """Yields notes on missing channels and readings, on copies of rows, and on runs with several rows."""
     for channel in layout.channels:
         if channel.column not in columns:
@@ -403,7 +470,7 @@ def missing_data_notes(name: str, columns: dict[str, np.ndarray], layout: Layout
             )
 
 
-def driven_backward_notes(name: str, columns: dict[str, np.ndarray], layout: Layout) -> Iterator[str]:
+def driven_backward_notes(name: str, columns: Columns, layout: Layout) -> Iterator[str]:
     """Yields a note on settled rows in which a load torque without a sign drives a shaft that runs backward."""
     on = np.flatnonzero(driven_on(columns, layout))
     if on.size and not set(TIME) & set(columns) and columns[LOAD].min() >= 0:

@@ -16,14 +16,15 @@ from typing import Any
 import numpy as np
 
 from calibration.data import (
-    cell_values,
+    Columns,
+    Json,
+    Names,
     clock,
     column_names,
     contradictions,
     delimited,
     instruments,
     presets_file,
-    repeated_readings,
     row_checks,
     sides,
 )
@@ -181,9 +182,9 @@ def of_arrays(
 
 def _columns(
     arrays: NamedArrays, meanings: Sequence[Column | None], layout: Layout, battery: bool
-) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
+) -> tuple[Columns, Names]:
     """Values of the columns with a meaning, and notes on cells that are read as another value."""
-    columns: dict[str, np.ndarray] = {}
+    columns: Columns = {}
     bad: list[tuple[int, int, str]] = []
     notes: list[str] = []
     count = 0
@@ -203,11 +204,11 @@ def _columns(
         elif meaning.column in layout.idle:
             _refuse_idle(arrays, meaning, raw, layout)
         else:
-            columns[meaning.column], refused = cell_values.convert_column(meaning, raw, layout)
+            columns[meaning.column], refused = column_names.convert_column(meaning, raw, layout)
             wrong = np.flatnonzero(refused).tolist()
             count += len(wrong)
             for k in wrong[:LISTED]:
-                said = cell_values.refused_cell_sentence(
+                said = column_names.refused_cell_sentence(
                     arrays.row(k), meaning, column_texts(raw[k : k + 1])[0], layout
                 )
                 bad.append((k, j, said))
@@ -234,13 +235,13 @@ def _listed(name: str, said: Sequence[str], count: int) -> str:
     return f"{first}; also {'; '.join(more)}{rest}"
 
 
-def _without_repeats(name: str, columns: dict[str, np.ndarray], layout: Layout) -> Iterator[str]:
+def _without_repeats(name: str, columns: Columns, layout: Layout) -> Iterator[str]:
     """Takes readings that a log repeats out of its columns, with a sentence on each channel."""
     if not set(TIME) <= set(columns):
         return
     run = columns.get("run_id")
     for channel in (c for c in layout.channels if c.column in columns and c.column != layout.imposed_column):
-        values, rows = repeated_readings.used_once(columns[channel.column], columns["time_s"], run)
+        values, rows = row_checks.used_once(columns[channel.column], columns["time_s"], run)
         if rows:
             columns[channel.column] = values
             yield (
@@ -311,7 +312,7 @@ def _refuse_stated(arrays: NamedArrays, voltages: Raw) -> None:
         )
 
 
-def single_run(cells: dict[str, Any], layout: Layout | None = None) -> Runs:
+def single_run(cells: Json, layout: Layout | None = None) -> Runs:
     """Returns one run from options by column name, each checked as a cell of a file; on a battery without a voltage.
 
     Args:
@@ -322,14 +323,14 @@ def single_run(cells: dict[str, Any], layout: Layout | None = None) -> Runs:
     """
     layout = Layout() if layout is None else layout
     rows = layout.quantities()
-    columns: dict[str, np.ndarray] = {}
+    columns: Columns = {}
     for column, value in cells.items():
         quantity = rows[column]
         meaning = Column(quantity, column, next(iter(quantity.units)))
         text = bound_text(value) if isinstance(value, float) else str(value)
-        columns[column], refused = cell_values.convert_column(meaning, [text], layout)
+        columns[column], refused = column_names.convert_column(meaning, [text], layout)
         if refused.any():
-            raise BadConfiguration(cell_values.refused_cell_sentence("option", meaning, text, layout, hints=False))
+            raise BadConfiguration(column_names.refused_cell_sentence("option", meaning, text, layout, hints=False))
     if layout.imposed == "voltage":
         columns.setdefault(SUPPLY, np.array([math.nan]))
     if "total_mass_kg" in cells and cells["total_mass_kg"] <= cells["payload_kg"]:

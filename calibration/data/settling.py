@@ -11,6 +11,7 @@ from itertools import pairwise
 import jax.numpy as jnp
 import numpy as np
 
+from calibration.data import Columns
 from calibration.data.columns import LOAD, SPEED, TIME
 from calibration.data.contradictions import GAP
 from calibration.data.courses import applied_drive, differs_from_row_before
@@ -161,10 +162,10 @@ class Settled:
         columns = {name: x for name, x in columns.items() if len(x) == count and name not in (*TIME, "mode")}
         return dataclasses.replace(self.runs, columns=columns, extras={}, log=None)
 
-    def table(self) -> dict[str, np.ndarray]:
+    def table(self) -> Columns:
         """The settled runs, a column each as tables of runs have them."""
         kept = self.kept
-        found: dict[str, np.ndarray] = {}
+        found: Columns = {}
         means = dict(self.runs.columns) | {k: v for k, v in self.runs.extras.items() if v.dtype.kind == "f"}
         read = {c.column for s in self.signals for c in (s.channel,)} | {"time_s", "order", "run_id"}
         read |= {c.sd_column for c in channels.EVERY} | {angle for angle, _, _ in RATES}

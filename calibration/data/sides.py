@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from calibration.data import Columns, Names
 from calibration.data.columns import DUTY, SIDES, SUPPLY, VOLTS, Layout
 from calibration.data.input_errors import BadData, bound_text
 from calibration.data.table import Runs, drive_of_sides
@@ -32,7 +33,7 @@ def supply_and_shares(volts: np.ndarray, supply: np.ndarray | None = None) -> tu
     return source, np.divide(volts, source, out=np.zeros_like(volts), where=source != 0)
 
 
-def of_volts(name: str, columns: dict[str, np.ndarray], battery: bool) -> tuple[str, ...]:
+def of_volts(name: str, columns: Columns, battery: bool) -> Names:
     """Replaces the sides' voltages of a table by their shares of the supply's voltage.
 
     Returns:

@@ -6,6 +6,7 @@ import math
 import re
 from typing import Any
 
+from calibration.data import Json
 from calibration.data.input_errors import BadConfiguration, parse_number
 
 FORM = 'expected a number, or one with its standard deviation as "0.61 ± 0.03" or "0.61 ± 5 %"'
@@ -43,7 +44,7 @@ def stated_number(text: str, where: str) -> tuple[float, float]:
     return mean, float(f"{size:.12g}")  # a percentage leaves digits of rounding
 
 
-def taken_apart(table: dict[str, Any], where: str, prefix: str = "") -> dict[str, float]:
+def taken_apart(table: Json, where: str, prefix: str = "") -> dict[str, float]:
     """Replaces each `value ± sd` of a table and its subtables by the value; returns the sds by dotted name.
 
     Raises:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from calibration.data import surface_labels
+from calibration.data import Columns, Names, surface_labels
 from calibration.data.columns import (
     CIRCUITS,
     CONDITIONS,
@@ -68,12 +68,12 @@ class Runs:
     """
 
     source: str
-    columns: dict[str, np.ndarray]
-    unknown: tuple[str, ...] = ()
+    columns: Columns
+    unknown: Names = ()
     digest: str = ""
     extras: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
     layout: Layout = dataclasses.field(default_factory=Layout)
-    notes: tuple[str, ...] = ()
+    notes: Names = ()
     headings: Mapping[str, str] = dataclasses.field(default_factory=dict)
     log: Runs | None = None
 
@@ -128,7 +128,7 @@ class Runs:
         )
 
     @property
-    def axes(self) -> tuple[str, ...]:
+    def axes(self) -> Names:
         """Columns of the conditions that its runs have, the imposed quantity first."""
         duty = () if self.sampled else DUTY
         usual = (*CONDITIONS, *DUTY, *WHEN)
@@ -192,7 +192,7 @@ class Runs:
         """Stated sds of the readings [SI], NaN for others, shape (rows, channels)."""
         return self._stacked(tuple(c.sd_column for c in self.channels))
 
-    def _stacked(self, columns: tuple[str, ...]) -> np.ndarray:
+    def _stacked(self, columns: Names) -> np.ndarray:
         nothing = np.full(len(self), np.nan)
         found = [self.columns.get(column, nothing) for column in columns]
         return np.stack(found, 1) * np.asarray([c.factor for c in self.channels])

@@ -8,7 +8,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data import delimited, input_files, named_arrays
+from calibration.data import Columns, delimited, input_files, named_arrays
 from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.data.named_arrays import column_texts
 from calibration.data.sources import reading
@@ -44,7 +44,7 @@ def parse_stairs(text: str) -> tuple[float, float, int]:
     return rise / 1000, tread / 1000, int(count)
 
 
-def _read(path: Path, option: str, wanted: Rows[Rows[str]]) -> tuple[dict[str, np.ndarray], Rows[str]]:
+def _read(path: Path, option: str, wanted: Rows[Rows[str]]) -> tuple[Columns, Rows[str]]:
     """Columns of the first of some headers that a file has."""
     if not path.exists():
         raise BadConfiguration(f"{option}: got {path}, no such file")

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
+from calibration.data import Json
 from calibration.data.input_errors import BadConfiguration
 from calibration.inference.fit_notes import Remark, next_step
 from calibration.inference.identifiability import Z95
@@ -71,7 +70,7 @@ def analyse_sensitivity(
             "--parameters: the derivative of every output by every input is zero; choose others, or change --outputs"
         )
     parts = _by_method(study, method, ~idle, evaluations, seed)
-    comparison: dict[str, dict[str, Any]] = {}
+    comparison: dict[str, Json] = {}
     if method == "derivative":
         spent = study.evaluations, study.seconds, dict(study.sampled)
         study.tell(next_step("sobol"))
@@ -172,9 +171,9 @@ def _study_of(row: Quantity, study: Study, found: Local, part: Part | None) -> O
     )
 
 
-def _compared(study: Study, bounds: dict[str, Part], sampled: dict[str, Part]) -> dict[str, dict[str, Any]]:
+def _compared(study: Study, bounds: dict[str, Part], sampled: dict[str, Part]) -> dict[str, Json]:
     """Comparison of derivative bounds with Sobol indices of the same points, by output."""
-    compared: dict[str, dict[str, Any]] = {}
+    compared: dict[str, Json] = {}
     for name, bound in bounds.items():
         beside = sampled[name]
         if not bound.overall or not beside.overall:

@@ -7,6 +7,7 @@ import dataclasses
 import jax
 import numpy as np
 
+from calibration.data import Columns
 from calibration.inference.identifiability import Z95
 from calibration.sensitivity import derivative
 from calibration.sensitivity.study import Study, source_words
@@ -25,10 +26,10 @@ class Local:
         swing: with each single input at the ends of its 95 % interval [SI], shape (2, points, inputs).
     """
 
-    value: dict[str, np.ndarray]
-    derivative: dict[str, np.ndarray]
-    by_score: dict[str, np.ndarray]
-    swing: dict[str, np.ndarray]
+    value: Columns
+    derivative: Columns
+    by_score: Columns
+    swing: Columns
     statuses: dict[str, dict[str, int]]
 
 

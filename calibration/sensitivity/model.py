@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from calibration.data import Columns, Names
 from calibration.data.contradictions import cannot_stand
 from calibration.data.input_errors import BadConfiguration, allowed_words
 from mmrjax import derived, fidelities
@@ -39,8 +40,8 @@ class Answer:
         statuses: source (a fidelity, or a module of derived outputs) → codes, shape (points,).
     """
 
-    values: dict[str, np.ndarray]
-    statuses: dict[str, np.ndarray]
+    values: Columns
+    statuses: Columns
 
     def counts(self) -> dict[str, dict[str, int]]:
         """Source → status → number of points."""
@@ -58,9 +59,9 @@ def known_outputs(robot: Robot) -> dict[str, Quantity]:
     return {o.name: o for o in (*table_of_outputs.output_table(robot.channels), *derived.TABLE)}
 
 
-def default_outputs(robot: Robot, turns: bool) -> tuple[str, ...]:
+def default_outputs(robot: Robot, turns: bool) -> Names:
     """Names of the default outputs: every channel, and those defined for the robot's load."""
-    beside: tuple[str, ...] = DEFAULT
+    beside: Names = DEFAULT
     if turns:
         apart = {row.name for row in derived.OF_STRAIGHT}
         return (
@@ -76,7 +77,7 @@ def default_outputs(robot: Robot, turns: bool) -> tuple[str, ...]:
     return tuple(n for n in (*channels.channel_names(robot.channels), *beside) if robot.knows(outputs[n].rests_on))
 
 
-def chosen_outputs(words: tuple[str, ...], robot: Robot, turns: bool = False) -> tuple[Quantity, ...]:
+def chosen_outputs(words: Names, robot: Robot, turns: bool = False) -> tuple[Quantity, ...]:
     """Outputs of these names, or the default ones for none; `start` means all outputs of a start.
 
     Args:
@@ -127,7 +128,7 @@ class Model:
     """
 
     robot: Robot
-    columns: tuple[str, ...]
+    columns: Names
     fidelity: str
     options: Mapping[str, float]
     outputs: tuple[Quantity, ...]
@@ -168,17 +169,15 @@ class Model:
         statuses = {source: codes for part in parts.values() for source, codes in part.statuses.items()}
         return Answer({o.name: values[o.name] for o in self.outputs}, statuses)
 
-    def ignores(self, source: str) -> tuple[str, ...]:
+    def ignores(self, source: str) -> Names:
         """Conditions without influence on any output of a source."""
         each = [set(o.ignores) for o in self.sources[source]]
         return tuple(sorted(set.intersection(*each)))
 
-    def derivatives(
-        self, values: Float[np.ndarray, "points columns"], conditions: Conditions
-    ) -> dict[str, np.ndarray]:
+    def derivatives(self, values: Float[np.ndarray, "points columns"], conditions: Conditions) -> Columns:
         """Exact derivatives of each output by each column [SI per unit], shape (points, columns); zeros for a run
         without values."""
-        found: dict[str, np.ndarray] = {}
+        found: Columns = {}
         for source in self.sources:
             size = self.chunk(source, len(values), differentiated=True)
             made = self._chunked(self._function(source, differentiated=True), size, values, conditions)
@@ -195,7 +194,7 @@ class Model:
 
     def _chunked(
         self, function: Callable[..., dict[str, Array]], size: int, values: Any, conditions: Conditions
-    ) -> dict[str, np.ndarray]:
+    ) -> Columns:
         """A function over chunks of one shape; the last is padded by its last point."""
         points, values = len(values), np.asarray(values)
         alike = conditions.shape == ()  # the program broadcasts them
@@ -224,7 +223,7 @@ def _outputs(
     variation: Variation,
     source: str,
     options: dict[str, float],
-    names: tuple[str, ...],
+    names: Names,
     values: Array,
     conditions: Conditions,
 ) -> dict[str, Array]:
@@ -238,7 +237,7 @@ def _outputs(
 
 
 def _derived(
-    variation: Variation, source: str, names: tuple[str, ...], values: Array, conditions: Conditions
+    variation: Variation, source: str, names: Names, values: Array, conditions: Conditions
 ) -> dict[str, Array]:
     conditions = jax.tree.map(lambda x: jnp.broadcast_to(x, values.shape[:1]), conditions)
     compute = derived.compute_function(source)
@@ -254,7 +253,7 @@ def _derivatives(
     variation: Variation,
     source: str,
     options: dict[str, float],
-    names: tuple[str, ...],
+    names: Names,
     values: Array,
     conditions: Conditions,
 ) -> dict[str, Array]:

@@ -69,7 +69,12 @@ def elementary_effects(points: np.ndarray, values: np.ndarray) -> Effects | None
     finally:
         np.random.set_state(state)  # noqa: NPY002
     size = np.asarray(analysis["mu_star"], float)
-    elementary = _elementary(points[kept].reshape(-1, steps, points.shape[1]), by[finite])
+    # change of the output per change of the moved input, shape (trajectories, inputs)
+    moved = np.diff(points[kept].reshape(-1, steps, points.shape[1]), axis=1)
+    which = np.abs(moved).argmax(-1)
+    change = np.diff(by[finite], axis=1) / np.take_along_axis(moved, which[..., None], -1)[..., 0]
+    elementary = np.zeros_like(change)
+    np.put_along_axis(elementary, which, change, 1)
     width = float(stats.t.ppf(0.5 + LEVEL / 2, int(finite.sum()) - 1)) / np.sqrt(finite.sum())
     error = width * np.abs(elementary).std(0, ddof=1)
     return Effects(
@@ -79,16 +84,6 @@ def elementary_effects(points: np.ndarray, values: np.ndarray) -> Effects | None
         int(finite.sum()),
         int(count - finite.sum()),
     )
-
-
-def _elementary(points: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Change of the output per change of the moved input, shape (trajectories, inputs)."""
-    moved = np.diff(points, axis=1)
-    which = np.abs(moved).argmax(-1)
-    change = np.diff(values, axis=1) / np.take_along_axis(moved, which[..., None], -1)[..., 0]
-    effects = np.zeros_like(change)
-    np.put_along_axis(effects, which, change, 1)
-    return effects
 
 
 def _problem(inputs: int) -> dict[str, object]:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 import numpy as np
 from scipy import stats
 
+from calibration.data import Columns, Json, Names
 from calibration.data.runs import Runs
 from calibration.described import describe, sentences
 from calibration.inference.fit_notes import Remark
@@ -81,7 +81,7 @@ class Points:
         supply = "battery" if np.isnan(imposed[k]) else f"{imposed[k]:g} {unit}"
         return ", ".join((f"{self.configuration[k]}, {supply}", *(f"{x[k]:g}{unit}" for _, x, unit in self.ground)))
 
-    def columns(self) -> dict[str, np.ndarray]:
+    def columns(self) -> Columns:
         """Columns as in tables of runs."""
         own = (
             {"supply_voltage_V": self.voltage} if self.motor_speed is None else {"motor_speed_rpm": self.motor_speed}
@@ -168,7 +168,7 @@ class Interaction:
     interval: tuple[float, float]
     sure: bool
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Json:
         """Entry of result.json."""
         return {
             "pair": list(self.pair),
@@ -196,7 +196,7 @@ class NextRuns:
     gain: np.ndarray
     noise: str
     sd: np.ndarray
-    output_sd: dict[str, np.ndarray]
+    output_sd: Columns
 
 
 @dataclasses.dataclass(frozen=True)
@@ -226,11 +226,11 @@ class SensitivityResult:
     next_runs: NextRuns | None
     evaluations: int
     seconds: float
-    comparison: dict[str, dict[str, Any]]
+    comparison: dict[str, Json]
     remarks: tuple[Remark, ...]
 
     @property
-    def names(self) -> tuple[str, ...]:
+    def names(self) -> Names:
         """Names of the inputs."""
         return tuple(self.inputs)
 
@@ -249,7 +249,7 @@ class SensitivityResult:
         return np.clip(most, 0.0, 1.0)
 
     @property
-    def negligible(self) -> tuple[str, ...]:
+    def negligible(self) -> Names:
         """Inputs with less than `NEGLIGIBLE` of the variance of every output at every point."""
         return tuple(n for n, x in zip(self.names, self.importance(), strict=True) if x < NEGLIGIBLE)
 
@@ -273,11 +273,11 @@ class SensitivityResult:
         return describe(self)
 
     @property
-    def notes(self) -> tuple[str, ...]:
+    def notes(self) -> Names:
         """Remarks as sentences."""
         return sentences(self.remarks)
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Json:
         """Entries of result.json, docs/schemas/sensitivity.schema.json."""
         names = self.names
         return {
@@ -317,7 +317,7 @@ class SensitivityResult:
             "notes": list(self.notes),
         }
 
-    def _indices(self, study: OutputStudy) -> dict[str, Any]:
+    def _indices(self, study: OutputStudy) -> Json:
         if self.method == "local":
             return {
                 name: {"derivative": study.derivative[:, k].tolist(), "elasticity": study.elasticity[:, k].tolist()}
@@ -325,10 +325,10 @@ class SensitivityResult:
             }
         return _by_input(self.names, study.overall)
 
-    def tables(self) -> dict[str, dict[str, np.ndarray]]:
+    def tables(self) -> dict[str, Columns]:
         """CSV tables by file name: derivatives and swings at each point, indices over all and at each point."""
         names = np.array(self.names)
-        found: dict[str, list[dict[str, np.ndarray]]] = {"points.csv": [], "indices.csv": []}
+        found: dict[str, list[Columns]] = {"points.csv": [], "indices.csv": []}
         for name, study in self.outputs.items():
             points, size = study.derivative.shape
             where = {key: np.repeat(x, size) for key, x in self.points.columns().items()}
@@ -360,7 +360,7 @@ class SensitivityResult:
         }
 
 
-def _output(study: OutputStudy) -> dict[str, Any]:
+def _output(study: OutputStudy) -> Json:
     return {
         "label": study.row.label,
         "unit": study.row.unit_shown,
@@ -373,7 +373,7 @@ def _output(study: OutputStudy) -> dict[str, Any]:
     }
 
 
-def _by_input(names: tuple[str, ...], estimates: dict[str, Estimate]) -> dict[str, Any]:
+def _by_input(names: Names, estimates: dict[str, Estimate]) -> Json:
     return {
         name: {
             key: value
@@ -384,7 +384,7 @@ def _by_input(names: tuple[str, ...], estimates: dict[str, Estimate]) -> dict[st
     }
 
 
-def interactions(study: OutputStudy, names: tuple[str, ...]) -> list[Interaction]:
+def interactions(study: OutputStudy, names: Names) -> list[Interaction]:
     """Pairs of the relevant inputs of an output, the strongest first."""
     second = study.second
     if second is None:
@@ -402,7 +402,7 @@ def interactions(study: OutputStudy, names: tuple[str, ...]) -> list[Interaction
     return sorted(found, key=lambda pair: -pair.second)
 
 
-def _next_runs(runs: NextRuns, names: tuple[str, ...]) -> dict[str, Any]:
+def _next_runs(runs: NextRuns, names: Names) -> Json:
     columns = runs.points.columns()
     return {
         "candidates": runs.candidates,

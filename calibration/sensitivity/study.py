@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from calibration.data import Columns
 from calibration.inference.fit_notes import Remark, next_step
 from calibration.sensitivity.model import Answer, Model, count_statuses
 from calibration.sensitivity.result import Points
@@ -65,7 +66,7 @@ class Study:
         )
         self.evaluations, self.seconds = 0, 0.0
         self.told = time.perf_counter()
-        self.sampled: dict[str, np.ndarray] = {}
+        self.sampled: Columns = {}
 
     def at(self, k: int) -> Conditions:
         """Conditions of one point."""
@@ -79,7 +80,7 @@ class Study:
         """Columns of the model at scores of all inputs."""
         return np.asarray(self.inputs.values(scores))
 
-    def sample(self, values: np.ndarray, points: Sequence[int]) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
+    def sample(self, values: np.ndarray, points: Sequence[int]) -> Iterator[tuple[int, Columns]]:
         """Outputs at the same values of the model's columns, one point at a time; counted and timed.
 
         A source is not computed again if only conditions differ that it ignores.
@@ -120,7 +121,7 @@ class Study:
             for source, whole in self.sampled.items()
         }
 
-    def gradients(self, scores: np.ndarray, conditions: Conditions) -> tuple[dict[str, np.ndarray], ...]:
+    def gradients(self, scores: np.ndarray, conditions: Conditions) -> tuple[Columns, ...]:
         """Outputs and their derivatives by the scores of all inputs, for conditions of each row or common ones.
 
         Counted and timed.

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import ndtri
 
+from calibration.data import Names
 from calibration.data.input_errors import BadConfiguration, allowed_words
 from calibration.data.posterior_file import Posterior
 from calibration.inference import priors
@@ -45,14 +46,14 @@ class Inputs:
     """
 
     parameters: Posterior
-    conditions: tuple[str, ...]
+    conditions: Names
     low: np.ndarray
     high: np.ndarray
     axes: dict[str, Axis]
     is_posterior: bool = False
 
     @property
-    def names(self) -> tuple[str, ...]:
+    def names(self) -> Names:
         """Names of the inputs: parameters, then conditions."""
         return (*self.parameters.coordinates, *self.conditions)
 
@@ -60,7 +61,7 @@ class Inputs:
         return len(self.names)
 
     @property
-    def columns(self) -> tuple[str, ...]:
+    def columns(self) -> Names:
         """Columns of a point's values: inputs, and parameters tied to one."""
         return (*self.parameters.names, *self.conditions)
 
@@ -121,7 +122,7 @@ _OTHERS = ("driver.", "rig.", "motor.resistance_thermal_", "motor.time_constant_
 
 def default_input_names(
     robot: Robot, configurations: Sequence[str], battery: bool, model: str = "steady", turns: bool = False
-) -> tuple[str, ...]:
+) -> Names:
     """Parameters of the robot with a prior of nonzero width, for these configurations and those common to all.
 
     Omitted are the battery's if it does not feed the motors, guides' on wheels, and parameters that the

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -12,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from calibration.data import Json, Names
 from calibration.data.requirements_file import Envelope, Requirement, Requirements
 from calibration.sizing import sheet
 from calibration.sizing.part_options import Options
@@ -69,7 +69,7 @@ def build_robot(robot: Robot, base_mass: float, configuration: str, design: Desi
     ratio, radius, parallel = (jnp.exp(design.continuous[..., k]) for k in range(3))
     d, c = design.drive, design.cell
     more = d["mass"] + design.cells * parallel * c["mass"] - base_mass
-    values: dict[str, Any] = {
+    values: Json = {
         **{f"motor.{key}": d[key] for key in (
             "resistance", "torque_constant", "friction_coulomb", "friction_viscous", "inertia", "inductance",
             "resistance_thermal_winding", "resistance_thermal_housing",
@@ -116,7 +116,7 @@ class Task(eqx.Module):
     demands: tuple[Demand, ...] = eqx.field(static=True)
 
     @property
-    def labels(self) -> tuple[str, ...]:
+    def labels(self) -> Names:
         """Label of each margin of `evaluate_design`."""
         return tuple(d.label for d in self.demands)
 

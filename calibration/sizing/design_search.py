@@ -6,7 +6,6 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -15,6 +14,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float
 
+from calibration.data import Json, Names
 from calibration.data.input_errors import BadConfiguration, allowed_words
 from calibration.data.parts import CellSheet
 from calibration.data.requirements_file import Requirements
@@ -64,7 +64,7 @@ class SizedDesign:
     parallel: float
     objectives: dict[str, float]
     margins: dict[str, float]
-    bounds: tuple[str, ...]
+    bounds: Names
     robot: Robot
 
     @property
@@ -78,7 +78,7 @@ class SizedDesign:
         order = sorted(self.margins.items(), key=lambda item: item[1])
         return [*(label for label, m in order if m < BINDS), *self.bounds]
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Json:
         """Entry of `result.json`."""
         return {
             "motor": self.drive.motor.name, "gearbox": f"{self.drive.family}, stages {self.drive.stages}",
@@ -106,7 +106,7 @@ class Sizing:
     task: Task
     options: Options
     objective: str
-    unmeetable: tuple[str, ...]
+    unmeetable: Names
     ideal: SizedDesign | None
     best: SizedDesign | None
     alternatives: tuple[SizedDesign, ...]
@@ -233,10 +233,10 @@ def evaluate_designs(problem: Task, choice: Space, rows: np.ndarray, x: np.ndarr
 def size_robot(
     robot: Robot,
     asked: Requirements,
-    objectives: tuple[str, ...] = ("mass",),
+    objectives: Names = ("mass",),
     *,
     starts: int = 256,
-    motors: tuple[str, ...] = (),
+    motors: Names = (),
     seed: int = 0,
     tell: Callable[[Remark], None] = lambda note: None,
 ) -> Sizing:

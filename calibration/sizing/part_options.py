@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from calibration.data import Columns, Names
 from calibration.data.parts import (
     CellSheet,
     GearboxSheet,
@@ -50,7 +51,7 @@ class Drive(NamedTuple):
         return f"{self.motor.name}, {self.family}, {self.stages} stage{'s' if self.stages > 1 else ''}"
 
 
-def drive_options(names: tuple[str, ...] = ()) -> tuple[Drive, ...]:
+def drive_options(names: Names = ()) -> tuple[Drive, ...]:
     """All motors of the sheets (or those named) with all sizes of gearbox that their source combines them with."""
     options = []
     for motor in packaged_motors():
@@ -74,13 +75,6 @@ def packable_cells() -> tuple[CellSheet, ...]:
     )
 
 
-def mass_per_charge() -> float:
-    """Mass of lithium-polymer cells [kg/C], from the only pack with a mass on its label."""
-    return next(
-        c.mass / (c.cells * c.capacity) for c in packaged_cells() if not math.isnan(c.mass) and c.chemistry == _LIPO
-    )
-
-
 _LIPO = "lithium-polymer"
 
 
@@ -95,8 +89,8 @@ class Options:
 
     drives: tuple[Drive, ...]
     cells: tuple[CellSheet, ...]
-    drive: dict[str, np.ndarray]
-    cell: dict[str, np.ndarray]
+    drive: Columns
+    cell: Columns
     base_mass: float
 
 
@@ -104,7 +98,7 @@ def _stated(value: float, otherwise: float) -> float:
     return otherwise if math.isnan(value) else value
 
 
-def options_for_robot(robot: Robot, names: tuple[str, ...] = ()) -> Options:
+def options_for_robot(robot: Robot, names: Names = ()) -> Options:
     """Options for a robot.
 
     Args:
@@ -137,7 +131,9 @@ def options_for_robot(robot: Robot, names: tuple[str, ...] = ()) -> Options:
                 "ratio_least": d.ratios[0], "ratio_most": d.ratios[-1],
             }
         )  # fmt: skip
-    per_charge = mass_per_charge()
+    per_charge = next(
+        c.mass / (c.cells * c.capacity) for c in packaged_cells() if not math.isnan(c.mass) and c.chemistry == _LIPO
+    )
     resistance = float(battery.resistance) * paper_cell.capacity
     columns = [
         {
@@ -153,5 +149,5 @@ def options_for_robot(robot: Robot, names: tuple[str, ...] = ()) -> Options:
     return Options(chosen, packs, _columns(rows), _columns(columns), base)
 
 
-def _columns(rows: list[dict[str, float]]) -> dict[str, np.ndarray]:
+def _columns(rows: list[dict[str, float]]) -> Columns:
     return {key: np.array([row[key] for row in rows]) for key in rows[0]}

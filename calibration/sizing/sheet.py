@@ -5,13 +5,13 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from calibration.data import Json, Names
 from calibration.data.contradictions import cannot_stand
 from calibration.data.input_errors import BadConfiguration, allowed_words
 from calibration.data.requirements_file import STAIRS, TREAD, Envelope, Requirement, Requirements
@@ -58,9 +58,9 @@ class Change:
     after: float
     unit: str
     gradient: float
-    breaks: tuple[str, ...] = ()
+    breaks: Names = ()
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Json:
         """Entry of `result.json`."""
         return {
             "parameter": self.parameter, "from": self.before, "to": self.after, "unit": self.unit,
@@ -85,7 +85,7 @@ class Outcome:
     value: float | None
     margin: float | None
     status: str
-    at: dict[str, Any]
+    at: Json
     change: tuple[Change, ...] = ()
 
     @property
@@ -93,7 +93,7 @@ class Outcome:
         """True if the requirement is met."""
         return self.margin is not None and self.margin >= 0
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Json:
         """Entry of `result.json`."""
         r = self.requirement
         return {
@@ -187,7 +187,7 @@ def envelope_points(robot: Robot, requirement: Requirement) -> EnvelopePoint:
     )  # fmt: skip
 
 
-def _changed(robot: Robot, rated: Ratings, names: tuple[str, ...], theta: Array) -> tuple[Robot, Ratings]:
+def _changed(robot: Robot, rated: Ratings, names: Names, theta: Array) -> tuple[Robot, Ratings]:
     """Robot with parameters from a vector, and its ratings, which include `battery.cells`."""
     values = dict(zip(names, theta, strict=True))
     cells = values.pop(CELLS)
@@ -219,7 +219,7 @@ def _unrated(robot: Robot) -> Robot:
 def _quantity_over(
     robot: Robot,
     rated: Ratings,
-    names: tuple[str, ...],
+    names: Names,
     rows: Float[Array, "rows parameters"],
     at: EnvelopePoint,
     name: str,
@@ -235,9 +235,7 @@ def _quantity_over(
 
 
 @compiled
-def _gradient(
-    robot: Robot, rated: Ratings, names: tuple[str, ...], theta: Array, at: EnvelopePoint, name: str
-) -> Array:
+def _gradient(robot: Robot, rated: Ratings, names: Names, theta: Array, at: EnvelopePoint, name: str) -> Array:
     """Derivative of a quantity at one point by the parameters."""
 
     def value(theta: Array) -> Array:
@@ -253,7 +251,7 @@ class _QuantityOfRobot:
 
     robot: Robot
     requirement: Requirement
-    names: tuple[str, ...]
+    names: Names
 
     @property
     def at(self) -> EnvelopePoint:
@@ -348,7 +346,7 @@ def _outcome(held: _QuantityOfRobot) -> Outcome:
     )
 
 
-def _corner(held: _QuantityOfRobot, k: int) -> dict[str, Any]:
+def _corner(held: _QuantityOfRobot, k: int) -> Json:
     """A point in the names of a file."""
     r, at = held.requirement, held.at
     e = r.envelope
@@ -356,7 +354,7 @@ def _corner(held: _QuantityOfRobot, k: int) -> dict[str, Any]:
         PAYLOAD: ("payload_kg", at.payload), SLOPE: ("slope_deg", at.slope_deg), AMBIENT: ("ambient_C", at.ambient),
         CHARGE: ("state_of_charge" if e.battery else "supply_voltage_V", at.charge),
     }  # fmt: skip
-    corner: dict[str, Any] = {known[a][0]: round(float(np.asarray(known[a][1])[k]), 9) for a in r.quantity.axes}
+    corner: Json = {known[a][0]: round(float(np.asarray(known[a][1])[k]), 9) for a in r.quantity.axes}
     if r.name == "endurance_min":
         low = e.charge_end
         corner |= {

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from calibration.data import Names
 from calibration.inference import blocks, fit_notes
 from calibration.inference.identifiability import HELD
 from calibration.inference.simulation_errors import root_mean_square
@@ -105,7 +106,7 @@ def no_prediction(kind: str, rows: int, total: int) -> str:
     )
 
 
-def same_predictions(kind: str, others: tuple[str, ...]) -> str:
+def same_predictions(kind: str, others: Names) -> str:
     """Kinds of blocks that give the same predictions."""
     return (
         f"held out by {' or by '.join(blocks.kind_in_words(k) for k in others)}: the same predictions as held "
@@ -127,7 +128,7 @@ def search_agreement(starts: int, agree: int, elsewhere: int, more: float, open:
     return ", ".join(parts)
 
 
-def unsettled_search(names: tuple[str, ...]) -> str:
+def unsettled_search(names: Names) -> str:
     """A search that ended before it converged."""
     determined = f"these data do not determine {', '.join(names)}" if names else "the data determine them all"
     return (

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from calibration.data import Names
 from calibration.data.input_errors import three_digits
 from calibration.described import describe
 from calibration.discovery import loop_notes
@@ -730,7 +731,7 @@ def imposed_delay(delay: float, sd: float) -> str:
 
 
 def leader_choice(
-    names: tuple[str, ...],
+    names: Names,
     rms_sigma: tuple[float, ...],
     leader: int,
     closest: int,

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from calibration.data import Names
 from mmrjax.errors import count_noun
 
 if TYPE_CHECKING:
@@ -93,13 +94,13 @@ def sampling_scope(method: str, points: int) -> str:
     return f"{METHODS[method]}, over {points} operating points"
 
 
-def points_left_out(points: int, total: int, sampled: bool, outputs: tuple[str, ...]) -> str:
+def points_left_out(points: int, total: int, sampled: bool, outputs: Names) -> str:
     """Points that are left out."""
     who = "too many robots of the sample do" if sampled else "the robot does"
     return f"{points} of {total} operating points are left out, since {who} not travel there ({', '.join(outputs)})"
 
 
-def sample_left_out(points: int, share: float, outputs: tuple[str, ...]) -> str:
+def sample_left_out(points: int, share: float, outputs: Names) -> str:
     """Operating points with part of the sample left out."""
     return (
         f"at {points} operating points up to {100 * share:.1f} % of the sample is left out, since the "

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+from calibration.data import Names
 from calibration.data.columns import LOAD
 from calibration.data.input_errors import bound_text
 
@@ -49,7 +50,7 @@ def differing_repeats(
     column: str,
     values: tuple[float, float],
     apart: str,
-    unused: tuple[str, ...] = (),
+    unused: Names = (),
     more: int = 0,
     near: str = "",
 ) -> str:
@@ -81,7 +82,7 @@ def unused_columns(source: str, columns: tuple[tuple[str, str], ...]) -> str:
     return "; ".join(said)
 
 
-def nothing_varies(source: str, rows: int, column: str, unused: tuple[str, ...] = ()) -> str:
+def nothing_varies(source: str, rows: int, column: str, unused: Names = ()) -> str:
     """Runs of one condition."""
     vary, are, them, if_conditions = (
         ("vary", "are", "them", "they are conditions")
@@ -116,7 +117,7 @@ def constant_condition(column: str, value: float, alike: str) -> str:
     return f"{here}: {ALIKE[alike]}, and only their priors tell them apart"
 
 
-def ends_early(runs: tuple[str, ...], lasts: float, share: float) -> str:
+def ends_early(runs: Names, lasts: float, share: float) -> str:
     """Histories that end before the robot is under way."""
     at = "" if math.isnan(share) else f", at {share:.0%} of the speed of steady travel"
     return (
@@ -125,7 +126,7 @@ def ends_early(runs: tuple[str, ...], lasts: float, share: float) -> str:
     )
 
 
-def never_grips(runs: tuple[str, ...], share: float) -> str:
+def never_grips(runs: Names, share: float) -> str:
     """Histories in which the movers slide to the end."""
     return (
         f"{_runs(runs, 'never grips', 'never grip')}: in the end the robot travels at {share:.0%} of the "
@@ -133,7 +134,7 @@ def never_grips(runs: tuple[str, ...], share: float) -> str:
     )
 
 
-def _runs(names: tuple[str, ...], one: str, several: str) -> str:
+def _runs(names: Names, one: str, several: str) -> str:
     return f"run {names[0]} {one}" if len(names) == 1 else f"runs {', '.join(names)} {several}"
 
 
@@ -145,7 +146,7 @@ def coarse_steps(lasts: float, step: float) -> str:
     )
 
 
-def inherited_priors(part: str, changed: tuple[tuple[str, float, float], ...], kept: tuple[str, ...]) -> str:
+def inherited_priors(part: str, changed: tuple[tuple[str, float, float], ...], kept: Names) -> str:
     """A part that is not the nominal robot's while friction of it is."""
     each = ", ".join(f"{name} {bound_text(mine)} for {bound_text(nominal)}" for name, mine, nominal in changed)
     one = len(kept) == 1
@@ -156,9 +157,7 @@ def inherited_priors(part: str, changed: tuple[tuple[str, float, float], ...], k
     )
 
 
-def off_by(
-    column: str, unit: str, factor: float, units: tuple[str, ...], others: tuple[str, ...], imposed: str
-) -> str:
+def off_by(column: str, unit: str, factor: float, units: Names, others: Names, imposed: str) -> str:
     """Readings that no robot like this one shows."""
     off, size = (factor, "large") if factor > 1 else (1 / factor, "small")
     what = f"{column}: readings are about {bound_text(float(f'{off:.2g}'))} times too {size} for this robot"

@@ -289,17 +289,13 @@ def _sliding(at: Footing, v: Array, signals: Signals) -> Array:
     return -(at.along @ v) - signals.speed_slip_terms
 
 
-def load_shares(at: Footing, v: Array) -> tuple[Array, Scalar]:
-    """Share of each rolling contact in the load, and the robot's speed along the ground, their load-weighted mean."""
-    bears = at.force * at.rolls
-    share = bears / jnp.maximum(jnp.sum(bears), 1e-9)
-    return share, share @ (at.carried @ v)
-
-
 def climb_instant(run: System, motion: Motion, on: Scalar) -> tuple[Signals, Footing, _Pull, Array]:
     """All signals, contacts, forces and load shares of an instant; `on`: share of their voltage at the motors."""
     at = footing.footing(run.shape, run.terrain, motion.q, motion.v)
-    share, speed = load_shares(at, motion.v)
+    # share of each rolling contact in the load, and the robot's speed along the ground, their load-weighted mean
+    bears = at.force * at.rolls
+    share = bears / jnp.maximum(jnp.sum(bears), 1e-9)
+    speed = share @ (at.carried @ motion.v)
     conditions = _driven(run, on)
 
     ratio = run.robot.gearbox.ratio

@@ -1,6 +1,11 @@
-"""The start from standstill: its peak current, duration and electrical energy."""
+"""The start from standstill: its peak current, duration and electrical energy, and its stages."""
 
 from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -8,10 +13,148 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mmrjax.compile.compiling import compiled
+from mmrjax.fidelities.base import History
 from mmrjax.fidelities.drive import TIME_SETTLED, drive
 from mmrjax.model.conditions import Conditions
+from mmrjax.model.paper_tables import PITCH_GROUSER, PITCH_TOOTH
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import CONVERGED
+
+#: Names of the stages, in order.
+NAMES = ("starting", "acceleration with slipping", "uniform")
+#: Deviation from the last speed that ends a start [-], and length of the end of a run that is averaged for it [s].
+WITHIN, LAST = 0.01, 0.15
+
+
+@dataclasses.dataclass(frozen=True)
+class StartStages:
+    """The stages of one start; times since its first sample.
+
+    Attributes:
+        sense: direction of the shafts at the end, 1 or -1.
+        starting: end of the first stage [s]: the slide has reached its maximum, the shafts have spun up.
+        slipping: end of the second stage [s]: the slide stays within V_s from here; `starting` if it never left.
+        settled: t' [s]: the speed is within 1 % of its last value, the mean over the last 0.15 s.
+        end: of the run [s].
+        slip: of each stage, and over_settling: from 0 to t', by `mean_slip` [-]; NaN for a stage of no length.
+    """
+
+    sense: float
+    starting: float
+    slipping: float
+    settled: float
+    end: float
+    slip: tuple[float, float, float]
+    over_settling: float
+
+    @property
+    def bounds(self) -> tuple[float, float, float, float]:
+        """Start and end times of the stages [s]."""
+        return 0.0, self.starting, self.slipping, self.end
+
+    def to_json(self) -> dict[str, Any]:
+        """The stages as in `result.json`."""
+
+        def number(x: float) -> float | None:
+            return float(x) if np.isfinite(x) else None
+
+        each = zip(NAMES, self.bounds[:-1], self.bounds[1:], self.slip, strict=True)
+        return {
+            "stages": [{"stage": n, "from_s": a, "until_s": b, "slip": number(s)} for n, a, b, s in each],
+            "acceleration_time_s": self.settled,
+            "slip_over_acceleration": number(self.over_settling),
+        }
+
+
+def _smoothed(time: np.ndarray, values: np.ndarray, period: float) -> np.ndarray:
+    """Means over a `period` about each instant of evenly spaced samples; at the ends, of the nearest whole period."""
+    count = min(round(period / (time[-1] / len(time))) | 1, len(values) | 1) if time[-1] > 0 else 1
+    if count < 3 or count > len(values):
+        return values
+    return np.pad(np.convolve(values, np.ones(count) / count, "valid"), count // 2, mode="edge")
+
+
+def mean_slip(
+    time: Float[np.ndarray, " times"],
+    speed: Float[np.ndarray, " times"],
+    theoretical: Float[np.ndarray, " times"],
+    begin: float,
+    end: float,
+) -> float:
+    """Mean slip (33) over an interval, 1 - ∫V_x dt / ∫V_x_teor dt [-]: the lost share of the movers' distance.
+
+    It weights s by V_x_teor and is finite from standstill on, where s itself is 0/0. NaN if the movers do not move.
+    """
+    if not end > begin:
+        return np.nan
+    within = time[(time > begin) & (time < end)]
+    at = np.concatenate([[begin], within, [end]])
+    travelled, rolled = (np.trapezoid(np.interp(at, time, v), at) for v in (speed, theoretical))
+    return float(1 - travelled / rolled) if abs(rolled) > 1e-9 else np.nan
+
+
+def stages_of_start(
+    time: Float[np.ndarray, " times"],
+    speed: Float[np.ndarray, " times"],
+    theoretical: Float[np.ndarray, " times"],
+    sliding: Float[np.ndarray, " times"],
+    speed_static: float,
+    way: float = 0.0,
+) -> StartStages:
+    """The stages of one start, from samples without gaps.
+
+    Args:
+        time: [s]; speed, theoretical, sliding: V, r_k ω_k and the contact patch's speed over the ground [m/s].
+        speed_static: V_s of the friction law [m/s].
+        way: distance of the movers between two contacts that cause ripple [m]; slide and speed are averaged over it
+            at the last speed. 0: no ripple.
+    """
+    sense = -1.0 if theoretical[-1] < -1e-4 else 1.0
+    starting = float(time[int(np.argmax(sense * sliding))])
+    sliding, even = (_smoothed(time, x, way / max(abs(float(theoretical[-1])), 1e-3)) for x in (sliding, speed))
+    beyond = np.flatnonzero((sense * sliding > speed_static) & (time >= starting))
+    slipping = float(time[min(int(beyond[-1]) + 1, len(time) - 1)]) if beyond.size else starting
+    last = speed[last_samples(time)].mean()
+    late = np.flatnonzero(np.abs(even - last) > WITHIN * abs(last))
+    settled = float(time[min(int(late[-1]) + 1, len(time) - 1)]) if late.size else 0.0
+    bounds = (0.0, starting, max(slipping, starting), float(time[-1]))
+    each = [mean_slip(time, speed, theoretical, a, b) for a, b in itertools.pairwise(bounds)]
+    over = mean_slip(time, speed, theoretical, 0.0, settled)
+    return StartStages(sense, bounds[1], bounds[2], settled, bounds[3], (each[0], each[1], each[2]), over)
+
+
+def stages_of_histories(
+    robot: Robot, history: History, which: Sequence[int] | np.ndarray
+) -> list[StartStages | None]:
+    """Stages of each run of a batch from standstill, up to its last number; None for a run without numbers.
+
+    Args:
+        which: index of each run's configuration in `robot`; its loads are vehicles.
+    """
+    found: list[StartStages | None] = []
+    for k, index in enumerate(which):
+        signals = history.signals
+        upto = count_finite_samples(np.asarray(signals.total_current)[k])
+        of_run = (history.time, signals.speed, signals.speed_theoretical, signals.speed_sliding)
+        time, *motion = (np.asarray(x)[k][:upto] for x in of_run)
+        chassis = robot.configurations.members[int(index)]
+        static, way = float(chassis.ground.friction.speed_static), 0.0
+        if history.reactions is not None:  # from individual contacts
+            way = PITCH_GROUSER if float(chassis.on_tracks) > 0.5 else PITCH_TOOTH
+        found.append(stages_of_start(time, motion[0], motion[1], motion[2], static, way) if upto else None)
+    return found
+
+
+def count_finite_samples(values: Float[np.ndarray, " times"]) -> int:
+    """Number of samples of a run up to its last finite one."""
+    finite = np.flatnonzero(np.isfinite(values))
+    return int(finite[-1]) + 1 if finite.size else 0
+
+
+def last_samples(time: Float[np.ndarray, " times"]) -> np.ndarray:
+    """Mask of the last 0.15 s, several pitches of the running gear; for a short run, of its last tenth."""
+    return np.asarray(time >= time[-1] - min(LAST, 0.1 * float(time[-1])))
+
 
 #: Share of the final speed that ends a start [-].
 SHARE = 0.95

@@ -76,6 +76,7 @@ def time_grid(
     longest: float | Float[np.ndarray, " intervals"] = LONGEST,
     start: tuple[float, float] = START,
     change: tuple[float, float] = CHANGE,
+    parts: int = 1,
 ) -> np.ndarray:
     """Instants from 0 to the last of `times` [s], including `times` and `changes`.
 
@@ -84,6 +85,7 @@ def time_grid(
             The first step after a smaller change is longer.
         longest: longest step, if `STEPS` permit it [s]; an array: for each interval between `times`.
         start, change: first step and growth of the steps after the start and after changes.
+        parts: number of equal steps in place of each.
     """
     last = float(np.max(times, initial=0.0))
     changes = np.zeros(0) if changes is None else np.asarray(changes, float)
@@ -104,14 +106,15 @@ def time_grid(
         return young + np.maximum(t - knee, 0.0) / longest
 
     at, ends, at_knee = clock(times[:-1] - since), clock(times[1:] - since), clock(knee)
-    parts = []
+    instants = []
     for k in range(len(times) - 1):
         count = max(1, int(np.ceil(ends[k] - at[k] - 1e-9)))
         wanted = np.linspace(at[k], ends[k], count, endpoint=False)
         young = first[k] / grows[k] * np.expm1(grows[k] * np.minimum(wanted, at_knee[k]))
-        parts.append(since[k] + young + np.maximum(wanted - at_knee[k], 0.0) * longest[k])
-        parts[-1][0] = times[k]
-    return np.concatenate([*parts, times[-1:]])
+        instants.append(since[k] + young + np.maximum(wanted - at_knee[k], 0.0) * longest[k])
+        instants[-1][0] = times[k]
+    whole = np.concatenate([*instants, times[-1:]])
+    return np.interp(np.arange((len(whole) - 1) * parts + 1) / parts, np.arange(len(whole)), whole)
 
 
 def _in_time(conditions: Conditions) -> tuple[Conditions, Conditions]:
@@ -332,7 +335,9 @@ def solve_states(robot: Robot, conditions: Conditions, times: Float[Array, " tim
     """
     steps, constant = run_steps(conditions, times)
     of_first, first_state = first_instant(robot, conditions)
-    along = _with_motor(robot, of_first)
+    # change of the unknowns with motor speed when shafts and robot move as one, in their units
+    size, per_speed = drive_units(robot), robot.chassis(of_first.configuration).radius / robot.gearbox.ratio
+    along = jnp.zeros(len(size)).at[MOTOR].set(1.0).at[GROUND].set(per_speed * size[MOTOR] / size[GROUND])
 
     def taken(y: Array, step: RunStep) -> tuple[Array, RunStates]:
         held, lag = step.held(constant), _lag_of(robot, constant, step, y)
@@ -513,12 +518,6 @@ def _in_blocks(of_steps: T) -> T:
 def _of_steps(blocks: T, count: int) -> T:
     """Inverse of `_in_blocks` for this number of steps."""
     return jax.tree.map(lambda x: x.reshape(x.shape[0] * BLOCK, *x.shape[2:])[:count], blocks)
-
-
-def _with_motor(robot: Robot, conditions: Conditions) -> Array:
-    """Change of the unknowns with motor speed when shafts and robot move as one, in their units."""
-    size, per_speed = drive_units(robot), robot.chassis(conditions.configuration).radius / robot.gearbox.ratio
-    return jnp.zeros(len(size)).at[MOTOR].set(1.0).at[GROUND].set(per_speed * size[MOTOR] / size[GROUND])
 
 
 def _jump(

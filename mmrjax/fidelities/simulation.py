@@ -17,8 +17,7 @@ from mmrjax.compile.precision import as_jax_arrays, in_double, in_trace
 from mmrjax.compile.programs import has_tracer
 from mmrjax.errors import UsageError, allowed_words
 from mmrjax.fidelities.base import History
-from mmrjax.fidelities.results import Results
-from mmrjax.fidelities.run_batches import Pending, flatten_conditions, reshape_runs, run_batch, total_mass
+from mmrjax.fidelities.results import Pending, Results, flatten_conditions, reshape_runs, run_batch, total_mass
 from mmrjax.missions import mission_batch
 from mmrjax.missions.mission import Start
 from mmrjax.missions.profile import Profile

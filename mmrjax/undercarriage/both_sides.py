@@ -373,7 +373,8 @@ def stand(run: System) -> Motion:
 
     Load transfer to the lower side is not included yet.
     """
-    heading = _heading(run)
+    stated = run.conditions.heading_deg
+    heading = jnp.zeros(()) if stated is None else jnp.radians(stated)
     along = jnp.degrees(jnp.arcsin(sine(run.conditions.slope) * cosine(heading)))
     half = half_robot.stand(dataclasses.replace(run, conditions=dataclasses.replace(run.conditions, slope_deg=along)))
     q = (
@@ -383,11 +384,6 @@ def stand(run: System) -> Motion:
     )
     memory = {name: jnp.stack([x, x]) for name, x in half.memory.items()}
     return Motion(q, jnp.zeros_like(q), jnp.zeros(len(SIDES), q.dtype), half.discharge, memory)
-
-
-def _heading(run: System) -> Scalar:
-    stated = run.conditions.heading_deg
-    return jnp.zeros(()) if stated is None else jnp.radians(stated)
 
 
 def roll(run: System) -> Motion:

@@ -332,7 +332,11 @@ def _differentiated(
     # The model's constants follow from the rest of the run.
     run, d_run = (dataclasses.replace(x, model=None, data=None) for x in (run, tangents[0]))
     d_motion = tangents[1]
-    linearized = _linearized(run, motion, step, d_run)
+    # the contacts' sums with derivatives with respect to the motion and to the `changed` inputs
+    constants = contact_sums.contact_inputs(d_run.path, d_run.chassis, d_run.conditions.adhesion)
+    differentiated = tuple(name for name, change in constants.items() if change is not None)
+    given = _inputs(run, motion) | {"slip": step.slip}
+    linearized = contact_sums.linearize(run.path, run.chassis, given, step.gained, differentiated)
 
     def held(run: System, motion: Motion) -> tuple[Array, Array, _Later, Signals, Scalar]:
         return _held(run, motion, step.gained, linearized)
@@ -355,14 +359,6 @@ def _inputs(run: System, motion: Motion) -> dict[str, Scalar]:
     """Inputs of the contacts, by name."""
     moving = dict(zip(contact_sums.MOTION, (*motion.q[1:], *motion.v), strict=True))
     return moving | contact_sums.contact_inputs(run.path, run.chassis, run.conditions.adhesion)
-
-
-def _linearized(run: System, motion: Motion, step: _Step, changed: System) -> Linearized:
-    """The contacts' sums with derivatives with respect to the motion and to the `changed` inputs."""
-    constants = contact_sums.contact_inputs(changed.path, changed.chassis, changed.conditions.adhesion)
-    differentiated = tuple(name for name, change in constants.items() if change is not None)
-    given = _inputs(run, motion) | {"slip": step.slip}
-    return contact_sums.linearize(run.path, run.chassis, given, step.gained, differentiated)
 
 
 def _held(

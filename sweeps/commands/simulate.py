@@ -16,8 +16,8 @@ from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration
 from mmrjax import fidelities
 from mmrjax.compile.compiling import SELDOM, compiled
-from mmrjax.derived.start_figures import curve_peak
-from mmrjax.fidelities import outputs, start_stages
+from mmrjax.derived.start_figures import curve_peak, stages_of_histories
+from mmrjax.fidelities import outputs
 from mmrjax.fidelities.base import History, Run
 from mmrjax.fidelities.result import result_of_signals
 from mmrjax.model import channels, ground, quantities
@@ -246,7 +246,7 @@ def starts_from_standstill(robot: Robot, batch: Run, runs: records.Runs) -> list
     """Of each run from standstill its stages, their slip (33) and the acceleration time; no stages where it does not
     get under way."""
     assert batch.history is not None  # the fidelity was asked for it
-    found = start_stages.stages_of_histories(robot, batch.history, runs.configurations(robot))
+    found = stages_of_histories(robot, batch.history, runs.configurations(robot))
     nothing: Json = {"stages": [], "acceleration_time_s": None, "slip_over_acceleration": None}
     under_way = [STATUSES[int(s)] in words.UNDER_WAY for s in np.asarray(batch.result.status)]
     return [

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from calibration.inference import blocks
 from calibration.inference.identifiability import Z95
 from calibration.inference.result import CalibrationResult
-from sweeps.pages.figure_style import BLUE, FAINT, INK, ORANGE, VERMILION, new_figure
+from sweeps.pages.figure_style import BLUE, FAINT, INK, ORANGE, VERMILION, colour_bar, new_figure
 from sweeps.pages.words import short_name
 
 #: Most panels of a pair plot, and radii that hold 68 % and 95 % of a normal distribution of two [sds].
@@ -75,7 +75,7 @@ def draw_correlations(found: CalibrationResult) -> Figure:
             if abs(c[i, j]) > 0.3:
                 left.text(j, i, f"{c[i, j]:.2f}".replace("0.", "."), ha="center", va="center", fontsize=7.5,
                           color="white" if abs(c[i, j]) > 0.7 else INK)  # fmt: skip
-    fig.colorbar(image, ax=left, shrink=0.8, label="correlation")
+    colour_bar(fig, image, left, shrink=0.8, label="correlation")
     s = np.maximum(found.identifiability.singular_values, 1e-6)
     right.semilogy(np.arange(1, len(s) + 1), s, "o-", color=BLUE)
     right.axhline(1.0, color=ORANGE, lw=1)

@@ -13,7 +13,19 @@ from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 
 from calibration.data import Names
-from sweeps.pages.figure_style import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, SKY, VERMILION, corner_note, new_figure
+from sweeps.pages.figure_style import (
+    BLUE,
+    FAINT,
+    GREEN,
+    INK,
+    ORANGE,
+    PURPLE,
+    SKY,
+    VERMILION,
+    colour_bar,
+    corner_note,
+    new_figure,
+)
 from sweeps.pages.words import short_name
 from sweeps.points.climbs import SIZE
 from sweeps.points.zarr_store import Layout
@@ -162,7 +174,7 @@ def _map(
     for number, values in zip(numbers, np.split(output[order], first[1:]), strict=True):
         cells.flat[number] = np.median(values)
     drawn = axes.pcolormesh(across, along, cells, shading="nearest", cmap="viridis", rasterized=True)
-    fig.colorbar(drawn, ax=axes, label=f"median {label}")
+    colour_bar(fig, drawn, axes, label=f"median {label}")
     axes.set(xlabel=one.label, ylabel=other.label, title="over both")
     _ticks(axes.xaxis, one)
     _ticks(axes.yaxis, other)

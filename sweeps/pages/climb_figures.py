@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,7 +15,18 @@ from mmrjax.climbing import belt_loop, footing
 from mmrjax.climbing.footing import PITCH, SHAFT
 from mmrjax.model.paper_tables import BODY_HEIGHT
 from mmrjax.undercarriage import rendering
-from sweeps.pages.figure_style import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, VERMILION, figure_settings, new_figure
+from sweeps.pages.figure_style import (
+    BLUE,
+    FAINT,
+    GREEN,
+    INK,
+    ORANGE,
+    PURPLE,
+    VERMILION,
+    figure_settings,
+    is_narrow,
+    new_figure,
+)
 from sweeps.results.climb_results import SHOWN as IN_TITLE
 from sweeps.results.climb_results import ClimbResult, Seen, footing_coordinates
 
@@ -24,6 +36,8 @@ Drawable = ClimbResult | Seen
 _GROUND = "#b8a98f"
 #: Silhouettes of a page at most; frames of a film a second, and how often it is slower than life.
 SHOWN, RATE, SLOW = 6, 12, 2.0
+#: Share of the time within which numbers of silhouettes are joined, in a wide and in a narrow figure.
+NEAR = (0.03, 0.09)
 
 
 def _outlines(found: Drawable, q: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -130,7 +144,11 @@ def draw_climb_course(found: ClimbResult) -> Figure:
             ax.axvline(x, color=FAINT, lw=0.8)
         ax.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0))
     above = axes[0, 0].secondary_xaxis("top")
-    above.set_xticks(at, [str(n) for n in range(1, len(at) + 1)])
+    ends = [0, *(np.flatnonzero(np.diff(at) > NEAR[is_narrow()] * t["time_s"][-1]) + 1), len(at)]
+    numbers = [(a + 1, b) for a, b in itertools.pairwise(ends)]
+    above.set_xticks(
+        [(at[a - 1] + at[b - 1]) / 2 for a, b in numbers], [f"{a}" if a == b else f"{a}-{b}" for a, b in numbers]
+    )
     above.tick_params(length=0)
     axes[-1, 0].set_xlabel("time [s]")
     return fig

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import io
+import itertools
 import json
 import re
 import textwrap
@@ -16,13 +17,16 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
 from matplotlib.collections import QuadMesh
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.layout_engine import ConstrainedLayoutEngine
-from matplotlib.text import Text
+from matplotlib.legend import Legend
+from matplotlib.text import Annotation, Text
 from matplotlib.ticker import LogFormatter, NullFormatter, ScalarFormatter
+from matplotlib.transforms import Affine2D, Bbox
 
 from calibration.data import Json
 from mmrjax.model.channels import Channel
@@ -74,6 +78,10 @@ _RC: dict[Any, Any] = {
 NARROW = 4.3
 #: Letters of a line across it, and of a line of the names at its left.
 LETTERS, NAMES = 42, 20
+#: Layouts of a narrow figure at most, and height added by one of them [inches].
+LAYOUTS, TALLER = 5, 4.0
+#: Height of a line of a legend [inches].
+LINE = 0.2
 
 
 @contextmanager
@@ -117,12 +125,12 @@ def new_figure(rows: int, columns: int, height: float, **keywords: Any) -> tuple
     return fig, grid
 
 
-def legend_columns(labels: Iterable[str]) -> int:
-    """Columns of a legend: all labels in one line; in a narrow figure as many as fit into its width."""
+def legend_columns(labels: Iterable[str], most: int = 99) -> int:
+    """Columns of a legend: all labels in one line, or `most`; in a narrow figure as many as fit into its width."""
     lengths = [len(label) for label in labels]
     if not is_narrow():
-        return max(len(lengths), 1)
-    return max(1, min(len(lengths), int(72 * NARROW // (0.62 * LEAST_NARROW * max(lengths, default=1) + 40))))
+        return max(min(len(lengths), most), 1)
+    return max(1, min(len(lengths), most, int(72 * NARROW // (0.62 * LEAST_NARROW * max(lengths, default=1) + 40))))
 
 
 def can_stack(fig: Figure) -> bool:
@@ -130,8 +138,16 @@ def can_stack(fig: Figure) -> bool:
     return pages.FOR_PHONES and hasattr(fig, "panels")
 
 
+def colour_bar(fig: Any, drawn: ScalarMappable, axes: Any, **keywords: Any) -> Any:
+    """Scale of colours next to axes; below them in a narrow figure."""
+    return fig.colorbar(drawn, ax=axes, location="bottom" if is_narrow() else "right", **keywords)
+
+
 def fit_for_phones(fig: Figure) -> Figure:
-    """A narrow figure with wrapped labels and titles; stacked panels have the labels that they shared."""
+    """A narrow figure with wrapped labels and titles; stacked panels have the labels that they shared.
+
+    Legends next to their axes are above them.
+    """
     grid: Any = vars(fig)["panels"]
     for i, j in np.ndindex(grid.shape):
         axes = grid[i, j]
@@ -143,11 +159,25 @@ def fit_for_phones(fig: Figure) -> Figure:
         axes.set_xlabel("\n".join(textwrap.wrap(axes.get_xlabel(), LETTERS)))
         axes.set_title("\n".join(textwrap.wrap(axes.get_title(loc="left"), LETTERS - 12)))
         names = [tick.get_text() for tick in axes.get_yticklabels()]
-        if max(map(len, names), default=0) > NAMES:
-            axes.set_yticks(axes.get_yticks(), [textwrap.fill(name, NAMES) for name in names])
-    for legend in fig.legends:
-        legend.set_ncols(1)
+        if _has_names(axes.yaxis) and max(map(len, names), default=0) > NAMES:
+            axes.set_yticks(axes.get_yticks(), [_broken_name(name) for name in names])
+    legends: Any = fig.findobj(lambda artist: isinstance(artist, Legend))
+    for legend in legends:
+        if legend.axes is not None and legend.get_bbox_to_anchor().x0 > legend.axes.bbox.x1:
+            legend.set_loc("lower left")
+            legend.set_bbox_to_anchor((0.0, 1.05 + 0.15 * bool(legend.axes.child_axes)))
+            fig.set_figheight(fig.get_figheight() + LINE * len(legend.get_texts()))
     return fig
+
+
+def _broken_name(name: str) -> str:
+    """A name in lines of at most `NAMES` letters if it can be broken at spaces, dots and underlines."""
+    lines = [""]
+    for part in re.findall(r"[^ ._]*[ ._]*", name):
+        if lines[-1] and len(lines[-1] + part.rstrip()) > NAMES:
+            lines.append("")
+        lines[-1] += part
+    return "\n".join(line.rstrip() for line in lines)
 
 
 def has_colour_scale(fig: Figure) -> bool:
@@ -173,8 +203,12 @@ def figure_as_svg(fig: Figure) -> str:
     if (engine := fig.get_layout_engine()) is not None:
         fig.set_dpi(72)  # that of SVG
         engine.execute(fig)
-        if least == LEAST_NARROW and _wrap(fig):
-            engine.execute(fig)
+        if least == LEAST_NARROW:
+            for _ in range(LAYOUTS):
+                if not _wrap(fig) | _give_names_room(fig):
+                    break
+                engine.execute(fig)
+            _clear_texts(fig)
         fig.set_layout_engine(None)  # or savefig draws everything once more to lay it out
     buffer = io.StringIO()
     fig.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
@@ -192,7 +226,7 @@ def _wrap(fig: Figure) -> bool:
     width, wrapped = 72 * fig.get_figwidth(), False
     for written in fig.findobj(lambda artist: isinstance(artist, Text) and artist.get_visible()):
         assert isinstance(written, Text)
-        text, box = written.get_text(), written.get_window_extent()
+        text, box = written.get_text(), Text.get_window_extent(written)  # without an arrow
         beyond = max(box.x1 - width, -box.x0, 0.0)
         if beyond > 0 and " " in text and written.get_rotation() == 0:
             longest = max(map(len, text.split("\n")))
@@ -200,6 +234,70 @@ def _wrap(fig: Figure) -> bool:
             written.set_text("\n".join(textwrap.wrap(text, max(12, int(longest * room) - 2))))
             wrapped = True
     return wrapped
+
+
+def _give_names_room(fig: Figure) -> bool:
+    """Enlarge the figure to separate names at y axes, and turn names at x axes upright; True if any changed."""
+    more, turned = 0.0, False
+    for axes in filter(Axes.get_visible, fig.axes):
+        for axis, low, high in ((axes.xaxis, "x0", "x1"), (axes.yaxis, "y0", "y1")):
+            names = [t for t in axis.get_ticklabels() if t.get_text() and t.get_visible()]
+            if len(names) < 2 or not _has_names(axis):
+                continue
+            boxes = sorted((t.get_window_extent() for t in names), key=lambda box: getattr(box, low))
+            pairs = [(getattr(a, high) - getattr(b, low), a, b) for a, b in itertools.pairwise(boxes)]
+            if axis is axes.yaxis:
+                share = max(1 + lap / (abs(b.y0 + b.y1 - a.y0 - a.y1) / 2 + 1e-9) for lap, a, b in pairs)
+                more += max(share - 1, 0.0) * axes.bbox.height / 72
+            elif names[0].get_rotation() != 90 and (names[0].get_rotation() or max(lap for lap, *_ in pairs) > 0):
+                axis.set_tick_params(rotation=90)
+                for name in names:
+                    name.set_horizontalalignment("center")
+                turned = True
+    if more > 0.05:
+        fig.set_figheight(fig.get_figheight() + min(more, TALLER))
+    return more > 0.05 or turned
+
+
+def _clear_texts(fig: Figure) -> None:
+    """Separates texts inside axes from other texts: numbers that lie over one are hidden, words are moved.
+
+    A map shows all its numbers or none.
+    """
+    every: Any = fig.findobj(lambda a: isinstance(a, Text) and a.get_visible() and a.get_text().strip() != "")
+    boxes = {text: Text.get_window_extent(text) for text in every if text.get_rotation() == 0}
+
+    def is_free(text: Text, box: Bbox) -> bool:
+        return not any(
+            min(box.x1, b.x1) - max(box.x0, b.x0) > 2 and min(box.y1, b.y1) - max(box.y0, b.y0) > 2
+            for other, b in boxes.items()
+            if other is not text
+        )
+
+    inside: list[Any] = [text for axes in fig.axes for text in axes.texts if text in boxes]
+    crowded = {text.axes for text in inside if text.axes.images and not is_free(text, boxes[text])}
+    for text in sorted(inside, key=lambda text: not _is_number(text)):
+        box, panel, line = boxes[text], text.axes.bbox, text.get_fontsize() / 2
+        if _is_number(text) and (text.axes in crowded or not is_free(text, box)):
+            text.set_visible(False)
+            del boxes[text]
+        if text not in boxes or is_free(text, box):
+            continue
+        aside = max(panel.x0 + 2 - box.x0, 0.0)
+        for lines, along in itertools.product(sorted(range(-12, 13), key=abs), dict.fromkeys((0.0, aside))):
+            moved = box.translated(along, lines * line)
+            if panel.y0 < moved.y0 and moved.y1 < panel.y1 and is_free(text, moved):
+                if isinstance(text, Annotation) and isinstance(text.anncoords, str):
+                    text.xyann = tuple(np.add(text.xyann, (along, lines * line)))
+                else:
+                    text.set_transform(text.get_transform() + Affine2D().translate(along, lines * line))
+                boxes[text] = moved
+                break
+
+
+def _is_number(text: Text) -> bool:
+    """True for a number in a cell or a bar, which a table shows too."""
+    return re.fullmatch(r"[-−+.\d ]+%?", text.get_text()) is not None
 
 
 def readable_colour(colour: Any) -> Any:
@@ -235,11 +333,16 @@ def _place(fig: Figure, axes: Axes) -> Json:
     return {"box": [round(v, 1) for v in place], **both}
 
 
+def _has_names(axis: Axis) -> bool:
+    """True if the ticks of an axis have names, not numbers."""
+    return not isinstance(axis.get_major_formatter(), ScalarFormatter | LogFormatter | NullFormatter)
+
+
 def _run(axis: Axis) -> Json:
     """The ends of an axis, whether it is logarithmic, and its names where its ticks have any."""
     ends = [float(f"{end:.6g}") for end in axis.get_view_interval()]
     known: Json = {"ends": ends, "log": axis.get_scale() == "log"}
-    if not isinstance(axis.get_major_formatter(), ScalarFormatter | LogFormatter | NullFormatter):
+    if _has_names(axis):
         names = [(float(t.get_loc()), t.label1.get_text() or t.label2.get_text()) for t in axis.get_major_ticks()]
         if names and all(name for _, name in names):
             known["names"] = names

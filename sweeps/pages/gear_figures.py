@@ -13,7 +13,7 @@ from calibration.data import Json
 from mmrjax.model.paper_tables import PITCH_GROUSER, PITCH_TOOTH
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import STATUSES
-from mmrjax.undercarriage import ripple
+from mmrjax.undercarriage import ripple_peaks
 from sweeps.pages.figure_style import (
     BLUE,
     FAINT,
@@ -65,7 +65,7 @@ class Gear:
     def period(self) -> float:
         """Eq. (34) [s], at the mean speed of the driving pulley; the belt runs on the pulley on wheels too."""
         speed = float(self.signals.speed_wheel[self.tail(TAIL)].mean())
-        return ripple.period_pitch(PITCH_GROUSER if self.on_tracks else PITCH_TOOTH, speed, self.radius)
+        return ripple_peaks.period_pitch(PITCH_GROUSER if self.on_tracks else PITCH_TOOTH, speed, self.radius)
 
 
 def members_with_gear(
@@ -99,7 +99,7 @@ def ripple_numbers(gear: Gear) -> Json:
     """What ripples in a run, by how much and how often."""
     tail, signals = gear.tail(TAIL), gear.signals
     drawn, travel, reaction = (
-        ripple.ripple(gear.time[tail], x[tail]) for x in (signals.total_current, signals.speed, signals.normal)
+        ripple_peaks.ripple(gear.time[tail], x[tail]) for x in (signals.total_current, signals.speed, signals.normal)
     )
     return {
         "configuration": gear.name,
@@ -140,7 +140,7 @@ def draw_touchdowns(gear: Gear, title: str = "grousers land (dotted)") -> Figure
     fig, grid = new_figure(2, 1, 5.0, sharex=True)
     last = gear.tail(SHOWN)
     time = 1e3 * (gear.time[last] - gear.time[last][0])
-    lands = ripple.touchdowns(time, gear.reactions.grouser[last], gear.reactions.place[last])
+    lands = ripple_peaks.touchdowns(time, gear.reactions.grouser[last], gear.reactions.place[last])
     upper, lower = grid[:, 0]
     upper.plot(time, gear.signals.total_current[last], color=BLUE)
     upper.set(ylabel="total current [A]")

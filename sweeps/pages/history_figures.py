@@ -12,8 +12,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from calibration.data import Columns
-from mmrjax.derived.start_figures import curve_peak
-from mmrjax.fidelities.start_stages import StartStages, count_finite_samples, last_samples, stages_of_histories
+from mmrjax.derived.start_figures import (
+    StartStages,
+    count_finite_samples,
+    curve_peak,
+    last_samples,
+    stages_of_histories,
+)
 from mmrjax.model import channels
 from mmrjax.model.channels import Channel
 from mmrjax.model.quantities import MM

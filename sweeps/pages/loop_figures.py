@@ -23,8 +23,10 @@ from sweeps.pages.figure_style import (
     INK,
     ORANGE,
     SKY,
+    colour_bar,
     configuration_looks,
     corner_note,
+    is_narrow,
     legend_columns,
     new_figure,
 )
@@ -230,13 +232,14 @@ def draw_errors(found: DiscoveryResult) -> Figure:
             axes.barh(np.arange(len(lines)) + 0.4 * k - 0.2, values, height=0.38, color=colour, label=when)
             for row, v in enumerate(values):
                 axes.text(v, row + 0.4 * k - 0.2, f" {v:.2g}", va="center", fontsize=8, color=INK)
-        axes.set_yticks(range(len(lines)), list(lines) if place == 0 else [""] * len(lines))
+        axes.set_yticks(range(len(lines)), list(lines) if place == 0 or is_narrow() else [""] * len(lines))
         axes.invert_yaxis()
         axes.margins(x=0.16)
         axes.grid(axis="y", visible=False)
         axes.set_title(channel.label)
         axes.set_xlabel("rms error [%]")
-    fig.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside upper right", ncols=2)
+    labels = grid[0, 0].get_legend_handles_labels()[1]
+    fig.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside upper right", ncols=legend_columns(labels))
     return fig
 
 
@@ -388,7 +391,7 @@ def look_alikes(found: DiscoveryResult) -> Figure:
     axes.set_xticks(range(len(names)), names, rotation=60, ha="right")
     axes.set_yticks(range(len(names)), names)
     axes.grid(visible=False)
-    fig.colorbar(shown, ax=axes, label="|cos| of the signatures", shrink=0.8)
+    colour_bar(fig, shown, axes, label="|cos| of the signatures", shrink=0.8)
     return fig
 
 

@@ -12,7 +12,7 @@ from scipy.spatial import ConvexHull
 
 from mmrjax.climbing.resting_posture import BELTS, FRONT_AXLE, REAR_AXLE, Outline
 from mmrjax.model.quantities import MM
-from sweeps.pages.figure_style import BLUE, INK, ORANGE, VERMILION, new_figure
+from sweeps.pages.figure_style import BLUE, INK, ORANGE, VERMILION, colour_bar, new_figure
 from sweeps.results.posture_results import Drawn, Postures, StepMap
 
 _GROUND = "#d9cfbf"
@@ -87,7 +87,7 @@ def draw_highest_steps(over: StepMap) -> Figure:
     maps = ((over.step_mm, "highest step [mm]"), (over.margin_mm, "margin of tipping at rest [mm]"))
     for axes, (values, label) in zip(grid[:, 0], maps, strict=True):
         drawn = axes.contourf(over.angles_deg, over.angles_deg, values, levels=12, cmap="cividis")
-        fig.colorbar(drawn, ax=axes, label=label)
+        colour_bar(fig, drawn, axes, label=label)
         axes.plot(over.own_deg[1], over.own_deg[0], "o", color="white", mec=INK, ms=8, label="this run")
         axes.plot(over.rear_deg, over.front_deg, "*", color=VERMILION, mec="white", ms=13, label="highest")
         axes.set(

@@ -11,7 +11,19 @@ from matplotlib.patches import Rectangle
 from mmrjax.model.quantities import MM
 from mmrjax.undercarriage.ripple_peaks import MATTERS, SIGNALS, strongest_resonances
 from sweeps.pages import words
-from sweeps.pages.figure_style import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, SKY, VERMILION, new_figure
+from sweeps.pages.figure_style import (
+    BLUE,
+    FAINT,
+    GREEN,
+    INK,
+    ORANGE,
+    PURPLE,
+    SKY,
+    VERMILION,
+    colour_bar,
+    legend_columns,
+    new_figure,
+)
 from sweeps.results.resonance_results import ResonanceResult, ripple_percent
 
 ORDERS = 8  # lines of the Campbell diagram
@@ -90,8 +102,10 @@ def draw_campbell_diagram(axes: Axes, found: ResonanceResult) -> None:
     axes.set(ylim=(0, top), ylabel="frequency [Hz]")
     heading = f"{found.configuration}: {what.name} pass every {what.travel / MM:.4g} mm of travel; dotted: Table 8"
     axes.set_title(heading, pad=18)
+    labels = axes.get_legend_handles_labels()[1]
     axes.legend(
-        loc="upper center", bbox_to_anchor=(0.5, -0.02), ncols=3, handletextpad=0.2, columnspacing=1.2,
+        loc="upper center", bbox_to_anchor=(0.5, -0.02), ncols=legend_columns(labels, 3), handletextpad=0.2,
+        columnspacing=1.2,
         title="a run's strongest line, larger for more ripple (sd / mean):", title_fontsize=8.5, alignment="center",
     )  # fmt: skip
 
@@ -165,4 +179,4 @@ def ripple_map(axes: Axes, found: ResonanceResult, name: str) -> None:
     remarks += [kinds] if kinds else []
     axes.set_title(f"Ripple of {label}" + (f"   ({'; '.join(remarks)})" if remarks else ""))
     if len(axes.collections) and "mesh" in locals():
-        axes.figure.colorbar(mesh, ax=axes, pad=0.01, aspect=8, label="sd / mean [%]")
+        colour_bar(axes.figure, mesh, axes, pad=0.01, aspect=8, label="sd / mean [%]")

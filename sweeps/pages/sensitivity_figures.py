@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from calibration.sensitivity.replicates import Estimate
 from calibration.sensitivity.result import NEGLIGIBLE, NextRuns, OutputStudy, SensitivityResult
 from mmrjax.errors import count_noun
-from sweeps.pages.figure_style import BLUE, GREEN, INK, ORANGE, VERMILION, corner_note, new_figure
+from sweeps.pages.figure_style import BLUE, GREEN, INK, ORANGE, VERMILION, corner_note, legend_columns, new_figure
 from sweeps.pages.words import short_name
 
 #: Inputs that a figure shows at most, and operating points of a tornado.
@@ -137,7 +137,8 @@ def _bars(ax: Axes, study: OutputStudy, found: SensitivityResult, top: np.ndarra
         f"effect over the 95 % range{unit}" if "mean_absolute_effect" in shown else "share of the variance [-]"
     )
     ax.grid(axis="y", visible=False)
-    ax.legend(loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=2, fontsize=7.5)  # beside no bar
+    columns = legend_columns(ax.get_legend_handles_labels()[1], 2)
+    ax.legend(loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=columns, fontsize=7.5)  # beside no bar
 
 
 def _over_points(ax: Axes, study: OutputStudy, found: SensitivityResult, top: np.ndarray) -> None:

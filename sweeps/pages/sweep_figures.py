@@ -14,7 +14,7 @@ from matplotlib.ticker import MaxNLocator
 from calibration.data import Columns, Json
 from mmrjax.model.channels import Channel
 from sweeps.pages import words
-from sweeps.pages.figure_style import FAINT, INK, axis_label, corner_note, new_figure
+from sweeps.pages.figure_style import FAINT, INK, axis_label, colour_bar, corner_note, new_figure
 from sweeps.report.condition_columns import UNITS, imposed_column
 from sweeps.report.run_tables import reading_text
 
@@ -75,7 +75,7 @@ def draw_sweep(runs: Columns, channel: Channel) -> Figure:
             axes.set(xlabel="slope [°]", ylabel="payload [kg]")
     from matplotlib.cm import ScalarMappable
 
-    bar = fig.colorbar(ScalarMappable(norm, "viridis"), ax=grid, shrink=0.8, pad=0.01)
+    bar = colour_bar(fig, ScalarMappable(norm, "viridis"), grid, shrink=0.8, pad=0.01)
     bar.set_label(axis_label(channel))
     return fig
 

@@ -40,6 +40,9 @@ from sweeps.store import RunFolder
 
 Table = Columns
 
+#: Steps of `compare` in place of each step of a fit.
+PARTS = 4
+
 
 @dataclasses.dataclass(frozen=True)
 class SimulationResult:
@@ -183,6 +186,8 @@ def evaluate_runs(
 def follow_histories(robot: Robot, runs: Runs, model: str | None) -> Table:
     """Conditions and simulated outputs at every row of a table of time histories.
 
+    Its steps are finer than those of fits, which use the grid up to thousands of times.
+
     Args:
         robot: prepared for the table; model: requested fidelity; None: the fidelity for histories.
 
@@ -190,7 +195,7 @@ def follow_histories(robot: Robot, runs: Runs, model: str | None) -> Table:
         BadConfiguration: a fidelity that cannot follow them.
     """
     seen = jax.device_get(
-        _observed(observers.observer_kind(runs).of(runs, robot, model), params.without_weak_types(robot))
+        _observed(observers.Histories.of(runs, robot, model, PARTS), params.without_weak_types(robot))
     )
     columns = {c.column: seen.reading[:, k] / c.factor for k, c in enumerate(robot.channels)}
     return {**condition_table(robot, runs), **columns, **outputs.status_words(seen.status, seen.flags)}

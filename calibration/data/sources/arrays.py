@@ -12,7 +12,7 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
-from calibration.data import input_files
+from calibration.data import Columns, input_files
 from calibration.data.input_errors import BadData
 from calibration.data.sources.recorded_signals import Signal, of_arrays, values_in_memory
 
@@ -111,7 +111,7 @@ def _check_matlab(path: Path, name: str) -> None:
     input_files.check_memory(name, size)
 
 
-def _variable(loaded: Callable[[], dict[str, np.ndarray]], name: str) -> Callable[[], np.ndarray]:
+def _variable(loaded: Callable[[], Columns], name: str) -> Callable[[], np.ndarray]:
     return lambda: loaded()[name]
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from calibration.data import Columns
 from calibration.data.input_errors import BadData
 from calibration.data.sources.recorded_signals import Clock, Signal
 
@@ -97,11 +98,11 @@ def _first(reader: Any, topic: str) -> Any:
     return reader.deserialize(raw, connection.msgtype)
 
 
-def _column(read: Callable[[], dict[str, np.ndarray]], field: str) -> Callable[[], np.ndarray]:
+def _column(read: Callable[[], Columns], field: str) -> Callable[[], np.ndarray]:
     return lambda: read()[field]
 
 
-def _topic(path: Path, topic: str) -> dict[str, np.ndarray]:
+def _topic(path: Path, topic: str) -> Columns:
     """Values of every field of a topic, and under "" its time [ns]."""
     rows: list[tuple[Any, ...]] = []
     recorded: list[int] = []

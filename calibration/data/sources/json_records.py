@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from calibration.data import input_files
+from calibration.data import Columns, Json, input_files
 from calibration.data.input_errors import BadData
 from calibration.data.sources.recorded_signals import (
     RUN,
@@ -54,7 +54,7 @@ def of_json(path: Path, name: str) -> tuple[Signal, ...]:
     return of_content(found, name)
 
 
-def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _object(pairs: list[tuple[str, Any]]) -> Json:
     """An object of JSON.
 
     Raises:
@@ -73,7 +73,7 @@ def of_content(content: Any, name: str) -> tuple[Signal, ...]:
     Raises:
         BadData: nothing in it is a table.
     """
-    arrays: dict[str, Any] = {}
+    arrays: Json = {}
     _collect(content, "", arrays, name, 1)
     arrays = _stacked({at: values for at, values in arrays.items() if values.size})
     if not arrays:
@@ -84,7 +84,7 @@ def of_content(content: Any, name: str) -> tuple[Signal, ...]:
     return of_arrays(name, {at: (v.shape, v.dtype, values_in_memory(v)) for at, v in arrays.items()})
 
 
-def _collect(value: Any, at: str, arrays: dict[str, np.ndarray], name: str, depth: int) -> None:
+def _collect(value: Any, at: str, arrays: Columns, name: str, depth: int) -> None:
     if depth > DEEPEST:
         raise BadData(f"{name}, {at}: is nested too deep; expected at most {DEEPEST} levels")
     if isinstance(value, Mapping):
@@ -104,7 +104,7 @@ def _collect(value: Any, at: str, arrays: dict[str, np.ndarray], name: str, dept
         arrays[at or "values"] = value if isinstance(value, np.ma.MaskedArray) else np.asarray(value)
 
 
-def _add_time(value: Mapping[str, Any], at: str, arrays: dict[str, np.ndarray]) -> None:
+def _add_time(value: Mapping[str, Any], at: str, arrays: Columns) -> None:
     """Adds the time of episodes without a clock, if a rate or a step is stated next to them."""
     steps = [
         value[key] ** power
@@ -133,7 +133,7 @@ def _unfolded(value: Mapping[str, Any]) -> Mapping[str, Any] | list[Any]:
     return dict(zip(map(str, names), map(list, zip(*rows, strict=True)), strict=True))
 
 
-def _records(records: Sequence[Mapping[str, Any]], at: str, arrays: dict[str, np.ndarray], name: str) -> None:
+def _records(records: Sequence[Mapping[str, Any]], at: str, arrays: Columns, name: str) -> None:
     """Columns of records; a missing entry is a missing reading."""
     if (episodes := _episodes(records)) is not None:
         arrays.update({f"{at}.{key}" if at else key: values for key, values in episodes.items()})
@@ -150,7 +150,7 @@ def _records(records: Sequence[Mapping[str, Any]], at: str, arrays: dict[str, np
         arrays[f"{at}.{key}" if at else key] = _array(values)
 
 
-def _episodes(records: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray] | None:
+def _episodes(records: Sequence[Mapping[str, Any]]) -> Columns | None:
     """Columns of records that each hold lists of numbers of one length, a run each; None for other records.
 
     A text that differs in every record names the runs, else their number does.
@@ -196,7 +196,7 @@ def _array(values: Sequence[Any]) -> np.ndarray:
     return found if found.dtype.kind in "biufUS" else found.astype(object)
 
 
-def _stacked(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def _stacked(arrays: Columns) -> Columns:
     """Joins tables with the same columns, one under each key, into one table with the key as `RUN`.
 
     A file of WPILib SysId has such tables: «slow-forward», «fast-backward», ... are lists of rows.

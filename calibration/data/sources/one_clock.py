@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from calibration.data import counters
+from calibration.data import Columns, Names
+from calibration.data.clock import unwrap_counter
 from calibration.data.input_errors import BadData, bound_text
 from calibration.data.sources.recorded_signals import UNITS, Clock, Signal
 from mmrjax.errors import count_noun
@@ -55,7 +56,7 @@ def clock_seconds(clock: Clock) -> Elapsed:
         raw = raw.astype(np.int64)
     unit, period = clock.unit or guessed_unit(raw), 0.0
     if (np.diff(raw) < 0).any():
-        raw, period = counters.unwrap_counter(raw.astype(float), np.zeros(len(raw), int))
+        raw, period = unwrap_counter(raw.astype(float), np.zeros(len(raw), int))
     one = UNITS[unit]
     return Elapsed((raw - raw[:1]) * one, float(raw[0]) * one, unit, period)
 
@@ -86,7 +87,7 @@ def on_one_grid(
     is_held: Callable[[str], bool],
     is_measured: Callable[[str], bool],
     grid: str,
-) -> tuple[np.ndarray, dict[str, np.ndarray], tuple[str, ...]]:
+) -> tuple[np.ndarray, Columns, Names]:
     """Returns time [s] from the first row, values of each signal at these times, and notes on the resampling.
 
     The grid is the time stamps of the densest measured signal, or of the stated clock. Signals on its clock stay as
@@ -130,7 +131,7 @@ def on_one_grid(
                 f"{name}: {clocks[key].name} ends at {bound_text(time[-1])} s, before {clocks[main].name} and "
                 "every command have begun; expected clocks with a time in common"
             )
-    values: dict[str, np.ndarray] = {}
+    values: Columns = {}
     brought: dict[str, list[str]] = {}
     for column, signal in chosen.items():
         own, key, sorted_by = signal.load(), same[id(signal.clock)], order[id(signal.clock)]

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from calibration.data import delimited, input_files, presets_file
+from calibration.data import Columns, Names, delimited, input_files, presets_file
 from calibration.data.columns import SPEED, TIME, WHEN, WORDS, Layout
 from calibration.data.input_errors import BadData
 from calibration.data.named_arrays import NamedArrays, Raw, column_numbers, column_texts
@@ -160,7 +160,7 @@ def _of_table(arrays: NamedArrays, layout: Layout, columns: Preset | None) -> Re
     )
 
 
-def weakened_field_notes(preset: Preset, values: Mapping[str, Raw]) -> tuple[str, ...]:
+def weakened_field_notes(preset: Preset, values: Mapping[str, Raw]) -> Names:
     """Returns a note on each current of a preset whose part along d is large, so that no DC motor is equivalent.
 
     Args:
@@ -237,7 +237,7 @@ def _of_signals(source: Source, layout: Layout, columns: Preset | None, between:
     return Reading(arrays, mapped)
 
 
-def _chosen(source: Source, mapped: Mapped, layout: Layout) -> tuple[dict[str, Signal], str, tuple[str, ...]]:
+def _chosen(source: Source, mapped: Mapped, layout: Layout) -> tuple[dict[str, Signal], str, Names]:
     """Signals by the name of their column, the clock stated as the grid, and notes on missing signals.
 
     A signal has a column if a table of columns names it, or if the last part of its path is a column's name.
@@ -275,7 +275,7 @@ def _extras(source: Source, chosen: Mapping[str, Signal], own: Sequence[Signal])
     return {s.path: s for s in others}
 
 
-def _in_rows(source: Source, signals: Mapping[str, Signal], rows: int = 0) -> dict[str, np.ndarray]:
+def _in_rows(source: Source, signals: Mapping[str, Signal], rows: int = 0) -> Columns:
     """Values of the columns of a table; a single value applies to every row."""
     lengths = {column: s.length for column, s in signals.items()}
     rows = rows or max(lengths.values(), default=0)
@@ -295,7 +295,7 @@ def _in_rows(source: Source, signals: Mapping[str, Signal], rows: int = 0) -> di
 
 def _on_a_grid(
     source: Source, chosen: Mapping[str, Signal], layout: Layout, between: str, clock: str, mapped: Mapped
-) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
+) -> tuple[Columns, Names]:
     """Values of signals with separate clocks, on one grid."""
     meanings = dataclasses.replace(layout, mapped=mapped).meanings(source.name, list(chosen))
     column_of = {c: "" if m is None else m.column for c, m in zip(chosen, meanings, strict=True)}

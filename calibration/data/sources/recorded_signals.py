@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 
-from calibration.data import input_files
+from calibration.data import Names, input_files
 from calibration.data.input_errors import BadData
 from mmrjax.errors import similar_words
 
@@ -267,7 +267,7 @@ class Source:
     kind: str
     signals: tuple[Signal, ...]
     digest: str = ""
-    notes: tuple[str, ...] = ()
+    notes: Names = ()
 
     def below(self, prefix: str) -> Source:
         """The signals below a path.

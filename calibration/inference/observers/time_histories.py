@@ -243,8 +243,11 @@ class Histories(Observer):
         return runs.has("time_s")
 
     @classmethod
-    def of(cls, runs: Runs, robot: Robot, fidelity: str | None = None) -> Histories:
-        """Observer of a table; rows may be in any order, and constant conditions of a run are its first row's."""
+    def of(cls, runs: Runs, robot: Robot, fidelity: str | None = None, parts: int = 1) -> Histories:
+        """Observer of a table; rows may be in any order, and constant conditions of a run are its first row's.
+
+        Args: as for `Observer`; parts: number of steps in place of each step of a fit.
+        """
         if fidelity is not None and fidelities.get_fidelity(fidelity).name != "drive":
             raise BadConfiguration(f"--model {fidelity}: {runs.source} holds time histories; they need --model drive")
         if runs.turns:
@@ -268,7 +271,7 @@ class Histories(Observer):
         ]
         change = LOOSE if robot.loose else CHANGE
         grids = [
-            time_grid(whole["time_s"][rows[n]], *c, h, START if robot.has_ground else change, change)
+            time_grid(whole["time_s"][rows[n]], *c, h, START if robot.has_ground else change, change, parts)
             for rows, n, c, h in zip(every, noted, _drive_jumps(whole, every, robot.rig), steps, strict=True)
         ]
         # The last instant begins a step too, of length zero.
