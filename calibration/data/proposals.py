@@ -68,10 +68,10 @@ RATES = (
     ("turns", "rad_s", 0.5 / math.pi), ("rad", "turns_s", 2 * math.pi), ("deg", "turns_s", 360.0),
     ("mm", "m_s", 1e3), ("m", "mm_s", 1e-3),
 )  # fmt: skip
+#: Units that only quantities of places have, and that only their rates have.
+_PLACES, _SPEEDS = {"m", "turns"}, {"m_s", "turns_s"}
 #: Largest relative difference of a rate from one of these, and of a place from the integral of its rate.
 SAME_RATE, INTEGRAL = 0.03, 0.05
-#: Quantities of places and rates.
-PLACES, SPEEDS = ("output_angle", "position"), ("motor_speed", "output_speed", "speed")
 #: Quantities of which the only signal in one of their units is taken if its name has no meaning.
 BY_UNIT = ("supply_voltage", "total_current", "motor_speed", "winding_temperature")
 
@@ -252,7 +252,9 @@ def _by_rate(
     """
     agreed: dict[str, Candidate] = {}
     for place, rate in itertools.product(pool, pool):
-        if place.quantity not in PLACES or rate.quantity not in SPEEDS or place.signal.path in agreed:
+        if not _PLACES & {*columns[place.quantity].values()} or not _SPEEDS & {*columns[rate.quantity].values()}:
+            continue
+        if place.signal.path in agreed:
             continue
         time = seconds(rate.signal) if place.signal.length == rate.signal.length else None
         if time is None or len(time) != rate.signal.length or "motor" in rate.signal.path.casefold():

@@ -264,7 +264,8 @@ def settled_points(name: str, columns: Columns, layout: Layout, robot: Robot) ->
         )
         if own > 2 * before:
             return kept, ()
-    kept = {column: values for column, values in kept.items() if column not in ("time_s", "run_id")}
+    for column in (*TIME, "run_id"):
+        kept.pop(column, None)
     said = f"rows are {three_digits(apart)} s apart or more, most at another setting"
     settle = f", and the motors settle in about {three_digits(CONSTANTS_APART * constant)} s" if constant > 0 else ""
     return kept, (f"{name}: {said}{settle}: each row is read as a settled run, without its time",)
