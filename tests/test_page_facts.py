@@ -1,6 +1,7 @@
 """What pages say of limits, scales and tables: what is judged, by which measure, and that nothing overruns."""
 
 import dataclasses
+import itertools
 import re
 
 import matplotlib.pyplot as plt
@@ -12,12 +13,13 @@ from calibration.data.robot_file import RobotFile
 from mmrjax import effects
 from mmrjax.model import paper_robots, params
 from mmrjax.model.paper_tables import TRACKED, WHEELED
-from sweeps.pages import sweep_figures
+from sweeps import pages
+from sweeps.pages import figure_style, sweep_figures
 from sweeps.paper import run_figures as paper_runs
 from sweeps.report import page_renderer, run_tables
 from sweeps.report import runs_report as page
 from sweeps.report.document import Document, Section
-from sweeps.results.resonance_results import ResonanceResult
+from sweeps.report.resonance_report import ResonanceResult
 
 
 def run_of(robot, **conditions):
@@ -124,3 +126,37 @@ def test_a_point_within_a_range_to_avoid_is_never_a_plain_no():
     table = {"speed_mean_mm_s": np.array([979.0, 979.0, 1100.0])}
     found = Found("6T2A", 0.0, "", None, None, table, {}, [], [])
     assert [found.to_avoid(k) for k in range(3)] == ["yes", "at other payloads", "no"]
+
+
+def test_texts_of_a_narrow_figure_are_apart(monkeypatch):
+    """Names break at dots and panels grow for them, a map shows all its numbers or none, words make room."""
+    monkeypatch.setattr(pages, "FOR_PHONES", True)
+    names = [f"tracked_{k}.ground.friction.speed_static" for k in range(9)]
+    with figure_style.figure_settings(figure_style.NARROW):
+        fig, grid = figure_style.new_figure(1, 2, 1.5)
+        left, right = grid[0]
+        left.barh(range(9), np.arange(1.0, 10.0))
+        left.set_yticks(range(9), names)
+        left.text(3, 4, "one remark"), left.text(3, 4, "another remark")
+        image = right.imshow(np.eye(9))
+        right.set_xticks(range(9), names, rotation=60, ha="right")
+        for k in range(9):
+            right.text(k, 4, "-0.25", ha="center", va="center")
+        figure_style.colour_bar(fig, image, right, label="correlation")
+        labels = ["a legend that has many words in it", "and another that has as many"]
+        for label in labels:
+            left.plot([0, 1], label=label)
+        left.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0))
+        assert figure_style.legend_columns(labels, 2) == 1
+        figure_style.figure_as_svg(figure_style.fit_for_phones(fig))
+        shown = left.get_yticklabels()
+        boxes = sorted((label.get_window_extent() for label in shown), key=lambda box: box.y0)
+        assert all(a.y1 < b.y0 + 1 for a, b in itertools.pairwise(boxes))
+        for label, name in zip(shown, names, strict=True):
+            *broken, _ = lines = label.get_text().split("\n")
+            assert "".join(lines) == name and broken and all(line[-1] in "._" for line in broken)
+        assert not any(text.get_visible() for text in right.texts)
+        one, other = (text.get_window_extent() for text in left.texts)
+        assert one.y1 < other.y0 + 2 or other.y1 < one.y0 + 2
+        assert {label.get_rotation() for label in right.get_xticklabels()} == {90}
+        assert left.get_legend().get_window_extent().y0 > left.bbox.y1 and left.bbox.width > 0.3 * fig.bbox.width

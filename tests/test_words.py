@@ -551,7 +551,7 @@ def test_what_settled_runs_cannot_tell_from_an_effect_is_said_of_them_alone(samp
 
 def test_a_formula_without_terms_says_so():
     assert Formula("", "mark", (), (), 0.0, 9).formula == "no single term explains 90 % of it"
-    assert Formula("ΔU = 1 V", "mark", (1.0,), (0.1,), 3.0, 9).to_json()["formula"] == "ΔU = 1 V"
+    assert Formula("ΔU = 1 V", "mark", (1.0,), (0.1,), 3.0, 9).formula == "ΔU = 1 V"
 
 
 def test_why_an_effect_is_ruled_out():
