@@ -8,7 +8,7 @@ import pytest
 from calibration.sensitivity.result import Points
 from calibration.words import fit_words, sensitivity_words
 from mmrjax.model import channels
-from sweeps.paper import error_tables
+from sweeps.paper import report
 from sweeps.report import mission_report, runs_report, sweep_report
 
 SHOWN = [channels.find_channel("total_current"), channels.find_channel("speed")]
@@ -131,7 +131,7 @@ def test_reproduce_compares_with_the_bench_and_the_paper():
         return {"variant": "", "group": group, "rows": rows, "of": 20, "cells": cells}
 
     every = [of(9, 13), of(9, 13, "6T2A"), of(8, 20), of(5, 20), of(5, 10, "6T2A"), of(3, 20)]
-    assert error_tables.error_answer(every) == (
+    assert report.error_answer(every) == (
         "rms error against 20 of 20 measured rows: 5.0 % total current, 6.0 % motor speed, 7.0 % speed, with adhesion "
         "raised (13 rows settle on its own). The paper's own simulation: 3.0 % total current, 4.0 % motor speed, "
         "5.0 % speed."
