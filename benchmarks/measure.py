@@ -17,6 +17,8 @@ from typing import Any
 import jax
 import numpy as np
 
+import mmrjax
+
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))  # the plain reference model
 
 
@@ -46,7 +48,8 @@ def machine() -> dict[str, Any]:
         cpu = names[0] if names else cpu
     device = jax.devices()[0]
     versions = {name: importlib.metadata.version(name) for name in ("jax", "jaxlib", "diffrax", "optimistix")}
-    versions |= {name: importlib.metadata.version(name) for name in ("numpy", "scipy", "mmrjax")}
+    versions |= {name: importlib.metadata.version(name) for name in ("numpy", "scipy")}
+    versions["mmrjax"] = mmrjax.__version__  # a checkout need not be installed
     return {
         "date": datetime.date.today().isoformat(),
         "cpu": cpu,

@@ -110,7 +110,7 @@ def glossary() -> str:
 def statuses() -> str:
     """Page of the statuses of a run, its flags and the verdicts of `loop` and `climb`."""
     from sweeps.pages import words
-    from sweeps.results.climb_results import VERDICTS
+    from sweeps.report.climb_report import VERDICTS
 
     parts = {
         "Statuses": {name: _sentence(status.meaning) for name, status in words.STATUSES.items()},

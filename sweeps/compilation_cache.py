@@ -8,7 +8,6 @@ folder that others could change is not used (`mmrjax.compile.private`). Importab
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import importlib.metadata
 import os
@@ -144,32 +143,12 @@ def _prune(caches: Path) -> None:
             return
 
 
-@dataclasses.dataclass(frozen=True)
-class Contents:
-    """Contents of the cache.
-
-    Attributes:
-        path: its folder; None where it is switched off.
-        entries: compiled programs in it; size: of them all [bytes].
-        exposed: why it is not used, if others could change it.
-    """
-
-    path: Path | None
-    entries: int
-    size: int
-    exposed: str = ""
-
-    def __str__(self) -> str:
-        if self.path is None:
-            return f"off ({VARIABLE}=off)" if os.environ.get(VARIABLE) else "off"
-        if self.exposed:
-            return f"{self.path}: not used, since {self.exposed}"
-        return f"{self.path}: {self.entries} programs, {self.size / 1e6:.1f} MB"
-
-
-def describe_cache(path: Path | None = None) -> Contents:
-    """Returns the folder of the cache and its contents."""
+def describe_cache(path: Path | None = None) -> str:
+    """Folder of the cache with number and size of its programs, or why it is not used."""
     folder = cache_location(path)
-    entries = [] if folder is None else _entries(folder)
-    exposed = "" if folder is None else exposure_reason(folder)
-    return Contents(folder, len(entries), sum(entry[1] for entry in entries), exposed)
+    if folder is None:
+        return f"off ({VARIABLE}=off)" if os.environ.get(VARIABLE) else "off"
+    if exposed := exposure_reason(folder):
+        return f"{folder}: not used, since {exposed}"
+    entries = _entries(folder)
+    return f"{folder}: {len(entries)} programs, {sum(entry[1] for entry in entries) / 1e6:.1f} MB"

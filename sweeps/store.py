@@ -7,6 +7,7 @@ import datetime
 import errno
 import fcntl
 import hashlib
+import importlib
 import importlib.metadata
 import json
 import os
@@ -20,15 +21,60 @@ from typing import Any, TextIO, TypeVar
 
 import numpy as np
 
-from calibration.data import Columns, Json, Names, writing
+from calibration.data import Columns, Json, Names, robot_file, writing
 from calibration.data.input_errors import BadConfiguration, InputError
+from calibration.data.robot_file import RobotFile
 from calibration.data.runs import Runs
 from calibration.discovery.kept import REFIT_FILE
 from mmrjax import __version__
 from mmrjax.model import params
 from mmrjax.model.robot import Robot
+from sweeps import config as configuration
 from sweeps.config import FolderPart, RobotPart
-from sweeps.console import print_message
+from sweeps.console import print_message, print_output
+from sweeps.report import terminal_renderer
+from sweeps.report.document import Document
+
+Page = Callable[[Path], Any]
+
+
+def print_report(document: Document, file: RobotFile | None = None) -> Page:
+    """Print a document and return its page, which ends with the robot's parameters if its file is given."""
+    terminal_renderer.print_document(document)
+    return lambda folder: importlib.import_module("sweeps.report.page_renderer").write_report_page(
+        folder, document, file
+    )
+
+
+def finish_run_folder(
+    folder: Folder,
+    config: RobotPart,
+    manifest: Json,
+    *,
+    robot: Robot | None = None,
+    note: str = "",
+    solved: bool = True,
+    page: Page | None = None,
+    runs: Runs | None = None,
+) -> int:
+    """Write the configuration and the page (if wanted), move the folder into place and print its path.
+
+    Args:
+        folder: with the command's own files; robot: written as `robot.toml` with a note, if it is not among them.
+        manifest: entries besides program, versions and hashes; runs: the table whose hash is recorded, if any.
+        solved: True if every solver gave an answer.
+
+    Returns:
+        The exit code: 0, or 3 where a solver failed.
+    """
+    if robot is not None:
+        robot_file.write_robot(robot, folder.results() / "robot.toml", note=f"{note}, from {config.robot}")
+    folder.write_text("config.resolved.toml", configuration.as_toml(config))
+    if page is not None and getattr(config, "report", True):
+        page(folder.results())
+    print_output(str(folder.finish(manifest, runs)))
+    return DONE if solved else SOLVER_FAILED
+
 
 T = TypeVar("T")
 #: Exit codes of a command that is done: every solver gave an answer, or one failed. A run that stalls or slides, a
@@ -206,7 +252,25 @@ class Folder:
             "seconds": round((now - self.started).total_seconds(), 3),
         }
         names = {"manifest.json", *(p.name for p in self.partial.iterdir())} - {LOCK, CHUNKS} - self._foreign()
-        whole = {**result_provenance(), **times, **manifest, "hashes": hashes, "contents": sorted(names)}
+        # Program, versions and devices that made a result
+        import jax
+        import jax.numpy as jnp
+
+        whole = {
+            **{
+                "schema": MANIFEST,
+                "program": f"mmrjax {__version__}",
+                "arguments": sys.argv[1:],
+                "python": platform.python_version(),
+                "versions": {name: importlib.metadata.version(name) for name in PACKAGES},
+                "devices": [str(d) for d in jax.devices()],
+                "float": jnp.result_type(float).name,
+            },
+            **times,
+            **manifest,
+            "hashes": hashes,
+            "contents": sorted(names),
+        }
         self.write_json("manifest.json", whole)
         return self.move_into_place()
 
@@ -481,22 +545,6 @@ def open_folder(
     folder = RunFolder(beside.out or default_path(command), identity, force=beside.force)
     folder.tables = getattr(config, "table", folder.tables)
     return folder
-
-
-def result_provenance() -> Json:
-    """Program, versions and devices that made a result."""
-    import jax
-    import jax.numpy as jnp
-
-    return {
-        "schema": MANIFEST,
-        "program": f"mmrjax {__version__}",
-        "arguments": sys.argv[1:],
-        "python": platform.python_version(),
-        "versions": {name: importlib.metadata.version(name) for name in PACKAGES},
-        "devices": [str(d) for d in jax.devices()],
-        "float": jnp.result_type(float).name,
-    }
 
 
 def rows_of_fit(robot: Path) -> frozenset[str]:

@@ -138,7 +138,8 @@ def test_cited_commands_run(tmp_path, command):
     if small is None:
         pytest.skip("run by its own tests")
     words = [VALUES.get(word, word) for word in given]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    folders = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
+    environment = {**os.environ, "PYTHONPATH": folders}
     done = subprocess.run(
         [sys.executable, ROOT / script, *words, *small.split()],
         cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=1200, check=False,

@@ -66,8 +66,8 @@ def test_second_process_compiles_nothing_and_answers_the_same(first):
     assert again["kept"] == 0 and again["read"] == began["kept"]
     assert again["answer"] == began["answer"]
     described = compilation_cache.describe_cache(cache)
-    assert described.entries == began["kept"] and described.size > 10_000
-    assert str(described.path) == began["folder"] and f"{described.entries} programs" in str(described)
+    assert described.startswith(f"{began['folder']}: {began['kept']} programs, ")
+    assert float(described.split()[-2]) > 0.0
 
 
 @pytest.mark.slow
@@ -86,14 +86,14 @@ def test_cache_switched_off_has_no_place(word, monkeypatch):
     monkeypatch.setenv("MMRJAX_CACHE", word)
     assert compilation_cache.cache_location() is None
     assert compilation_cache.keep_programs() is None
-    assert str(compilation_cache.describe_cache()) == "off (MMRJAX_CACHE=off)"
+    assert compilation_cache.describe_cache() == "off (MMRJAX_CACHE=off)"
 
 
 @pytest.mark.slow
 def test_process_with_cache_switched_off_keeps_nothing(tmp_path):
     done = process("off", XDG_CACHE_HOME=str(tmp_path), HOME=str(tmp_path))
     assert done["folder"] is None and done["kept"] == done["read"] == 0
-    assert not list(tmp_path.iterdir())
+    assert not [p for p in tmp_path.iterdir() if p.name != ".nv"]  # a GPU's driver leaves that one
 
 
 @pytest.mark.slow

@@ -177,6 +177,10 @@ def test_peak_is_the_top_of_a_parabola():
     top(
         start_figures.curve_peak(x, jnp.where(x < 0.8, 3 - (x - 0.37) ** 2, jnp.nan)), 3.0, atol=1e-12
     )  # of a run that has ended
+    # A current that its limit holds: no overshoot between the samples at the corner.
+    held = jnp.minimum(30 * x, 1.5 - 1e-3 * x)
+    assert float(start_figures.curve_peak(x, held, 1.5)) == pytest.approx(1.5, abs=1e-3)
+    assert float(start_figures.curve_peak(x, held)) > 1.6
     for rises in (x, -x, jnp.where(x < 0.8, x, jnp.nan)):  # no top between: the largest sample
         assert float(start_figures.curve_peak(x, rises)) == float(jnp.nanmax(rises))
 

@@ -19,6 +19,7 @@ from calibration.data import robot_file
 from calibration.discovery import discover, discrepancy, formula
 from calibration.discovery.discrepancy import CurveBeside, fit_discrepancy, refine_window, similar_variables
 from calibration.discovery.projection import defect_by_row
+from calibration.discovery.result import Formula
 from calibration.discovery.score_tests import diagnose_fit
 from calibration.discovery.smooth import smooth_curve
 from calibration.inference import bases
@@ -150,7 +151,11 @@ def test_formula_finds_the_variable(found):
     """One term where a term explains the curve; no term does for a step of the voltage, which words describe."""
     proposal = found.what.proposal
     if found.what.balance == "electrical":
-        assert not proposal.terms and loop_words.proposed_formula(found.what).startswith("The curve ")
+        seen = SimpleNamespace(
+            window=None, variable=found.what.variable, at=found.what.grid, value=found.what.curve, unit="V",
+            proposal=Formula(proposal.formula, proposal.mark, (), (), proposal.gain, proposal.tried),
+        )  # fmt: skip
+        assert not proposal.terms and loop_words.proposed_formula(seen).startswith("The curve rises from ")
         return
     assert found.what.variable in proposal.variables
     assert len(proposal.terms) == 1 and proposal.mark == "a proposal, not a finding"

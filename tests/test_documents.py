@@ -32,10 +32,10 @@ from sweeps.report import (
     size_report,
     terminal_renderer,
 )
+from sweeps.report.check_report import CheckResult
+from sweeps.report.comparison_report import Comparison, add_second_robot, compare_readings
 from sweeps.report.document import Cell, Column, Document, Note, Section, Table, remarks
-from sweeps.results.check_results import CheckResult
-from sweeps.results.comparison_results import Comparison, add_second_robot, compare_readings
-from sweeps.results.size_results import SizeResult
+from sweeps.report.size_report import SizeResult
 
 
 def outcomes() -> tuple[sheet.Outcome, ...]:

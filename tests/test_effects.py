@@ -22,6 +22,8 @@ from numpy.testing import assert_allclose
 
 from calibration.data.effect_file import readable_signals
 from calibration.discovery import setups
+from calibration.inference.linearization import PROBED
+from calibration.inference.observers.settled import SettledRuns
 from mmrjax import effects
 from mmrjax.effects import ALL, BY_NAME, Effect, base
 from mmrjax.effects.periodic import Periodic
@@ -70,7 +72,7 @@ SIGNAL_UNITS = {
     "H": "inductance",
     "kg·m^2": "inertia_added",
     "rad": "angle heading",
-    "-": "side duty pause share_drawn on_tracks battery slope adhesion order direction direction_travel direction_turn efficiency_load",
+    "-": "side command duty pause share_drawn on_tracks battery slope adhesion order direction direction_travel direction_turn efficiency_load",
 }
 UNIT_OF = {name: unit for unit, fields in SIGNAL_UNITS.items() for name in fields.split()}
 SENSOR_UNITS = {c.name: c.unit_si for c in channels.EVERY}
@@ -145,7 +147,7 @@ def random_states(n=400):
     return dataclasses.replace(
         straight,
         pause=rng.uniform(0, 1, n),
-        duty=np.random.default_rng(13).uniform(-1, 1, n),
+        command=np.random.default_rng(13).uniform(-1, 1, n),
         side=rng.choice((-1.0, 1.0), n),
         yaw_rate=turn,
         direction_turn=np.sign(turn),
@@ -254,7 +256,7 @@ DRIVERS = {
     "demand": ("demand", "traction", "resistance"),
     "weight": ("normal", "mass"),
     "slope": ("slope",),
-    "duty": ("pause", "duty"),
+    "duty": ("pause", "command"),
     "configuration": ("configuration", "on_tracks"),
     "direction": ("direction",),
     "the side": ("side",),
@@ -393,7 +395,7 @@ def law_readable(effect: type[Effect]) -> None:
 #: Signals that are the same in a run in mirror image (the robot turned about on the same slope).
 EVEN = (
     *("configuration", "on_tracks", "payload", "adhesion", "battery", "discharge", "memory", "mass", "normal"),
-    *("inductance", "inertia_added", "adhesion_limit", "efficiency_load", "temperature", "duty", "pause"),
+    *("inductance", "inertia_added", "adhesion_limit", "efficiency_load", "temperature", "command", "duty", "pause"),
 )
 
 
@@ -980,6 +982,8 @@ def test_library_declares_what_the_loop_asks_for():
         "duty_dead_band",
         "duty_saturation",
     ]
+    # An effect of a balance without a probe would have a score of 0 in every table.
+    assert {e.balance for e in ALL if SettledRuns.shows(e)} <= {*PROBED, "sensor"}
     assert [e.name for e in ALL if e.odd_in_travel] == [*both_ways, "slope_bias"]
     assert {e.name: e.movers for e in ALL if e.movers} == {
         "mass_offset": "wheels", "grouser_polygon": "tracks", "vibration_slip": "tracks",

@@ -18,6 +18,7 @@ from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.rig import Rig
 from mmrjax.model.signals import STATUSES
+from sweeps.commands import rig_check
 
 AMPERES = np.array([-8.0, -2.0, 0.5, 5.0])
 #: Friction of motor (N·m) and efficiency of `bench`; its load has none here.
@@ -159,3 +160,15 @@ def test_rows_of_a_clamp_in_tables(tmp_path):
     assert "80 A, where the file's numbers turn the load" in rig_facts.doubtful_current(
         records.read_runs(strong, robot=held), held
     )
+
+
+def test_check_does_not_call_a_held_shaft_stalled(tmp_path, capsys):
+    rig(tmp_path, "motor_speed", '"motor_current", "motor_voltage"')
+    current = np.r_[-np.arange(2.0, 18, 2)[::-1], np.arange(2.0, 18, 2)]
+    rows = zip(current, 0.25 * current, 0.6 * current, strict=True)
+    lines = ["motor_speed_rpm,motor_current_A,motor_voltage_V,load_torque_Nm"]
+    lines += [f"0,{i},{u:.4g},{t + 0.01 * k:.4g}" for k, (i, u, t) in enumerate(rows)]
+    (tmp_path / "runs.csv").write_text("\n".join(lines) + "\n")
+    assert rig_check.check_rig_file(tmp_path / "rig.toml", str(tmp_path / "runs.csv"), (), False) == 0
+    printed = capsys.readouterr().out
+    assert "what these data can determine" in printed and "not every row settles" not in printed

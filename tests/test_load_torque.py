@@ -347,7 +347,8 @@ def test_a_dynos_table_gives_back_its_motor_and_nothing_is_missing(tmp_path):
     (tmp_path / "rig.toml").write_text(off.format(head=head))
     (tmp_path / "runs.csv").write_text("\n".join(lines) + "\n")
     rig = mm.read_robot(str(tmp_path / "rig.toml"))
-    found = mm.discover(mm.read_runs(str(tmp_path / "runs.csv"), robot=rig), rig)
+    runs = mm.read_runs(str(tmp_path / "runs.csv"), robot=rig)
+    found = mm.discover(runs, rig, noise="motor_current=0.03 A,motor_speed=0.03 rpm")  # the steps of the table
     assert found.verdict == "none"
     motor = found.robot.motor
     for name, value in {"resistance": 0.5, "torque_constant": 0.05, "friction_coulomb": 0.01}.items():

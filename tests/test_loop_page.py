@@ -18,8 +18,9 @@ from test_loop_command import commanded
 from test_stated_values import traced as leads
 from worlds import settled, tables
 
-from calibration.data.writing import finite_or_null
+from calibration.data.writing import json_value
 from calibration.discovery.clusters import Cluster
+from calibration.discovery.discover import FAR
 from calibration.discovery.loop_notes import Asked, NameSupport, NameTest, RuledOut
 from calibration.discovery.result import Alternative, Estimate, HiddenEffect, Resolved, StatedValue, Worse
 from calibration.discovery.settings import WITHOUT_NAME
@@ -94,7 +95,7 @@ def shown(tmp_path_factory):
             found = MADE[name]()
             folder = tmp_path_factory.mktemp(name)
             text = page_of(folder, found)
-            document = finite_or_null(found.to_json())
+            document = json_value(found.to_json())
             known[name] = SimpleNamespace(found=found, document=document, text=text, page=Tables(text))
         capsys.readouterr()
         print_document(documented(known[name].found))
@@ -225,10 +226,16 @@ def test_what_is_held_by_its_prior_is_said_everywhere(shown, capsys, tmp_path, n
     assert held == {n for n in made.held_by_prior if n in made.base_shift}
     assert all("held_by_prior" in p for e in seen.document["effects"] for p in e["parameters"].values())
     (note,) = [n for n in made.notes if n.startswith("not determined ")]
-    assert tuple(note.split("): ")[1].split(", ")) == made.held_by_prior
+    far = {n for n, p in made.base_shift.items() if abs(p.shift_after) > FAR}
+    pairs = {n for pair in made.together for n in (pair.one, pair.other)}
+    assert note.split("): ")[1].split(", ") == [n for n in made.held_by_prior if n not in far | pairs]
     assert " ".join(note.split()) in seen.printed
+    together = " ".join(n for n in made.notes if n.startswith("determined only together"))
+    assert far == {n.split()[0] for n in made.notes if " is implausible, " in n} and all(n in together for n in pairs)
     head, *rows = seen.page.tables["base"]
-    assert {row[0] for row in rows if row[head.index("determined")] == "no"} == held
+    said = {row[0]: row[head.index("determined")] for row in rows}
+    assert {n for n, answer in said.items() if answer == "no"} == held - pairs
+    assert {n for n, answer in said.items() if answer.startswith("only with ")} == pairs & set(said)
     made.save(tmp_path)
     assert note in (tmp_path / "robot.toml").read_text("utf-8")
 
@@ -291,7 +298,7 @@ def lines_of(found, capsys):
     """Lines of the whole document, of what a terminal shows of it, and of parts of result.json."""
     capsys.readouterr()
     print_document(documented(found))
-    written = finite_or_null(found.to_json())
+    written = json_value(found.to_json())
     jsonschema.validate(written, SCHEMA)
     parts = json.dumps({part: written[part] for part in PARTS}, indent=1, ensure_ascii=False)
     text = f"{as_text(documented(found))}# TERMINAL\n{capsys.readouterr().out}# JSON\n{parts}"

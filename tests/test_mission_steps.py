@@ -5,8 +5,10 @@ import dataclasses
 import jax.numpy as jnp
 import pytest
 
+from mmrjax.missions import mission_straight, mission_turning
 from mmrjax.missions.mission_steps import _stayed_below, _top
 from mmrjax.missions.profile import profile
+from mmrjax.model import params
 
 
 def test_a_row_holds_until_the_next_or_ramps_to_it():
@@ -33,6 +35,15 @@ def test_the_largest_within_a_step_is_that_of_the_cubic(curve, top):
     ends = [jnp.asarray(float(x)) for x in (curve(0.0), curve(1.0))]
     slopes = [jnp.asarray((curve(t + h) - curve(t - h)) / (2 * h)) for t in (0.0, 1.0)]
     assert float(_top(*ends, *slopes)) == pytest.approx(top, rel=1e-6)
+
+
+def test_a_current_within_a_step_counts_up_to_the_drivers_limit(robot):
+    """A cubic overshoots where the limit begins to act: it gave 7.6 A for 3.4 A."""
+    limited = params.replace(robot, {"driver.current_limit": 1.5})
+    for law in (mission_straight, mission_turning):
+        at_most, free = (law.peaks_within(r, jnp.zeros(20), jnp.full(20, 5.0)) for r in (limited, robot))
+        assert float(at_most["current"]) == pytest.approx(1.5 * robot.sides) and float(free["current"]) > 9
+        assert float(at_most["temperature"]) == float(free["temperature"])
 
 
 def test_cells_are_cut_off_once_they_stayed_below_for_the_delay(robot):

@@ -358,7 +358,7 @@ def test_search_of_rollouts_ends_at_the_limit_of_adhesion_from_inside(measured):
     posed = pose(measured, paper_robots.nominal(), stated="current=10%,motor_speed=6%,speed=4%")
     limit = fit.search_starts(posed, jnp.zeros((1, len(posed.coordinates))), posed.data)[0]
     assert np.any(np.asarray(posed.observation(limit.z[0]).adhesion_used) > 1 - problem.MARGIN)
-    inside = limit.z[0].at[posed.coordinates.names.index("6T2A.ground.friction.static")].add(3e-4)
+    inside = jnp.asarray(limit.z[0]).at[posed.coordinates.names.index("6T2A.ground.friction.static")].add(3e-4)
     r, jacobian, seen = fit.linearise(posed, inside, posed.data)
     assert (np.asarray(seen.adhesion_used) < 1 - problem.MARGIN)[:10].all()
     plain = np.linalg.lstsq(np.asarray(jacobian), np.asarray(r))[0]

@@ -81,7 +81,9 @@ def test_wheel_and_sdist_install_in_a_clean_environment(tmp_path):
     assert (
         wheel.name.startswith(f"mmrjax-{PROJECT['version']}-") and sdist.name == f"mmrjax-{PROJECT['version']}.tar.gz"
     )
-    libraries = sysconfig.get_path("purelib")
+    given = os.environ.get("PYTHONPATH", "").split(os.pathsep)
+    beside = [folder for folder in given if folder and not (Path(folder) / "mmrjax").is_dir()]
+    libraries = os.pathsep.join([*beside, sysconfig.get_path("purelib")])
     for file in (wheel, sdist):
         place = tmp_path / file.suffix.strip(".")
         venv.create(place, symlinks=True)

@@ -19,7 +19,7 @@ from sweeps.paper import run_figures as paper_runs
 from sweeps.report import page_renderer, run_tables
 from sweeps.report import runs_report as page
 from sweeps.report.document import Document, Section
-from sweeps.results.resonance_results import ResonanceResult
+from sweeps.report.resonance_report import ResonanceResult
 
 
 def run_of(robot, **conditions):

@@ -12,7 +12,6 @@ from calibration.data.input_errors import BadConfiguration, BadData
 from mmrjax.model import paper_robots, params
 from sweeps.inputs import one_run
 from sweeps.report.words import posture_words
-from sweeps.results import posture_results
 from tests.commands import ends
 
 
@@ -25,7 +24,7 @@ def robot():
 def flush(robot):
     cells = {"levers_front_deg": 180.0, "levers_rear_deg": -8.5, "slope_deg": 15.0}
     runs = one_run(robot, cells)
-    return posture_results.posture_of_runs(robot, runs, runs.conditions(robot))
+    return posture_words.posture_of_runs(robot, runs, runs.conditions(robot))
 
 
 @pytest.mark.slow
@@ -36,7 +35,7 @@ def test_posture_of_a_run(flush):
     assert table["contact_mm"][0] == pytest.approx(503, abs=1)
     assert table["pitch_deg"][0] == pytest.approx(-0.0119, abs=1e-4)  # the tail 0.1 mm up
     assert flush.over.step_mm.max() == pytest.approx(270, abs=0.5) and flush.over.step_mm.shape == (61, 61)
-    k = np.argmin(abs(posture_results.ANGLES - 180)), np.argmin(abs(posture_results.ANGLES + 6))
+    k = np.argmin(abs(posture_words.ANGLES - 180)), np.argmin(abs(posture_words.ANGLES + 6))
     assert flush.over.step_mm[k] < table["highest_step_mm"][0] + 5
     assert (
         "steps up to 232 mm" in posture_words.posture_sentences(flush) and posture_words.tipping_remarks(flush) == []
@@ -45,7 +44,7 @@ def test_posture_of_a_run(flush):
 
 @pytest.mark.slow
 def test_a_run_that_would_tip_is_said_to(flush):
-    tipping = posture_results.Postures(
+    tipping = posture_words.Postures(
         {**flush.table, "margin_mm": np.array([-3.0])}, flush.rest, flush.step, flush.over
     )
     assert posture_words.tipping_remarks(tipping) == [
@@ -55,7 +54,7 @@ def test_a_run_that_would_tip_is_said_to(flush):
 
 def test_runs_without_levers_have_no_posture(robot):
     runs = one_run(robot, {})
-    assert posture_results.posture_of_runs(robot, runs, runs.conditions(robot)) is None
+    assert posture_words.posture_of_runs(robot, runs, runs.conditions(robot)) is None
 
 
 @pytest.mark.slow
@@ -63,7 +62,7 @@ def test_one_pair_alone_leaves_the_other_as_the_robot_states_it(robot):
     raised = params.replace(robot, {"running_gear.lever_rear": np.pi / 2})
     conditions = one_run(raised, {"levers_front_deg": 20.0}).conditions(raised)
     assert conditions.levers_rear_deg is None and conditions.states_levers
-    tops = posture_results.posture_of_runs(raised, one_run(raised, {"levers_front_deg": 20.0}), conditions).table
+    tops = posture_words.posture_of_runs(raised, one_run(raised, {"levers_front_deg": 20.0}), conditions).table
     assert tops["tip_rear_mm"][0] == pytest.approx(262, abs=1)
 
 
@@ -126,7 +125,7 @@ def test_page_of_a_check_draws_the_robot_as_its_geometry_is_asked_about(robot):
         )
         for name in ("speed_m_s", "step_mm", "gap_mm", "length_mm")
     ]
-    drawn = posture_results.of_requirements(robot, outcomes)
+    drawn = posture_words.of_requirements(robot, outcomes)
     assert list(drawn) == ["step_mm", "gap_mm", "length_mm"]
     step, front, rear = drawn["step_mm"]
     assert step.step == pytest.approx(0.246, abs=1e-3) and -60 < front < -40 and -60 < rear < -30

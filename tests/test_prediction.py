@@ -153,7 +153,7 @@ def test_measured_runs_show_a_voltage_drop_and_a_slip_that_rests_on_a_row(tmp_pa
     found = discover(runs, robot)
     assert found.verdict == "class" and found.written and found.gain.mean > found.gain.se
     standing = {e.name: found.support.rests_on(e.name) for e in found.effects}
-    assert standing == {"series_resistance": None, "vibration_slip": 10}
+    assert standing == {"series_resistance": None, "brush_drop": None, "gear_load_loss": None, "vibration_slip": 10}
     assert "supply_sag" in found.effects[0].members and found.effects[0].families == (
         "voltage drop that changes with current",
     )

@@ -63,7 +63,7 @@ def test_a_folder_that_others_could_change_is_not_used_and_that_is_said(cache, c
         assert compilation_cache.keep_programs() is None
         assert f"compiled programs are not kept: {reason}" in capsys.readouterr().err.replace("\n", " ")
         assert not programs._private(str(cache))
-        assert str(compilation_cache.describe_cache()) == f"{cache}: not used, since {reason}"
+        assert compilation_cache.describe_cache() == f"{cache}: not used, since {reason}"
     finally:
         os.geteuid = mine
         jax.config.update("jax_compilation_cache_dir", kept)

@@ -29,7 +29,7 @@ from sweeps.commands import compare
 from sweeps.pages import power_figures, sweep_figures, words
 from sweeps.points import run
 from sweeps.report import comparison_report, page_renderer, runs_report, sweep_report
-from sweeps.results.comparison_results import Comparison
+from sweeps.report.comparison_report import Comparison
 
 SWEEP_FIGURES = {f"sweep_{name}" for name in channels.USUAL}
 
@@ -245,7 +245,7 @@ def driven(robot, tmp_path_factory):
 def test_report_shows_the_runs_own_history_with_its_peak(driven):
     folder, page, batch = driven
     assert drawn(page) == {"history", "slip", "power"} and outside(folder) == []
-    rows = Tables(page).tables["starts"][1:]
+    rows = Tables(page).tables["starts"][2:]
     assert [row[0] for row in rows] == ["6T2A, 33 V, 0 kg, 5°", "6T2A, 33 V, 0 kg, 25°", "4W2T, 0.3 V, 0 kg, 5°"]
     assert [row[1] for row in rows] == ["settled", "slides", "stands"]
     for k, row in enumerate(rows):

@@ -134,7 +134,7 @@ def test_history_follows_the_demand_and_holds_each_segments_peak(done):
 @pytest.mark.slow
 def test_console_says_the_numbers_and_the_status(done):
     said = (done.parent / "said.txt").read_text()
-    assert "profile mission.csv: 10 s, 2 cycles, 7 segments each" in said
+    assert "Profile mission.csv: 10 s, 2 cycles, 7 segments each" in said
     result = json.loads((done / "result.json").read_text())
     assert re.search(rf"energy \[Wh\] +{result['energy_Wh']:.3f}", said)
     assert re.search(r"status +converged", said)
@@ -168,7 +168,7 @@ def test_runs_of_a_file_follow_the_same_profile(mmrjax, capsys, monkeypatch):
     )  # tracks cost more than wheels
     assert result["missions"][0]["state_of_charge"] is None
     assert list(rows(folder / "segments.csv")["run_id"]) == ["a"] * 14 + ["b"] * 14
-    assert Tables((folder / "report.html").read_text()).tables["runs"][1][0].startswith("a: 6T2A")
+    assert Tables((folder / "report.html").read_text()).tables["runs"][0][1].startswith("a: 6T2A")
 
 
 def test_battery_that_ends_in_the_mission_is_said(mmrjax, capsys, monkeypatch):

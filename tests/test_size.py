@@ -20,7 +20,7 @@ from calibration.sizing.design import OBJECTIVES, build_robot, evaluate_design, 
 from calibration.sizing.part_options import BELT_STAGE, MOTOR, drive_options, options_for_robot
 from mmrjax.derived.requirements import QUANTITIES
 from mmrjax.model import params
-from sweeps.results.size_results import design_verdict
+from sweeps.report.size_report import design_verdict
 from tests.commands import command
 
 SCHEMA = json.loads((Path(__file__).parents[1] / "docs" / "schemas" / "size.schema.json").read_text("utf-8"))

@@ -849,7 +849,7 @@ def test_grid_too_large_for_the_disk_is_refused_with_figures(sweep, monkeypatch,
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
     many = CONFIG.replace("number = 50", "number = 20000000").replace("chunk = 40", "chunk = 100000")
     for dry in ([], ["--dry-run"]):
-        ends(sweep("s", *dry, config=many), "the results would take 3.39 GB (uncompressed)", "has 1 GB free")
+        ends(sweep("s", *dry, config=many), "the results would take 3.4 GB (uncompressed)", "has 1 GB free")
     assert [p.name for p in tmp_path.iterdir()] == ["plan.toml"]
 
 

@@ -160,7 +160,7 @@ def test_a_sweep_on_the_battery_has_no_axis_of_voltages(mmrjax, tmp_path):
 def test_the_command_line_reverses(mmrjax, tmp_path):
     ends(
         mmrjax("simulate --voltage -15 --no-report --out a"),
-        "reverses: steady travel backward",
+        "speed -438 mm/s",
         code=0,
     )
     mmrjax("simulate --voltage 15 --out b --no-report")
@@ -177,7 +177,7 @@ def test_the_command_line_reverses(mmrjax, tmp_path):
     assert "-33 V" in (tmp_path / "c" / "report.html").read_text()
     ends(
         mmrjax("simulate --voltage", 0, "--slope", 20, "--model", "drive", "--no-report", "--out", "d"),
-        "rolls_back: gravity drives the robot",
+        "No operating point: gravity drives the robot",
         code=0,
     )
     ends(mmrjax("simulate --voltage -10001"), "supply_voltage_V: got -10001; expected -10000 to 10000")
@@ -205,7 +205,9 @@ def test_compare_takes_readings_with_their_signs(mmrjax, tmp_path):
     _, out, _ = ends(mmrjax("compare mine.csv --no-report --out a"), code=0)
     assert "did not converge" not in out
     rows = table(tmp_path / "a" / "comparison.csv")
-    assert rows[0]["error_total_current_percent"] == pytest.approx(rows[1]["error_total_current_percent"])
+    # An error is simulated less measured, with its sign, over the size of the channel.
+    forth, back = (float(row["error_total_current_percent"]) for row in rows)
+    assert forth == pytest.approx(-back) and abs(forth) < 1
     assert rows[1]["status"] == "reverses"
 
 
@@ -255,7 +257,7 @@ def test_what_was_reached_is_shown_when_the_battery_ends(mmrjax, tmp_path):
     (row,) = table(tmp_path / "a" / "runs.csv")
     assert row["status"] == "battery_empty" and float(row["speed_mm_s"]) > 500 and float(row["total_current_A"]) > 1
     when, far = float(row["time_end_s"]), float(row["displacement_m"])
-    assert f"after {when:.1f} s and {far:.2f} m" in out
+    assert f"after {when:.1f} s and {far:.2f} m" in out and re.search(rf"displacement.* \[m\] +{far:.2f}\n", out)
     # The same run, ended just before and just after: where the charge runs out does not depend on the samples.
     assert mmrjax(asked, f"{when - 0.01:.4f}", "--no-report", "--out", "b")[0] == 0
     assert mmrjax(asked, f"{when + 0.01:.4f}", "--no-report", "--out", "c")[0] == 0

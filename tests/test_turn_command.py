@@ -27,9 +27,8 @@ from sweeps.pages import mission_figures, turn_figures
 from sweeps.pages.figure_style import figure_as_svg
 from sweeps.points.imposed import UNLIMITED
 from sweeps.points.job import showing_turns
-from sweeps.report import run_tables, turn_report
+from sweeps.report import check_report, run_tables, turn_report
 from sweeps.report.words import turn_words
-from sweeps.results import check_results
 from tests.commands import ends, rows
 
 
@@ -123,11 +122,9 @@ def test_a_turn_beyond_the_supply_is_refused_with_what_it_reaches(monkeypatch, s
 
 def test_a_required_turn_without_a_steady_state_is_not_told_of_options_of_runs():
     asked = types.SimpleNamespace(quantity=requirements.QUANTITIES["turning_radius_mm"])
-    said = check_results.reached_value_text(
-        types.SimpleNamespace(requirement=asked, value=None, status="not_settled")
-    )
+    said = check_report.reached_value_text(types.SimpleNamespace(requirement=asked, value=None, status="not_settled"))
     assert "no settled turn" in said and "--duration" not in said
-    assert said != check_results.reached_value_text(
+    assert said != check_report.reached_value_text(
         types.SimpleNamespace(requirement=asked, value=None, status="stalled")
     )
 

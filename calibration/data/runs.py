@@ -35,6 +35,7 @@ from calibration.data.sources import opening, reading
 from calibration.data.sources.in_memory import EXPECTED
 from calibration.data.sources.reading import Mapped
 from calibration.data.table import Runs
+from calibration.data.unread_rows import without_unread
 from mmrjax.model.quantities import MM, RPM
 from mmrjax.model.rig import Instrument
 from mmrjax.model.robot import NO_BRAKE, Robot
@@ -173,6 +174,7 @@ def of_arrays(
     runs = Runs(name, columns, tuple(extras), arrays.digest, extras, layout, notes, headings)
     if robot is not None:
         contradictions.check_contradictions(runs, robot)
+        runs = without_unread(runs, robot)
     return runs
 
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import dataclasses
 import io
 import json
 import math
+import operator
 import re
 import shutil
 from collections.abc import Iterator, Mapping
@@ -155,7 +157,7 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
 
 def json_text(content: Mapping[str, Any]) -> str:
     """Data as JSON: numbers that are not finite become null, characters that are not `printable` their escapes."""
-    text = json.dumps(finite_or_null(content), indent=2, ensure_ascii=False)
+    text = json.dumps(json_value(content), indent=2, ensure_ascii=False)
     shown = printable(text)
     pairs = zip(text, shown, strict=True)
     return text if shown == text else "".join(a if a == b else json.dumps(a)[1:-1] for a, b in pairs)
@@ -227,14 +229,26 @@ def _is_number(text: str) -> bool:
     return False
 
 
-def finite_or_null(value: Any) -> Any:
-    """JSON-able data with null in place of numbers that are not finite."""
+def json_value(value: Any) -> Any:
+    """Data for JSON, with null in place of numbers that are not finite.
+
+    An object becomes the entries that its class lists in `JSON`, as `key` or `key=attribute.of.attribute`. Without
+    such a list it becomes its `to_json()`, or the fields of its dataclass.
+    """
+    listed = getattr(value, "JSON", None)
+    if listed is None and hasattr(value, "to_json"):
+        return json_value(value.to_json())
+    if listed is None and dataclasses.is_dataclass(value):
+        listed = [field.name for field in dataclasses.fields(value)]
+    if listed is not None:
+        pairs = (entry.partition("=") for entry in listed)
+        return {key: json_value(operator.attrgetter(attribute or key)(value)) for key, _, attribute in pairs}
     if isinstance(value, Mapping):
-        return {key: finite_or_null(v) for key, v in value.items()}
+        return {key: json_value(v) for key, v in value.items()}
     if isinstance(value, list | tuple):
-        return [finite_or_null(v) for v in value]
+        return [json_value(v) for v in value]
     if isinstance(value, np.ndarray):
-        return finite_or_null(value.tolist())
+        return json_value(value.tolist())
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, float) and not math.isfinite(value):

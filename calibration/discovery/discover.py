@@ -272,6 +272,7 @@ def prepare_loop(
     library = {**library, **kind.library, **own}
     library = scales.library_of_size(ready.robot, distinct.conditions(ready.robot), library, turned)
     settings = dataclasses.replace(settings_for(kind, replicates, seed, prefer), forbidden=tuple(forbidden))
+    settings = dataclasses.replace(settings, silent=tuple(c.name for c in ready.noise.silent))
     return LoopInput(distinct, numbers, ready.robot, ready.noise, ready.stated, settings, library, said, at_first)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 import numpy as np
 
@@ -41,6 +40,7 @@ class DiscrepancyLocation:
         by_duty: True if the motors' voltage varied only with the duty.
     """
 
+    JSON = ("balance", "channel", "balances_alike", "variable", "variables_alike")
     place: str
     variable: str
     alike: tuple[str, ...]
@@ -75,13 +75,3 @@ class DiscrepancyLocation:
         drivers |= {"payload": "load", "slope": "demand" if self.balance == "slip" else "slope"}
         drivers |= {"voltage": "duty"} if self.by_duty else {}
         return f"{what} that changes with {drivers.get(variable, variable)}"
-
-    def to_json(self) -> dict[str, Any]:
-        """Entries of result.json."""
-        return {
-            "balance": self.balance,
-            "channel": self.channel,
-            "balances_alike": self.balances_alike,
-            "variable": self.variable,
-            "variables_alike": self.variables_alike,
-        }

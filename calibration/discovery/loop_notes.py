@@ -29,6 +29,9 @@ BETTER = 5.0
 #: Least share of its root that an effect keeps without any one run. A row of a table may have a wrong reading; a run
 #: of a history has hundreds of samples, so that only significance is tested.
 KEPT = {"row": 1 / math.sqrt(3), "run": 0.0}
+#: Zero error of an instrument over the rms of its readings, below which it is not established without a stated noise:
+#: sds that grow with the readings, or that are too small, leave such an offset.
+SMALL_OFFSET = 0.05
 #: Largest relative change of an amplitude over a variable for an established law.
 FORM = 0.3
 #: Least share of the informative hold-out blocks in which an effect is chosen again. Informative are those that leave
@@ -53,6 +56,7 @@ class NameTest:
         varies: root of the score of an amplitude that changes with a variable, in addition to the largest set [σ];
             over: that variable; by_chance: critical value for as many variables, independent of the library.
         spread: relative change of the amplitude to either end of that variable [-].
+        offset: zero error of an instrument without a stated noise, over the rms of its readings [-]; else infinite.
     """
 
     effect: str
@@ -70,6 +74,7 @@ class NameTest:
     over: str = ""
     by_chance: float = 0.0
     spread: float = math.inf
+    offset: float = math.inf
 
     @property
     def stands(self) -> bool:
@@ -94,6 +99,7 @@ class NameTest:
             "larger": bool(self.larger),
             "remains": self.remains,
             "form": self.shows_form and self.spread > FORM,
+            "noise": self.offset < SMALL_OFFSET,
         }
         return tuple(doubt for doubt, holds in doubts.items() if holds)
 

@@ -13,7 +13,7 @@ from calibration.data import robot_file
 from calibration.data.columns import DRIVING
 from calibration.data.posterior_file import Posterior
 from calibration.data.runs import WHEN, Runs
-from calibration.data.writing import write_json, write_table
+from calibration.data.writing import json_value, write_json, write_table
 from calibration.described import describe, sentences
 from calibration.discovery.clusters import Cluster
 from calibration.discovery.headline import headline
@@ -112,6 +112,7 @@ class FoundEffect:
 class Formula:
     """A formula for a curve; see `formula.Proposal`."""
 
+    JSON = ("formula", "mark", "coefficients", "sds", "bic_gain_over_curve", "tried")
     expression: str
     mark: str
     coefficients: tuple[float, ...]
@@ -123,12 +124,6 @@ class Formula:
     def formula(self) -> str:
         """Its expression, or that there is none."""
         return describe(self)
-
-    def to_json(self) -> dict[str, Any]:
-        """Entry of result.json."""
-        return {
-            n: getattr(self, n) for n in ("formula", "mark", "coefficients", "sds", "bic_gain_over_curve", "tried")
-        }
 
 
 @dataclasses.dataclass(frozen=True)
@@ -191,6 +186,7 @@ class Alternative:
         reasons: for their implausibility.
     """
 
+    JSON = ("effects", "prior_sds", "sizes", "rise_chi2", "why")
     effects: dict[str, float]
     prior_sds: dict[str, float]
     sizes: dict[str, float]
@@ -201,10 +197,6 @@ class Alternative:
     def why(self) -> str:
         """Reasons for not being plausible, as a sentence."""
         return describe(self)
-
-    def to_json(self) -> dict[str, Any]:
-        """Entry of result.json."""
-        return {name: getattr(self, name) for name in ("effects", "prior_sds", "sizes", "rise_chi2", "why")}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -308,6 +300,7 @@ class RankedExperiment:
 class NextExperiment:
     """The next experiment, with the whole menu; see `experiments.Proposal`."""
 
+    JSON = ("name", "experiments", "description", "separates", "expected_sigma", "settles", "menu")
     name: str
     experiments: tuple[str, ...]
     instruction: Instruction
@@ -320,11 +313,6 @@ class NextExperiment:
     def description(self) -> str:
         """What to do and what to read."""
         return describe(self.instruction)
-
-    def to_json(self) -> dict[str, Any]:
-        """Entry of result.json."""
-        kept = ("name", "experiments", "description", "separates", "expected_sigma", "settles")
-        return {**{n: getattr(self, n) for n in kept}, "menu": [dataclasses.asdict(e) for e in self.menu]}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -440,23 +428,25 @@ class Resolved:
 
     def to_json(self) -> dict[str, Any]:
         """Entry of result.json."""
-        return {
-            "asked": describe(self.asked),
-            "statement": self.statement,
-            "explains": self.explains,
-            "rows": self.rows,
-            "constants": {name: dataclasses.asdict(e) for name, e in self.constants.items()},
-            "known_from_rows": list(self.known_from_rows),
-            "alike": [{"a": a, "b": b, "correlation": r} for a, b, r in self.alike],
-            "outside": list(self.outside),
-            "settled": self.settled,
-            "fall_chi2": self.fall,
-            "p": self.p,
-            "chi2": {"before": self.chi2[0], "after": self.chi2[1], "readings": self.readings},
-            "rms_percent": {n: {"before": b, "after": a} for n, (b, a) in self.rms_percent.items()},
-            "slip_rms_points": {"before": self.slip_rms[0], "after": self.slip_rms[1]},
-            "notes": list(self.notes),
-        }
+        return json_value(
+            {
+                "asked": describe(self.asked),
+                "statement": self.statement,
+                "explains": self.explains,
+                "rows": self.rows,
+                "constants": self.constants,
+                "known_from_rows": self.known_from_rows,
+                "alike": [{"a": a, "b": b, "correlation": r} for a, b, r in self.alike],
+                "outside": self.outside,
+                "settled": self.settled,
+                "fall_chi2": self.fall,
+                "p": self.p,
+                "chi2": {"before": self.chi2[0], "after": self.chi2[1], "readings": self.readings},
+                "rms_percent": {n: {"before": b, "after": a} for n, (b, a) in self.rms_percent.items()},
+                "slip_rms_points": {"before": self.slip_rms[0], "after": self.slip_rms[1]},
+                "notes": self.notes,
+            }
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -624,63 +614,66 @@ class DiscoveryResult:
 
     def to_json(self) -> dict[str, Any]:
         """Everything as JSON-able data, as docs/schemas/loop.schema.json describes it."""
-        proposal = self.next_experiment
-        return {
-            "schema": SCHEMA,
-            "verdict": self.verdict,
-            "mechanism": None if self.summary.mechanism is None else _mechanism(self.summary.mechanism, self.unnamed),
-            "missed": [m._asdict() for m in self.summary.missed],
-            "headline": dataclasses.asdict(self.headline) | {"statement": describe(self.headline)},
-            "statement": self.statement,
-            "rows": len(self.runs),
-            "rows_used": int(self.included.sum()),
-            "rows_unusable": list(self.unusable),
-            "rows_outliers": list(self.outliers),
-            "effects": [_effect(e, self.support) for e in self.effects]
-            + ([] if self.unnamed is None else [_unnamed(self.unnamed)]),
-            "next_experiment": None if proposal is None else proposal.to_json(),
-            "remains": None if self.remains is None else self.remains.to_json(),
-            "cannot_see": list(self.cannot_see),
-            "needs_series": list(self.needs_histories),
-            "needs_reverse": list(self.needs_reverse),
-            **self.detail.to_json(),
-            "alternatives": [a.to_json() for a in self.alternatives],
-            "implausible": [a.to_json() for a in self.implausible],
-            "hidden": [dataclasses.asdict(h) for h in self.hidden],
-            "standing": self.standing,
-            "cluster": None if self.cluster is None else dataclasses.asdict(self.cluster),
-            "residual_clusters": [c.to_json() for c in self.residual_clusters],
-            **self._errors_to_json(),
-            "prediction": {
-                "gain": None if self.gain is None else self.gain.mean,
-                "se": None if self.gain is None or not np.isfinite(self.gain.se) else self.gain.se,
-                "unit": "nat a reading",
-                "written": "found" if self.written else "refit",
-            },
-            "adequate": {"before": self.before.adequate, "after": self.after.adequate},
-            "evidence": {"before": _evidence(self.before), "after": _evidence(self.after)},
-            "chi2": {
-                "before": self.chi2[0],
-                "after": self.chi2[1],
-                "readings": self.readings,
-                "of_readings": dict(zip(("before", "after"), self.chi2_of_readings, strict=True)),
-            },
-            "base_shift": {name: dataclasses.asdict(p) for name, p in self.base_shift.items()},
-            "together": [pair.to_json() for pair in self.together],
-            "scores": [dataclasses.asdict(s) for s in self.scores],
-            "bootstrap": {
-                "replicates": self.replicates,
-                "asked": self.settings.replicates,
-                "seed": self.settings.seed,
-                "family_wise_error": self.settings.family_wise_error,
-                "shares": self.settings.shares,
-            },
-            "settings": dataclasses.asdict(self.settings),
-            "noise": self.noise,
-            "noise_sensitivity": [s.to_json() for s in self.sensitivity],
-            "notes": list(self.notes),
-            "resolved": None if self.resolved is None else self.resolved.to_json(),
-        }
+        return json_value(
+            {
+                "schema": SCHEMA,
+                "verdict": self.verdict,
+                "mechanism": None
+                if self.summary.mechanism is None
+                else _mechanism(self.summary.mechanism, self.unnamed),
+                "missed": [m._asdict() for m in self.summary.missed],
+                "headline": vars(self.headline) | {"statement": describe(self.headline)},
+                "statement": self.statement,
+                "rows": len(self.runs),
+                "rows_used": int(self.included.sum()),
+                "rows_unusable": self.unusable,
+                "rows_outliers": self.outliers,
+                "effects": [_effect(e, self.support) for e in self.effects]
+                + ([] if self.unnamed is None else [_unnamed(self.unnamed)]),
+                "next_experiment": self.next_experiment,
+                "remains": self.remains,
+                "cannot_see": self.cannot_see,
+                "needs_series": self.needs_histories,
+                "needs_reverse": self.needs_reverse,
+                **self.detail.to_json(),
+                "alternatives": self.alternatives,
+                "implausible": self.implausible,
+                "hidden": self.hidden,
+                "standing": self.standing,
+                "cluster": self.cluster,
+                "residual_clusters": self.residual_clusters,
+                **self._errors_to_json(),
+                "prediction": {
+                    "gain": None if self.gain is None else self.gain.mean,
+                    "se": None if self.gain is None else self.gain.se,
+                    "unit": "nat a reading",
+                    "written": "found" if self.written else "refit",
+                },
+                "adequate": {"before": self.before.adequate, "after": self.after.adequate},
+                "evidence": {"before": _evidence(self.before), "after": _evidence(self.after)},
+                "chi2": {
+                    "before": self.chi2[0],
+                    "after": self.chi2[1],
+                    "readings": self.readings,
+                    "of_readings": dict(zip(("before", "after"), self.chi2_of_readings, strict=True)),
+                },
+                "base_shift": self.base_shift,
+                "together": self.together,
+                "scores": self.scores,
+                "bootstrap": {
+                    "replicates": self.replicates,
+                    "asked": self.settings.replicates,
+                    "seed": self.settings.seed,
+                    "family_wise_error": self.settings.family_wise_error,
+                    "shares": self.settings.shares,
+                },
+                "settings": self.settings,
+                "noise": self.noise,
+                "noise_sensitivity": self.sensitivity,
+                "notes": self.notes,
+                "resolved": self.resolved,
+            }
+        )
 
     def _errors_to_json(self) -> dict[str, Any]:
         """Errors of the fits and of data held out, as in `to_json`."""
@@ -693,12 +686,12 @@ class DiscoveryResult:
             },
             "errors_percent_of": OF_SIZE,
             "held_out_by": {
-                kind: {"before": before, "after": after, "blocks": list(self.readings_of_rows.blocks[kind])}
+                kind: {"before": before, "after": after, "blocks": self.readings_of_rows.blocks[kind]}
                 for kind, (before, after) in self.errors_held_out.items()
             },
-            "held_out_unpredictable": list(self.held_out_unpredictable),
-            "held_out_worse": [dataclasses.asdict(w) for w in self.held_out_worse],
-            "alternatives_held_out": [dataclasses.asdict(a) for a in self.alternatives_held_out],
+            "held_out_unpredictable": self.held_out_unpredictable,
+            "held_out_worse": self.held_out_worse,
+            "alternatives_held_out": self.alternatives_held_out,
         }
 
     def rows_table(self) -> dict[str, np.ndarray]:
@@ -781,51 +774,47 @@ def _effect(e: FoundEffect, support: NameSupport | None) -> dict[str, Any]:
         "name": e.name,
         "class": [*e.members, *e.stated],
         "standing": "established" if support is None or support.established(e.name) else "tentative",
-        "doubts": [] if test is None else list(test.fails),
+        "doubts": [] if test is None else test.fails,
         "rests_on_row": None if test is None else test.rests_on,
         "root": None if test is None else test.root,
         "root_needed": None if test is None else test.needed,
-        "families": list(e.families),
+        "families": e.families,
         "balance": e.balance,
         "unit": e.unit,
         "equation": e.equation,
         "source": e.source,
-        "parameters": {name: dataclasses.asdict(p) for name, p in e.parameters.items()},
+        "parameters": e.parameters,
         "p_value": e.p_value,
         "score": e.score,
         "share": e.share,
         "accuracy_of_form": None
         if test is None or not test.shows_form
         else {"over": test.over, "share": test.spread},
-        "members": {name: dataclasses.asdict(m) for name, m in e.members.items()},
-        "stated_values": {name: dataclasses.asdict(s) for name, s in e.stated.items()},
+        "members": e.members,
+        "stated_values": e.stated,
     }
 
 
 def _mechanism(m: Mechanism, curve: UnnamedDiscrepancy | None) -> dict[str, Any]:
-    found = {n: getattr(m, n) for n in ("share", "gain", "again")} | {"se": m.se if np.isfinite(m.se) else None}
-    listed = {n: list(getattr(m, n)) for n in ("families", "effects", "fails")}
-    errors = {kind: se if np.isfinite(se) else None for kind, se in m.errors.items()}
+    names = ("families", "effects", "fails", "share", "gain", "again", "se", "errors")
     return {
-        **listed,
-        **found,
-        "errors": errors,
+        **{name: getattr(m, name) for name in names},
         "established": not m.fails,
         "course": "" if curve is None else describe(curve),
     }
 
 
 def _unnamed(d: UnnamedDiscrepancy) -> dict[str, Any]:
-    curve = {"at": d.at.tolist(), "value": d.value.tolist(), "sd": d.sd.tolist(), "unit": d.unit}
+    curve = {name: getattr(d, name) for name in ("at", "value", "sd", "unit")}
     return {
         "name": "unnamed",
         "class": [],
-        "families": list(d.families),
+        "families": d.families,
         "balance": d.balance,
         "channel": d.channel,
-        "balances_alike": list(d.balances_alike),
+        "balances_alike": d.balances_alike,
         "variable": d.variable,
-        "variables_alike": list(d.variables_alike),
+        "variables_alike": d.variables_alike,
         "window": d.window,
         "unit": d.unit,
         "equation": None,
@@ -836,7 +825,7 @@ def _unnamed(d: UnnamedDiscrepancy) -> dict[str, Any]:
         "score_free_in_each_run": d.score_free_in_each_run,
         "curve": curve,
         "course": describe(d),
-        "proposal": d.proposal.to_json(),
+        "proposal": d.proposal,
     }
 
 

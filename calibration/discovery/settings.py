@@ -53,6 +53,7 @@ class Settings:
         refuted: rise of χ² that refutes an alternative [σ²].
         prefer: one of `PREFERENCES`.
         forbidden: kinds of experiments, and configurations, that are not proposed (see `menu.KINDS`).
+        silent: channels whose noise nobody states.
     """
 
     shares: dict[str, float]
@@ -87,6 +88,7 @@ class Settings:
     refuted: float = 4.0
     prefer: str = FIT
     forbidden: tuple[str, ...] = ()
+    silent: tuple[str, ...] = ()
 
     def outliers(self, rows: int) -> int:
         """Largest number of rows that may be excluded."""

@@ -28,7 +28,7 @@ from calibration.discovery.settings import Settings
 from calibration.discovery.smooth import smooth_curve, smooth_surface
 from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
-from calibration.inference.linearization import Linearization
+from calibration.inference.linearization import Linearization, amplitude_of
 
 #: Number of curves that are added to effects, one after the other.
 CURVES = 3
@@ -311,9 +311,20 @@ def name_tests(
                 equation in lacks,
                 "run" if space.bare.observe.long else "row",
                 *_varies_most(space, whole, effect, beside_all, settings.shares["single"]),
+                offset=_offset_share(space, best, effect, settings),
             )
         )
     return tuple(tests)
+
+
+def _offset_share(space: CandidateSpace, best: Candidate, effect: str, settings: Settings) -> float:
+    """Zero error of an instrument without a stated noise over the rms of its readings [-]; else infinite."""
+    kind = space.library[effect]
+    if kind.channel not in settings.silent or not getattr(kind, "of_zero", False):
+        return math.inf
+    shown = np.asarray(space.bare.data.measured)[:, [c.name for c in space.bare.channels].index(kind.channel)]
+    amplitude = abs(float(best.amplitude[best.active.index(effect)])) * amplitude_of(kind).spec.prior_sd(0.0)
+    return amplitude / max(float(np.sqrt(np.nanmean(shown[space.included] ** 2))), 1e-300)
 
 
 def _deficient_equations(space: CandidateSpace, seen: Diagnosis, bases: Bases) -> set[str]:

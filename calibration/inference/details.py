@@ -67,16 +67,19 @@ class Strongest:
 
 @dataclasses.dataclass(frozen=True)
 class TimeSide:
-    """Statistics of one fit over time: memory; order (word, waves a turn of the driving shaft) → score; drift."""
+    """Statistics of one fit over time: memory; order (word, waves a turn of the driving shaft) → score; drift.
+
+    Without drift if the other conditions determine the time (see `bases.COLLINEAR`).
+    """
 
     memory: Memory
     orders: dict[tuple[str, float], Strongest]
-    drift: Strongest
+    drift: Strongest | None
 
     def to_json(self) -> dict[str, Any]:
         """Entries of `result.json`."""
-        orders = [{"order": w, "a_turn": n, **dataclasses.asdict(s)} for (w, n), s in self.orders.items()]
-        return {"memory": dataclasses.asdict(self.memory), "orders": orders, "drift": dataclasses.asdict(self.drift)}
+        orders = [{"order": w, "a_turn": n, **vars(s)} for (w, n), s in self.orders.items()]
+        return {"memory": self.memory, "orders": orders, "drift": self.drift}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,12 +98,4 @@ class TimeStatistics(Detail):
     after: TimeSide
 
     def to_json(self) -> dict[str, Any]:
-        return {
-            "series": {
-                "runs": self.runs,
-                "samples": self.samples,
-                "orders_unresolved": list(self.orders_unresolved),
-                "before": self.before.to_json(),
-                "after": self.after.to_json(),
-            }
-        }
+        return {"series": vars(self)}

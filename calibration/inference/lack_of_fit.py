@@ -83,11 +83,7 @@ class Adequacy:
 
     def to_json(self) -> dict[str, object]:
         """Entries of `adequate` in result.json."""
-        return {
-            **dataclasses.asdict(self),
-            "shown_by": describe(self.shown_by),
-            "statement": self.statement,
-        }
+        return {**vars(self), "shown_by": describe(self.shown_by), "statement": self.statement}
 
 
 @dataclasses.dataclass(frozen=True)

@@ -26,7 +26,7 @@ from mmrjax.numerics.one_sided import clip
 
 #: Balances with a defect that changes the readings of settled travel. Those on one line act on the readings in the
 #: same way except for the variables that they depend on: three channels close three equations.
-PROBED = ("mass", "supply", "electrical", "motor", "gearbox", "track", "ground", "slip")
+PROBED = ("mass", "supply", "electrical", "motor", "gearbox", "track", "ground", "slip", "duty")
 
 
 def balance_probe(whose: str) -> Effect:

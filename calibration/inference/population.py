@@ -388,7 +388,7 @@ class Searched:
         return {
             "members": len(self.found.z),
             "settled": self.found.settled,
-            "generations": [dataclasses.asdict(g) for g in self.found.generations],
+            "generations": self.found.generations,
             "outcomes": self.outcomes(),
             "at_edge": {name: describe(at) for name, at in self.edge.items()},
             "derivatives_apart": list(self.apart),

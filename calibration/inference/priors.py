@@ -195,13 +195,17 @@ def _uncertain(robot: Robot, names: Iterable[str]) -> tuple[str, ...]:
 def stated_names(robot: Robot, configurations: Iterable[str], idle: tuple[str, ...] = ()) -> tuple[str, ...]:
     """Parameters that a robot's file states with a ± other than 0, which is a request to fit them.
 
-    They must belong to configurations in the data, show in the data, and follow no other parameter.
+    They must be parameters of the robot, belong to configurations in the data, show in the data, and follow no other
+    parameter.
 
     Args:
         idle: ends of the names of parameters that the data do not show.
     """
     others = set(robot.configurations) - set(configurations)
-    mine = [n for n, _, sd in robot.rig.priors if sd > 0 and n.partition(".")[0] not in {"rig", *others}]
+    fields = parameters_by_name(robot)  # a prior may be of an effect that the robot no longer has
+    mine = [
+        n for n, _, sd in robot.rig.priors if sd > 0 and n in fields and n.partition(".")[0] not in {"rig", *others}
+    ]
     return _drive(robot, (n for n in mine if _leader(robot, n) is None and not n.endswith(idle)))
 
 

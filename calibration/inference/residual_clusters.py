@@ -101,12 +101,9 @@ class ResidualCluster:
 
     def to_json(self) -> dict[str, object]:
         """Entries of `residual_clusters` in result.json."""
-        document = {
-            f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name not in ("at", "residual")
-        }
-        document |= {"levels": [dataclasses.asdict(m) for m in self.levels], "alike": list(self.alike)}
+        document = vars(self) | {"statement": self.statement}
         document |= {"coarser": [{"column": name, "share": share} for name, share in self.coarser]}
-        return {**document, "statement": self.statement}
+        return {name: x for name, x in document.items() if name not in ("at", "residual")}
 
 
 def residual_clusters(fit: Residuals, seed: int = 0) -> tuple[ResidualCluster, ...]:

@@ -76,6 +76,13 @@ class SteadyEstimate:
     apart_in_sd: float
 
 
+#: Entries of an estimate in result.json that are its fields.
+ENTRIES = (
+    "value", "sd", "interval", "interval_linear", "interval_open", "unit", "meaning", "prior", "variance_ratio",
+    "held_by_prior", "at_bound", "measured_by_data",
+)  # fmt: skip
+
+
 @dataclasses.dataclass(frozen=True)
 class Estimate:
     """Estimate of one free parameter.
@@ -114,22 +121,8 @@ class Estimate:
 
     def to_json(self) -> dict[str, Any]:
         """Entry of `parameters` in result.json."""
-        found = {
-            "value": self.value,
-            "sd": self.sd,
-            "interval": self.interval,
-            "interval_linear": self.interval_linear,
-            "interval_open": self.interval_open,
-            "unit": self.unit,
-            "meaning": self.meaning,
-            "prior": self.prior.to_json(),
-            "shift_in_prior_sd": self.shift,
-            "variance_ratio": self.variance_ratio,
-            "held_by_prior": self.held_by_prior,
-            "at_bound": self.at_bound,
-            "measured_by_data": self.measured_by_data,
-        }
-        return found if self.with_steady is None else {**found, "with_steady": dataclasses.asdict(self.with_steady)}
+        found = {name: getattr(self, name) for name in ENTRIES} | {"shift_in_prior_sd": self.shift}
+        return found if self.with_steady is None else {**found, "with_steady": self.with_steady}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -199,7 +192,7 @@ class Block:
     def to_json(self) -> dict[str, Any]:
         """Entry of `held_out_by` in result.json."""
         return {
-            **_by_name(self.errors),
+            **self.errors,
             "unreachable_rows": self.unreachable_rows,
             "converged": self.converged,
         }
@@ -215,18 +208,11 @@ class HeldOut:
         reading: by channel [SI], NaN if the fit's robot does not reach the row, shape (rows,).
     """
 
+    JSON = ("all=errors", "unreachable_rows", "blocks")
     errors: Errors
     unreachable_rows: tuple[int, ...]
     blocks: dict[str, Block]
     reading: dict[str, np.ndarray]
-
-    def to_json(self) -> dict[str, Any]:
-        """Entry of `held_out_by` in result.json."""
-        return {
-            "all": _by_name(self.errors),
-            "unreachable_rows": self.unreachable_rows,
-            "blocks": {label: block.to_json() for label, block in self.blocks.items()},
-        }
 
 
 @dataclasses.dataclass(frozen=True)
@@ -380,8 +366,8 @@ class CalibrationResult:
 
     def to_json(self) -> dict[str, Any]:
         """Entries of result.json, docs/schemas/calibrate.schema.json."""
-        about, before, main = self.identifiability, _by_name(self.errors_before), self.main_blocks
-        return writing.finite_or_null(
+        about, main = self.identifiability, self.main_blocks
+        return writing.json_value(
             {
                 "schema": SCHEMA,
                 "model": self.model,
@@ -390,17 +376,17 @@ class CalibrationResult:
                     name: {**p.to_json(), "determined": self.determined(name)} for name, p in self.parameters.items()
                 },
                 "tied": {name: f"{tie.ratio:.4g} x {tie.leader}" for name, tie in self.tied.items()},
-                "noise": _by_name(self.noise),
+                "noise": self.noise,
                 "percent_of": OF_SIZE,
                 "errors": {
                     # no fit precedes, so both are the same
-                    "before": {"fitted": before, "held_out": before},
+                    "before": {"fitted": self.errors_before, "held_out": self.errors_before},
                     "after": {
-                        "fitted": _by_name(self.errors_after),
-                        "held_out": None if main is None else _by_name(main.errors),
+                        "fitted": self.errors_after,
+                        "held_out": None if main is None else main.errors,
                     },
                 },
-                "held_out_by": {kind: held.to_json() for kind, held in self.held_out.items()},
+                "held_out_by": self.held_out,
                 "optimizer": {
                     "method": METHOD,
                     "status": "converged" if self.converged else "not_converged",
@@ -410,11 +396,11 @@ class CalibrationResult:
                     "starts_at_best": self.starts.agree,
                     "agreement": self.starts.statement(),
                     "seed": self.seed,
-                    "population": None if self.searched is None else self.searched.to_json(),
+                    "population": self.searched,
                 },
-                "chi2": dataclasses.asdict(self.chi_square),
-                "adequate": self.adequacy.to_json(),
-                "residual_clusters": [c.to_json() for c in self.residual_clusters],
+                "chi2": self.chi_square,
+                "adequate": self.adequacy,
+                "residual_clusters": self.residual_clusters,
                 "identifiability": {
                     "singular_values": about.singular_values,
                     "rank": about.rank,
@@ -423,7 +409,7 @@ class CalibrationResult:
                         {"singular_value": s, "components": main} for s, main in about.weak_directions()
                     ],
                     "correlated": [{"a": a, "b": b, "correlation": r} for a, b, r in about.correlated()],
-                    "together": [pair.to_json() for pair in self.together],
+                    "together": self.together,
                 },
                 "statuses_before": _counts(self.status_before),
                 "statuses": self.counts,
@@ -469,10 +455,6 @@ class CalibrationResult:
         writing.write_json(folder / "result.json", self.to_json())
         writing.write_table(folder / "rows.csv", self.rows(), tables)
         posterior.write_posterior(self.posterior, folder / posterior.FILE)
-
-
-def _by_name(values: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    return {name: dataclasses.asdict(value) for name, value in values.items()}
 
 
 def _counts(status: np.ndarray) -> dict[str, int]:

@@ -9,6 +9,7 @@ from scipy import stats
 
 from calibration.data import Columns, Json, Names
 from calibration.data.runs import Runs
+from calibration.data.writing import json_value
 from calibration.described import describe, sentences
 from calibration.inference.fit_notes import Remark
 from calibration.sensitivity.replicates import LEVEL, REPLICATES, Estimate
@@ -163,19 +164,11 @@ class Interaction:
         sure: True if it is also above zero with an interval that allows for all tested pairs.
     """
 
+    JSON = ("pair", "second", "second_interval=interval", "sure")
     pair: tuple[str, str]
     second: float
     interval: tuple[float, float]
     sure: bool
-
-    def to_json(self) -> Json:
-        """Entry of result.json."""
-        return {
-            "pair": list(self.pair),
-            "second": self.second,
-            "second_interval": list(self.interval),
-            "sure": self.sure,
-        }
 
 
 @dataclasses.dataclass(frozen=True)
@@ -280,42 +273,44 @@ class SensitivityResult:
     def to_json(self) -> Json:
         """Entries of result.json, docs/schemas/sensitivity.schema.json."""
         names = self.names
-        return {
-            "schema": SCHEMA,
-            "method": self.method,
-            "model": self.model,
-            "seed": self.seed,
-            "statement": self.statement(),
-            "inputs": {name: dataclasses.asdict(x) for name, x in self.inputs.items()},
-            "correlated": self.correlated,
-            "points": [
-                {key: column[k].item() for key, column in self.points.columns().items()}
-                for k in range(len(self.points))
-            ],
-            "outputs": {name: _output(study) for name, study in self.outputs.items()},
-            "indices": {name: self._indices(study) for name, study in self.outputs.items()},
-            "interactions": {
-                name: [pair.to_json() for pair in interactions(study, names)]
-                for name, study in self.outputs.items()
-                if study.second is not None
-            },
-            "convergence": {
-                name: [
-                    {"evaluations": count, "indices": _by_input(names, {"index": estimate})}
-                    for count, estimate in study.convergence
-                ]
-                for name, study in self.outputs.items()
-                if study.convergence
-            },
-            "comparison": self.comparison,
-            "negligible": list(self.negligible),
-            "statuses": self.statuses,
-            "statuses_sampled": self.sampled,
-            "next_runs": None if self.next_runs is None else _next_runs(self.next_runs, names),
-            "evaluations": self.evaluations,
-            "seconds": self.seconds,
-            "notes": list(self.notes),
-        }
+        return json_value(
+            {
+                "schema": SCHEMA,
+                "method": self.method,
+                "model": self.model,
+                "seed": self.seed,
+                "statement": self.statement(),
+                "inputs": self.inputs,
+                "correlated": self.correlated,
+                "points": [
+                    {key: column[k].item() for key, column in self.points.columns().items()}
+                    for k in range(len(self.points))
+                ],
+                "outputs": {name: _output(study) for name, study in self.outputs.items()},
+                "indices": {name: self._indices(study) for name, study in self.outputs.items()},
+                "interactions": {
+                    name: interactions(study, names)
+                    for name, study in self.outputs.items()
+                    if study.second is not None
+                },
+                "convergence": {
+                    name: [
+                        {"evaluations": count, "indices": _by_input(names, {"index": estimate})}
+                        for count, estimate in study.convergence
+                    ]
+                    for name, study in self.outputs.items()
+                    if study.convergence
+                },
+                "comparison": self.comparison,
+                "negligible": self.negligible,
+                "statuses": self.statuses,
+                "statuses_sampled": self.sampled,
+                "next_runs": None if self.next_runs is None else _next_runs(self.next_runs, names),
+                "evaluations": self.evaluations,
+                "seconds": self.seconds,
+                "notes": self.notes,
+            }
+        )
 
     def _indices(self, study: OutputStudy) -> Json:
         if self.method == "local":

@@ -53,19 +53,13 @@ class Change:
         breaks: names of requirements that are met now and would be violated.
     """
 
+    JSON = ("parameter", "from=before", "to=after", "unit", "gradient", "breaks")
     parameter: str
     before: float
     after: float
     unit: str
     gradient: float
     breaks: Names = ()
-
-    def to_json(self) -> Json:
-        """Entry of `result.json`."""
-        return {
-            "parameter": self.parameter, "from": self.before, "to": self.after, "unit": self.unit,
-            "gradient": self.gradient, "breaks": list(self.breaks),
-        }  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,6 +75,10 @@ class Outcome:
         change: single changes that would meet it, the smallest first; empty if it is met or none does.
     """
 
+    JSON = (
+        "name=requirement.name", "required=requirement.limit", "sense=requirement.sense", "value", "margin",
+        "unit=requirement.quantity.unit", "met", "status", "at", "change", "source=requirement.source",
+    )  # fmt: skip
     requirement: Requirement
     value: float | None
     margin: float | None
@@ -92,15 +90,6 @@ class Outcome:
     def met(self) -> bool:
         """True if the requirement is met."""
         return self.margin is not None and self.margin >= 0
-
-    def to_json(self) -> Json:
-        """Entry of `result.json`."""
-        r = self.requirement
-        return {
-            "name": r.name, "required": r.limit, "sense": r.sense, "value": self.value, "margin": self.margin,
-            "unit": r.quantity.unit, "met": self.met, "status": self.status, "at": self.at,
-            "change": [c.to_json() for c in self.change], "source": r.source,
-        }  # fmt: skip
 
 
 def with_ratings(robot: Robot, asked: Requirements) -> Requirements:

@@ -498,6 +498,7 @@ DOUBTS = {
     "larger": ("size", "has a rival of an implausible size ({larger})"),
     "remains": ("equation", "leaves something in its own equation"),
     "form": ("its form", "changes{spread} over {over_variable} ({0.varies:.1f} σ)"),
+    "noise": ("noise", "is {0.offset:.1%} of the readings of an instrument whose noise is not stated (--noise)"),
 }
 
 

@@ -17,6 +17,7 @@ from mmrjax.fidelities.base import History
 from mmrjax.fidelities.drive import TIME_SETTLED, drive
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.paper_tables import PITCH_GROUSER, PITCH_TOOTH
+from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import CONVERGED
 
@@ -170,11 +171,12 @@ def start_times() -> np.ndarray:
     return np.concatenate([[0.0], early, np.linspace(LATEST, TIME_SETTLED, REST)])
 
 
-def curve_peak(times: Float[Array, " times"], x: Float[Array, " times"]) -> Float[Array, ""]:
+def curve_peak(times: Float[Array, " times"], x: Float[Array, " times"], kink: Scalar = np.inf) -> Float[Array, ""]:
     """Largest value of a sampled curve: the vertex of the parabola through its largest sample and both neighbours.
 
     Args:
         times: not decreasing [s]; x: samples, NaN if the curve has no value.
+        kink: value at which the curve bends, as a current does at its limit; no parabola reaches beyond it.
     """
     known = jnp.where(jnp.isfinite(x), x, -jnp.inf)
     k = jnp.clip(jnp.argmax(known), 1, x.shape[0] - 2)
@@ -184,7 +186,9 @@ def curve_peak(times: Float[Array, " times"], x: Float[Array, " times"]) -> Floa
     rise, fall = (x[k] - x[k - 1]) / before, (x[k + 1] - x[k]) / after
     bend = (fall - rise) / (before + after)
     slope = rise + bend * before
-    return jnp.where(inside, x[k] - slope**2 / (4 * jnp.where(inside, bend, -1.0)), known[jnp.argmax(known)])
+    highest = known[jnp.argmax(known)]
+    top = jnp.minimum(x[k] - slope**2 / (4 * jnp.where(inside, bend, -1.0)), jnp.maximum(kink, highest))
+    return jnp.where(inside, top, highest)
 
 
 def first_crossing(
@@ -230,7 +234,9 @@ def compute(robot: Robot, conditions: Conditions) -> dict[str, Array]:
     whole = jnp.concatenate([jnp.zeros(1), jnp.cumsum(width * (power[1:] + power[:-1]) / 2)])
     here = power[k] + share * (power[k + 1] - power[k])
     found = {
-        "peak_current": curve_peak(times, jnp.asarray(robot.sides * signals.current)),
+        "peak_current": curve_peak(
+            times, jnp.asarray(robot.sides * signals.current), robot.sides * robot.driver.current_limit
+        ),
         "time_to_speed": times[k] + share * width[k],
         "energy_start": whole[k] + share * width[k] * (power[k] + here) / 2,
     }

@@ -45,12 +45,12 @@ class DutyExponent(DutyEffect):
     )
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
-        log = jnp.log(at_least(jnp.abs(signals.duty), LEAST_POWER))
+        log = jnp.log(at_least(jnp.abs(signals.command), LEAST_POWER))
         beyond = (self.exponent - 1) * log
         near = jnp.abs(beyond) < 1e-6
         far = jnp.where(near, 1.0, beyond)
         ratio = jnp.where(near, 1 + beyond / 2, jnp.expm1(far) / far)
-        return -self.amplitude * signals.duty * log * ratio
+        return -self.amplitude * signals.command * log * ratio
 
 
 class DutyDeadBand(DutyEffect):
@@ -65,8 +65,8 @@ class DutyDeadBand(DutyEffect):
     amplitude: Scalar = amplitude("-", "dead band d over 1 - d", (-0.2, 1.0), "a few percent of the command", sd=0.05)
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
-        size = jnp.abs(signals.duty)
-        return self.amplitude * (1 - size) * signals.duty / at_least(size, LEAST_POWER)
+        size = jnp.abs(signals.command)
+        return self.amplitude * (1 - size) * signals.command / at_least(size, LEAST_POWER)
 
 
 class DutySaturation(DutyEffect):
@@ -87,4 +87,4 @@ class DutySaturation(DutyEffect):
     )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
-        return self.amplitude * at_least(jnp.abs(signals.duty) - self.duty_full, 0.0) * jnp.sign(signals.duty)
+        return self.amplitude * at_least(jnp.abs(signals.command) - self.duty_full, 0.0) * jnp.sign(signals.command)

@@ -23,7 +23,7 @@ from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Signals
 from mmrjax.numerics.rarely import compute_rarely
-from mmrjax.numerics.rosenbrock import rosenbrock_stages, step_longest
+from mmrjax.numerics.rosenbrock import error_across_kink, rosenbrock_stages, step_longest
 
 #: The first step of a segment [s], and the shortest.
 FIRST, SHORTEST = 1e-4, 1e-9
@@ -128,11 +128,18 @@ class MotionLaw(Protocol):
         ...
 
     def peaks_within(self, robot: Robot, y: Array, tops: Array) -> dict[str, Scalar]:
-        """Peaks of currents and temperatures from the largest unknowns within a step."""
+        """Peaks of currents and temperatures from the largest unknowns within a step.
+
+        A current counts up to the driver's limit: beyond it only the ends of a step are exact.
+        """
         ...
 
     def exceeded(self, robot: Robot, found: Any) -> dict[str, Scalar]:
         """Limits exceeded at an instant."""
+        ...
+
+    def limited(self, robot: Robot, y: Array) -> Array:
+        """True for each motor at its driver's current limit."""
         ...
 
     def norm(self, error: Array) -> Scalar:
@@ -384,7 +391,8 @@ class _Leg(NamedTuple):
         y, q, u, _ = rosenbrock_stages(rates, c.y, c.q, h, looped=law.LONG)
         y = y.at[law.CLOCK].set(jnp.where(last & ~trips, self.length, y[law.CLOCK]))
         scale = self.tolerance * (1 + jnp.maximum(jnp.abs(c.y), jnp.abs(y)))
-        size = law.norm(u[-1] / scale)
+        kink = jnp.any(law.limited(robot, c.y) != law.limited(robot, y))
+        size = law.norm(error_across_kink(u[-1], c.y, y, kink) / scale)
         size = jax.lax.stop_gradient(jnp.where(jnp.isfinite(size), size, 1e6))
         grown = h * jnp.clip(0.9 * jnp.maximum(size, 1e-12) ** -0.25, 0.1, 6.0)
         return _Tried(y, q, h, last, size <= 1, grown)

@@ -175,7 +175,7 @@ def peaks(robot: Robot, found: Signals) -> dict[str, Scalar]:
 
 def peaks_within(robot: Robot, y: Array, tops: Array) -> dict[str, Scalar]:
     return {
-        "current": robot.sides * UNITS[CURRENT] * tops[CURRENT],
+        "current": robot.sides * jnp.minimum(UNITS[CURRENT] * tops[CURRENT], robot.driver.current_limit),
         "temperature": jnp.where(y[WINDING] > 0, UNITS[WINDING] * tops[WINDING], -jnp.inf),
     }
 
@@ -183,6 +183,10 @@ def peaks_within(robot: Robot, y: Array, tops: Array) -> dict[str, Scalar]:
 def exceeded(robot: Robot, found: Signals) -> dict[str, Scalar]:
     hot = jnp.asarray(found.temperature) > robot.motor.temperature_limit
     return {**result.exceeded_limits(robot, found), "too_hot": hot}
+
+
+def limited(robot: Robot, y: Array) -> Array:
+    return jnp.asarray(robot.driver.limits(UNITS[CURRENT] * y[CURRENT]))
 
 
 norm = functools.partial(rosenbrock.error_norm, own=len(UNITS))

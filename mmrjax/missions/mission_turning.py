@@ -189,7 +189,7 @@ def peaks(robot: Robot, found: TurningInstant) -> dict[str, Scalar]:
 
 
 def peaks_within(robot: Robot, y: Array, tops: Array) -> dict[str, Scalar]:
-    current = robot.sides * _EACH[0] * tops[CURRENT]
+    current = robot.sides * jnp.minimum(_EACH[0] * tops[CURRENT], robot.driver.current_limit)
     temperature = jnp.where(y[WINDING] > 0, _EACH[2] * tops[WINDING], -jnp.inf)
     either = _of_sides(robot, {"current": current, "temperature": temperature})
     return {"current": sum_of_sides(current) / 2, "temperature": jnp.max(temperature), **either}
@@ -205,6 +205,10 @@ def _of_sides(robot: Robot, each: dict[str, Any]) -> dict[str, Scalar]:
 def exceeded(robot: Robot, found: TurningInstant) -> dict[str, Scalar]:
     each = jax.vmap(lambda s: mission_straight.exceeded(robot, s))(found.signals)
     return {name: jnp.any(x) for name, x in each.items()}
+
+
+def limited(robot: Robot, y: Array) -> Array:
+    return jnp.asarray(robot.driver.limits(_EACH[0] * y[CURRENT]))
 
 
 norm = functools.partial(

@@ -94,7 +94,7 @@ def duty_given(robot: Robot, conditions: Conditions) -> Scalar:
         on_tracks=robot.chassis(conditions.configuration).on_tracks,
         battery=conditions.battery,
         order=conditions.order,
-        duty=conditions.duty,
+        command=conditions.duty,
     )
     way = jnp.where(conditions.duty < 0, -1.0, 1.0)
     return way * clip(way * (conditions.duty - effects_sum(robot, demanded, "duty")), 0.0, 1.0)
@@ -130,6 +130,7 @@ def begin_signals(robot: Robot, conditions: Conditions, state: State, direction:
         speed_output=state.speed / chassis.radius if robot.loose else speed_wheel,
         angle=state.distance / chassis.radius,
         temperature=state.temperature,
+        command=conditions.duty,
         duty=duty,
         pause=jnp.where(jnp.abs(jnp.asarray(conditions.open)) > 0.5, 0.0, 1 - jnp.abs(duty)),
         share_drawn=robot.driver.share_drawn(duty),

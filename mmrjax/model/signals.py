@@ -130,7 +130,8 @@ class Signals(eqx.Module):
     mass: Scalar = UNSET  # total M [kg]; effects of balance `mass` see the stated one
     normal: Scalar = UNSET  # normal load of one side [N]
     # supply and electrical
-    duty: Scalar = UNSET  # D of the driver, after its current limit [-]
+    command: Scalar = UNSET  # duty that is demanded of the driver [-]
+    duty: Scalar = UNSET  # D that the driver gives, after its current limit [-]
     pause: Scalar = UNSET  # share of a period without pulses, 1 - |D|; 0 if the motors are open or shorted [-]
     share_drawn: Scalar = UNSET  # share of the motors' current that the supply gives [-]
     total_current: Scalar = UNSET  # D I of all motors, from the supply I_s, eq. (10) [A]

@@ -9,17 +9,13 @@ import diffrax
 import jax.numpy as jnp
 from diffrax import RESULTS
 
-from mmrjax.numerics.rosenbrock import rosenbrock_stages
+from mmrjax.numerics.rosenbrock import error_across_kink, rosenbrock_stages
 
 # Weights of the stages in the two coefficients of the dense output.
 _D = (
     (10.12623508344586, -7.487995877610167, -34.80091861555747, -7.992771707568823, 1.025137723295662),
     (-0.6762803392806898, 6.087714651680015, 16.43084320892478, 24.76722511418386, -6.594389125716872),
 )
-
-
-#: Share of a step's change that counts as its error if it crosses a kink [-].
-KINK = 1e-2
 
 
 class RodasInterpolation(diffrax.LocalLinearInterpolation):
@@ -49,9 +45,7 @@ class Rodas4(diffrax.AbstractAdaptiveSolver):
     with respect to time is assumed to be zero.
 
     Attributes:
-        branch: (unknowns, args) → booleans that change at a kink of the right-hand side. The error estimate does not
-            see a kink within a step: the method linearises at its start. `KINK` of the unknowns' change is added
-            to the estimate of such a step, so that it becomes short.
+        branch: (unknowns, args) → booleans that change at a kink of the right-hand side, see `error_across_kink`.
     """
 
     branch: Callable[[Any, Any], Any] = lambda y, args: False
@@ -74,6 +68,5 @@ class Rodas4(diffrax.AbstractAdaptiveSolver):
         y1, _, u, _ = rosenbrock_stages(rate, y0, y0[:0], t1 - t0)
         c2, c3 = (sum(d * v for d, v in zip(row, u[:5], strict=True)) for row in _D)
         kink = jnp.any(self.branch(y0, args) != self.branch(y1, args))
-        error = u[-1] + jnp.where(kink, KINK * jnp.abs(y1 - y0), 0.0) * jnp.where(u[-1] < 0, -1.0, 1.0)
         dense = {"y0": y0, "y1": y1, "c2": c2, "c3": c3}
-        return y1, error, dense, None, RESULTS.successful
+        return y1, error_across_kink(u[-1], y0, y1, kink), dense, None, RESULTS.successful

@@ -32,6 +32,9 @@ _C = (
     (8.083246795921522, -7.981132988064893, -31.52159432874371, 16.31930543123136, -6.058818238834054),
 )
 
+#: Share of a step's change that counts as its error if it crosses a kink [-].
+KINK = 1e-2
+
 
 def error_norm(error: Float[Array, " unknowns"], own: int, weight: float | np.ndarray = 1.0) -> Scalar:
     """Root mean square of an error of the robot's `own` unknowns; memories add to it and never dilute it."""
@@ -47,6 +50,17 @@ def error_norm_of_sides(error: Float[Array, " unknowns"], whole: slice, own: int
     weight = np.full(error.shape[0], 0.5)
     weight[whole] = 1.0
     return error_norm(error, own, weight)
+
+
+def error_across_kink(
+    error: Float[Array, " unknowns"], y0: Float[Array, " unknowns"], y1: Float[Array, " unknowns"], kink: Array
+) -> Float[Array, " unknowns"]:
+    """Error of a step, with `KINK` of the unknowns' change if it crosses a kink of the rates.
+
+    The method linearises at the start of a step, so that its estimate does not see a kink within it. With this share
+    the step becomes short.
+    """
+    return error + jnp.where(kink, KINK * jnp.abs(y1 - y0), 0.0) * jnp.where(error < 0, -1.0, 1.0)
 
 
 def step_longest(robot: Robot, conditions: Conditions) -> Array | None:

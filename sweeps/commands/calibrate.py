@@ -9,8 +9,7 @@ from sweeps.console import print_message, step_reporter
 from sweeps.inputs import load_robot, read_runs
 from sweeps.pages import words
 from sweeps.report import calibration_report
-from sweeps.skeleton import finish_run_folder, print_report
-from sweeps.store import open_folder
+from sweeps.store import finish_run_folder, open_folder, print_report
 
 
 def execute(config: configuration.Calibrate, beside: configuration.FittedRuns) -> int:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.data import Columns, requirements_file, robot_file
+from calibration.data import requirements_file
 from calibration.data.input_errors import BadConfiguration
 from calibration.described import in_words
 from calibration.sizing import sheet
@@ -21,10 +21,9 @@ from sweeps.inputs import load_robot
 from sweeps.pages import words
 from sweeps.points import imposed
 from sweeps.report import check_report
-from sweeps.results import posture_results
-from sweeps.results.check_results import CheckResult, requirement_limit, worst_corner_text
-from sweeps.skeleton import finish_run_folder, print_report
-from sweeps.store import RunFolder, open_folder
+from sweeps.report.check_report import CheckResult, requirement_limit, worst_corner_text
+from sweeps.report.words import posture_words
+from sweeps.store import RunFolder, finish_run_folder, open_folder, print_report
 
 
 def execute(config: configuration.Check, beside: configuration.FolderPart) -> int:
@@ -48,12 +47,14 @@ def execute(config: configuration.Check, beside: configuration.FolderPart) -> in
     with open_folder("check", config, robot, beside) as folder:
         with step_reporter(print_message, "reading the requirements") as heard:
             outcomes = sheet.check_requirements(robot, asked, changes=config.changes, tell=in_words(heard))
-            found = CheckResult(asked, robot, outcomes, posture_results.of_requirements(robot, outcomes))
+            found = CheckResult(asked, robot, outcomes, posture_words.of_requirements(robot, outcomes))
         _write(folder, config, found)
         shown = print_report(check_report.check_document(found, capabilities.shown_name(file), config.changes), file)
         manifest = {"seed": None, **sheet.count_outcomes(found.outcomes)}
         solved = words.every_run_solved(Counter(o.status for o in found.outcomes))
-        return finish_run_folder(folder, config, manifest, solved=solved, page=shown)
+        return finish_run_folder(
+            folder, config, manifest, robot=found.robot, note="the robot of this check", solved=solved, page=shown
+        )
 
 
 def _check_charge(robot: Robot, asked: requirements_file.Requirements) -> None:
@@ -69,24 +70,20 @@ def _check_charge(robot: Robot, asked: requirements_file.Requirements) -> None:
 
 def _write(folder: RunFolder, config: configuration.Check, found: CheckResult) -> None:
     folder.write_text("requirements.toml", found.asked.text)
-    robot_file.write_robot(
-        found.robot, folder.results() / "robot.toml", note=f"the robot of this check, from {config.robot}"
-    )
-    folder.write_table("requirements.csv", outcomes_table(found))
-    folder.write_json("result.json", found.to_json())
-
-
-def outcomes_table(found: CheckResult) -> Columns:
-    """Outcomes as a table, one row for each requirement."""
+    # Outcomes as a table, one row for each requirement
     nan = float("nan")
-    return {
-        "name": np.array([o.requirement.name for o in found.outcomes]),
-        "sense": np.array([o.requirement.sense for o in found.outcomes]),
-        "required": np.array([requirement_limit(o) for o in found.outcomes]),
-        "value": np.array([nan if o.value is None else o.value for o in found.outcomes]),
-        "margin": np.array([nan if o.margin is None else o.margin for o in found.outcomes]),
-        "unit": np.array([o.requirement.quantity.unit for o in found.outcomes]),
-        "met": np.array([o.met for o in found.outcomes]),
-        "status": np.array([o.status for o in found.outcomes]),
-        "at": np.array([worst_corner_text(o) for o in found.outcomes]),
-    }
+    folder.write_table(
+        "requirements.csv",
+        {
+            "name": np.array([o.requirement.name for o in found.outcomes]),
+            "sense": np.array([o.requirement.sense for o in found.outcomes]),
+            "required": np.array([requirement_limit(o) for o in found.outcomes]),
+            "value": np.array([nan if o.value is None else o.value for o in found.outcomes]),
+            "margin": np.array([nan if o.margin is None else o.margin for o in found.outcomes]),
+            "unit": np.array([o.requirement.quantity.unit for o in found.outcomes]),
+            "met": np.array([o.met for o in found.outcomes]),
+            "status": np.array([o.status for o in found.outcomes]),
+            "at": np.array([worst_corner_text(o) for o in found.outcomes]),
+        },
+    )
+    folder.write_json("result.json", found.to_json())

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from calibration.data import robot_file, terrains
+from calibration.data import terrains
 from calibration.data.contradictions import without_levers
 from calibration.data.input_errors import BadConfiguration
 from mmrjax.climbing import climb_simulation, terrain
@@ -31,9 +31,8 @@ from sweeps.inputs import check_configurations, load_robot
 from sweeps.points import imposed, scale
 from sweeps.points.climbs import NEAR, SLOW, SOUGHT, climb_refusal
 from sweeps.report import climb_report
-from sweeps.results.climb_results import Along, ClimbResult
-from sweeps.skeleton import finish_run_folder, print_report
-from sweeps.store import open_folder
+from sweeps.report.climb_report import Along, ClimbResult
+from sweeps.store import finish_run_folder, open_folder, print_report
 
 #: Runs of a round of a search.
 ROUND = 12
@@ -71,16 +70,21 @@ def execute(config: configuration.Climb, beside: configuration.FolderPart) -> in
         if rows := found.slopes:
             folder.write_table("derivatives.csv", {name: np.array([row[name] for row in rows]) for name in rows[0]})
         folder.write_json("result.json", found.to_json())
-        robot_file.write_robot(
-            robot, folder.results() / "robot.toml", note=f"the robot of this climb, from {config.robot}"
-        )
         if config.film:
             from sweeps.pages import climb_figures
 
             climb_figures.render_climb(found, folder.results() / "climb.gif")
         shown = print_report(climb_report.climb_document(found, file), file)
         manifest = {"seed": None, "verdict": found.verdict}
-        return finish_run_folder(folder, config, manifest, solved=found.verdict != "failed", page=shown)
+        return finish_run_folder(
+            folder,
+            config,
+            manifest,
+            robot=robot,
+            note="the robot of this climb",
+            solved=found.verdict != "failed",
+            page=shown,
+        )
 
 
 def _climbed(

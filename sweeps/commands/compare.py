@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.data import Columns, instruments
+from calibration.data import Columns, Names, instruments
 from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.robot_file import RobotFile
@@ -22,9 +22,8 @@ from sweeps import config as configuration
 from sweeps.inputs import beside_robot, fit_of, load_robot, read_runs
 from sweeps.points import run, uncertainty
 from sweeps.report import comparison_report
-from sweeps.results.comparison_results import Comparison, add_second_robot, compare_readings
-from sweeps.skeleton import print_report
-from sweeps.store import open_folder
+from sweeps.report.comparison_report import Comparison, add_second_robot, compare_readings
+from sweeps.store import RunFolder, open_folder, print_report
 
 #: Fidelity that follows time histories, and over what their errors are shown besides.
 HISTORIES, OVER = "drive", {"time_s": "time [s]"}
@@ -69,11 +68,7 @@ def execute(config: configuration.Compare, beside: configuration.ComparedRuns) -
             comparison, summary, stated.channels, Path(runs.source).name, config.model, capabilities.shown_name(file),
             fit_of(file, runs), notes=(*notes, *of_draws), against=_name_of(config, file, second),
         )  # fmt: skip
-        shown = print_report(comparison_report.comparison_document(found), dataclasses.replace(file, robot=robot))
-        answer = comparison_report.comparison_answer(found)
-        further = {"statement": answer, "errors": summary, "notes": [*file.remarks, *notes]}
-        result = run.SimulationResult("compare", config.model, robot, runs, table, further)
-        return run.write_run_folder(folder, config, result, shown)
+        return _written(folder, config, dataclasses.replace(file, robot=robot), runs, table, found, notes)
 
 
 def _over_time(
@@ -108,13 +103,24 @@ def _over_time(
             comparison, summary, runs.channels, Path(runs.source).name, HISTORIES, capabilities.shown_name(file),
             fit_of(file, runs), OVER, notes, _name_of(config, file, second),
         )  # fmt: skip
-        shown = print_report(
-            comparison_report.comparison_document(found), dataclasses.replace(file, robot=ready.robot)
-        )
-        answer = comparison_report.comparison_answer(found)
-        further = {"statement": answer, "errors": summary, "notes": [*file.remarks, *notes]}
-        result = run.SimulationResult("compare", HISTORIES, ready.robot, runs, table, further)
-        return run.write_run_folder(folder, config, result, shown)
+        return _written(folder, config, dataclasses.replace(file, robot=ready.robot), runs, table, found, notes)
+
+
+def _written(
+    folder: RunFolder,
+    config: configuration.Compare,
+    file: RobotFile,
+    runs: records.Runs,
+    table: Columns,
+    found: Comparison,
+    notes: Names,
+) -> int:
+    """Print a comparison and write its folder, with these notes in `result.json`; returns the exit code."""
+    shown = print_report(comparison_report.comparison_document(found), file)
+    answer = comparison_report.comparison_answer(found)
+    further = {"statement": answer, "errors": found.summary, "notes": [*file.remarks, *notes]}
+    result = run.SimulationResult("compare", found.model, file.robot, runs, table, further)
+    return run.write_run_folder(folder, config, result, shown)
 
 
 def _second_robot(config: configuration.Compare, file: RobotFile) -> RobotFile | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import re
 import textwrap
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -23,10 +23,12 @@ from mmrjax.model.params import Parameter, Spec
 from mmrjax.model.signals import Result
 from sweeps.console import print_output
 from sweeps.pages import words
-from sweeps.results.climb_results import VERDICTS
+from sweeps.report.climb_report import VERDICTS
 
 #: A line of an explanation: heading and text.
 Line = tuple[str, str]
+#: Lines on a name, none if it has another meaning.
+Explain = Callable[[str, dict[str, type[Effect]]], Iterator[Line]]
 WIDTH, INDENT = 80, 16
 #: Of a run, solved for, and of a mission.
 EVERY_OUTPUT: tuple[Any, ...] = (*outputs.FURTHER, *derived.TABLE, *mission_batch.OUTPUTS, *mission_batch.OF_TURNS)
@@ -159,27 +161,16 @@ def _status(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
         yield "in files", "column status of runs.csv, counts in result.json"
 
 
-def _verdict(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
-    if name in VERDICTS:
-        yield "means", VERDICTS[name][1]
-        yield "in files", "verdict of result.json of mmrjax climb"
+def _meaning(meanings: Mapping[str, str], where: str = "") -> Explain:
+    """Explains names that have a meaning each; `where` they are found in files."""
 
+    def about(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
+        if name in meanings:
+            yield "means", meanings[name]
+            if where:
+                yield "in files", where
 
-def _verdict_of_loop(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
-    if name in words.LOOP_VERDICTS:
-        yield "means", words.LOOP_VERDICTS[name]
-        yield "in files", "verdict of result.json of mmrjax loop"
-
-
-def _word(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
-    if name in words.GLOSSARY and name not in words.LOOP_VERDICTS:
-        yield "means", words.GLOSSARY[name]
-
-
-def _flag(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
-    if name in words.FLAGS:
-        yield "means", words.FLAGS[name]
-        yield "in files", "column flags of runs.csv, counts in result.json; a run may have several"
+    return about
 
 
 def _channel(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
@@ -271,8 +262,17 @@ def _bounds(spec: Spec) -> str:
 
 
 #: What explains a name, by kind.
-EXPLAINED: dict[str, Callable[[str, dict[str, type[Effect]]], Iterator[Line]]] = {
-    "effect": _effect, "status": _status, "verdict of the loop": _verdict_of_loop, "verdict of a climb": _verdict,
-    "flag": _flag, "channel": _channel, "output": _output, "parameter": _parameter,
-    "condition": _condition, "word of the reports": _word,
-}  # fmt: skip
+EXPLAINED: dict[str, Explain] = {
+    "effect": _effect,
+    "status": _status,
+    "verdict of the loop": _meaning(words.LOOP_VERDICTS, "verdict of result.json of mmrjax loop"),
+    "verdict of a climb": _meaning(
+        {name: meaning for name, (_, meaning) in VERDICTS.items()}, "verdict of result.json of mmrjax climb"
+    ),
+    "flag": _meaning(words.FLAGS, "column flags of runs.csv, counts in result.json; a run may have several"),
+    "channel": _channel,
+    "output": _output,
+    "parameter": _parameter,
+    "condition": _condition,
+    "word of the reports": _meaning({k: v for k, v in words.GLOSSARY.items() if k not in words.LOOP_VERDICTS}),
+}

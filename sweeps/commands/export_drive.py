@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from calibration.data import Json, robot_file
+from calibration.data import Json
 from sweeps import config as configuration
 from sweeps.export.formats import Export, export_format
 from sweeps.inputs import load_robot
 from sweeps.report import export_report
 from sweeps.report.words import export_words as words
-from sweeps.skeleton import finish_run_folder, print_report
-from sweeps.store import open_folder
+from sweeps.store import finish_run_folder, open_folder, print_report
 
 
 def execute(config: configuration.Export, beside: configuration.FolderPart) -> int:
@@ -20,16 +19,19 @@ def execute(config: configuration.Export, beside: configuration.FolderPart) -> i
             file, config.to, configuration=config.configuration, data=config.data, at=config.joint,
             draws=config.draws, seed=config.seed,
         )  # fmt: skip
-        robot_file.write_robot(
-            file.robot, folder.results() / "robot.toml", note=f"what was exported, from {config.robot}"
-        )
         for name, content in found.files.items():
             folder.write_bytes(name, content if isinstance(content, bytes) else content.encode())
         folder.write_text("LAW.md", words.law_text(found))
         folder.write_json("result.json", to_json(found))
         shown = print_report(export_report.export_document(found))
         return finish_run_folder(
-            folder, config, {"seed": config.seed}, page=shown, runs=found.comparison.situation.runs
+            folder,
+            config,
+            {"seed": config.seed},
+            robot=file.robot,
+            note="what was exported",
+            page=shown,
+            runs=found.comparison.situation.runs,
         )
 
 

@@ -16,11 +16,17 @@ from sweeps.store import PACKAGES
 
 def check_installation() -> int:
     """Print one line for each check; returns 0 if all pass, else 1."""
+    import jax
+
     checks: dict[str, Callable[[], str]] = {
-        "Python": _python, "packages": _packages, "devices": _devices, "compilation cache": _cache,
+        "Python": lambda: f"{platform.python_version()} on {platform.machine()}",
+        "packages": lambda: ", ".join(f"{name} {importlib.metadata.version(name)}" for name in ("mmrjax", *PACKAGES)),
+        "devices": lambda: ", ".join(map(str, jax.devices())),
+        "compilation cache": compilation_cache.describe_cache,
         "a solved run": _run,
-        "derivatives": _derivative, "writing here": _folder,
-    }  # fmt: skip
+        "derivatives": _derivative,
+        "writing here": _folder,
+    }
     healthy = True
     for k, (name, check) in enumerate(checks.items(), 1):
         try:
@@ -30,24 +36,6 @@ def check_installation() -> int:
             line, healthy = f"{name} FAILED: {type(error).__name__}: {error}", False
         print(line)
     return 0 if healthy else 1
-
-
-def _python() -> str:
-    return f"{platform.python_version()} on {platform.machine()}"
-
-
-def _packages() -> str:
-    return ", ".join(f"{name} {importlib.metadata.version(name)}" for name in ("mmrjax", *PACKAGES))
-
-
-def _devices() -> str:
-    import jax
-
-    return ", ".join(str(d) for d in jax.devices())
-
-
-def _cache() -> str:
-    return str(compilation_cache.describe_cache())
 
 
 def _run() -> str:

@@ -34,8 +34,7 @@ from sweeps.console import print_message, print_output, step_reporter
 from sweeps.inputs import load_robot, read_runs
 from sweeps.report import loop_report
 from sweeps.report.fit_tables import Change
-from sweeps.skeleton import finish_run_folder, print_report
-from sweeps.store import SOLVER_FAILED, RunFolder, open_folder
+from sweeps.store import SOLVER_FAILED, RunFolder, finish_run_folder, open_folder, print_report
 
 T = TypeVar("T")
 #: File of what regression says before anything is confirmed, and its schema.

@@ -28,9 +28,8 @@ from sweeps.console import print_message, progress_bar
 from sweeps.inputs import OPTIONS, given_runs, load_robot
 from sweeps.points import imposed, run
 from sweeps.report import mission_report
-from sweeps.results.mission_results import Missions
-from sweeps.skeleton import print_report
-from sweeps.store import open_folder
+from sweeps.report.mission_report import Missions
+from sweeps.store import open_folder, print_report
 
 #: Rows of history.csv: of a run at most, at least, and of all runs together.
 MOST_ROWS, LEAST_ROWS, ALL_ROWS = 20_000, 200, 200_000
@@ -48,7 +47,22 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
     assert config.profile is not None
     file = load_robot(config)
     robot = file.robot
-    _check_robot(robot)
+    if robot.rig.imposed != "voltage":
+        what = imposed.SAID[robot.rig.imposed].words
+        raise BadConfiguration(
+            f"--profile: the {what} is imposed on this robot, and a profile drives motors by their voltage; "
+            'simulate a table of runs, or state imposed = "voltage" in the robot\'s file'
+        )
+    if robot.loose:
+        raise BadConfiguration(
+            "--profile: a profile does not follow a backlash; set it to 0, or simulate over time with --model drive"
+        )
+    for name, load in robot.configurations.items():
+        if float(load.torque_gravity) > 0:
+            raise BadConfiguration(
+                f"--profile: {name} is an arm whose gravity load varies with its angle, unlike a profile; "
+                "simulate it over time with --model drive"
+            )
     source = profiles.read_profile(config.profile)
     for note in source.notes:
         print_message(note)
@@ -78,25 +92,6 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
         return run.write_run_folder(
             folder, config, result, print_report(mission_report.missions_document(file, found), file)
         )
-
-
-def _check_robot(robot: Robot) -> None:
-    if robot.rig.imposed != "voltage":
-        what = imposed.SAID[robot.rig.imposed].words
-        raise BadConfiguration(
-            f"--profile: the {what} is imposed on this robot, and a profile drives motors by their voltage; "
-            'simulate a table of runs, or state imposed = "voltage" in the robot\'s file'
-        )
-    if robot.loose:
-        raise BadConfiguration(
-            "--profile: a profile does not follow a backlash; set it to 0, or simulate over time with --model drive"
-        )
-    for name, load in robot.configurations.items():
-        if float(load.torque_gravity) > 0:
-            raise BadConfiguration(
-                f"--profile: {name} is an arm whose gravity load varies with its angle, unlike a profile; "
-                "simulate it over time with --model drive"
-            )
 
 
 def _check_acting(robot: Robot, source: ProfileTable) -> None:

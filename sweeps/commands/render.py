@@ -19,7 +19,7 @@ from sweeps.console import print_output, progress_bar
 from sweeps.inputs import load_robot, one_run
 from sweeps.pages import words
 from sweeps.points import imposed, run, scale
-from sweeps.results.climb_results import Seen
+from sweeps.report.climb_report import Seen
 from sweeps.store import DONE, SOLVER_FAILED
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from calibration.data import robot_file
 from calibration.data import runs as records
 from mmrjax import fidelities
 from mmrjax.model.paper_tables import CONFIGURATIONS
@@ -11,8 +10,7 @@ from sweeps.console import print_message
 from sweeps.inputs import load_robot
 from sweeps.paper import data, report
 from sweeps.points import imposed
-from sweeps.skeleton import finish_run_folder
-from sweeps.store import open_folder
+from sweeps.store import finish_run_folder, open_folder
 
 
 def execute(config: configuration.Reproduce, beside: configuration.FolderPart) -> int:
@@ -34,10 +32,13 @@ def execute(config: configuration.Reproduce, beside: configuration.FolderPart) -
                 "errors": data.bench_error_summary(rows),
                 "adhesion_raised": rows.ratio,
             }
-        robot_file.write_robot(
-            robot, folder.results() / "robot.toml", note=f"the robot of these figures, from {config.robot}"
-        )
         folder.write_json("result.json", result)
         return finish_run_folder(
-            folder, config, {"seed": None}, solved=rows is None or "failed" not in rows.plain["status"], runs=runs
+            folder,
+            config,
+            {"seed": None},
+            robot=robot,
+            note="the robot of these figures",
+            solved=rows is None or "failed" not in rows.plain["status"],
+            runs=runs,
         )

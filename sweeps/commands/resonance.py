@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from calibration.data import Columns, Json, robot_file
+from calibration.data import Columns, Json
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.runs import Runs
 from mmrjax.fidelities.track import track_batch
@@ -36,9 +36,8 @@ from sweeps.pages import words
 from sweeps.points import imposed, run, scale
 from sweeps.points.grid import grid_conditions
 from sweeps.report import resonance_report
-from sweeps.results.resonance_results import SLOW, ResonanceResult
-from sweeps.skeleton import finish_run_folder, print_report
-from sweeps.store import RunFolder, open_folder
+from sweeps.report.resonance_report import SLOW, ResonanceResult
+from sweeps.store import RunFolder, finish_run_folder, open_folder, print_report
 
 CHUNK = 96  # runs in one call
 FEWEST = 5  # voltages over which a peak can be told
@@ -84,7 +83,16 @@ def execute(config: configuration.Resonance, beside: configuration.FolderPart) -
         _write(folder, config, found)
         shown = print_report(resonance_report.resonance_document(found, file), file)
         manifest, solved = {"seed": None, "statuses": found.statuses}, words.every_run_solved(found.statuses)
-        return finish_run_folder(folder, config, manifest, solved=solved, page=shown, runs=runs)
+        return finish_run_folder(
+            folder,
+            config,
+            manifest,
+            robot=found.robot,
+            note="the robot of this map",
+            solved=solved,
+            page=shown,
+            runs=runs,
+        )
 
 
 def _grid(config: configuration.Resonance, voltages: tuple[float, ...], payloads: tuple[float, ...]) -> GridPart:
@@ -196,9 +204,6 @@ def _write(folder: RunFolder, config: configuration.Resonance, found: ResonanceR
         _rows([{"payload_kg": p, **m._asdict()} for p, modes in found.modes.items() for m in modes], Mode),
     )
     folder.write_table("peaks.csv", _rows([p._asdict() for p in found.peaks], Peak))
-    robot_file.write_robot(
-        found.robot, folder.results() / "robot.toml", note=f"the robot of this map, from {config.robot}"
-    )
     folder.write_json("result.json", found.to_json())
 
 

@@ -351,10 +351,10 @@ def _data_blocks(found: RigCheck, runs: Runs, seen: Foresight) -> tuple[Block, .
     said = [*found.unused(), *runs.missing()]
     if len(seen.status) < len(runs):
         said.insert(0, f"loop and calibrate use the readings of {len(seen.status)} of them, evenly in time (--rows)")
+    held = runs.has("held") or (runs.layout.imposed == "motor_speed" and not runs[runs.layout.imposed_column].any())
+    settled = {*words.SETTLED, *(["stalled"] if held else [])}  # a shaft that is held stands still, as it should
     others = [
-        f"{count_noun(count, 'row')}: {name}"
-        for name, count in Counter(seen.status).items()
-        if name not in words.SETTLED
+        f"{count_noun(count, 'row')}: {name}" for name, count in Counter(seen.status).items() if name not in settled
     ]
     if others:
         said.append(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import re
 from collections.abc import Mapping
@@ -31,18 +30,6 @@ NUMBERS: dict[str, dict[str, float]] = {
 LARGEST = 0.1
 #: Least widths of resistance and torque constant; makers print three digits and allow 5 to 10 % between motors [%].
 WIDTH_RESISTANCE, WIDTH_CONSTANT = 5.0, 3.0
-
-
-@dataclasses.dataclass(frozen=True)
-class Sheet:
-    """Numbers of a sheet [SI], None where it has none."""
-
-    voltage: float | None
-    speed: float | None
-    idle: float | None
-    torque: float | None
-    stall: float | None
-    resistance: float | None
 
 
 def _units(text: str) -> str:
@@ -78,22 +65,21 @@ def read_data_sheet(stated: Mapping[str, str]) -> dict[str, Stated]:
     if not stated:
         others = ", ".join(f"--{name}" for name in NUMBERS if name != "no-load-current")
         raise BadConfiguration(f"--from-sheet: no numbers; expected --no-load-current and three or more of {others}")
-    numbers = {name: _number(name, text) for name, text in stated.items()}
-    sheet = Sheet(*(numbers.get(name) for name in NUMBERS))
+    sheet = {name: _number(name, text) for name, text in stated.items()}
     drop = _current(sheet)
-    voltage, idle = sheet.voltage, sheet.idle
+    voltage, speed, idle, torque, stall, stated_resistance = map(sheet.get, NUMBERS)
     assert idle is not None
-    resistances = [(sheet.resistance, "resistance"), (_ratio(voltage, sheet.stall), "voltage / stall current")]
-    if sheet.resistance is None and sheet.stall is None:
+    resistances = [(stated_resistance, "resistance"), (_ratio(voltage, stall), "voltage / stall current")]
+    if stated_resistance is None and stall is None:
         resistances.append((_ratio(voltage, idle + drop), "voltage and power at no load"))
-    if voltage is None and sheet.resistance is None and sheet.speed is not None and sheet.torque is not None:
-        resistances.append((sheet.torque * sheet.speed / drop**2, "stall torque, no-load speed and stall current"))
+    if voltage is None and stated_resistance is None and speed is not None and torque is not None:
+        resistances.append((torque * speed / drop**2, "stall torque, no-load speed and stall current"))
     given = [(value, source) for value, source in resistances if value is not None]
     resistance = given[0][0]
     back = resistance * drop if voltage is None else voltage - resistance * idle
     constants = [
-        (_ratio(back, sheet.speed), "voltage / no-load speed"),
-        (_ratio(sheet.torque, drop), "stall torque / stall current"),
+        (_ratio(back, speed), "voltage / no-load speed"),
+        (_ratio(torque, drop), "stall torque / stall current"),
     ]
     known = [(value, source) for value, source in constants if value is not None]
     _refuse_contradictions((given, "resistance", "ohm"), (known, "torque constant", "N·m/A"))
@@ -120,32 +106,33 @@ def _ratio(one: float | None, other: float | None) -> float | None:
     return None if one is None or other is None else one / other
 
 
-def _current(sheet: Sheet) -> float:
+def _current(sheet: Mapping[str, float]) -> float:
     """Stall current less no-load current [A].
 
     Raises:
         BadConfiguration: numbers that do not determine it, or a no-load current that is not the smaller one.
     """
-    if sheet.idle is None:
+    voltage, speed, idle, torque, stall, resistance = map(sheet.get, NUMBERS)
+    if idle is None:
         raise BadConfiguration("--no-load-current: missing; the friction of the motor follows from it alone")
-    missing = [name for name, value in zip(NUMBERS, dataclasses.astuple(sheet), strict=True) if value is None]
-    if sheet.speed is None and sheet.torque is None:
+    missing = [name for name in NUMBERS if name not in sheet]
+    if speed is None and torque is None:
         raise BadConfiguration("--no-load-speed and --stall-torque: both missing; the torque constant needs one")
-    totals = [x for x in (sheet.stall, _ratio(sheet.voltage, sheet.resistance)) if x is not None]
-    if totals and min(totals) <= sheet.idle:
-        raise BadConfiguration(f"--no-load-current: got {three_digits(sheet.idle)} A, and the stall current is "
+    totals = [x for x in (stall, _ratio(voltage, resistance)) if x is not None]
+    if totals and min(totals) <= idle:
+        raise BadConfiguration(f"--no-load-current: got {three_digits(idle)} A, and the stall current is "
                                f"{three_digits(min(totals))} A; expected less")  # fmt: skip
     total = totals[0] if totals else None
-    if total is not None and (sheet.resistance is not None or sheet.voltage is not None):
-        return total - sheet.idle
-    if sheet.speed is not None and sheet.torque is not None:
-        power = sheet.torque * sheet.speed
+    if total is not None and (resistance is not None or voltage is not None):
+        return total - idle
+    if speed is not None and torque is not None:
+        power = torque * speed
         if total is not None:
-            return total - sheet.idle
-        if sheet.resistance is not None:
-            return math.sqrt(power / sheet.resistance)
-        if sheet.voltage is not None:  # U D² = M_s ω_0 (D + I_0)
-            return (power + math.sqrt(power**2 + 4 * sheet.voltage * power * sheet.idle)) / (2 * sheet.voltage)
+            return total - idle
+        if resistance is not None:
+            return math.sqrt(power / resistance)
+        if voltage is not None:  # U D² = M_s ω_0 (D + I_0)
+            return (power + math.sqrt(power**2 + 4 * voltage * power * idle)) / (2 * voltage)
     lacking = ", ".join(f"--{name}" for name in missing)
     raise BadConfiguration(
         f"--from-sheet: missing {lacking}; the others do not determine resistance and torque constant; state one more"

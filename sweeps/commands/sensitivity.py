@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from calibration.data import Json, Names, robot_file
+from calibration.data import Json, Names
 from calibration.data.columns import Layout
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.robot_file import RobotFile
@@ -36,8 +36,7 @@ from sweeps.points.grid import grid_conditions, grid_configurations
 from sweeps.points.job import showing_turns
 from sweeps.points.run import check_runs_bearable
 from sweeps.report import sensitivity_report
-from sweeps.skeleton import finish_run_folder, print_report
-from sweeps.store import open_folder
+from sweeps.store import finish_run_folder, open_folder, print_report
 
 #: Operating points where a sample is drawn at each: corners and middle of Table 8.
 CORNERS = {
@@ -82,12 +81,18 @@ def execute(config: configuration.Sensitivity, beside: configuration.FolderPart)
         folder.write_json("result.json", found.to_json())
         for name, table in found.tables().items():
             folder.write_table(name, table)
-        robot_file.write_robot(
-            file.robot, folder.results() / "robot.toml", note=f"the robot of this study, from {config.robot}"
-        )
         shown = print_report(sensitivity_report.sensitivity_document(found, file), file)
         manifest = {"seed": found.seed, "statuses": found.statuses}
-        return finish_run_folder(folder, config, manifest, solved=found.solved, page=shown, runs=runs)
+        return finish_run_folder(
+            folder,
+            config,
+            manifest,
+            robot=file.robot,
+            note="the robot of this study",
+            solved=found.solved,
+            page=shown,
+            runs=runs,
+        )
 
 
 def _ranges(vary: Names) -> dict[str, tuple[float, float]]:

@@ -6,7 +6,7 @@ import shlex
 
 import numpy as np
 
-from calibration.data import Columns, Json, robot_file, settling
+from calibration.data import Columns, Json, settling
 from calibration.data.settling import Settled
 from calibration.described import sentences
 from calibration.inference import ranges
@@ -15,8 +15,7 @@ from calibration.words import settle_words
 from sweeps import config as configuration
 from sweeps.inputs import load_robot, read_runs
 from sweeps.report import settle_report
-from sweeps.skeleton import finish_run_folder, print_report
-from sweeps.store import open_folder
+from sweeps.store import finish_run_folder, open_folder, print_report
 
 
 def execute(config: configuration.Settle, beside: configuration.SettledLog) -> int:
@@ -35,15 +34,20 @@ def execute(config: configuration.Settle, beside: configuration.SettledLog) -> i
     )
     few = settle_words.too_few(found, SettledRuns.fewest, loop)
     with open_folder("settle", config, robot, beside, runs) as folder:
-        robot_file.write_robot(
-            robot, folder.results() / "robot.toml", note=f"the rig of this log, from {config.robot}"
-        )
         folder.write_table("settled.csv", found.table())
         folder.write_table("stretches.csv", stretches_table(found))
         folder.write_json("result.json", to_json(found, few))
         turned = sentences(ranges.turned_signs(found.settled_runs(), robot))
         shown = print_report(settle_report.settle_document(found, few, turned))
-        return finish_run_folder(folder, config, {"seed": None, "settled": len(found.kept)}, page=shown, runs=runs)
+        return finish_run_folder(
+            folder,
+            config,
+            {"seed": None, "settled": len(found.kept)},
+            robot=robot,
+            note="the rig of this log",
+            page=shown,
+            runs=runs,
+        )
 
 
 def stretches_table(found: Settled) -> Columns:

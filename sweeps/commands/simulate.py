@@ -35,9 +35,7 @@ from sweeps.points.job import showing_turns
 from sweeps.report import runs_report
 from sweeps.report.runs_report import PEAK
 from sweeps.report.words import posture_words
-from sweeps.results import posture_results
-from sweeps.skeleton import print_report
-from sweeps.store import RunFolder, open_folder
+from sweeps.store import RunFolder, open_folder, print_report
 
 _HISTORIES = 1000  # runs of which histories are kept
 _SHOWN = 6  # runs on the console
@@ -75,7 +73,7 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
         seen = showing_turns(robot, runs.axes)
         table, histories = _simulated(folder, seen, runs, config)
         table[PERMISSIBLE] = permissible_durations(robot, table)
-        stands = posture_results.posture_of_runs(robot, runs, run.conditions_of_runs(robot, runs, config))
+        stands = posture_words.posture_of_runs(robot, runs, run.conditions_of_runs(robot, runs, config))
         notes = run_remarks(robot, table) + capabilities.unknown_numbers_sentence(robot)
         further: Json = {"notes": [*file.remarks, *notes]}
         remarks = list(notes)
@@ -112,7 +110,21 @@ def _simulated(
     assert batch.history is not None  # the fidelity was asked for it
     folder.write_table("history.csv", capabilities.without_idle(robot, history_table(robot, batch.history, runs)))
     if batch.history.reactions is not None:
-        folder.write_table("reactions.csv", reactions_table(batch.history, runs))
+        # Loads inside one side's running gear over time [N], a row a sample
+        loads = batch.history.reactions
+        assert loads is not None  # the fidelity resolves them
+        table = {
+            "run_id": np.repeat(_names(runs), batch.history.time.shape[-1]),
+            "time_s": np.ravel(batch.history.time),
+            "guide_N": np.ravel(loads.guided.sum(-1)),
+            "front_N": np.ravel(loads.support[..., 0]),
+            "rear_N": np.ravel(loads.support[..., 1]),
+            "centrifugal_tension_N": np.ravel(loads.centrifugal),
+        }
+        for name in ("grouser", "tension"):
+            values = getattr(loads, name)
+            table |= {f"{name}_{k + 1:02d}_N": values[..., k].ravel() for k in range(values.shape[-1])}
+        folder.write_table("reactions.csv", table)
     return {**run.condition_table(robot, runs), **over_time(robot, batch)}, batch
 
 
@@ -130,7 +142,8 @@ def over_time(robot: Robot, batch: Run) -> Columns:
     last = np.where(finite.any(-1), finite.shape[-1] - 1 - np.argmax(finite[..., ::-1], -1), 0)
     rows = np.arange(len(last))
     motors = float(robot.sides) * np.asarray(history.signals.current)
-    columns[PEAK] = np.maximum(_peaks(jnp.asarray(time), jnp.asarray(np.abs(motors))), 0.0)
+    limit = float(robot.sides) * float(robot.driver.current_limit)
+    columns[PEAK] = np.maximum(_peaks(jnp.asarray(time), jnp.asarray(np.abs(motors)), jnp.asarray(limit)), 0.0)
     columns["displacement_m"], columns["time_end_s"] = np.array(history.distance)[rows, last], time[rows, last]
     empty = (status == BATTERY_EMPTY) & ~finite[rows, -1]
     if empty.any():
@@ -160,8 +173,10 @@ def permissible_durations(robot: Robot, table: Columns) -> np.ndarray:
 
 
 @functools.partial(compiled, options=SELDOM)
-def _peaks(time: Float[Array, "runs samples"], values: Float[Array, "runs samples"]) -> Float[Array, " runs"]:
-    return jax.vmap(curve_peak)(time, values)
+def _peaks(
+    time: Float[Array, "runs samples"], values: Float[Array, "runs samples"], kink: Array
+) -> Float[Array, " runs"]:
+    return jax.vmap(curve_peak, in_axes=(0, 0, None))(time, values, kink)
 
 
 @functools.partial(compiled, options=SELDOM)
@@ -253,21 +268,3 @@ def starts_from_standstill(robot: Robot, batch: Run, runs: records.Runs) -> list
         {"run_id": str(name), **(s.to_json() if s is not None and goes else nothing)}
         for name, s, goes in zip(_names(runs), found, under_way, strict=True)
     ]
-
-
-def reactions_table(history: History, runs: records.Runs) -> Columns:
-    """Loads inside one side's running gear over time [N], a row a sample."""
-    loads = history.reactions
-    assert loads is not None  # the fidelity resolves them
-    table = {
-        "run_id": np.repeat(_names(runs), history.time.shape[-1]),
-        "time_s": np.ravel(history.time),
-        "guide_N": np.ravel(loads.guided.sum(-1)),
-        "front_N": np.ravel(loads.support[..., 0]),
-        "rear_N": np.ravel(loads.support[..., 1]),
-        "centrifugal_tension_N": np.ravel(loads.centrifugal),
-    }
-    for name in ("grouser", "tension"):
-        values = getattr(loads, name)
-        table |= {f"{name}_{k + 1:02d}_N": values[..., k].ravel() for k in range(values.shape[-1])}
-    return table

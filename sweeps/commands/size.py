@@ -21,9 +21,8 @@ from sweeps.inputs import load_robot
 from sweeps.pages import words
 from sweeps.points import imposed
 from sweeps.report import size_report
-from sweeps.results.size_results import SizeResult, describe_design
-from sweeps.skeleton import finish_run_folder, print_report
-from sweeps.store import RunFolder, open_folder
+from sweeps.report.size_report import SizeResult, describe_design
+from sweeps.store import RunFolder, finish_run_folder, open_folder, print_report
 
 
 def execute(config: configuration.Size, beside: configuration.FolderPart) -> int:

@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from calibration.data import Json, profiles, robot_file
+from calibration.data import Json, profiles
 from calibration.data.input_errors import BadConfiguration, InputError
 from calibration.data.robot_file import RobotFile
 from mmrjax.model.signals import STATUSES
-from sweeps import config_campaign, skeleton
+from sweeps import config_campaign
 from sweeps.config import Sweep
 from sweeps.config_campaign import Campaign, StoreOptions
 from sweeps.console import print_message, print_output, progress_bar
@@ -33,7 +33,7 @@ from sweeps.report import campaign_report, sweep_report
 from sweeps.report.document import Column, Table
 from sweeps.report.run_tables import endings_table
 from sweeps.report.terminal_renderer import print_table
-from sweeps.store import DONE, IDENTITY, SOLVER_FAILED, default_path, open_folder
+from sweeps.store import DONE, IDENTITY, SOLVER_FAILED, default_path, finish_run_folder, open_folder, print_report
 
 #: Most runs of which a grid leaves a table, runs.csv; of more it leaves a store, in a tenth of the time and bytes.
 TABLE = 100_000
@@ -79,7 +79,7 @@ def _into_table(config: Sweep, file: RobotFile, options: StoreOptions) -> int:
             notes = uncertainty.interval_ranges(table, found)
             table |= found.columns
         result = run.SimulationResult("sweep", config.model, robot, runs, table)
-        shown = skeleton.print_report(sweep_report.sweep_document(file, config.model, table, notes), file)
+        shown = print_report(sweep_report.sweep_document(file, config.model, table, notes), file)
         return run.write_run_folder(folder, config, result, shown)
 
 
@@ -261,9 +261,6 @@ def finish_sweep(
         with store.last() as left:
             if left:
                 # Write all files of a run folder except the store, then move the store into place
-                robot_file.write_robot(
-                    job.robot, store.results() / "robot.toml", note=f"the robot of this sweep, from {config.robot}"
-                )
                 found = sweep_summary(store.layout, job, store.done().values())
                 store.write_json("result.json", found)
                 manifest = {
@@ -272,7 +269,14 @@ def finish_sweep(
                     "hashes": same["data"],
                 }
                 document = campaign_report.campaign_document(file, store.layout, found, store.partial / STORE)
-                skeleton.finish_run_folder(store, config, manifest, page=skeleton.print_report(document, file))
+                finish_run_folder(
+                    store,
+                    config,
+                    manifest,
+                    robot=job.robot,
+                    note="the robot of this sweep",
+                    page=print_report(document, file),
+                )
     done = store.done()
     if not store.finished:
         print_output(f"{len(done)} of {len(job.blocks)} chunks of {store.partial} are done; the last share "

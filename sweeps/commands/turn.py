@@ -29,9 +29,7 @@ from sweeps.inputs import load_robot, one_run
 from sweeps.points import imposed, run, scale
 from sweeps.report import turn_report
 from sweeps.report.words import posture_words, turn_words
-from sweeps.results import posture_results
-from sweeps.skeleton import print_report
-from sweeps.store import open_folder
+from sweeps.store import open_folder, print_report
 
 #: Duties of the inner side, as shares of the outer one's, over which a settled turn is shown.
 SHARES = np.linspace(1.0, -1.0, 97)
@@ -85,7 +83,7 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
         table = {**run.condition_table(robot, runs), **_columns(robot, shown, asked, first), **own}
         turn = {name: _number(table[name][0]) for name in (q.column for q in quantities.TABLE["turn"])}
         with report_stage(stages, stages, "posture"):
-            stands = posture_results.posture_of_runs(robot, runs, asked)
+            stands = posture_words.posture_of_runs(robot, runs, asked)
         notes = []
         if stands is not None:
             folder.write_table("posture.csv", stands.table)

@@ -433,12 +433,6 @@ def mujoco_module() -> Any:
     return found
 
 
-def compile_scene(files: Mapping[str, str]) -> Any:
-    """Model of a scene and the fragment that it includes, in memory."""
-    assets = {name: text.encode() for name, text in files.items()}
-    return mujoco_module().MjModel.from_xml_string(files["scene.xml"], assets)
-
-
 def settle_in_mujoco(
     files: Mapping[str, str], found: Motor, at: Situation, expected: AtJoint, rows: Sequence[int]
 ) -> AtJoint:
@@ -447,7 +441,9 @@ def settle_in_mujoco(
     Args:
         expected: by the steady law, near which each run begins; rows: which runs.
     """
-    mujoco, model = mujoco_module(), compile_scene(files)
+    # Model of a scene and the fragment that it includes, in memory
+    assets = {name: text.encode() for name, text in files.items()}
+    mujoco, model = mujoco_module(), mujoco_module().MjModel.from_xml_string(files["scene.xml"], assets)
     model.opt.gravity[:] = 0  # an arm's weight is part of the stated load
     data = mujoco.MjData(model)
     current, speed = np.empty(len(rows)), np.empty(len(rows))

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from sweeps.pages.figure_style import FAINT, GREEN, INK, VERMILION, is_narrow, new_figure
-from sweeps.results.check_results import (
+from sweeps.report.check_report import (
     CheckResult,
     reached_value_text,
     required_value_text,

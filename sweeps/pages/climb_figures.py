@@ -27,8 +27,8 @@ from sweeps.pages.figure_style import (
     is_narrow,
     new_figure,
 )
-from sweeps.results.climb_results import SHOWN as IN_TITLE
-from sweeps.results.climb_results import ClimbResult, Seen, footing_coordinates
+from sweeps.report.climb_report import FILMED as IN_TITLE
+from sweeps.report.climb_report import ClimbResult, Seen, footing_coordinates
 
 #: What can be drawn.
 Drawable = ClimbResult | Seen

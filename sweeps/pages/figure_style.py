@@ -199,7 +199,13 @@ def figure_as_svg(fig: Figure) -> str:
     for written in fig.findobj(lambda artist: isinstance(artist, Text)):
         assert isinstance(written, Text)
         written.set_fontsize(max(written.get_fontsize(), least))
-        written.set_color(readable_colour(written.get_color()))
+        # A text's colour, darkened until it can be read on white paper; what is near white is for a dark ground,
+        # and stays
+        colour = written.get_color()
+        channels = np.array(to_rgb(colour))
+        while 1.25 < 1.05 / (_luminance(channels) + 0.05) < CONTRAST:
+            channels = channels * 0.97
+        written.set_color(tuple(channels))
     if (engine := fig.get_layout_engine()) is not None:
         fig.set_dpi(72)  # that of SVG
         engine.execute(fig)
@@ -298,15 +304,6 @@ def _clear_texts(fig: Figure) -> None:
 def _is_number(text: Text) -> bool:
     """True for a number in a cell or a bar, which a table shows too."""
     return re.fullmatch(r"[-−+.\d ]+%?", text.get_text()) is not None
-
-
-def readable_colour(colour: Any) -> Any:
-    """A text's colour, darkened until it can be read on white paper; what is near white is for a dark ground, and
-    stays."""
-    channels = np.array(to_rgb(colour))
-    while 1.25 < 1.05 / (_luminance(channels) + 0.05) < CONTRAST:
-        channels = channels * 0.97
-    return tuple(channels)
 
 
 def _luminance(channels: np.ndarray) -> float:

@@ -149,27 +149,23 @@ def from_standstill(shown: list[Start], current_title: str = "total current", sp
             corner_note(zoom, f"no numbers: {words.short_status(start.status)}", color=VERMILION)
             continue
         colour = look[start.configuration][0]
-        _inrush(zoom, start, colour)
+        peak = int(np.argmax(start.current))
+        early = start.time <= INRUSH
+        zoom.plot(1e3 * start.time[early], start.current[early], color=colour)
+        top = 1.3 * max(float(start.current[early].max()), 1e-3)
+        zoom.set(xlim=(0, 1e3 * INRUSH), ylim=(min(0.0, 1.1 * float(start.current[early].min())), top))
+        zoom.set(xlabel="time [ms]", ylabel="total current [A]")
+        if early[peak]:
+            place = (1e3 * start.time[peak], start.current[peak])
+            zoom.plot(*place, "o", ms=5, color=colour)
+            zoom.annotate(
+                f"peak {start.current[peak]:.3g} A\nat {1e3 * start.time[peak]:.1f} ms", place, xytext=(8, -2),
+                textcoords="offset points", fontsize=8.5, va="top",
+            )  # fmt: skip
+        _stages(zoom, start, 1e3)
         _current(current, start, colour)
         _speeds(speed, start, colour)
     return fig
-
-
-def _inrush(axes: Axes, start: Start, colour: str) -> None:
-    peak = int(np.argmax(start.current))
-    early = start.time <= INRUSH
-    axes.plot(1e3 * start.time[early], start.current[early], color=colour)
-    top = 1.3 * max(float(start.current[early].max()), 1e-3)
-    axes.set(xlim=(0, 1e3 * INRUSH), ylim=(min(0.0, 1.1 * float(start.current[early].min())), top))
-    axes.set(xlabel="time [ms]", ylabel="total current [A]")
-    if early[peak]:
-        place = (1e3 * start.time[peak], start.current[peak])
-        axes.plot(*place, "o", ms=5, color=colour)
-        axes.annotate(
-            f"peak {start.current[peak]:.3g} A\nat {1e3 * start.time[peak]:.1f} ms", place, xytext=(8, -2),
-            textcoords="offset points", fontsize=8.5, va="top",
-        )  # fmt: skip
-    _stages(axes, start, 1e3)
 
 
 def _current(axes: Axes, start: Start, colour: str) -> None:

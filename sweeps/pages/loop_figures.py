@@ -31,8 +31,8 @@ from sweeps.pages.figure_style import (
     new_figure,
 )
 from sweeps.pages.words import short_name
-from sweeps.report.condition_columns import UNITS, imposed_column
 from sweeps.report.fit_tables import Change
+from sweeps.report.run_tables import UNITS, imposed_column
 
 #: Effects on the ladder and on the map of look-alikes.
 RUNGS, ALIKE = 20, 14
@@ -165,9 +165,9 @@ def time_statistics(detail: TimeStatistics, channels: Sequence[Channel], verdict
     grid[0, 0].set_ylabel("autocorrelation of the residual")
     grid[0, 0].legend(loc="best")
     axes = grid[0, count]
-    lines = [*(word for word, _ in detail.before.orders), "drift in time"]
+    lines = [*(word for word, _ in detail.before.orders), *["drift in time"] * (detail.before.drift is not None)]
     for k, (_, side, colour) in enumerate(sides):
-        values = [*(o.explained for o in side.orders.values()), side.drift.explained]
+        values = [o.explained for o in (*side.orders.values(), side.drift) if o]
         place = np.arange(len(lines)) + (k - (len(sides) - 1) / 2) * 0.36
         axes.barh(place, np.sqrt(values), height=0.34, color=colour)
     axes.set_yticks(range(len(lines)), lines, fontsize=8)

@@ -196,7 +196,7 @@ def _source(axes: Axes, time: np.ndarray, rows: Columns) -> None:
         )
 
 
-def draw_mission_energy(run: Json, on_battery: bool) -> Figure:
+def draw_mission_energy(run: Json, on_battery: bool, on_ground: bool = True) -> Figure:
     """Energy of one run by use, in the order of the chain [Wh], and its share of the energy drawn [%].
 
     Args:
@@ -206,8 +206,7 @@ def draw_mission_energy(run: Json, on_battery: bool) -> Figure:
     source = "drawn from the battery's charge" if on_battery else "drawn from the supply"
     bars: list[tuple[str, float, str]] = [(source, drawn, INK)]
     for name in SINKS:
-        label, colour = words.SINKS[name], _COLOURS[name]
-        bars.append((label, float(run[f"energy_to_{name}_Wh"]), colour))
+        bars.append((words.sink_labels(on_ground)[name], float(run[f"energy_to_{name}_Wh"]), _COLOURS[name]))
     bars.append(("left in motion at the end", float(run["energy_stored_Wh"]), FAINT))
     bars.append(("returned to the source", float(run["energy_returned_Wh"]), GREEN))
     bars = [bar for bar in bars if abs(bar[1]) > 1e-5 * max(drawn, 1e-12)]

@@ -13,7 +13,7 @@ from scipy.spatial import ConvexHull
 from mmrjax.climbing.resting_posture import BELTS, FRONT_AXLE, REAR_AXLE, Outline
 from mmrjax.model.quantities import MM
 from sweeps.pages.figure_style import BLUE, INK, ORANGE, VERMILION, colour_bar, new_figure
-from sweeps.results.posture_results import Drawn, Postures, StepMap
+from sweeps.report.words.posture_words import Drawn, Postures, StepMap
 
 _GROUND = "#d9cfbf"
 _ROUND = np.linspace(0.0, 2 * np.pi, 181)

@@ -24,7 +24,7 @@ from sweeps.pages.figure_style import (
     legend_columns,
     new_figure,
 )
-from sweeps.results.resonance_results import ResonanceResult, ripple_percent
+from sweeps.report.resonance_report import ResonanceResult, ripple_percent
 
 ORDERS = 8  # lines of the Campbell diagram
 MAPS = ("reaction", "current", "speed")

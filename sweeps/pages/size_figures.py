@@ -10,7 +10,7 @@ from matplotlib.patches import Patch, Rectangle
 from calibration.sizing.chart import LIMITS, Chart
 from calibration.sizing.design import OBJECTIVES
 from sweeps.pages.figure_style import BLUE, GREEN, INK, ORANGE, PURPLE, SKY, VERMILION, legend_columns, new_figure
-from sweeps.results.size_results import SizeResult
+from sweeps.report.size_report import SizeResult
 
 _COLOURS = dict(zip(LIMITS, (BLUE, "#555555", VERMILION, PURPLE, ORANGE, "#8c564b", SKY, GREEN), strict=True))
 

@@ -15,8 +15,7 @@ from calibration.data import Columns, Json
 from mmrjax.model.channels import Channel
 from sweeps.pages import words
 from sweeps.pages.figure_style import FAINT, INK, axis_label, colour_bar, corner_note, new_figure
-from sweeps.report.condition_columns import UNITS, imposed_column
-from sweeps.report.run_tables import reading_text
+from sweeps.report.run_tables import UNITS, imposed_column, reading_text
 
 _PANELS = 3  # voltages drawn of a configuration
 _CELLS = 12  # along an axis up to which cells are labelled

@@ -119,6 +119,12 @@ SINKS = {
     "lift": "lift (net of what comes back)",
 }  # fmt: skip
 
+
+def sink_labels(on_ground: bool) -> dict[str, str]:
+    """Labels of the uses of energy; a shaft has no tracks."""
+    return SINKS if on_ground else SINKS | {"track": "friction of the load"}
+
+
 #: Words of the pages, for docs/reference/glossary.md.
 GLOSSARY = {
     "balance": "one equation of the model, for instance the voltages along the motor's circuit or the torques at the "

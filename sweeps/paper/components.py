@@ -8,10 +8,24 @@ from matplotlib.figure import Figure
 
 from mmrjax.model.paper_tables import TRACKED, WHEELED
 from mmrjax.model.robot import Robot
-from sweeps.pages.figure_style import FAINT, INK, PURPLE, corner_note, label_end, new_figure
+from sweeps.pages.figure_style import (
+    BLUE,
+    FAINT,
+    GREEN,
+    INK,
+    ORANGE,
+    PURPLE,
+    VERMILION,
+    corner_note,
+    label_end,
+    new_figure,
+)
 from sweeps.pages.words import words_shown
 from sweeps.paper import data
-from sweeps.paper.look import CONFIGURATION, MODEL
+
+CONFIGURATION = {TRACKED: BLUE, WHEELED: VERMILION}
+MODEL = {"nominal": BLUE, "sm1": ORANGE, "sm2": GREEN}
+
 
 #: No load of the maker's sheet of RE30 310007: speed [rpm], current [A].
 SHEET_NO_LOAD = (8810.0, 0.165)

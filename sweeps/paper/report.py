@@ -72,12 +72,15 @@ def _against_the_bench(album: page.Album, robots: dict[str, Robot], rows: dict[s
     if TRACKED in mine.ratio:
         album.add("fig29_model_errors", lambda: run_figures.model_errors(robots, rows))
     errors = error_tables.variant_errors(_variants(name, rows), mine)
+    pick = mine.plain["status"] != "converged"
+    table = mine.conditions
+    shown = (table["configuration"], table["supply_voltage_V"], table["slope_deg"], mine.plain["status"])
     return {
         "answer": error_tables.error_answer(errors),
         "certainty": certainty,
         "errors": errors,
         "raised": data.raised_words(robot, mine.ratio),
-        "sliding": list(zip(*_sliding_rows(mine), strict=True)),
+        "sliding": list(zip(*tuple(column[pick] for column in shown), strict=True)),
         "measured": len(mine.conditions),
     }
 
@@ -96,10 +99,3 @@ def _variants(name: str, rows: dict[str, data.Rows]) -> Columns:
         nominal = rows["nominal"]
         answer["nominal (PM): adhesion raised, its own mass"] = error(nominal.weighed, nominal.measured)[pick]
     return answer | {"the paper's own simulation": simulation_errors.relative_error(mine.paper, mine.measured)}
-
-
-def _sliding_rows(rows: data.Rows) -> tuple[np.ndarray, ...]:
-    pick = rows.plain["status"] != "converged"
-    table = rows.conditions
-    shown = (table["configuration"], table["supply_voltage_V"], table["slope_deg"], rows.plain["status"])
-    return tuple(column[pick] for column in shown)

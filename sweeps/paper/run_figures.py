@@ -26,7 +26,7 @@ from sweeps.pages.figure_style import (
 )
 from sweeps.pages.words import words_shown
 from sweeps.paper import data
-from sweeps.paper.look import CONFIGURATION, MODEL
+from sweeps.paper.components import CONFIGURATION, MODEL
 
 _MODES = {1: (BLUE, "o"), 2: (SKY, "v"), 3: (GREEN, "^"), 4: (VERMILION, "s")}
 

@@ -25,7 +25,6 @@ from mmrjax.climbing.climb_simulation import (
     constant_angles,
 )
 from mmrjax.climbing.footing import PITCH
-from mmrjax.climbing.terrain import Terrain
 from mmrjax.fidelities.variation import STATUS, Axis, Variation
 from mmrjax.model import masses
 from mmrjax.model.conditions import Conditions
@@ -70,17 +69,6 @@ def climb_attributes(obstacle: Obstacle) -> dict[str, Json]:
     del found[VERDICT]["units"]
     found[VERDICT] |= {"flag_values": [*range(len(NAMES))], "flag_meanings": " ".join(NAMES)}
     return found
-
-
-def terrains_of(obstacle: Obstacle, sizes: np.ndarray) -> Terrain:
-    """Terrains of sizes [mm]."""
-    nose, tread = obstacle.nose_mm / 1000, obstacle.tread_mm / 1000
-    make = {
-        "step": lambda s: terrain.single_step(s, nose),
-        "stairs": lambda s: terrain.stairs(s, tread, obstacle.count, nose),
-        "gap": terrain.gap,
-    }
-    return jax.vmap(make[obstacle.kind])(jnp.asarray(sizes) / 1000)
 
 
 def further_variation(obstacle: Obstacle, varied: Columns, robot: Robot, where: str) -> dict[str, float]:
@@ -156,8 +144,15 @@ def compute_climbs(
     sequence = _sequences(obstacle, robot, at, points)
 
     def run(sizes: np.ndarray, told: Callable[[float], None]) -> Climb:
+        # Terrains of sizes [mm]
+        nose, tread = obstacle.nose_mm / 1000, obstacle.tread_mm / 1000
+        make = {
+            "step": lambda s: terrain.single_step(s, nose),
+            "stairs": lambda s: terrain.stairs(s, tread, obstacle.count, nose),
+            "gap": terrain.gap,
+        }
         return climb_batch(
-            robot, at, terrains_of(obstacle, sizes), sequence,
+            robot, at, jax.vmap(make[obstacle.kind])(jnp.asarray(sizes) / 1000), sequence,
             duration=obstacle.duration_s, step=obstacle.time_step_s, sample=SAMPLE, record=not obstacle.find,
             progress=told,
         )  # fmt: skip

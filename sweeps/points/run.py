@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from calibration.data import Columns, Json, robot_file
+from calibration.data import Columns, Json
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.runs import Runs
 from calibration.inference import observers
@@ -25,7 +25,7 @@ from mmrjax.model.conditions import Conditions
 from mmrjax.model.power import COULOMB_PER_MAH
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import FLAGS, STATUSES
-from sweeps import capabilities, skeleton
+from sweeps import capabilities
 from sweeps import config as configuration
 from sweeps.config import FidelityPart, Part, SupplyPart
 from sweeps.console import progress_bar as bar
@@ -35,8 +35,7 @@ from sweeps.points.axes import Plan
 from sweeps.points.sampled_design import Blocks, Drawn
 from sweeps.points.scale import Job
 from sweeps.points.tasks import of_fidelity
-from sweeps.skeleton import Page
-from sweeps.store import RunFolder
+from sweeps.store import Page, RunFolder, finish_run_folder
 
 Table = Columns
 
@@ -228,11 +227,15 @@ def write_run_folder(
         folder: of the command; config: its configuration, with the robot's name; page: its page.
     """
     folder.write_table("runs.csv", capabilities.without_idle(result.robot, result.table))
-    robot_file.write_robot(
-        result.robot, folder.results() / "robot.toml", note=f"the robot of this run, from {config.robot}"
-    )
     folder.write_json("result.json", result.to_json())
     manifest = {"seed": None, "statuses": result.statuses}
-    return skeleton.finish_run_folder(
-        folder, config, manifest, solved=words.every_run_solved(result.statuses), page=page, runs=result.runs
+    return finish_run_folder(
+        folder,
+        config,
+        manifest,
+        robot=result.robot,
+        note="the robot of this run",
+        solved=words.every_run_solved(result.statuses),
+        page=page,
+        runs=result.runs,
     )

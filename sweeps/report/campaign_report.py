@@ -19,8 +19,8 @@ from sweeps.pages import words
 from sweeps.points.climbs import LARGEST, SIZE, VERDICT
 from sweeps.points.zarr_store import STORE, Layout
 from sweeps.report import catalogue, run_tables
+from sweeps.report.climb_report import VERDICTS
 from sweeps.report.document import Block, Column, Document, Figure, Note, Section, Table
-from sweeps.results.climb_results import VERDICTS
 
 #: Points, and chunks that they come from, that figures and quantiles are made of; outputs that are drawn.
 THINNED, CHUNKS, DRAWN = 200_000, 100, 6

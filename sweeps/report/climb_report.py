@@ -2,13 +2,252 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import csv
+import dataclasses
+import functools
+import json
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
 
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from calibration.data import Columns, Json, Names, robot_file
+from calibration.data.input_errors import BadConfiguration
 from calibration.data.robot_file import RobotFile
-from mmrjax.climbing.climb_derivatives import OUTPUTS
+from mmrjax.climbing.climb_derivatives import OUTPUTS, ClimbInputs, Derivatives, outputs_of_run
+from mmrjax.climbing.climb_simulation import LOSSES, NAMES, OVER, SOURCES, Climb
+from mmrjax.climbing.footing import FRONT, PITCH, REAR, SHAFT
+from mmrjax.climbing.terrain import Terrain
+from mmrjax.model.robot import Robot
 from sweeps.report import catalogue, run_tables
 from sweeps.report.document import Block, Document, Note, Section, Table
-from sweeps.results.climb_results import VERDICTS, Along, ClimbResult
+
+#: Verdicts in words.
+VERDICTS: dict[str, tuple[str, str]] = {
+    "over": ("gets over", "the rear axle is past the obstacle and a wheel's radius beyond"),
+    "tips": ("tips over", "the robot pitched by more than 100 deg"),
+    "stalls": ("stalls", "it comes no further and its tracks stand: the motors cannot turn them"),
+    "slides": ("slides", "it comes no further and its tracks run on: the ground does not hold them"),
+    "hangs": ("hangs", "it comes no further with its body on an edge, or has fallen into a gap"),
+    "unfinished": ("is under way", "the time was over while it still went on; take a longer --duration"),
+    "failed": ("failed", "numbers of the run went wrong, or its levers would begin below the ground"),
+}
+
+
+#: Columns of `history.csv` that are the coordinates, and others that a film shows.
+COORDINATES = ("x_mm", "z_mm", "pitch_deg", "shaft_deg", "front_deg", "rear_deg")
+FILMED = ("time_s", "traction_current_A")
+
+
+def footing_coordinates(table: Columns) -> np.ndarray:
+    """Coordinates of `mmrjax.climbing.footing` at every sample of a history, (samples, 6)."""
+    x, z, pitch, shaft, front, rear = (table[name] for name in COORDINATES)
+    turned = np.radians([-pitch, shaft, front, 180 - rear])
+    return np.stack([x / 1000, z / 1000, *turned], axis=1)
+
+
+@dataclasses.dataclass(frozen=True)
+class Along:
+    """Variables of derivatives.
+
+    Attributes:
+        names, units: of the values; values, widths: in these units; given: the run that such values make.
+    """
+
+    names: Names
+    units: Names
+    values: Array
+    widths: Array
+    given: Callable[[Array], ClimbInputs]
+
+    @property
+    def rows(self) -> list[tuple[str, str, float, float]]:
+        """Name, unit, value and width of each."""
+        return list(zip(self.names, self.units, self.values.tolist(), self.widths.tolist(), strict=True))
+
+
+@dataclasses.dataclass(frozen=True)
+class Seen:
+    """Drawn part of a `ClimbResult`, read from its run folder."""
+
+    robot: Robot
+    configuration: str
+    obstacle: str
+    terrain: Terrain
+    table: Columns
+
+    @staticmethod
+    def read(folder: Path) -> Seen:
+        """Of a folder of `mmrjax climb`.
+
+        Raises:
+            BadConfiguration: it is none.
+        """
+        try:
+            found = json.loads((folder / "result.json").read_text("utf-8"))
+            ground = found["terrain"]
+            with (folder / "history.csv").open(newline="", encoding="utf-8") as stream:
+                rows = list(csv.DictReader(stream))
+            table = {name: np.array([float(row[name]) for row in rows]) for name in (*COORDINATES, *FILMED)}
+            lengths = (jnp.asarray(ground[name]) / 1000 for name in ("points_mm", "nose_mm", "finish_mm"))
+            return Seen(
+                robot_file.find_robot_file(str(folder / "robot.toml")).robot,
+                found["configuration"], found["obstacle"], Terrain(*lengths), table,
+            )  # fmt: skip
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise BadConfiguration(f"--climb: {folder} cannot be read; expected a folder of mmrjax climb") from error
+
+
+@dataclasses.dataclass(frozen=True)
+class ClimbResult:
+    """Result of `climb`.
+
+    Attributes:
+        robot, configuration, obstacle: of the run; the last in words.
+        terrain: of the run that is shown; climb: that run, alone.
+        radius: of the pulleys [m].
+        tried: sizes [mm] and verdicts of a search; largest: that it got over [mm], None: no search or none.
+        sought: name of the searched size; empty: no search.
+        along, derivatives: if requested, else None.
+    """
+
+    robot: Robot
+    configuration: str
+    obstacle: str
+    terrain: Terrain
+    climb: Climb
+    tried: tuple[tuple[float, str], ...] = ()
+    largest: float | None = None
+    sought: str = ""
+    along: Along | None = None
+    derivatives: Derivatives | None = None
+
+    @property
+    def verdict(self) -> str:
+        """Outcome of the run shown."""
+        return NAMES[int(self.climb.verdict[0])]
+
+    @property
+    def over(self) -> bool:
+        """True if it got over."""
+        return int(self.climb.verdict[0]) == OVER
+
+    @functools.cached_property
+    def table(self) -> Columns:
+        """The run over time."""
+        r: Any = self.climb.run(0)
+        q, v = r.motion.q, r.motion.v
+        energy = {f"{name}_J": r.energy[name] for name in (*SOURCES, *LOSSES)}
+        sides = float(self.robot.sides)
+        radius = float(self.robot.radius_pulley)
+        return {
+            "time_s": r.time,
+            "x_mm": 1000 * q[:, 0],
+            "z_mm": 1000 * q[:, 1],
+            "pitch_deg": -np.degrees(q[:, PITCH]),
+            "shaft_deg": np.degrees(q[:, SHAFT]),
+            "front_deg": np.degrees(q[:, FRONT]),
+            "rear_deg": 180 - np.degrees(q[:, REAR]),
+            "speed_mm_s": 1000 * np.hypot(v[:, 0], v[:, 1]),
+            "belt_mm_s": 1000 * radius * v[:, SHAFT],
+            "traction_current_A": r.current,
+            "front_current_A": r.lever_current[:, 0],
+            "rear_current_A": r.lever_current[:, 1],
+            "motors_current_A": r.total_current,
+            "front_voltage_V": r.lever_voltage[:, 0],
+            "rear_voltage_V": r.lever_voltage[:, 1],
+            "front_holds": r.holds[:, 0],
+            "rear_holds": r.holds[:, 1],
+            "front_torque_Nm": r.torque[:, 0],
+            "rear_torque_Nm": r.torque[:, 1],
+            "margin_mm": 1000 * r.margin,
+            "reaction_N": sides * r.normal,
+            "body_share": r.body,
+            **energy,
+            "stored_J": r.stored - r.stored[0],
+        }
+
+    @property
+    def margins(self) -> dict[str, float]:
+        """Margins of the run, shares by the names of `OUTPUTS`; none of a run without numbers."""
+        if self.verdict == "failed":
+            return {}
+        found = outputs_of_run(self.robot, self.terrain, self.climb, 0)
+        return {name: float(value) for name, value in found.items() if name.startswith("margin_")}
+
+    @property
+    def slopes(self) -> list[Json] | None:
+        """Derivatives, a row an output and value that it is derived by; None: not asked for."""
+        along, found = self.along, self.derivatives
+        if along is None or found is None:
+            return None
+        by = ("by", "by_unit", "by_value", "by_width")
+        names = ("output", "unit", "value", *by, "derivative", "slope", "slope_sd")
+        found_by = {name: (found.by[name], found.slope[name], found.slope_sd[name]) for name in OUTPUTS}
+        return [
+            dict(zip(names, (n, unit, found.found[n], *row, *(float(x[k]) for x in found_by[n])), strict=True))
+            for n, (unit, _) in OUTPUTS.items()
+            for k, row in enumerate(along.rows)
+        ]
+
+    def statement(self) -> str:
+        """The answer in a sentence."""
+        if self.sought:
+            if self.largest is None:
+                smallest = min(size for size, _ in self.tried)
+                return f"It gets over no {self.sought} that was tried, the smallest of {smallest:.0f} mm."
+            beyond = [(s, v) for s, v in self.tried if s > self.largest]
+            least = min(beyond, default=None)
+            why = "" if least is None else f"; at {least[0]:.0f} mm it {VERDICTS[least[1]][0]}"
+            return f"The largest {self.sought} that it gets over is {self.largest:.0f} mm{why}."
+        short, meaning = VERDICTS[self.verdict]
+        return f"The robot {short}: {self.obstacle}" + ("." if self.over else f"; {meaning}.")
+
+    def numbers(self) -> dict[str, float]:
+        """Largest and final numbers of the run that is shown."""
+        t = self.table
+        levers, tracks = (float(t[name][-1] - t[name][0]) for name in ("levers_J", "supply_J"))
+        return {
+            "time_s": float(t["time_s"][-1]),
+            "furthest_mm": float(1000 * self.climb.furthest[0]),
+            "pitch_most_deg": float(t["pitch_deg"].max()),
+            "pitch_least_deg": float(t["pitch_deg"].min()),
+            "margin_least_mm": float(np.fmin.reduce(t["margin_mm"])),
+            "traction_current_most_A": float(np.abs(t["traction_current_A"]).max()),
+            "front_current_most_A": float(np.abs(t["front_current_A"]).max()),
+            "rear_current_most_A": float(np.abs(t["rear_current_A"]).max()),
+            "front_torque_most_Nm": float(np.abs(t["front_torque_Nm"]).max()),
+            "rear_torque_most_Nm": float(np.abs(t["rear_torque_Nm"]).max()),
+            "front_voltage_most_V": float(np.abs(t["front_voltage_V"]).max()),
+            "rear_voltage_most_V": float(np.abs(t["rear_voltage_V"]).max()),
+            "energy_levers_J": levers,
+            "energy_J": tracks + levers,
+        }
+
+    def to_json(self) -> Json:
+        """`result.json`."""
+        return {
+            "schema": "mmrjax.climb/1",
+            "statement": self.statement(),
+            "configuration": self.configuration,
+            "obstacle": self.obstacle,
+            "terrain": {
+                "points_mm": (1000 * np.asarray(self.terrain.points)).tolist(),
+                "nose_mm": 1000 * float(self.terrain.nose),
+                "finish_mm": 1000 * float(self.terrain.finish),
+            },
+            "verdict": self.verdict,
+            "sought": self.sought or None,
+            "largest_mm": self.largest,
+            "tried": [{"size_mm": size, "verdict": verdict} for size, verdict in self.tried],
+            "run": self.numbers(),
+            "margins": self.margins,
+            "derivatives": self.slopes,
+        }
+
 
 #: Outputs whose derivatives the terminal shows.
 SHOWN = ("margin_success", "crest_time_s", "crest_energy_J", "crest_current_rms_A")

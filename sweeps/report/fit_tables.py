@@ -11,8 +11,8 @@ from calibration.data import Columns
 from calibration.inference.residual_clusters import ResidualCluster
 from mmrjax.model.channels import Channel
 from sweeps.report import catalogue, run_tables
-from sweeps.report.condition_columns import condition_formats
 from sweeps.report.document import Cell, Column, Section, Table, remarks
+from sweeps.report.run_tables import condition_formats
 
 #: Names of fits that rms errors are of.
 FITS = {

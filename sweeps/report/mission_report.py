@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections import Counter
 from collections.abc import Iterable
 
 import numpy as np
 
-from calibration.data import Columns, Json
-from calibration.data.profiles import CONTROLLED, YAW_RATE
+from calibration.data import Columns, Json, profiles
+from calibration.data.profiles import CONTROLLED, YAW_RATE, ProfileTable
 from calibration.data.robot_file import RobotFile
 from mmrjax.errors import count_noun
+from mmrjax.missions import mission_batch
 from mmrjax.missions.profile import PAIRS
 from mmrjax.model import channels
 from mmrjax.model.energy import SINKS
@@ -23,7 +25,50 @@ from sweeps.report import catalogue, run_tables
 from sweeps.report.document import Block, Column, Document, Note, Section, Table, columns, remarks
 from sweeps.report.run_tables import quantity_column
 from sweeps.report.runs_report import run_headings
-from sweeps.results.mission_results import Missions
+
+
+@dataclasses.dataclass(frozen=True)
+class Missions:
+    """Runs over one profile, as tables.
+
+    Attributes:
+        table: a row a run, `runs.csv`; segments: a row a segment, `segments.csv`; course: a row an accepted step that
+            is kept, `history.csv`.
+        source: the profile that they follow.
+        whole: whether the course of every run reaches its end.
+    """
+
+    table: Columns
+    segments: Columns
+    course: Columns
+    source: ProfileTable
+    whole: bool
+
+    def to_json(self) -> Json:
+        """Content of `result.json`: for one run its numbers by name, for several a list of them."""
+        each = [self._one(k) for k in range(len(self.table["status"]))]
+        about = {
+            "name": self.source.source, "sha256": self.source.digest, "duration_s": self.source.duration,
+            "segments": self.source.segments, "cycles": self.source.cycles,
+            "between_rows": profiles.BETWEEN[self.source.linear],
+        }  # fmt: skip
+        return {"profile": about, **(each[0] if len(each) == 1 else {"missions": each})}
+
+    def _one(self, row: int) -> Json:
+        to = {name: f"energy_to_{name}_Wh" for name in SINKS}
+        numbers = {
+            c: float(self.table[c][row])
+            for c in mission_batch.mission_columns(self.source.turns)
+            if c not in to.values()
+        }
+        flags = str(self.table["flags"][row])
+        return {
+            **numbers,
+            "energy_by_where_Wh": {name: float(self.table[column][row]) for name, column in to.items()},
+            "status": str(self.table["status"][row]),
+            "flags_raised": flags.split(";") if flags else [],
+        }
+
 
 #: Segments of a cycle that a page has room for.
 SEGMENTS = 60
@@ -43,6 +88,7 @@ def missions_document(file: RobotFile, found: Missions) -> Document:
     table, source = found.table, found.source
     shown = capabilities.without_idle(file.robot, table)
     first, names = {key: value[0] for key, value in table.items()}, _names(table)
+    answer = mission_answer({key: value[0] for key, value in shown.items()}, file.robot.has_ground)
     fed = "battery" if np.isfinite(first["state_of_charge"]) else "supply"
     cycles, each = (f", {source.cycles} cycles", " each") if source.cycles > 1 else ("", "")
     between = "linear" if source.linear else "held"
@@ -58,7 +104,7 @@ def missions_document(file: RobotFile, found: Missions) -> Document:
     whole = len(names) == 1 and first["status"] == "converged"
     return Document(
         f"Mission {source.source}" + ("" if len(names) > 1 else f" of {names[0]}"),
-        mission_answer(first),
+        answer,
         (
             run_tables.lead_note(file, more=detail),
             Note(lead, terminal=True),
@@ -67,11 +113,11 @@ def missions_document(file: RobotFile, found: Missions) -> Document:
             *([] if whole else [endings]),
             *remarks(_charge_left(table)),
         ),
-        page_sections=lambda: _sections(file.robot, found, first),
+        page_sections=lambda: _sections(file.robot, found, first, answer),
     )
 
 
-def _sections(robot: Robot, found: Missions, first: Json) -> Iterable[Section]:
+def _sections(robot: Robot, found: Missions, first: Json, answer: str) -> Iterable[Section]:
     """The first run over time, from above, its energy and its segments."""
     source, name, limit = found.source, found.segments["run_id"][0], float(robot.motor.temperature_limit)
     mine = found.course["run_id"] == name
@@ -90,7 +136,9 @@ def _sections(robot: Robot, found: Missions, first: Json) -> Iterable[Section]:
         f"{_NO_RETURN}; what driven motors give feeds the other consumers first." if on_battery else f"{_NO_RETURN}."
     )  # fmt: skip
     asked = "battery's charge" if on_battery else "supply", returned, abs(first["unaccounted_share"])
-    energy = catalogue.figure("mission.energy", first, on_battery, finding=mission_answer(first), words=asked)
+    energy = catalogue.figure(
+        "mission.energy", first, on_battery, robot.has_ground, finding=answer, words=asked
+    )  # fmt: skip
     yield Section("Where the energy goes", (energy,), "energy-section")
     yield Section(
         "Segments", (_segments(found, name, capabilities.idle_columns(robot)), catalogue.note("mission.settles")),
@@ -115,14 +163,15 @@ def _names(runs: Columns) -> list[str]:
     return [", ".join([head, *(p for p in rest if not p.startswith("nan"))]) for head, *rest in parts]
 
 
-def mission_answer(run: Json) -> str:
+def mission_answer(run: Json, on_ground: bool = True) -> str:
     """One sentence: energy of the mission, its largest shares, and how long the battery lasts."""
     drawn = float(run["energy_drawn_Wh"])
     text = f"The mission takes {float(run['energy_Wh']):.3g} Wh"
     if np.isfinite(run.get("distance_m", np.nan)) and run["distance_m"] > 0:
         text += f" over {run['distance_m']:.0f} m"
     if drawn > 0:
-        shares = {words.SINKS[name]: float(run[f"energy_to_{name}_Wh"]) / drawn for name in SINKS}
+        labels = words.sink_labels(on_ground)
+        shares = {labels[name]: float(run[f"energy_to_{name}_Wh"]) / drawn for name in SINKS}
         largest = sorted(shares, key=lambda label: -shares[label])[:2]
         parts = [f"{label} {100 * shares[label]:.0f} %" for label in largest if shares[label] > 0]
         text += f" ({', '.join(parts)})"

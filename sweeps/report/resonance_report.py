@@ -2,16 +2,293 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Iterable
+from typing import Any
+
 import numpy as np
 
+from calibration.data import Columns, Json
 from calibration.data.robot_file import RobotFile
 from mmrjax.errors import count_noun
 from mmrjax.model.quantities import MM
-from mmrjax.undercarriage.ripple_peaks import MATTERS, PERIODS, SIGNALS, TAIL, strongest_resonances
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import STATUSES
+from mmrjax.undercarriage.modes import Mode
+from mmrjax.undercarriage.ripple_peaks import (
+    MATTERS,
+    PERIODS,
+    SIGNALS,
+    TAIL,
+    Crossing,
+    Passing,
+    Peak,
+    Resonance,
+    group_resonances,
+    strongest_resonances,
+)
 from sweeps.pages import words
 from sweeps.report import catalogue, run_tables
 from sweeps.report.document import Cell, Document, Section, Table, remarks
-from sweeps.results.resonance_results import SLOW, ResonanceResult
+
+SAID = 3  # ranges to avoid in a sentence
+
+
+#: Status of a run that is too slow for its ripple to be read.
+SLOW = "too_slow"
+
+
+@dataclasses.dataclass(frozen=True)
+class ResonanceResult:
+    """Result of `resonance`.
+
+    Attributes:
+        configuration, slope_deg, surface: of the map; passing: source of the excitation; robot: that was simulated.
+        table: a row a run, as in `points.csv`; the grid's first, then further points of Table 8.
+        modes: by payload [kg].
+        peaks, crossings: at every payload.
+    """
+
+    configuration: str
+    slope_deg: float
+    surface: str
+    passing: Passing
+    robot: Robot
+    table: Columns
+    modes: dict[float, list[Mode]]
+    peaks: list[Peak]
+    crossings: list[Crossing]
+
+    @property
+    def resonances(self) -> list[Resonance]:
+        """Peaks over the payloads; those without a mode are confirmed by none."""
+        return group_resonances(self.peaks)
+
+    @property
+    def read(self) -> np.ndarray:
+        """Rows whose ripple is read."""
+        return np.isfinite(self.table["reaction_ripple_percent"])
+
+    @property
+    def speeds(self) -> tuple[float, float]:
+        """Least and greatest speed read [m/s]; NaN without a reading."""
+        speed = self.table["speed_mean_mm_s"][self.read] * MM
+        return (float(speed.min()), float(speed.max())) if len(speed) else (float("nan"), float("nan"))
+
+    @property
+    def statuses(self) -> dict[str, int]:
+        """Number of runs by status; every status is included."""
+        return {s: int(np.sum(self.table["status"] == s)) for s in (*STATUSES, SLOW)}
+
+    @property
+    def avoid(self) -> list[tuple[float, float, list[Resonance]]]:
+        """Ranges of speed to avoid [m/s], lowest first, each of one mode and order, with what shows it."""
+        found: dict[tuple[str, int], list[Resonance]] = {}
+        for r in strongest_resonances(self.resonances):
+            found.setdefault((r.mode, r.order), []).append(r)
+        ranges = [
+            (min(r.avoid[0] for r in members), max(r.avoid[1] for r in members), members)
+            for members in found.values()
+        ]
+        return sorted(ranges, key=lambda x: x[0])
+
+    @property
+    def restless(self) -> list[tuple[float, float]]:
+        """Ranges of speed in which some run did not settle [m/s], each half way to the next run that did."""
+        ranges = []
+        speed = self.travel * MM
+        for payload in self.modes:
+            rows = np.flatnonzero((self.table["payload_kg"] == payload) & np.isfinite(speed))
+            rows = rows[np.argsort(speed[rows])]
+            x = speed[rows]
+            edges = np.concatenate([x[:1], (x[1:] + x[:-1]) / 2, x[-1:]])
+            bad = self.table["status"][rows] != "converged"
+            ranges += [(edges[k], edges[k + 1]) for k in np.flatnonzero(bad)]
+        return _merged(ranges)
+
+    @property
+    def travel(self) -> np.ndarray:
+        """Speed of every run [mm/s]; where it has none, as its voltage has it in the others (NaN: in none)."""
+        speed, voltage = self.table["speed_mean_mm_s"], self.table["supply_voltage_V"]
+        if self.read.sum() < 2:
+            return speed
+        line = np.polyfit(voltage[self.read], speed[self.read], 1)
+        return np.where(self.read, speed, np.polyval(line, voltage))
+
+    @property
+    def quiet(self) -> list[tuple[float, float]]:
+        """Ranges of speed without peaks to avoid, at any payload, where every run settles [m/s]."""
+        low, high = self.speeds
+        gaps = []
+        for begin, end in _merged([*((a, b) for a, b, _ in self.avoid), *self.restless]):
+            if begin > low:
+                gaps.append((low, min(begin, high)))
+            low = max(low, end)
+        return [*gaps, (low, high)] if low < high else gaps
+
+    def statement(self) -> str:
+        """Speeds to avoid, in one sentence."""
+        return " ".join(self.sentences)
+
+    @property
+    def sentences(self) -> list[str]:
+        """Sentences on speeds to avoid, the most important first."""
+        low, high = self.speeds
+        if not np.isfinite(low):
+            return [f"No run of {self.configuration} travels: there is no ripple to read (status says why)."]
+        parts = []
+        named, bare = ([r for r in self.avoid if bool(r[2][0].mode) is has] for has in (True, False))
+        if named:
+            loads = "" if len(self.modes) == 1 else "at one payload or another: "
+            parts.append(f"Avoid {loads}{_listed(named, self.passing.name)}.")
+        elif not bare:
+            largest = ", ".join(f"{s.label} {ripple_percent(self._largest(n))}" for n, s in SIGNALS.items())
+            parts.append(
+                f"No speed to avoid for its ripple between {span_text(low, high)} mm/s: nothing peaks at a natural "
+                f"frequency (largest ripple: {largest})."
+            )
+        if bare:
+            also = "Ripple also peaks" if named else "Ripple peaks"
+            parts.append(f"{also}, with no natural frequency to name, at {_listed(bare, self.passing.name)}.")
+        for name, lowest, highest in self._spread():
+            parts.append(
+                f"{name.capitalize()} has no one frequency: {span_text(lowest, highest, 1)} Hz over the "
+                "belt's position."
+            )
+        if self.restless:
+            spans = ", ".join(span_text(*x) for x in self.restless)
+            parts.append(f"Not every run settles at {spans} mm/s.")
+        if self.avoid or self.restless:
+            free = ", ".join(span_text(*x) for x in self.quiet)
+            parts.append(f"Free of all this: {free} mm/s." if free else "No speed is free of all this.")
+        if self._table8():
+            parts.append(self._table8())
+        if self.passing.name == "teeth":
+            parts.append(
+                f"This configuration has no grousers on the ground; what passes are the belt's teeth, every "
+                f"{self.passing.travel / MM:.2f} mm of travel."
+            )
+        return parts
+
+    def _largest(self, signal: str) -> float:
+        return float(np.nanmax(self.table[f"{signal}_ripple_percent"]))
+
+    def _spread(self) -> list[tuple[str, float, float]]:
+        """Modes that amplify but change by an octave with the position of the belt, with their range [Hz]."""
+        every = [m for modes in self.modes.values() for m in modes if m.amplifies and not m.resonant]
+        names = dict.fromkeys(m.name for m in every)
+        return [
+            (n, min(m.low for m in every if m.name == n), max(m.high for m in every if m.name == n)) for n in names
+        ]
+
+    def _table8(self) -> str:
+        """Sentence on the points of Table 8 in a range to avoid, by payload."""
+        rows = np.flatnonzero(self.table["table8"] & self.read)
+        inside = []
+        for voltage in np.unique(self.table["supply_voltage_V"][rows]):
+            found = rows[self.table["supply_voltage_V"][rows] == voltage]
+            hit = [k for k in found if self.shaken(k)]
+            if hit:
+                loads = ", ".join(f"{self.table['payload_kg'][k]:g}" for k in hit)
+                inside.append(f"{voltage:g} V with {'every payload' if len(hit) == len(found) else loads + ' kg'}")
+        return (
+            f"Of Table 8 at {self.slope_deg:g}°, affected at their own payload: {'; '.join(inside)}."
+            if inside
+            else ""
+        )
+
+    def shaken(self, row: int | np.integer[Any]) -> bool:
+        """True if a run is within one of the strongest peaks of its own payload."""
+        speed, payload = self.table["speed_mean_mm_s"][row] * MM, self.table["payload_kg"][row]
+        strong = {(r.mode, r.order, r.signal) for r in strongest_resonances(self.resonances)}
+        return any(
+            p.low <= speed <= p.high
+            for p in self.peaks
+            if p.payload == payload and (p.mode, p.order, p.signal) in strong
+        )
+
+    def to_avoid(self, row: int | np.integer[Any]) -> str:
+        """Verdict on the speed of a run: avoid (`yes`), avoid `at other payloads` than its own, or `no`."""
+        speed = self.table["speed_mean_mm_s"][row] * MM
+        within = any(low <= speed <= high for low, high, _ in self.avoid)
+        return "yes" if self.shaken(row) else "at other payloads" if within else "no"
+
+    def to_json(self) -> Json:
+        """`result.json`."""
+        return {
+            "schema": "mmrjax.resonance/1",
+            "statement": self.statement(),
+            "configuration": self.configuration,
+            "slope_deg": self.slope_deg,
+            "surface": self.surface,
+            "passing": {"of": self.passing.name, "pitch_m": self.passing.pitch, "travel_m": self.passing.travel},
+            "runs": len(self.table["status"]),
+            "statuses": self.statuses,
+            "speeds_m_s": self.speeds,
+            "modes": [
+                {"payload_kg": payload, **m._asdict(), "resonant": m.resonant}
+                for payload, members in self.modes.items()
+                for m in members
+            ],
+            "peaks": [p._asdict() for p in self.peaks],
+            "crossings": [c._asdict() for c in self.crossings],
+            "resonances": [r._asdict() for r in self.resonances],
+            "avoid": [
+                {"low_m_s": low, "high_m_s": high, "mode": members[0].mode, "order": members[0].order,
+                 "ripple": {r.signal: r.ripple for r in members}, "rise": {r.signal: r.rise for r in members}}
+                for low, high, members in self.avoid
+            ],
+            "quiet_m_s": self.quiet,
+            "restless_m_s": self.restless,
+            "table8": [
+                {
+                    "supply_voltage_V": self.table["supply_voltage_V"][k].item(),
+                    "payload_kg": self.table["payload_kg"][k].item(),
+                    "speed_mean_mm_s": self.table["speed_mean_mm_s"][k].item(),
+                    "status": str(self.table["status"][k]),
+                    "in_a_peak": self.shaken(k),
+                    "to_avoid": self.to_avoid(k),
+                }
+                for k in np.flatnonzero(self.table["table8"])
+            ],
+        }  # fmt: skip
+
+
+def _merged(ranges: Iterable[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Ranges as few that do not overlap, lowest first."""
+    found: list[tuple[float, float]] = []
+    for low, high in sorted(ranges):
+        if found and low <= found[-1][1]:
+            found[-1] = found[-1][0], max(found[-1][1], high)
+        else:
+            found.append((low, high))
+    return found
+
+
+def ripple_percent(value: float) -> str:
+    """A ripple [%] as a sentence has it."""
+    return "under 0.01 %" if value < 0.01 else f"{value:.0f} %" if value >= 10 else f"{value:.2g} %"
+
+
+def _listed(ranges: list[tuple[float, float, list[Resonance]]], what: str) -> str:
+    """Ranges to avoid, the lowest speed first; only the strongest if there are many."""
+    most = sorted(ranges, key=lambda r: -max(x.rise for x in r[2]))[:SAID]
+    texts = []
+    for low, high, members in sorted(most, key=lambda r: r[0]):
+        first, last = min(r.frequencies[0] for r in members), max(r.frequencies[1] for r in members)
+        meets = f"{members[0].mode} at {span_text(first, last, 1)} Hz meets " if members[0].mode else ""
+        order = f"{members[0].order} × {what}" if members[0].order else f"{span_text(first, last, 1)} Hz"
+        how = ", ".join(f"{SIGNALS[r.signal].label} {ripple_percent(100 * r.ripple)}" for r in members)
+        texts.append(f"{span_text(low, high)} mm/s ({meets}{order}; ripple up to: {how})")
+    more = f"; {len(ranges) - len(most)} more on the map" if len(ranges) > len(most) else ""
+    return "; ".join(texts) + more
+
+
+def span_text(low: float, high: float, unit: float = MM) -> str:
+    """`low-high` in a unit, or one number if both print the same."""
+    ends = f"{low / unit:.0f}", f"{high / unit:.0f}"
+    return ends[0] if ends[0] == ends[1] else f"{ends[0]}-{ends[1]}"
+
 
 _FEW = "travels, but fewer than {} {} passed while ripple was read; take a longer --duration"
 #: Most peaks that are shown unfolded.
@@ -28,6 +305,12 @@ def resonance_document(found: ResonanceResult, file: RobotFile) -> Document:
     endings = run_tables.endings_table(found.statuses, meanings={SLOW: _FEW.format(PERIODS, passing.name)})
     peaks, ended = _peaks(found), catalogue.note("resonance.ended", 100 * TAIL)
     folded = count_noun(len(peaks.rows), "peak") if len(peaks.rows) > UNFOLDED else ""
+    rows = []
+    for payload, modes in found.modes.items():
+        for m in modes:
+            low_high = f"{m.low:.1f} to {m.high:.1f}"
+            numbers = (m.frequency, low_high, m.natural, m.damping, 100 * m.share, 100 * m.positions)
+            rows.append((payload, m.name, *(Cell(x, "" if m.resonant else "none") for x in numbers)))
     return Document(
         "Which speeds to avoid",
         first,
@@ -37,7 +320,11 @@ def resonance_document(found: ResonanceResult, file: RobotFile) -> Document:
             figure if found.read.any() else catalogue.note("resonance.still"),
         ),
         (
-            Section("Natural frequencies", (catalogue.note("resonance.modes"), _modes(found)), "modes"),
+            Section(
+                "Natural frequencies",
+                (catalogue.note("resonance.modes"), catalogue.table("resonance.frequencies", rows)),
+                "modes",
+            ),
             Section(
                 "Peaks of ripple over speed",
                 (catalogue.note("resonance.peaks", passing.name, 100 * MATTERS),),
@@ -48,16 +335,6 @@ def resonance_document(found: ResonanceResult, file: RobotFile) -> Document:
             Section("How the runs ended", (ended, endings), "ended"),
         ),
     )
-
-
-def _modes(found: ResonanceResult) -> Table:
-    rows = []
-    for payload, modes in found.modes.items():
-        for m in modes:
-            low_high = f"{m.low:.1f} to {m.high:.1f}"
-            numbers = (m.frequency, low_high, m.natural, m.damping, 100 * m.share, 100 * m.positions)
-            rows.append((payload, m.name, *(Cell(x, "" if m.resonant else "none") for x in numbers)))
-    return catalogue.table("resonance.frequencies", rows)
 
 
 def _peaks(found: ResonanceResult) -> Table:

@@ -12,16 +12,45 @@ import numpy as np
 from calibration.data import Columns, Json
 from calibration.data.robot_file import RobotFile
 from mmrjax import effects
+from mmrjax.model import channels
 from mmrjax.model.channels import Channel
-from mmrjax.model.quantities import TABLE
+from mmrjax.model.quantities import SET, TABLE, Condition
 from mmrjax.model.robot import Robot
 from sweeps import capabilities
 from sweeps.pages import words
 from sweeps.points import uncertainty
 from sweeps.points.imposed import UNLIMITED
 from sweeps.report import catalogue
-from sweeps.report.condition_columns import CONDITIONS
 from sweeps.report.document import Cell, Column, Note, Table, columns
+
+#: Units of what may be imposed on a run, by column.
+UNITS = {"supply_voltage_V": "V", "motor_speed_rpm": "rpm", "motor_current_A": "A"}
+
+
+def imposed_column(runs: Iterable[str]) -> str:
+    """Column of what is imposed in runs: conditions come before readings."""
+    return next(column for column in runs if column in UNITS)
+
+
+def _column(condition: Condition) -> str:
+    """Column of a condition; that of its channel for an imposed speed or current."""
+    return next((c.column for c in channels.EVERY if c.name == condition.name), condition.column)
+
+
+#: Heading of each condition and format of its numbers, by column.
+CONDITIONS = {_column(c): (c.heading, c.shown) for c in SET if c.heading}
+
+
+def condition_formats(table: Columns, *, mass: bool = False) -> dict[str, tuple[str, str]]:
+    """Heading and format of each condition of a table, by column, without columns that are readings.
+
+    Args:
+        mass: True to include the total mass.
+    """
+    readings = {c for c in table if f"simulated_{c}" in table or f"after_{c}" in table}
+    shown = {c: about for c, about in CONDITIONS.items() if c in table and c not in readings}
+    return {c: about for c, about in shown.items() if mass or c != "total_mass_kg"}
+
 
 #: Quantities by column, of several of one column that of runs.
 _REGISTERED = {

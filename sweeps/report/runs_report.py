@@ -18,10 +18,10 @@ from mmrjax.model.robot import Robot
 from sweeps import capabilities
 from sweeps.pages import words
 from sweeps.report import catalogue, run_tables
-from sweeps.report.condition_columns import imposed_column
 from sweeps.report.document import SIDE_BY_SIDE, Block, Column, Document, Note, Section, Table, remarks
+from sweeps.report.run_tables import imposed_column
 from sweeps.report.words import posture_words
-from sweeps.results.posture_results import Postures
+from sweeps.report.words.posture_words import Postures
 
 #: Column of the largest current of all motors together in a run over time.
 PEAK = "peak_current_A"

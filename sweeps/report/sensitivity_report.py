@@ -30,10 +30,22 @@ def sensitivity_document(found: SensitivityResult, file: RobotFile) -> Document:
     )  # fmt: skip
     idle = "less than {:g} % everywhere: {}".format(100 * NEGLIGIBLE, ", ".join(found.negligible))
     said = [*([idle] if found.negligible else []), *_next_runs_in_words(found), *found.notes]
+    # The inputs that decide each output
+    rows = []
+    for study in found.outputs.values():
+        share = study.overall_share
+        top = [k for k in np.argsort(-share)[:3] if share[k] >= NEGLIGIBLE]
+        cells = [f"{short_name(found.names[k])} {100 * share[k]:.0f} %" for k in top]
+        rows.append((study.row.label, *cells, *[""] * (3 - len(cells))))
     return Document(
         "Which parameters matter",
         found.statement(),
-        (run_tables.lead_note(file, found.model, method + ran), _leading(found), overview, *remarks(said)),
+        (
+            run_tables.lead_note(file, found.model, method + ran),
+            catalogue.table("sensitivity.leading", rows),
+            overview,
+            *remarks(said),
+        ),
         page_sections=lambda: _sections(found),
     )
 
@@ -68,17 +80,6 @@ def _sections(found: SensitivityResult) -> Iterable[Section]:
 def _decided(study: OutputStudy) -> bool:
     """True if any input changes an output."""
     return bool(study.overall_share.max(initial=0.0) > 0)
-
-
-def _leading(found: SensitivityResult) -> Table:
-    """The inputs that decide each output."""
-    rows = []
-    for study in found.outputs.values():
-        share = study.overall_share
-        top = [k for k in np.argsort(-share)[:3] if share[k] >= NEGLIGIBLE]
-        cells = [f"{short_name(found.names[k])} {100 * share[k]:.0f} %" for k in top]
-        rows.append((study.row.label, *cells, *[""] * (3 - len(cells))))
-    return catalogue.table("sensitivity.leading", rows)
 
 
 def _output(name: str, study: OutputStudy, found: SensitivityResult) -> Iterable[Block]:

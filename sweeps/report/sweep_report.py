@@ -14,9 +14,8 @@ from mmrjax.errors import count_noun
 from sweeps import capabilities
 from sweeps.pages import words
 from sweeps.report import catalogue, run_tables
-from sweeps.report.condition_columns import imposed_column
 from sweeps.report.document import Document, Section, Table, remarks
-from sweeps.report.run_tables import quantity_column
+from sweeps.report.run_tables import imposed_column, quantity_column
 
 
 def sweep_document(file: RobotFile, model: str, runs: Columns, notes: Sequence[str] = ()) -> Document:

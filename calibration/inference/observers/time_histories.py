@@ -755,8 +755,10 @@ class Histories(Observer):
         names = bases_room.family_names(bases)
         orders = [w for w in bases_room.ORDERS if any(n[1] == w for n in names)]
 
-        def strongest(diagnosis: Diagnosis, variable: str) -> Strongest:
+        def strongest(diagnosis: Diagnosis, variable: str) -> Strongest | None:
             mine = [k for k, n in enumerate(names) if n[1] == variable]
+            if not mine:
+                return None
             k = max(mine, key=lambda j: np.asarray(diagnosis.scores.curve)[j])
             return Strongest(names[k][0], float(diagnosis.scores.curve[k]), float(diagnosis.scores.explained[k]))
 
@@ -770,7 +772,7 @@ class Histories(Observer):
                 lags,
                 _autocorrelation(diagnosis.linear, lags),
             )
-            waves = {(w, bases_room.ORDERS[w][0]): strongest(diagnosis, w) for w in orders}
+            waves = {(w, bases_room.ORDERS[w][0]): wave for w in orders if (wave := strongest(diagnosis, w))}
             return TimeSide(memory, waves, strongest(diagnosis, "time"))
 
         samples = int((np.asarray(self.rows_of) >= 0).sum())

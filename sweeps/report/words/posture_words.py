@@ -2,12 +2,144 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 
+import jax
 import numpy as np
 
+from calibration.data import Columns
+from calibration.data.columns import LEVERS
+from calibration.data.table import Runs
+from calibration.sizing.sheet import Outcome
+from mmrjax.climbing import resting_posture, static_limits
+from mmrjax.climbing.resting_posture import Outline
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.masses import lever_angles
+from mmrjax.model.quantities import MM
+from mmrjax.model.robot import Robot
 from sweeps.report.document import Column, Table
-from sweeps.results.posture_results import Postures
+
+#: Angles at which the map of highest steps looks at front and rear levers [deg].
+ANGLES = np.arange(-180.0, 181.0, 6.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Drawn:
+    """A robot from the side on the ground: lower, and from its centre of mass on higher by a step.
+
+    Attributes:
+        side: in a frame along the ground; base: height of its middle of the wheelbase [m]; step: [m]; slope: [rad].
+    """
+
+    side: Outline
+    base: float
+    step: float
+    slope: float = 0.0
+
+
+@dataclasses.dataclass(frozen=True)
+class StepMap:
+    """Highest steps and margins of tipping over angles of the levers.
+
+    Attributes:
+        angles_deg: of front and rear; step_mm, margin_mm (at rest on the run's slope): shape (front, rear).
+        best: the highest, drawn; front_deg, rear_deg: there.
+        own_deg: the run's own angles, front and rear.
+    """
+
+    angles_deg: np.ndarray
+    step_mm: np.ndarray
+    margin_mm: np.ndarray
+    best: Drawn
+    front_deg: float
+    rear_deg: float
+    own_deg: tuple[float, float]
+
+
+@dataclasses.dataclass(frozen=True)
+class Postures:
+    """Of the runs of a table.
+
+    Attributes:
+        table: by column; rest, step: the first run's, drawn, at rest and on its highest step; over: of the first run.
+    """
+
+    table: Columns
+    rest: Drawn
+    step: Drawn
+    over: StepMap
+
+
+def posture_of_runs(robot: Robot, runs: Runs, conditions: Conditions) -> Postures | None:
+    """Postures of the runs of a table; None if it states no levers."""
+    if not conditions.states_levers:
+        return None
+    rests, limits, lies, steps = jax.device_get(static_limits.postures_of_runs(robot, conditions))
+    shown = ("configuration", *(c for c in ("payload_kg", "slope_deg", *LEVERS) if runs.has(c)))
+    degrees, millimetres = 180 / np.pi, 1 / MM
+    table = {name: runs[name] for name in shown} | {
+        "pitch_deg": degrees * rests.pitch,
+        "contact_mm": millimetres * rests.length,
+        "bears": np.where(rests.line > 0.5, "all along", "at its ends"),
+        "load_front_percent": 100 * rests.load_front,
+        "centre_height_mm": millimetres * rests.centre_height,
+        "margin_mm": millimetres * rests.margin,
+        "inertia_kg_m2": rests.inertia,
+        "tips_back_deg": degrees * limits.tips_back,
+        "tips_forward_deg": degrees * limits.tips_forward,
+        "tips_aside_deg": degrees * limits.tips_aside,
+        "highest_step_mm": millimetres * limits.step,
+        "widest_gap_mm": millimetres * limits.gap,
+        "tip_front_mm": millimetres * limits.tip_front,
+        "tip_rear_mm": millimetres * limits.tip_rear,
+        "overall_length_mm": millimetres * limits.length,
+        "overall_height_mm": millimetres * limits.height,
+    }
+    first, side, step = jax.tree.map(lambda x: x[0], (conditions, lies, steps))
+    level = Drawn(side, float(rests.height[0]), 0.0, float(first.slope))
+    return Postures(table, level, _on_step(step), step_map(robot, first))
+
+
+def step_map(robot: Robot, conditions: Conditions) -> StepMap:
+    """Highest steps and margins of tipping of one run over the angles of its levers."""
+    found, margin = jax.device_get(static_limits.steps_over_lever_angles(robot, conditions, ANGLES, ANGLES))
+    front, rear = np.unravel_index(np.argmax(found.height), found.height.shape)
+    best = _on_step(jax.tree.map(lambda x: x[front, rear], found))
+    own = tuple(float(np.degrees(x)) for x in lever_angles(robot.running_gear, conditions))
+    return StepMap(
+        ANGLES, found.height / MM, margin / MM, best, float(ANGLES[front]), float(ANGLES[rear]), (own[0], own[1])
+    )
+
+
+def of_requirements(robot: Robot, outcomes: Sequence[Outcome]) -> dict[str, tuple[Drawn, float, float]]:
+    """A robot as requirements of its geometry ask about it, by their names: drawn, and angles of its levers [deg].
+
+    The best posture on a step, levers flush with the belt over a gap, folded for its size.
+    """
+    found: dict[str, tuple[Drawn, float, float]] = {}
+    for outcome in outcomes:
+        name = outcome.requirement.name
+        if name not in ("step_mm", "gap_mm", "length_mm"):
+            continue
+        conditions = Conditions(outcome.at["configuration"], payload=outcome.at.get("payload_kg", 0.0)).resolved(
+            robot
+        )
+        if name == "step_mm":
+            step, front, rear = jax.device_get(static_limits.best_step(robot, conditions))
+            drawn = _on_step(step)
+        else:
+            front = rear = float(static_limits.flush_lever_angle(robot)) if name == "gap_mm" else np.pi
+            stands = static_limits.with_levers(conditions, front, rear)
+            rests, side = resting_posture.level_posture(robot, stands), resting_posture.side_outline(robot, stands)
+            drawn = Drawn(jax.device_get(side.pitched(rests.pitch)), float(rests.height), 0.0)
+        found[name] = drawn, float(np.degrees(front)), float(np.degrees(rear))
+    return found
+
+
+def _on_step(found: static_limits.StepLimit) -> Drawn:
+    return Drawn(found.side, float(found.base), float(found.height))
+
 
 #: Columns of the page's table: heading, format.
 COLUMNS = {

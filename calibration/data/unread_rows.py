@@ -1,0 +1,91 @@
+"""Readings of settled rows that are none: a speed that was not read, and rows beyond a limit of supply or driver."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from calibration.data.columns import LOAD, SUPPLY
+from calibration.data.table import Runs
+from mmrjax.model.robot import Robot
+
+#: Share of the current at standstill below which a motor turns, if it drives more than its friction by this factor.
+TURNS, DRIVES = 0.3, 2.0
+#: Readings that no longer change: by this share at most, while the command rises by such a factor.
+ALIKE, RISE = 0.02, 1.05
+#: Fall of the supply's voltage over such rows, beyond which two of them are enough; else three.
+FALLS = 0.05
+
+
+def without_unread(runs: Runs, robot: Robot) -> Runs:
+    """The table of settled runs with missing readings in place of those that are none, and notes on them."""
+    if runs.sampled or runs.turns or runs.layout.imposed_column != SUPPLY or runs.has("held"):
+        return runs
+    columns, notes = dict(runs.columns), list(runs.notes)
+    drive = runs[SUPPLY] * (runs["duty"] if runs.has("duty") else 1.0)
+    beyond = _beyond_limit(runs, np.abs(drive))
+    unread = _turning(runs, robot, drive) & ~beyond
+    for channel in (c for c in runs.channels if runs.has(c.column)):
+        lost = beyond | (unread & (runs[channel.column] == 0) & channel.zero_at_rest)
+        columns[channel.column] = np.where(lost, np.nan, runs[channel.column])
+        if (lost & ~beyond).any():
+            notes.append(
+                f"{runs.source}, {channel.column}: 0 in {_rows(lost & ~beyond)} at the current of a motor that turns;"
+                " it was not read and is taken for missing"
+            )
+    if beyond.any():
+        notes.append(
+            f"{runs.source}, {_rows(beyond)}: the readings no longer change while the drive rises, so supply or "
+            "driver are at a limit; set aside"
+        )
+    return dataclasses.replace(runs, columns=columns, notes=tuple(notes))
+
+
+def _turning(runs: Runs, robot: Robot, drive: np.ndarray) -> np.ndarray:
+    """True for rows whose motor current is far from that at standstill and more than friction takes."""
+    motor = robot.motor
+    resistance, constant = float(motor.resistance), float(motor.torque_constant)
+    share = np.abs(runs["duty"]) if runs.has("duty") else np.ones(len(runs))
+    if runs.has("motor_current_A"):
+        current = np.abs(runs["motor_current_A"])
+    elif runs.has("total_current_A"):
+        current = np.abs(runs["total_current_A"]) / (float(robot.sides) * np.maximum(share, 1e-9))
+    else:
+        return np.zeros(len(runs), bool)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        slow = current < TURNS * np.abs(drive) / resistance
+        return slow & (current * constant > DRIVES * float(motor.friction_coulomb))
+
+
+def _beyond_limit(runs: Runs, drive: np.ndarray) -> np.ndarray:
+    """True for rows of the largest commands with the readings, or the supply's current, of the largest.
+
+    If the supply's voltage falls over them, the supply is at its limit in all of them. Else the least command may
+    just reach the limit.
+    """
+    found = np.zeros(len(runs), bool)
+    command, supply = (np.abs(runs["duty"]), np.abs(runs[SUPPLY])) if runs.has("duty") else (drive, drive)
+    drawn = [runs["total_current_A"][:, None]] if runs.has("total_current_A") else []
+    others = [runs[c] for c in (LOAD, "slope_deg", "payload_kg", "configuration") if runs.has(c)]
+    if len(runs) < 4 or any(len(np.unique(x)) > 1 for x in others):
+        return found
+    order = np.argsort(-command, kind="stable")
+    for shown in (np.abs(x)[order] for x in (*drawn, runs.measured())):
+        same = np.all(np.isnan(shown) | (np.abs(shown - shown[0]) <= ALIKE * np.abs(shown[0])), axis=1)
+        top = order[: int(np.argmin(same))]
+        levels = np.unique(command[top])
+        if len(levels) < 2 or levels[-1] < RISE * levels[0] or not np.isfinite(shown[0]).any():
+            continue
+        if supply[top].min() < (1 - FALLS) * supply[top].max() and supply[top[0]] == supply[top].min():
+            found[top] = True
+        elif len(levels) > 2 and drive[top].max() > RISE * drive[top].min():
+            found[top[command[top] > levels[0]]] = True
+    return found
+
+
+def _rows(which: np.ndarray) -> str:
+    """`row 3` or `rows 3, 4, 5`."""
+    numbers = [str(k + 1) for k in np.flatnonzero(which)]
+    shown = ", ".join(numbers[:12]) + f" and {len(numbers) - 12} more" * (len(numbers) > 12)
+    return f"row{'s' * (len(numbers) > 1)} {shown}"

@@ -1,1 +1,0 @@
-"""Typed results of commands; commands, pages and figures import them, never the reverse."""
