@@ -8,7 +8,7 @@ from pages import recorded
 from calibration.sensitivity.result import Points
 from calibration.words import fit_words, sensitivity_words
 from mmrjax.model import channels
-from sweeps.paper import error_tables
+from sweeps.paper import report
 from sweeps.report import mission_report, runs_report, sweep_report
 
 SHOWN = [channels.find_channel("total_current"), channels.find_channel("speed")]
@@ -99,7 +99,7 @@ ANSWERS = {
     "calibration": fit_words.calibration_answer(fitted(False, (3, 3))),
     "calibration, a row reached after it alone": fit_words.calibration_answer(fitted(False, (2, 3))),
     "calibration, undecided": fit_words.calibration_answer(fitted(None, (3, 3))),
-    "reproduce": error_tables.error_answer(reproduced()),
+    "reproduce": report.error_answer(reproduced()),
 }  # fmt: skip
 
 

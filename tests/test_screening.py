@@ -201,7 +201,9 @@ def test_what_is_ranked_is_said_not_to_be_confirmed():
         "amplitude 0.0123 ± 0.0004 N·m"
     ]  # the others explain no more than chance, or would supply power
     nothing = dataclasses.replace(RANKING, missing=False, p_value=0.4)
-    assert words.ranking_lines(nothing) == ["by regression: nothing is missing (family-wise p = 0.4)"]
+    assert words.ranking_lines(nothing) == [
+        "by regression, not yet confirmed: nothing exceeds chance (family-wise p = 0.4)"
+    ]
 
 
 def test_what_is_found_before_the_verdict_is_said_to_be_untested(capsys):
