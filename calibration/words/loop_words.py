@@ -716,12 +716,6 @@ def kept_out(rows: tuple[int, ...], why: str) -> str:
     return f"rows {', '.join(map(str, rows))} {reasons[why]}"
 
 
-def still_lacks(place: str, variable: str) -> str:
-    """Sentence on the discrepancy that remains with the effects found."""
-    where, over = bases.place_in_words(place), variable.replace("_", " ")
-    return f"not everything is explained: an error in the {where} that varies with {over} remains"
-
-
 def imposed_delay(delay: float, sd: float) -> str:
     """Delay of the imposed quantity, and the line for the rig's file."""
     when = "later" if delay > 0 else "earlier"
@@ -789,15 +783,6 @@ def unwritten_reason(curve: bool, gain: float, se: float) -> str:
     )
 
 
-def outstanding_verdicts(factors: tuple[float, ...], word: str) -> str:
-    """Verdicts that are not there yet."""
-    at = " and ".join(f"{f:g}" for f in factors)
-    return (
-        f"out of time: whether the verdict stands with {at} times the {word} noise is not known; run the same "
-        "command without --within"
-    )
-
-
 #: Code of a remark → a sentence with its values, or a function that makes one.
 SAID: dict[str, str | Callable[..., str]] = {
     "assumed_noise": "no sd is stated for {channels}: {usual} is assumed; state yours with --noise",
@@ -809,7 +794,10 @@ SAID: dict[str, str | Callable[..., str]] = {
     "kept_out": kept_out,
     "phases_differ": "the wave stands at another angle in each run (it explains {free:.0f} σ² free in each, "
     "{held:.0f} with one phase): robot.toml holds the mean; start runs from a mark",
-    "still_lacks": still_lacks,
+    "still_lacks": lambda place, variable: (
+        f"not everything is explained: an error in the {bases.place_in_words(place)} that varies with "
+        f"{variable.replace('_', ' ')} remains"
+    ),
     "late": imposed_delay,
     "led": leader_choice,
     "not_predictable": lambda kinds: (
@@ -818,7 +806,10 @@ SAID: dict[str, str | Callable[..., str]] = {
         "with parameters of its own"
     ),
     "lost_replicates": "only {settled} of {asked} bootstrap tables could be fitted again; the thresholds are theirs",
-    "outstanding": outstanding_verdicts,
+    "outstanding": lambda factors, word: (
+        f"out of time: whether the verdict stands with {' and '.join(f'{f:g}' for f in factors)} times the {word} "
+        "noise is not known; run the same command without --within"
+    ),
     "too_few_replicates": "{settled} bootstrap tables are too few for every kind of evidence "
     "to count; use 500 or "
     "more",
