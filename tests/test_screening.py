@@ -226,7 +226,7 @@ def test_a_budget_that_ends_after_the_screening_leaves_its_ranking(tmp_path, mmr
 
     monkeypatch.setattr(command, "discover", screened)
     options = ("--robot", "rig.toml", "--no-report", "--out", "found", "--within", "20s")
-    code, _, err = mmrjax("loop", "table.csv", *options)
+    code, _, err = mmrjax("loop table.csv", *options)
     assert code == 3 and err.count("  1. churning, a loss torque that changes with speed") == 2  # at once, and last
     assert "no verdict within 20 s\n" in err and "kept: ranking" in err
     left = json.loads((tmp_path / "found.partial" / "screening.json").read_text(encoding="utf-8"))

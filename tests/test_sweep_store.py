@@ -62,7 +62,7 @@ def sweep(mmrjax, tmp_path):
     def command(out, *options, config=None):
         if config is not None:
             (tmp_path / "plan.toml").write_text(config)
-        return mmrjax("sweep", "plan.toml", "--out", out, *options)
+        return mmrjax("sweep plan.toml --out", out, *options)
 
     return command
 
@@ -188,7 +188,7 @@ def test_outputs_of_a_grid_are_chosen_by_an_option(mmrjax, tmp_path):
 def test_large_grid_that_is_refused_leaves_nothing(mmrjax, tmp_path, monkeypatch):
     monkeypatch.setattr("sweeps.commands.sweep.TABLE", 3)
     monkeypatch.setattr(command, "MARGIN", 10**18)
-    ends(mmrjax("sweep", "--slopes", "0,5", "--out", "s"), "--out: the results would take")
+    ends(mmrjax("sweep --slopes 0,5 --out s"), "--out: the results would take")
     assert not list(tmp_path.iterdir())
 
 
@@ -925,7 +925,7 @@ def test_layout_counts_its_bytes_without_writing(whole):
 def test_plan_of_the_page_is_accepted(mmrjax, tmp_path):
     page = (Path(__file__).resolve().parents[1] / "docs" / "reference" / "plans.md").read_text(encoding="utf-8")
     (tmp_path / "plan.toml").write_text(page.split("```toml\n")[1].split("```")[0])
-    _, out, _ = ends(mmrjax("sweep", "plan.toml", "--dry-run", "--chunk", "1000"), code=0)
+    _, out, _ = ends(mmrjax("sweep plan.toml --dry-run --chunk 1000"), code=0)
     assert "60,680,000 (2 configuration x 41 slope_deg x 37 voltage x 20 motor.friction_coulomb x 1000 sample)" in out
 
 
