@@ -47,7 +47,7 @@ class _Outlet(Console):
             yield segment if segment.control else segment._replace(text=printable(segment.text))
 
 
-_WIDTH = None if sys.stdout is not None and sys.stdout.isatty() else 120  # a file has no width of its own
+_WIDTH = None if sys.stdout is not None and sys.stdout.isatty() else 160  # a file has no width of its own
 _out = _Outlet(highlight=False, soft_wrap=True, markup=False, width=_WIDTH)
 
 

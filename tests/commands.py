@@ -13,9 +13,10 @@ from sweeps import cli
 
 
 def command(arguments: Iterable[object]) -> int:
-    """Run a command; returns its exit code."""
+    """Run a command, its first words as one string; returns its exit code."""
+    words, *rest = arguments
     with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as end:
-        patch.setattr(sys, "argv", ["mmrjax", *map(str, arguments)])
+        patch.setattr(sys, "argv", ["mmrjax", *str(words).split(), *map(str, rest)])
         cli.main()
     return end.value.code
 

@@ -305,14 +305,14 @@ def compilations():
 
 @pytest.fixture
 def mmrjax(monkeypatch, capsys, tmp_path):
-    """Run a command in this process; returns exit code, stdout and stderr."""
+    """Run a command in this process, its first words as one string; returns exit code, stdout and stderr."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XLA_FLAGS", os.environ.get("XLA_FLAGS", ""))  # a command may set it, for this process alone
 
     monkeypatch.setattr(os, "_exit", sys.exit)  # how an interrupted command ends; this process goes on
 
-    def command(*arguments):
-        monkeypatch.setattr(sys, "argv", ["mmrjax", *map(str, arguments)])
+    def command(words="", *arguments):
+        monkeypatch.setattr(sys, "argv", ["mmrjax", *str(words).split(), *map(str, arguments)])
         with pytest.raises(SystemExit) as end:
             cli.main()
         out = capsys.readouterr()

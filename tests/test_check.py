@@ -461,7 +461,7 @@ def test_posture_of_a_robot_that_states_no_running_gear_is_not_known(robot):
 
 
 def test_heat_that_the_file_does_not_state_is_asked_for(tmp_path, capsys):
-    assert command(["rig", "new", tmp_path / "rig.toml", "--kind", "wheeled"]) == 0
+    assert command(["rig new", tmp_path / "rig.toml", "--kind", "wheeled"]) == 0
     asked = tmp_path / "asked.toml"
     for name, limit in (("payload_kg", 1), ("winding_C", 90)):
         asked.write_text(f"{name} = {limit}\n[envelope]\nsupply_voltage_V = 12\n")
@@ -474,7 +474,7 @@ def test_heat_that_the_file_does_not_state_is_asked_for(tmp_path, capsys):
 
 
 def test_a_battery_that_the_file_does_not_state_is_no_supply(tmp_path, capsys):
-    assert command(["rig", "new", tmp_path / "rig.toml", "--kind", "wheeled"]) == 0
+    assert command(["rig new", tmp_path / "rig.toml", "--kind", "wheeled"]) == 0
     asked = tmp_path / "asked.toml"
     asked.write_text("mass_kg = 50\nspeed_m_s = 0.5\n")
     assert command(["check", asked, "--robot", tmp_path / "rig.toml", "--out", tmp_path / "run"]) == 2

@@ -53,7 +53,7 @@ REFUSED = {
 def test_what_cannot_be_climbed_is_refused_in_one_sentence(mmrjax, tmp_path, case):
     arguments, message = REFUSED[case]
     if case == "a bench":
-        assert mmrjax("rig", "new", "bench.toml", "--kind", "bench")[0] == 0
+        assert mmrjax("rig new bench.toml --kind bench")[0] == 0
         message = r"climb: |bench\.toml"
     (tmp_path / "s.csv").write_text("time_s,front_deg,rear_deg\n0,45,180\n")
     (tmp_path / "t.csv").write_text("x_mm,z_mm\n0,0\n0,50\n")
@@ -163,19 +163,7 @@ def test_search_ends_within_a_millimetre_of_the_largest_that_is_got_over(limit):
 def test_one_climb_leaves_a_folder_whose_energy_adds_up(mmrjax, tmp_path):
     ends(
         mmrjax(
-            "climb",
-            "--gap",
-            "60",
-            "--levers-front",
-            "45",
-            "--voltage",
-            "24",
-            "--duration",
-            "2",
-            "--time-step",
-            "4e-4",
-            "--out",
-            "c",
+            "climb --gap 60 --levers-front 45 --voltage 24 --duration 2 --time-step 4e-4 --out c",
         ),
         "The robot gets over: a gap of 60 mm.",
         code=0,
@@ -197,10 +185,10 @@ def test_one_climb_leaves_a_folder_whose_energy_adds_up(mmrjax, tmp_path):
     seen = Seen.read(folder)
     assert footing_coordinates(seen.table)[-1, 4] == pytest.approx(np.radians(45), abs=2e-3)
     assert float(seen.terrain.finish) == pytest.approx(0.06)
-    ends(mmrjax("render", "c.png", "--climb", "c"), code=0)
+    ends(mmrjax("render c.png --climb c"), code=0)
     assert (tmp_path / "c.png").stat().st_size > 5000
     ends(
-        mmrjax("render", "d.gif", "--climb", "c", "--voltage", "12"),
+        mmrjax("render d.gif --climb c --voltage 12"),
         "--climb: not allowed with options of a run of the track model",
     )
-    ends(mmrjax("render", "d.gif", "--climb", "tests"), "tests cannot be read; expected a folder of mmrjax climb")
+    ends(mmrjax("render d.gif --climb tests"), "tests cannot be read; expected a folder of mmrjax climb")

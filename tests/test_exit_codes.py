@@ -35,7 +35,7 @@ def test_only_a_solver_that_failed_ends_with_3(status, code, mmrjax, monkeypatch
         return {**found, "status": np.array([status, *found["status"][1:]])}
 
     monkeypatch.setattr(run, "evaluate_runs", evaluate)
-    assert mmrjax("compare", "measured", "--no-report", "--out", "s")[0] == code
+    assert mmrjax("compare measured --no-report --out s")[0] == code
 
 
 def test_a_reader_that_has_had_enough_is_no_fault_of_a_file_of_effects(monkeypatch, capsys):

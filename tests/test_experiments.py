@@ -158,15 +158,6 @@ def foreseeing(sigma):
     )
 
 
-def test_less_effort_is_preferred_where_more_sigmas_are_no_gain():
-    assert experiments.choose_experiment(foreseeing({"weigh": [0, 6.0], "stall": [0, 40.0]})).experiments == (
-        "weigh",
-    )
-    assert experiments.choose_experiment(foreseeing({"weigh": [0, 3.0], "stall": [0, 40.0]})).experiments == (
-        "stall",
-    )
-
-
 def test_chance_is_the_share_of_draws_in_which_the_false_one_is_refuted():
     seen = foreseeing({"stall": [0, 2.5]})
     at, rng = SPANS["stall"], np.random.default_rng(0)
@@ -179,35 +170,38 @@ def test_chance_is_the_share_of_draws_in_which_the_false_one_is_refuted():
     assert np.mean(refuted) == pytest.approx(one.chances[0], abs=0.025)  # three sds of the draws
 
 
-def test_every_two_alternatives_count_not_only_those_with_the_best_fit():
-    # `shunt`, the lesser effort, tells both others from the best fit but not from one another; `stall` all three
-    proposal = experiments.choose_experiment(foreseeing({"shunt": [0, 9.0, 9.0], "stall": [0, 6.0, 12.0]}))
-    assert proposal.experiments == ("stall",) and proposal.settles
+FAR = [9.0 * k for k in range(1, 7)]
 
 
-def test_less_effort_is_preferred_also_beside_a_pair_that_nothing_tells():
-    assert experiments.choose_experiment(
-        foreseeing({"weigh": [0, 6.0, 6.0], "stall": [0, 40.0, 40.0]})
-    ).experiments == ("weigh",)
-
-
-def test_one_pair_of_many_alternatives_counts():
-    far = [9.0 * k for k in range(1, 6)]
-    proposal = experiments.choose_experiment(
-        foreseeing({"weigh": [0, 0.0, *far], "stall": [0, *(9.0 * k for k in range(1, 7))]})
-    )
-    assert proposal.experiments == ("stall",) and proposal.settles
-
-
-def test_pair_that_one_experiment_tells_is_worth_more_than_three_that_none_does():
-    # three pairs 1.9 sigma apart at most by `stall`; `weigh` tells one of them by 3
-    proposal = experiments.choose_experiment(foreseeing({"stall": [0, 1.9, 0.95], "weigh": [0, 1.5, 3.0]}))
-    assert "weigh" in proposal.experiments and proposal.expected_sigma >= 2.0
-
-
-def test_two_weak_experiments_are_proposed_together():
-    proposal = experiments.choose_experiment(foreseeing({"stall": [0, 1.9], "weigh": [0, 1.9]}))
-    assert set(proposal.experiments) == {"stall", "weigh"} and proposal.expected_sigma == pytest.approx(1.9 * 2**0.5)
+@pytest.mark.parametrize(
+    ("sigma", "chosen", "settles", "expected"),
+    [
+        (
+            {"weigh": [0, 6.0], "stall": [0, 40.0]},
+            {"weigh"},
+            True,
+            6.0,
+        ),  # more sigmas are no gain, less effort is one
+        ({"weigh": [0, 3.0], "stall": [0, 40.0]}, {"stall"}, True, 40.0),
+        # `shunt`, the lesser effort, tells both others from the best fit but not from one another; `stall` all three
+        ({"shunt": [0, 9.0, 9.0], "stall": [0, 6.0, 12.0]}, {"stall"}, True, 6.0),
+        (
+            {"weigh": [0, 6.0, 6.0], "stall": [0, 40.0, 40.0]},
+            {"weigh"},
+            False,
+            6.0,
+        ),  # beside a pair that nothing tells
+        ({"weigh": [0, 0.0, *FAR[:5]], "stall": [0, *FAR]}, {"stall"}, True, 9.0),  # one pair of many counts
+        # three pairs 1.9 sigma apart at most by `stall`; `weigh` tells one of them by 3
+        ({"stall": [0, 1.9, 0.95], "weigh": [0, 1.5, 3.0]}, {"stall", "weigh"}, False, (1.9**2 + 1.5**2) ** 0.5),
+        ({"stall": [0, 1.9], "weigh": [0, 1.9]}, {"stall", "weigh"}, False, 1.9 * 2**0.5),  # weak ones together
+        ({"stall": [0, 9.0, 9.0], "weigh": [0, 0.0, 0.5]}, {"stall"}, False, 9.0),  # a second one that adds nothing
+    ],
+)
+def test_the_experiment_is_the_one_of_least_effort_that_tells_most(sigma, chosen, settles, expected):
+    proposal = experiments.choose_experiment(foreseeing(sigma))
+    assert set(proposal.experiments) == chosen and proposal.settles == settles
+    assert proposal.expected_sigma == pytest.approx(expected)
 
 
 def test_a_second_experiment_is_proposed_where_one_leaves_two_together():
@@ -218,13 +212,6 @@ def test_a_second_experiment_is_proposed_where_one_leaves_two_together():
     assert proposal.expected_sigma == pytest.approx(7.0) and proposal.separates == ("b", "c")
     assert proposal.name.count(" and ") == 1
     assert [e.name for e in proposal.instruction.experiments] == list(proposal.experiments)
-
-
-def test_a_second_experiment_that_adds_nothing_is_not():
-    proposal = experiments.choose_experiment(foreseeing({"stall": [0, 9.0, 9.0], "weigh": [0, 0.0, 0.5]}))
-    assert (
-        proposal.experiments == ("stall",) and not proposal.settles and proposal.expected_sigma == pytest.approx(9.0)
-    )
 
 
 @pytest.mark.slow

@@ -73,10 +73,10 @@ def test_parameters_and_channels_are_explained_by_their_rows():
 
 
 def test_the_command_prints_80_columns_and_every_meaning_of_a_name(mmrjax):
-    _, out, _ = ends(mmrjax("explain", "cut_off"), "cut_off: status", "cut_off: flag", code=0)
+    _, out, _ = ends(mmrjax("explain cut_off"), "cut_off: status", "cut_off: flag", code=0)
     assert words.FLAGS["cut_off"] in " ".join(out.split())
     assert max(map(len, out.splitlines())) <= 80
-    _, out, _ = ends(mmrjax("explain", "held", "out"), code=0)
+    _, out, _ = ends(mmrjax("explain held out"), code=0)
     assert words.GLOSSARY["held out"] in " ".join(out.split())
     ends(mmrjax("explain"), "series_resistance", "motor.resistance", "converged", code=0)
 

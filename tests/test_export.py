@@ -33,7 +33,6 @@ from mmrjax.model.signals import Signals
 from sweeps.commands import rig_new
 from sweeps.export import (
     comparison,
-    constants,
     expressions,
     feed_forward,
     formats,
@@ -66,7 +65,7 @@ def compared(file):
     """A drive on wheels and the native model over Table 8."""
     drive = joints.joint_of_robot(file, WHEELS)
     runs = situation.situation_of_joint(drive, None)
-    return drive, runs, constants.constants_of(drive, runs.signals, None)
+    return drive, runs, law_source.constants_of(drive, runs.signals, None)
 
 
 @pytest.fixture(scope="module")
@@ -252,9 +251,9 @@ def test_energy_of_the_actuator_is_what_is_given_and_lost(with_effects):
 def test_serialised_actuator_has_the_same_bytes_in_every_process_and_folder(rig, tmp_path):
     code = (
         "import sys; from calibration.data import robot_file; "
-        "from sweeps.export import constants, jax_actuator, joint, law_source; "
+        "from sweeps.export import jax_actuator, joint, law_source; "
         "drive = joint.joint_of_robot(robot_file.find_robot_file('rig.toml')); "
-        "module = law_source.module_from_source(law_source.jax_source(drive, constants.constants_of(drive, None, None))); "
+        "module = law_source.module_from_source(law_source.jax_source(drive, law_source.constants_of(drive, None, None))); "
         "sys.stdout.buffer.write(jax_actuator.serialise_actuator(module))"
     )
     found = []
@@ -497,7 +496,7 @@ def test_start_of_the_actuator_is_that_of_the_model_with_losses_by_load(rig, vol
     rig.write_text(arm + LOSSES)
     file = robot_file.find_robot_file(str(rig))
     drive = joints.joint_of_robot(file)
-    module = law_source.module_from_source(law_source.jax_source(drive, constants.constants_of(drive, None, None)))
+    module = law_source.module_from_source(law_source.jax_source(drive, law_source.constants_of(drive, None, None)))
     step, inertia = 2e-5, float(drive.load.inertia + module.armature(module.PARAMS))
 
     def advance(at, _):

@@ -220,5 +220,5 @@ def test_names_in_files_of_every_format_reach_no_terminal(mmrjax, tmp_path, file
 def test_half_a_surrogate_pair_is_shown_replaced(mmrjax, tmp_path):
     (tmp_path / "surr.json").write_text('[{"\\ud800": 1, "t": 2}]')
     for further in ((), ("--json",)):
-        code, out, err = mmrjax("inspect", "surr.json", *further)
+        code, out, err = mmrjax("inspect surr.json", *further)
         assert code in (0, 4) and "Traceback" not in err and not obeyed(out + err)

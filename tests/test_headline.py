@@ -51,19 +51,21 @@ def test_it_is_the_deepest_claim_that_all_verdicts_hold(own, others, level, clai
 
 
 def test_it_is_said_with_the_noises_at_which_it_holds():
-    said = loop_words.loop_headline(headline(law("a"), [(0.7, of_mechanism(DROP)), (1.4, law("a"))]))
-    assert said == f"At 0.7, 1 and 1.4 times the noise a {DROP} is established as a mechanism"
-    weak = loop_words.loop_headline(headline(law("a"), [(0.7, law("a", established=False))]))
-    assert weak == "At 0.7 and 1 times the noise a voltage drop is missing, and no more is established"
-    assert loop_words.loop_headline(headline(nothing())) == "At the stated noise nothing is missing"
-    assert loop_words.loop_headline(headline(law("a", "b"))) == "At the stated noise one of a or b is established"
+    said = loop_words.loop_answer(headline(law("a"), [(0.7, of_mechanism(DROP)), (1.4, law("a"))]))
+    assert said == f"No at 0.7, 1 and 1.4 times the noise: missing is a {DROP}. Its exact law is not established."
+    weak = loop_words.loop_answer(headline(law("a"), [(0.7, law("a", established=False))]))
+    assert weak == "No at 0.7 and 1 times the noise: missing is a voltage drop, and no more is established."
+    assert loop_words.loop_answer(headline(law("a", "b"))) == (
+        f"No: missing is a {DROP} (a or b; these data cannot tell which)."
+    )
 
 
 def test_what_only_some_noises_cannot_tell_apart_comes_after_what_all_list():
     found = headline(of_mechanism(SLIP, DROP), [(0.7, of_mechanism(DROP)), (1.4, of_mechanism(DROP, "x that is"))])
     assert found.claims == ((DROP, SLIP, "x that is"),) and found.shared == (1,)
-    said = loop_words.loop_headline(found)
-    assert f"a {DROP} (not told at each noise from a {SLIP} or a x that is) is established" in said
+    assert f"missing is a {DROP} (not told at each noise from a {SLIP} or a x that is)." in loop_words.loop_answer(
+        found
+    )
 
 
 def test_one_mechanism_is_claimed_once():

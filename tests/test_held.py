@@ -126,6 +126,7 @@ def test_a_test_with_the_shaft_held_gives_constant_friction_and_resistance(tmp_p
         assert abs(p.value - right) < 4 * p.sd and p.sd < 0.1 * right, (name, p.value, p.sd)
 
 
+@pytest.mark.slow
 def test_a_locked_rotor_with_voltage_alone_gives_the_resistance(tmp_path):
     robot = rig(tmp_path, "voltage", '"motor_current"')
     columns = table()

@@ -228,14 +228,12 @@ def test_a_calibration_of_histories_gives_the_friction_back(robot, tmp_path):
 
 @pytest.mark.slow
 def test_commands_take_a_current_or_say_what_to_state(robot, tmp_path, mmrjax):
-    ends(mmrjax("simulate", "--robot", "rig.toml", "--motor-current", "2", "--no-report", "--out", "one"), code=0)
+    ends(mmrjax("simulate --robot rig.toml --motor-current 2 --no-report --out one"), code=0)
     row = (tmp_path / "one" / "runs.csv").read_text().splitlines()
     cells = dict(zip(row[0].split(","), row[1].split(","), strict=True))
     assert float(cells["motor_speed_rpm"]) == pytest.approx(settles(2.0) * 30 / np.pi, rel=1e-6)
     assert cells["motor_current_A"] == "2"
-    code, _, err = ends(
-        mmrjax("sweep", "--robot", "rig.toml", "--motor-currents", "1,2,-2", "--no-report", "--out", "many"), code=0
-    )
+    code, _, err = ends(mmrjax("sweep --robot rig.toml --motor-currents 1,2,-2 --no-report --out many"), code=0)
     for options, said in (
         (["simulate", "--voltage", "12"], "--voltage: the motors' current is imposed on this robot; state --motor-current [A]"),
         (["simulate"], "--motor-current: not stated; state it [A], as --motor-current 2"),

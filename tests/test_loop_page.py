@@ -135,7 +135,7 @@ def test_numbers_of_a_page_agree(shown, capsys, name):
     assert best > -d["settings"]["same"] or "ruled out by size or sign alone" in got.page.text
     # one family-wise p on all of the page, each effect with a p of its own that is no larger than is allowed
     p = words.p_value(got.found.before.p_value)
-    assert f"family-wise p {p}" in got.page.text and f"(family-wise p {p})" in d["statement"]
+    assert f"family-wise p {p}" in got.page.text and f"(family-wise p {p})" in d["verdict_statement"]
     for e in got.found.effects:
         assert e.p_value <= d["bootstrap"]["family_wise_error"]
         fall = got.found.chi2[0] - got.found.chi2[1]

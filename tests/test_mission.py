@@ -19,7 +19,6 @@ from mmrjax.model import energy, paper_robots, params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.signals import FLAGS, STATUSES
 
-RPM = np.pi / 30
 ROWS = 8
 _run = eqx.filter_jit(mission)
 
@@ -262,13 +261,6 @@ def test_temperature_follows_the_two_bodies_in_closed_form(robot):
     assert float(found.temperature_housing) == pytest.approx(end[1], rel=1e-6)
     assert float(found.peaks["temperature"]) == pytest.approx(end[0], rel=1e-6)
     del motor
-
-
-def test_a_motor_held_at_24_volts_is_too_hot(robot):
-    held = params.replace(robot, {"6T2A.track.loss_coulomb": 20.0})
-    found = run(held, asked(), rows([0, 60]))
-    assert "too_hot" in flagged(found.result.flags) and float(found.peaks["temperature"]) > 125.0
-    assert STATUSES[int(found.status[0, 0])] == "stalled"
 
 
 # --- limits -----------------------------------------------------------------------------------------

@@ -210,7 +210,7 @@ def test_sweep_of_missions_has_the_numbers_of_both_sides(robot, mmrjax, tmp_path
         'profile = "turn.csv"\nmodel = "drive"\nreport = false\noutputs = ["energy_Wh", "turned_deg"]\n'
         "[conditions]\nvoltage = 24\n[axes]\npayload = [0, 4, 8]\n"
     )
-    ends(mmrjax("sweep", "plan.toml", "--out", "run"), code=0)
+    ends(mmrjax("sweep plan.toml --out run"), code=0)
     store = zarr.open_group(tmp_path / "run" / "results.zarr", mode="r")
     of = dict(demand=[0.0, 0.3, 0.3, 0.3, 0.0], yaw_rate=[0.0, 0.8, 0.8, 0.0, 0.0], linear=True)
     asks = profile([0.0, 0.2, 0.4, 0.5, 0.6], "speed", **of)

@@ -30,20 +30,6 @@ def test_motor_laws_match_reference(sign):
         assert_allclose(rate, expected, rtol=1e-9, atol=1e-6)
 
 
-def test_motor_speed_constant_is_369_rpm_per_volt():
-    assert_allclose(1 / Motor().torque_constant * 60 / (2 * np.pi), 369, rtol=1e-3)
-
-
-def test_motor_without_friction_loses_no_torque():
-    assert float(Motor(friction_coulomb=0.0, friction_viscous=0.0).torque_loss(900.0, 1.0)) == 0.0
-
-
-def test_motor_friction_at_no_load_is_near_the_sheet_current():
-    # Table 2's fit at 8810 rpm against the sheet's 165 mA: samples of Fig. 11 lie below the sheet.
-    current = Motor().torque_loss(8810 * 2 * np.pi / 60, 1.0) / Motor().torque_constant
-    assert 0.10 < float(current) < 0.165
-
-
 def test_motor_temperature_settles_at_ambient_plus_heat():
     motor = Motor(
         resistance=2.0, resistance_thermal_winding=1.0, resistance_thermal_housing=4.0, temperature_ambient=20.0

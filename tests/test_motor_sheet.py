@@ -78,7 +78,7 @@ def test_viscous_friction_of_a_motor_does_not_look_like_a_missing_effect(mmrjax,
         "resistance": "0.62 ohm",
     }
     write_new_rig(tmp_path / "rig.toml", "dyno", False, sheet=sheet)
-    ends(mmrjax("loop", "runs.csv", "--robot", "rig.toml", "--out", "out", "--no-report"), code=0)
+    ends(mmrjax("loop runs.csv --robot rig.toml --out out --no-report"), code=0)
     assert json.loads((tmp_path / "out/result.json").read_text())["verdict"] == "none"
     fitted = robot_file.read_robot(tmp_path / "out/fitted.toml").motor
     assert float(fitted.friction_viscous) == pytest.approx(viscous, rel=0.1)
@@ -128,7 +128,7 @@ def test_sheets_that_contradict_themselves_or_lack_numbers_are_refused(change, m
 
 def test_sheet_without_numbers_leaves_no_file(mmrjax, tmp_path):
     ends(
-        mmrjax("rig", "new", "r.toml", "--from-sheet"),
+        mmrjax("rig new r.toml --from-sheet"),
         "--from-sheet: no numbers; expected --no-load-current and three or more of",
     )
     assert not list(tmp_path.iterdir())
@@ -137,7 +137,7 @@ def test_sheet_without_numbers_leaves_no_file(mmrjax, tmp_path):
 def test_rig_new_lists_what_robot_and_sheet_do_not_state(mmrjax, tmp_path):
     robot = str(Path(__file__).parent / "data" / "diffbot.urdf")
     sheet = [word for name, text in RE30.items() for word in (f"--{name}", text)]
-    code, out, err = mmrjax("rig", "new", "r.toml", "--from", robot, "--joint", "left_wheel_joint", *sheet)
+    code, out, err = mmrjax("rig new r.toml --from", robot, "--joint", "left_wheel_joint", *sheet)
     said = " ".join(out.split())
     assert (code, err) == (0, "")
     assert "not found, so fill in: motor.inertia [kg·m^2], gearbox.efficiency_load [-], rover." in said

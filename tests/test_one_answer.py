@@ -1,5 +1,6 @@
 """One sentence answers: the same in the terminal, on the page and in result.json."""
 
+import dataclasses
 import json
 
 import pytest
@@ -7,9 +8,10 @@ from commands import command
 from pages import Tables
 from test_documents import check, comparison, size
 
-from calibration.discovery.loop_notes import Headline
+from calibration.described import describe
+from calibration.discovery.loop_notes import FreedValue, Headline
 from calibration.words import loop_words
-from sweeps.report import loop_report, page_renderer, terminal_renderer
+from sweeps.report import page_renderer, terminal_renderer
 from sweeps.report.document import plain_text
 
 
@@ -33,22 +35,37 @@ def test_a_command_answers_with_one_sentence(words, tmp_path, capsys, monkeypatc
     assert capsys.readouterr().out.startswith(statement) and statement in page.text
 
 
-class Found:
-    """A result of the loop with a verdict at the estimated noise, and the claim that holds at every noise."""
+LAW = dict(claims=(("churning", "windage"),), families=(("loss torque that changes with speed",),), values=((),))
+#: Level of the claim that holds at every noise, and the answer to "is the model complete?" that it begins with.
+ANSWERS = {
+    "none": "Yes, ", "undescribed": "No verdict", "open": "Perhaps. ", "named": "No at", "class": "No at",
+    "mechanism": "No at", "place": "No at",
+}  # fmt: skip
 
-    def __init__(self, verdict, level, factors=(0.7, 1.0, 1.4)):
-        self.verdict, self.headline = verdict, Headline(level, (("churning", "windage"),), factors, (1,))
+
+@pytest.mark.parametrize("level", ANSWERS)
+def test_the_answer_of_the_loop_is_the_claim_that_holds_at_every_noise(level):
+    """«No: missing is ...» was once printed next to «whether anything is missing depends on the noise»."""
+    found = Headline(level, factors=(0.7, 1.0, 1.4), shared=(2,), **LAW)
+    answer = describe(found)
+    assert answer.startswith(ANSWERS[level]) and "at 0.7, 1 and 1.4 times the noise" in answer
+    assert ("missing is" in answer) == (answer.startswith("No at"))
+    assert ("established" in answer) == (level in ("mechanism", "place"))
+    alone = describe(dataclasses.replace(found, factors=(1.0,)))
+    assert "times the noise" not in alone and alone[:2] == answer[:2]
 
 
-@pytest.mark.parametrize(
-    ("verdict", "level", "begins"),
-    [("class", "open", "Perhaps. "), ("class", "place", "No. "), ("class", "class", "Missing. ")],
-)
-def test_the_answer_of_the_loop_is_the_claim_that_holds_at_every_noise(verdict, level, begins, monkeypatch):
-    """«No: missing is ...» was once printed beside «whether anything is missing depends on the noise»."""
-    monkeypatch.setattr(loop_words, "completeness_answer", lambda found: "Missing.")
-    found = Found(verdict, level)
-    answer = loop_report.loop_answer(found)
-    assert answer == f"{begins}{loop_words.loop_headline(found.headline)}."
-    alone = Found(verdict, level, (1.0,))
-    assert loop_report.loop_answer(alone) == "Missing."
+def test_the_answer_states_a_value_that_may_be_wrong_before_the_effect_that_imitates_it():
+    value = FreedValue("gearbox.efficiency_load", 0.685, "-")
+    found = Headline(
+        "class", (("gear_load_loss",),), (1.0,), (), (("loss torque that changes with load",),), ((value,),)
+    )
+    assert describe(found) == (
+        "No: missing is a loss torque that changes with load (gearbox.efficiency_load is 0.685 or gear_load_loss; "
+        "these data cannot tell which)."
+    )
+
+
+def test_a_parameter_that_moved_is_stated_with_its_ratio():
+    said = loop_words.moved_parameter("motor.friction_viscous", 1.2e-5, 4e-6, "N·m·s", 2.3)
+    assert said == "`motor.friction_viscous` is 1.2e-05 N·m·s, 3 times the stated 4e-06 (+2.3 prior sds)"

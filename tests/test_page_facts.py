@@ -82,7 +82,7 @@ def test_ticks_of_a_map_are_round_numbers_at_their_places(levels, ticks):
 
 
 def test_every_table_of_a_page_scrolls_in_itself(mmrjax, tmp_path):
-    assert mmrjax("simulate", "--out", "a")[0] == 0
+    assert mmrjax("simulate --out a")[0] == 0
     text = (tmp_path / "a" / "report.html").read_text()
     tables = re.findall(r"(.{0,24})<table", text)
     assert len(tables) > 1 and all(before.endswith('"scroll" tabindex="0">') for before in tables)

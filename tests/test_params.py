@@ -74,11 +74,6 @@ def test_replace_changes_the_named_and_nothing_else(robot_with_effects):
         assert {n for n in before if before[n] != after[n]} <= {name} and after[name] == 0.125
 
 
-def test_replace_unknown_name_is_refused(robot):
-    with pytest.raises(KeyError, match=r"no such parameter: motor\.resistanse"):
-        params.replace(robot, {"motor.resistanse": 1.0})
-
-
 def test_replace_takes_batches_and_tracers(robot):
     batch = params.replace(robot, {"motor.resistance": jnp.arange(3.0)})
     assert batch.motor.resistance.shape == (3,)
@@ -102,12 +97,6 @@ def test_parameters_have_no_weak_types(robot_with_effects):
         return x
 
     assert traced(given) == given
-
-
-def test_spec_is_frozen(robot):
-    spec = next(params.walk_parameters(robot)).spec
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        spec.unit = "kg"
 
 
 @pytest.mark.parametrize(("build", "torque"), [(paper_robots.sm1, 0.108), (paper_robots.sm2, 0.300)])

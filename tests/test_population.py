@@ -201,7 +201,7 @@ def test_damaged_members_are_refused_before_the_first_search(tmp_path, monkeypat
         )
     monkeypatch.setattr("sweeps.commands.loop.discover", never)
     ends(
-        mmrjax("loop", "measured", "--resolve", "--members", "kept.npz", "--out", "x"),
+        mmrjax("loop measured --resolve --members kept.npz --out x"),
         "--members kept.npz: not a readable file of members",
     )
     assert [p.name for p in tmp_path.iterdir()] == ["kept.npz"]

@@ -105,7 +105,7 @@ def test_a_table_states_levers_by_row(robot, tmp_path):
 def test_simulate_leaves_posture_and_page(tmp_path, mmrjax):
     folder = tmp_path / "run"
     ends(
-        mmrjax("simulate", "--levers-front", "30", "--levers-rear", "-8", "--out", str(folder)),
+        mmrjax("simulate --levers-front 30 --levers-rear -8 --out", str(folder)),
         "steps up to 236 mm",
         code=0,
     )

@@ -25,16 +25,6 @@ def test_battery_voltage_matches_reference():
         assert_allclose(battery.voltage(current, discharge), expected, rtol=1e-9)
 
 
-def test_battery_voltage_full_without_load_is_eight_cells():
-    battery = Battery(current_other=0.0)
-    assert_allclose(battery.voltage(0.0, 0.0), 33.36, rtol=1e-12)  # Table A4 rounds to 33.4
-
-
-def test_battery_table1_units_are_per_mah():
-    # Table 1 in its own units: 2000 mAh taken from a cell leave 4.17 - 1.0 + 0.28 V.
-    assert_allclose(Battery().voltage_no_load(2000 * 3.6), 3.45, rtol=1e-12)
-
-
 def test_battery_parabola_turns_beyond_capacity():
     battery = Battery()
     lowest = -battery.slope / (2 * battery.curvature)
@@ -71,10 +61,6 @@ def test_battery_whose_own_parabola_turns_up_is_remarked():
 @pytest.mark.parametrize(("discharge", "empty"), [(0.0, False), (7919.9, False), (7920.0, True), (1e5, True)])
 def test_battery_is_empty_from_its_capacity(discharge, empty):
     assert bool(Battery().empty(discharge)) is empty
-
-
-def test_battery_current_includes_other_consumers():
-    assert float(Battery().current(3.0)) == 4.5
 
 
 @pytest.mark.parametrize(("mode", "on_battery"), [(1, 1.0), (2, 0.0)])

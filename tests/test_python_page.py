@@ -80,10 +80,10 @@ def test_the_tutorial_about_a_log_finds_the_fan(tmp_path, mmrjax):
     packed = np.loadtxt(bench / "log.csv", delimiter=",", skiprows=1)
     assert_allclose(packed, made, atol=0.51, rtol=0)
     assert_allclose(packed[:, 2], made[:, 2], atol=6e-4)
-    assert mmrjax("rig", "new", "rig.toml", "--kind", "bench")[0] == 0
+    assert mmrjax("rig new rig.toml --kind bench")[0] == 0
     assert mmrjax("settle", bench / "log.csv", "--robot", "rig.toml", "--out", "settled", "--no-report")[0] == 0
     assert len((tmp_path / "settled" / "settled.csv").read_text().splitlines()) == 25
-    assert mmrjax("loop", "settled/settled.csv", "--robot", "rig.toml", "--out", "found", "--no-report")[0] == 0
+    assert mmrjax("loop settled/settled.csv --robot rig.toml --out found --no-report")[0] == 0
     found = json.loads((tmp_path / "found" / "result.json").read_text("utf-8"))
     assert found["verdict"] == "class" and "loss torque that changes with speed" in found["statement"]
     assert "windage" in found["statement"]

@@ -18,7 +18,7 @@ REPORTED = CONFIG.replace("report = false\n", "")
 def page(mmrjax, tmp_path):
     def write(config=REPORTED):
         (tmp_path / "plan.toml").write_text(config)
-        assert mmrjax("sweep", "plan.toml", "--out", "s", "--force")[0] == 0
+        assert mmrjax("sweep plan.toml --out s --force")[0] == 0
         return Tables((tmp_path / "s" / "report.html").read_text())
 
     return write

@@ -230,12 +230,6 @@ def test_what_cannot_be_is_refused_in_a_sentence_and_leaves_nothing(arguments, w
     assert list(tmp_path.iterdir()) == []
 
 
-def test_help_has_units_and_an_example(capsys):
-    assert command(["resonance", "--help"]) == 0
-    said = capsys.readouterr().out
-    assert "(V)" in said and "(kg)" in said and "Example: mmrjax resonance" in said
-
-
 def test_resolved_configuration_is_read_again(tracked):
     text = (tracked[0] / "config.resolved.toml").read_text()
     assert 'model = "track"' in text and "voltages_V = [24.0, 26.0" in text

@@ -446,32 +446,32 @@ def test_packaged_robot_is_as_it_was(tmp_path):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_rig_new_writes_a_file_that_reads(mmrjax, tmp_path, kind):
-    code, out, err = mmrjax("rig", "new", "my-rig.toml", "--kind", kind)
+    code, out, err = mmrjax("rig new my-rig.toml --kind", kind)
     assert (code, err) == (0, "") and "mmrjax rig check my-rig.toml" in out
     assert not robot_file.load_robot(str(tmp_path / "my-rig.toml")).rig.inherits
 
 
 def test_rig_new_keeps_a_file_unless_forced(mmrjax, tmp_path):
     (tmp_path / "my-rig.toml").write_text("mine")
-    ends(mmrjax("rig", "new", "my-rig.toml"), "my-rig.toml: there already; --force replaces it")
+    ends(mmrjax("rig new my-rig.toml"), "my-rig.toml: there already; --force replaces it")
     assert (tmp_path / "my-rig.toml").read_text() == "mine"
-    assert mmrjax("rig", "new", "my-rig.toml", "--force")[0] == 0
+    assert mmrjax("rig new my-rig.toml --force")[0] == 0
     assert not robot_file.load_robot(str(tmp_path / "my-rig.toml")).has_ground
 
 
 def test_rig_new_lists_the_kinds(mmrjax, tmp_path):
     ends(
-        mmrjax("rig", "new", "my-rig.toml", "--kind", "bensh"),
+        mmrjax("rig new my-rig.toml --kind bensh"),
         "--kind: got bensh; did you mean bench? allowed: bench, dyno, pendulum, servo, linear, carriage, wheeled, tracked",
     )
-    ends(mmrjax("rig", "new", "nowhere/my-rig.toml"), "no such folder as nowhere")
+    ends(mmrjax("rig new nowhere/my-rig.toml"), "no such folder as nowhere")
     assert not list(tmp_path.iterdir())
 
 
 @pytest.fixture
 def bench(mmrjax, tmp_path):
     """A bench as its template has it, and a table of it with sds, in mA."""
-    mmrjax("rig", "new", "my-rig.toml")
+    mmrjax("rig new my-rig.toml")
     robot = robot_file.load_robot(str(tmp_path / "my-rig.toml"))
     voltage = np.linspace(3.0, 24.0, 12)
     seen = steady_batch(robot, Conditions(voltage=voltage))
@@ -484,7 +484,7 @@ def bench(mmrjax, tmp_path):
 
 @pytest.mark.slow
 def test_rig_check_says_what_a_file_is(mmrjax, bench):
-    code, out, err = mmrjax("rig", "check", "my-rig.toml")
+    code, out, err = mmrjax("rig check my-rig.toml")
     assert (code, err) == (0, "")
     assert "One motor drives, through its gearbox 20 : 1, bench: a shaft of 0.002 kg·m²." in out
     assert "10 lines still hold the number of an example" in out
@@ -494,7 +494,7 @@ def test_rig_check_says_what_a_file_is(mmrjax, bench):
 @pytest.mark.slow
 def test_rig_check_says_what_a_table_can_determine(mmrjax, bench):
     """Friction of motor and load act alike on current and speed, as does the gear's loss: the wider prior gives way."""
-    _, out, _ = ends(mmrjax("rig", "check", "my-rig.toml", "runs.csv", "--json"), code=0)
+    _, out, _ = ends(mmrjax("rig check my-rig.toml runs.csv --json"), code=0)
     found = json.loads(out)
     assert found["schema"] == "mmrjax.rig_check/1" and found["data"]["rows"] == 12
     columns = {c["column"]: c for c in found["data"]["columns"]}
@@ -512,23 +512,19 @@ def test_rig_check_says_what_a_table_can_determine(mmrjax, bench):
 
 
 def test_rig_check_of_data_says_the_same_in_words(mmrjax, bench):
-    _, out, _ = ends(
-        mmrjax("rig", "check", "my-rig.toml", "runs.csv"), "total_current_A, yours total_current_mA", code=0
-    )
+    _, out, _ = ends(mmrjax("rig check my-rig.toml runs.csv"), "total_current_A, yours total_current_mA", code=0)
     assert re.search(r"total_current .*signed +(assumed, 2 %, as total_curr|estimated by how readings)", out)
     assert "gearbox.efficiency_load" in out and "not determined" in out
     assert "room: without a role" in out and "add output_torque to channels" in out
 
 
 def test_rig_check_ends_with_2_for_the_file_and_4_for_the_data(mmrjax, bench, tmp_path):
-    ends(
-        mmrjax("rig", "check", "mine.toml"), "mine.toml: no such file; mmrjax rig new mine.toml writes one to fill in"
-    )
+    ends(mmrjax("rig check mine.toml"), "mine.toml: no such file; mmrjax rig new mine.toml writes one to fill in")
     text = (tmp_path / "my-rig.toml").read_text().replace("\nratio = 20.0", "")
     (tmp_path / "lacking.toml").write_text(text)
-    ends(mmrjax("rig", "check", "lacking.toml"), "gearbox.ratio [-] is missing")
+    ends(mmrjax("rig check lacking.toml"), "gearbox.ratio [-] is missing")
     (tmp_path / "odd.csv").write_text("supply_voltage_V,total_current_A,motor_speed_rpm\n12,x,3000\n")
-    ends(mmrjax("rig", "check", "my-rig.toml", "odd.csv"), "odd.csv row 1, total_current_A: got x", code=4)
+    ends(mmrjax("rig check my-rig.toml odd.csv"), "odd.csv row 1, total_current_A: got x", code=4)
 
 
 ODD = {

@@ -191,5 +191,5 @@ def test_robots_with_a_mistake_are_refused_in_a_sentence(old, new, joint, messag
     ],
 )
 def test_rig_new_that_is_refused_leaves_nothing_behind(mmrjax, tmp_path, options, message):
-    ends(mmrjax("rig", "new", "r.toml", *options), message)
+    ends(mmrjax("rig new r.toml", *options), message)
     assert not list(tmp_path.iterdir())

@@ -238,7 +238,9 @@ def test_what_is_ranked_is_said_not_to_be_confirmed():
         "amplitude 0.0123 ± 0.0004 N·m"
     ]  # the others explain no more than chance, or would supply power
     nothing = dataclasses.replace(RANKING, missing=False, p_value=0.4)
-    assert words.ranking_lines(nothing) == ["by regression: nothing is missing (family-wise p = 0.4)"]
+    assert words.ranking_lines(nothing) == [
+        "by regression, not yet confirmed: nothing exceeds chance (family-wise p = 0.4)"
+    ]
 
 
 def test_what_is_found_before_the_verdict_is_said_to_be_untested(capsys):
@@ -261,7 +263,7 @@ def test_a_budget_that_ends_after_the_screening_leaves_its_ranking(tmp_path, mmr
 
     monkeypatch.setattr(command, "discover", screened)
     options = ("--robot", "rig.toml", "--no-report", "--out", "found", "--within", "20s")
-    code, _, err = mmrjax("loop", "table.csv", *options)
+    code, _, err = mmrjax("loop table.csv", *options)
     assert code == 3 and err.count("  1. churning, a loss torque that changes with speed") == 2  # at once, and last
     assert "no verdict within 20 s\n" in err and "kept: ranking" in err
     left = json.loads((tmp_path / "found.partial" / "screening.json").read_text(encoding="utf-8"))

@@ -38,7 +38,7 @@ ROOT = Path(__file__).parents[1]
 SCHEMA = json.loads((ROOT / "docs" / "schemas" / "sensitivity.schema.json").read_text(encoding="utf-8"))
 NAMES = ("motor.torque_constant", "6T2A.track.guide_share", "4W2T.track.loss_coulomb", "motor.inductance")
 SMALL = (
-    "sensitivity", "--parameters", ",".join(NAMES), "--voltages", "24", "--payloads", "3", "--slopes", "0,5",
+    "sensitivity --parameters", ",".join(NAMES), "--voltages", "24", "--payloads", "3", "--slopes", "0,5",
     "--evaluations", "3000", "--outputs", "total_current,speed",
 )  # fmt: skip
 
@@ -225,17 +225,14 @@ def test_posterior_of_a_robot_is_its_inputs_and_gives_runs_their_uncertainty(mmr
     robot_file.write_robot(fitted, tmp_path / "robot.toml", note="of a test")
     posteriors.write_posterior(found, tmp_path / posteriors.FILE)
     code, out, _ = mmrjax(
-        "sensitivity", "--robot", "robot.toml", "--posterior", "--voltages", "24", "--payloads", "3", "--slopes", "0",
-        "--configurations", "6T2A", "--outputs", "speed", "--evaluations", "6000", "--no-report", "--out", "p",
+        "sensitivity --robot robot.toml --posterior --voltages 24 --payloads 3 --slopes 0 --configurations 6T2A --outputs speed --evaluations 6000 --no-report --out p",
     )  # fmt: skip
     document = json.loads((tmp_path / "p" / "result.json").read_text())
     jsonschema.validate(document, SCHEMA)
     assert code == 0 and document["method"] == "local" and document["correlated"]
 
     _, out, _ = ends(
-        mmrjax(
-            "simulate", "--robot", "robot.toml", "--posterior", "60", "--voltage", "24", "--no-report", "--out", "u"
-        ),
+        mmrjax("simulate --robot robot.toml --posterior 60 --voltage 24 --no-report --out u"),
         code=0,
     )
     assert re.search(r"total current \[A\] +\d\.\d+ ± 0\.\d+", out)
@@ -245,27 +242,14 @@ def test_posterior_of_a_robot_is_its_inputs_and_gives_runs_their_uncertainty(mmr
     assert float(row["speed_mm_s_sd"]) == pytest.approx((high - low) / 3.92, rel=0.3)
     ends(
         mmrjax(
-            "sweep",
-            "--robot",
-            "robot.toml",
-            "--posterior",
-            "20",
-            "--slopes",
-            "0",
-            "--voltages",
-            "24",
-            "--configurations",
-            "6T2A",
-            "--no-report",
-            "--out",
-            "w",
+            "sweep --robot robot.toml --posterior 20 --slopes 0 --voltages 24 --configurations 6T2A --no-report --out w",
         ),
         " ± ",
         code=0,
     )
     assert "speed_mm_s_sd" in table(tmp_path / "w" / "runs.csv")[0]
     ends(
-        mmrjax("simulate", "--robot", "robot.toml", "--set", f"{NAMES[0]}=0.03", "--posterior", "20"),
+        mmrjax("simulate --robot robot.toml --set", f"{NAMES[0]}=0.03", "--posterior", "20"),
         f"{NAMES[0]} is 0.03 in the robot; expected",
         code=4,
     )
@@ -301,15 +285,13 @@ def test_what_is_refused(mmrjax, tmp_path, options, code, says):
     points += (
         [] if any(o in ("--voltages", "voltage=20:28", "voltage=28:20") for o in options) else ["--voltages", "24"]
     )
-    got, _, err = mmrjax("sensitivity", "--payloads", "3", *points, *options, "--out", "x")
+    got, _, err = mmrjax("sensitivity --payloads 3", *points, *options, "--out", "x")
     assert got == code and says in err, err
     assert not (tmp_path / "x").exists() and not (tmp_path / "x.partial").exists()
 
 
 def test_a_parameter_without_a_prior_of_some_width_is_refused(mmrjax, tmp_path):
-    got, _, err = mmrjax(
-        "sensitivity", "--parameters", "motor.friction_viscous", "--set", "motor.friction_viscous=0", "--out", "x"
-    )
+    got, _, err = mmrjax("sensitivity --parameters motor.friction_viscous --set motor.friction_viscous=0 --out x")
     assert got == 2 and "--parameters motor.friction_viscous: its prior has no width" in err
 
 
@@ -330,8 +312,7 @@ def test_candidates_are_read_as_tables_of_runs(mmrjax, tmp_path):
 def test_points_that_are_not_held_are_said(mmrjax, tmp_path):
     ends(
         mmrjax(
-            "sensitivity",
-            "--parameters",
+            "sensitivity --parameters",
             NAMES[0],
             "--voltages",
             "24",
@@ -363,10 +344,7 @@ def test_points_that_are_not_held_are_said(mmrjax, tmp_path):
 def test_conditions_that_vary_are_those_of_each_candidate_where_it_states_them(mmrjax, tmp_path, vary):
     ends(
         mmrjax(
-            "sensitivity",
-            "--method",
-            "local",
-            "--parameters",
+            "sensitivity --method local --parameters",
             NAMES[0],
             "--payloads",
             "3",
@@ -392,9 +370,7 @@ def test_conditions_that_vary_are_those_of_each_candidate_where_it_states_them(m
 @pytest.mark.slow
 def test_start_outputs_are_studied_by_drive(mmrjax, tmp_path):
     code, _, _ = mmrjax(
-        "sensitivity", "--method", "local", "--parameters", "motor.resistance,6T2A.ground.friction.dynamic", "--voltages", "24",
-        "--payloads", "0", "--slopes", "0", "--configurations", "6T2A", "--outputs", "start", "--no-report",
-        "--out", "t",
+        "sensitivity --method local --parameters motor.resistance,6T2A.ground.friction.dynamic --voltages 24 --payloads 0 --slopes 0 --configurations 6T2A --outputs start --no-report --out t",
     )  # fmt: skip
     document = json.loads((tmp_path / "t" / "result.json").read_text())
     assert code == 0 and set(document["outputs"]) == {"peak_current", "time_to_speed", "energy_start"}

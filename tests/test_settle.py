@@ -528,7 +528,7 @@ def test_an_angle_shows_the_speed_of_its_shaft(tmp_path):
 
 def test_the_command_leaves_a_table_that_is_read_as_settled_runs(tmp_path, mmrjax):
     _, world, robot = made(tmp_path)
-    _, out, _ = ends(mmrjax("settle", "log.csv", "--robot", "rig.toml", "--out", "found"), code=0)
+    _, out, _ = ends(mmrjax("settle log.csv --robot rig.toml --out found"), code=0)
     assert f"{len(world.conditions)} settled runs, " in " ".join(out.split())
     runs = records.read_runs(tmp_path / "found" / "settled.csv", robot=robot)
     assert not runs.sampled and len(runs) == len(world.conditions)

@@ -12,7 +12,6 @@ from numpy.testing import assert_allclose
 from pages import Tables, drawn, outside
 
 import mmrjax as mm
-from calibration.data import profiles
 from mmrjax.missions import mission_batch as missions
 from mmrjax.missions.mission_batch import OUTPUTS
 from mmrjax.missions.profile import profile
@@ -232,13 +231,6 @@ def test_voltage_of_the_profile_beside_the_battery_is_refused(mmrjax, capsys, mo
         mmrjax(capsys, monkeypatch, "simulate", "--profile", "volts.csv", "--battery"),
         "--battery: got it together with volts.csv, which states supply_voltage_V",
     )
-
-
-def test_help_names_the_packaged_profiles_and_units(mmrjax, capsys, monkeypatch):
-    code, out, _ = mmrjax(capsys, monkeypatch, "simulate", "--help")
-    text = " ".join(re.sub(r"[│]", " ", out).split())
-    assert code == 0 and all(name in text for name in profiles.PACKAGED)
-    assert "time_s (s)" in text and "simulate --profile patrol --battery" in text
 
 
 # --- rows of the history --------------------------------------------------------------------------------------------

@@ -20,7 +20,7 @@ from test_sweep_store import CONFIG, arrays
 from calibration.data.input_errors import BadConfiguration
 from mmrjax.model import paper_robots
 from sweeps.config_campaign import Campaign
-from sweeps.points import axes, cluster, identity, scale
+from sweeps.points import axes, cluster, scale, zarr_store
 from sweeps.points.job import prepare_job
 
 pytest.importorskip("distributed")
@@ -149,9 +149,9 @@ def test_scheduler_without_workers_is_refused(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_worker_with_another_program_is_refused(two_workers, monkeypatch):
-    honest = identity._code()
+    honest = zarr_store._code()
     changed = tuple((f, "0" * 16 if f == "mmrjax/model/motor.py" else h) for f, h in honest)
-    monkeypatch.setattr(identity, "_code", lambda: changed)
+    monkeypatch.setattr(zarr_store, "_code", lambda: changed)
     with pytest.raises(BadConfiguration, match=r"has another program; it differs in code \(mmrjax/motor\.py\)"):
         connect_when_up(two_workers.address)
     monkeypatch.undo()

@@ -28,7 +28,7 @@ from mmrjax.model.signals import STATUSES
 from sweeps import cli
 from sweeps.commands import sweep as command
 from sweeps.config_campaign import Campaign
-from sweeps.points import axes, identity, scale, zarr_store
+from sweeps.points import axes, scale, zarr_store
 from sweeps.points.job import laid_out, prepare_job
 from sweeps.points.tasks import task_of
 from sweeps.store import LOCK, MANIFEST, RunFolder
@@ -62,7 +62,7 @@ def sweep(mmrjax, tmp_path):
     def command(out, *options, config=None):
         if config is not None:
             (tmp_path / "plan.toml").write_text(config)
-        return mmrjax("sweep", "plan.toml", "--out", out, *options)
+        return mmrjax("sweep plan.toml --out", out, *options)
 
     return command
 
@@ -162,7 +162,7 @@ def test_large_grid_of_options_leaves_a_store_with_the_numbers_of_the_table(mmrj
     assert "--export csv" in said
     left = {f.name for f in (tmp_path / "large").iterdir()}
     assert left == {
-        "config.resolved.toml", "identity.json", "journal", "manifest.json", "result.json", "results.zarr", "robot.toml",
+        "config.resolved.toml", "zarr_store.json", "journal", "manifest.json", "result.json", "results.zarr", "robot.toml",
     }  # fmt: skip
     results = [json.loads((tmp_path / name / "result.json").read_text()) for name in ("small", "large")]
     assert results[0]["statuses"] == results[1]["statuses"] and results[0]["runs"] == results[1]["points"] == 12
@@ -188,7 +188,7 @@ def test_outputs_of_a_grid_are_chosen_by_an_option(mmrjax, tmp_path):
 def test_large_grid_that_is_refused_leaves_nothing(mmrjax, tmp_path, monkeypatch):
     monkeypatch.setattr("sweeps.commands.sweep.TABLE", 3)
     monkeypatch.setattr(command, "MARGIN", 10**18)
-    ends(mmrjax("sweep", "--slopes", "0,5", "--out", "s"), "--out: the results would take")
+    ends(mmrjax("sweep --slopes 0,5 --out s"), "--out: the results would take")
     assert not list(tmp_path.iterdir())
 
 
@@ -433,15 +433,15 @@ def test_sweep_of_other_data_code_or_versions_is_refused_saying_which(begun, mon
     robot.write_text(text + "\n# another day\n")
     ends(begun(), "differs in data (robot.toml);")
     robot.write_text(text)
-    honest = identity._code()
+    honest = zarr_store._code()
     changed = tuple((f, "0" * 16 if f == "mmrjax/model/motor.py" else h) for f, h in honest)
-    monkeypatch.setattr(identity, "_code", lambda: changed)
+    monkeypatch.setattr(zarr_store, "_code", lambda: changed)
     ends(begun(), "differs in code (mmrjax/model/motor.py);")
-    monkeypatch.setattr(identity, "_code", lambda: honest)
-    real = identity.installed_versions
-    monkeypatch.setattr(identity, "installed_versions", lambda packages: {**real(packages), "jax": "0.9.9"})
+    monkeypatch.setattr(zarr_store, "_code", lambda: honest)
+    real = zarr_store.installed_versions
+    monkeypatch.setattr(zarr_store, "installed_versions", lambda packages: {**real(packages), "jax": "0.9.9"})
     ends(begun(), "differs in versions (jax was ", ", is 0.9.9);")
-    monkeypatch.setattr(identity, "installed_versions", real)
+    monkeypatch.setattr(zarr_store, "installed_versions", real)
     monkeypatch.setattr(scale, "device_kind", lambda: "cpu: another")
     _, _, err = ends(begun(), "differs in device")
     assert "differs in device (device was 'cpu: cpu'" not in err
@@ -458,9 +458,9 @@ def test_force_begins_anew(begun, tmp_path):
 def test_identity_differences_are_few_words():
     old = {"configuration": {"a": "1", "b": "2", "c": "3", "d": "4"}, "code": {"x.py": "0"}}
     new = {"configuration": {"a": "2", "b": "3", "c": "4", "e": "5"}, "code": {"x.py": "1"}}
-    said = identity.identity_differences(old, new)
+    said = zarr_store.identity_differences(old, new)
     assert said == "configuration (a was 1, is 2, b was 2, is 3, c was 3, is 4 and 2 more); code (x.py)"
-    assert identity.identity_differences(old, old) == ""
+    assert zarr_store.identity_differences(old, old) == ""
 
 
 @pytest.mark.nightly
@@ -592,7 +592,7 @@ def test_store_is_not_abandoned_while_a_share_is_at_work(opened, tmp_path):
     share.begin((2, 3))
     rest.begin()
     rest.abandon()
-    assert (tmp_path / "s.partial" / "identity.json").is_file()
+    assert (tmp_path / "s.partial" / "zarr_store.json").is_file()
     share.close()
     rest.abandon()
     assert not list(tmp_path.iterdir())
@@ -634,7 +634,7 @@ def test_replacement_killed_between_any_two_steps_is_taken_up(opened, monkeypatc
     def finish(store):
         with store.last() as last:
             assert last
-            names = ["identity.json", "journal", "manifest.json", zarr_store.STORE]
+            names = ["zarr_store.json", "journal", "manifest.json", zarr_store.STORE]
             store.write_json("manifest.json", {"schema": MANIFEST, "contents": names})
             store.move_into_place()
 
@@ -688,7 +688,7 @@ def flip(file):
 
 HARMS = {"cut": cut, "flip": flip, "empty": lambda file: file.write_bytes(b""), "remove": Path.unlink}
 DAMAGED = (
-    "identity.json",
+    "zarr_store.json",
     "journal/1-of-1.jsonl",
     "zarr.json",
     "speed/zarr.json",
@@ -706,7 +706,7 @@ def victim(folder, name):
 def finished(store):
     with store.last() as last:
         assert last
-        names = ["identity.json", "journal", "manifest.json", zarr_store.STORE]
+        names = ["zarr_store.json", "journal", "manifest.json", zarr_store.STORE]
         store.write_json("manifest.json", {"schema": MANIFEST, "contents": names})
         store.move_into_place()
 
@@ -720,7 +720,7 @@ def test_what_is_damaged_of_an_interrupted_sweep_is_computed_again(opened, tmp_p
         written(store, k, speed=speed)
     store.close()
     HARMS[harm](victim(store.partial, name))
-    if name == "identity.json" and harm != "remove":  # without one the store had not begun
+    if name == "zarr_store.json" and harm != "remove":  # without one the store had not begun
         with pytest.raises(
             BadData, match=r"identity\.json is damaged; choose another path, or --force to begin anew"
         ):
@@ -751,7 +751,7 @@ def test_what_is_damaged_of_a_finished_sweep_is_said(opened, tmp_path, name, har
     HARMS[harm](file)
     with pytest.raises((BadData, BadConfiguration), match=r"is damaged; choose another path|s exists already"):
         opened()
-    if name not in ("manifest.json", "identity.json") or harm == "flip":
+    if name not in ("manifest.json", "zarr_store.json") or harm == "flip":
         return
     before = sorted(tmp_path.rglob("*"))
     with contextlib.suppress(BadConfiguration):
@@ -925,7 +925,7 @@ def test_layout_counts_its_bytes_without_writing(whole):
 def test_plan_of_the_page_is_accepted(mmrjax, tmp_path):
     page = (Path(__file__).resolve().parents[1] / "docs" / "reference" / "plans.md").read_text(encoding="utf-8")
     (tmp_path / "plan.toml").write_text(page.split("```toml\n")[1].split("```")[0])
-    _, out, _ = ends(mmrjax("sweep", "plan.toml", "--dry-run", "--chunk", "1000"), code=0)
+    _, out, _ = ends(mmrjax("sweep plan.toml --dry-run --chunk 1000"), code=0)
     assert "60,680,000 (2 configuration x 41 slope_deg x 37 voltage x 20 motor.friction_coulomb x 1000 sample)" in out
 
 

@@ -66,10 +66,7 @@ def test_the_words_name_the_same_statuses_as_the_codes():
     )
 
 
-DOWNHILL = (
-    "simulate", "--battery", "--configuration", "4W2T", "--slope", "-20", "--payload", "8", "--surface", "concrete",
-    "--set", "battery.current_other=0", "--no-report",
-)  # fmt: skip
+DOWNHILL = "simulate --battery --configuration 4W2T --slope -20 --payload 8 --surface concrete --set battery.current_other=0 --no-report"
 
 
 @pytest.mark.slow
@@ -81,7 +78,7 @@ DOWNHILL = (
     ],
 )
 def test_charging_above_the_charge_voltage_is_flagged_with_the_voltage_of_a_cell(mmrjax, tmp_path, model):
-    _, out, _ = ends(mmrjax(*DOWNHILL, *model, "--no-report", "--out", "a"), code=0)
+    _, out, _ = ends(mmrjax(DOWNHILL, *model, "--no-report", "--out", "a"), code=0)
     (row,) = table(tmp_path / "a" / "runs.csv")
     assert "overvoltage" in row["flags"].split(";") and float(row["total_current_A"]) < -0.5
     assert float(row["voltage_cell_V"]) == pytest.approx(float(row["voltage_V"]) / 8, rel=1e-6)
@@ -89,7 +86,7 @@ def test_charging_above_the_charge_voltage_is_flagged_with_the_voltage_of_a_cell
     (note,) = json.loads((tmp_path / "a" / "result.json").read_text())["notes"]
     assert note in " ".join(out.split()) and "A flow into the battery, a cell at 4." in note
     _, out, _ = ends(
-        mmrjax(*DOWNHILL, *model, "--set", "battery.voltage_charge=4.9", "--no-report", "--out", "b"), code=0
+        mmrjax(DOWNHILL, *model, "--set", "battery.voltage_charge=4.9", "--no-report", "--out", "b"), code=0
     )
     assert "overvoltage" not in out
 
@@ -124,17 +121,17 @@ def test_the_hot_winding_is_flagged_from_the_current_of_the_hot_resistance():
 
 
 def test_a_voltage_beside_the_battery_is_refused(mmrjax, tmp_path):
-    for command in (("simulate",), ("render", "a.png")):
-        code, _, err = mmrjax(*command, "--battery", "--voltage", "15")
+    for command in ("simulate", "render a.png"):
+        code, _, err = mmrjax(command, "--battery", "--voltage", "15")
         assert code == 2
         assert err == ("mmrjax: --voltage: got 15 with --battery, whose charge sets the voltage; give one of them\n")
-    ends(mmrjax("sweep", "--battery", "--voltages", "15,24"), "--voltages acts without --battery only")
-    ends(mmrjax("sensitivity", "--battery", "--vary", "voltage=15:24"), "--vary voltage: acts without --battery only")
+    ends(mmrjax("sweep --battery --voltages 15,24"), "--voltages acts without --battery only")
+    ends(mmrjax("sensitivity --battery --vary voltage=15:24"), "--vary voltage: acts without --battery only")
     (tmp_path / "plan.toml").write_text("[axes]\nvoltage = [15, 24]\n[conditions]\nbattery = true\n")
-    code, _, err = mmrjax("sweep", "plan.toml")
+    code, _, err = mmrjax("sweep plan.toml")
     assert code == 2 and err.startswith("mmrjax: plan.toml, voltage: acts without battery only")
     (tmp_path / "runs.csv").write_text("configuration,supply_voltage_V,payload_kg,slope_deg\n6T2A,24,0,0\n")
-    code, _, err = mmrjax("simulate", "--battery", "--runs", "runs.csv")
+    code, _, err = mmrjax("simulate --battery --runs runs.csv")
     assert code == 4
     assert err.startswith(
         "mmrjax: runs.csv row 1, supply_voltage_V: got 24 together with --battery, whose charge sets"
@@ -143,7 +140,7 @@ def test_a_voltage_beside_the_battery_is_refused(mmrjax, tmp_path):
 
 @pytest.mark.slow
 def test_a_sweep_on_the_battery_has_no_axis_of_voltages(mmrjax, tmp_path):
-    ends(mmrjax("sweep", "--battery", "--slopes", "0,5", "--payloads", "0,8", "--out", "a"), code=0)
+    ends(mmrjax("sweep --battery --slopes 0,5 --payloads 0,8 --out a"), code=0)
     rows = table(tmp_path / "a" / "runs.csv")
     assert len(rows) == 2 * 2 * 2 and {row["supply_voltage_V"] for row in rows} == {""}
     assert len({row["total_current_A"] for row in rows}) == len(rows)
@@ -151,10 +148,10 @@ def test_a_sweep_on_the_battery_has_no_axis_of_voltages(mmrjax, tmp_path):
     assert "nan V" not in page and "6T2A, battery" in (tmp_path / "a" / "figures" / "sweep_speed.svg").read_text()
     resolved = tmp_path / "a" / "config.resolved.toml"
     assert "voltages_V" not in resolved.read_text()
-    assert mmrjax("sweep", "--config", resolved, "--out", "b")[0] == 0  # what it left can be run again
+    assert mmrjax("sweep --config", resolved, "--out", "b")[0] == 0  # what it left can be run again
     assert table(tmp_path / "b" / "runs.csv") == rows
     (tmp_path / "runs.csv").write_text("configuration,payload_kg,slope_deg\n6T2A,8,5\n")
-    assert mmrjax("simulate", "--battery", "--runs", "runs.csv", "--out", "c")[0] == 0
+    assert mmrjax("simulate --battery --runs runs.csv --out c")[0] == 0
     (row,) = table(tmp_path / "c" / "runs.csv")
     assert row["total_current_A"] in {r["total_current_A"] for r in rows}
 
@@ -162,37 +159,28 @@ def test_a_sweep_on_the_battery_has_no_axis_of_voltages(mmrjax, tmp_path):
 @pytest.mark.slow
 def test_the_command_line_reverses(mmrjax, tmp_path):
     ends(
-        mmrjax("simulate", "--voltage", "-15", "--no-report", "--out", "a"),
+        mmrjax("simulate --voltage -15 --no-report --out a"),
         "speed -438 mm/s",
         code=0,
     )
-    mmrjax("simulate", "--voltage", "15", "--out", "b", "--no-report")
+    mmrjax("simulate --voltage 15 --out b --no-report")
     (back,), (forth,) = table(tmp_path / "a" / "runs.csv"), table(tmp_path / "b" / "runs.csv")
     for column in ("total_current_A", "motor_speed_rpm", "speed_mm_s"):
         assert float(back[column]) == pytest.approx(-float(forth[column]), rel=1e-6)
     ends(
         mmrjax(
-            "sweep",
-            "--voltages=-33,-15,15",
-            "--slopes",
-            "0,5",
-            "--payloads",
-            "0",
-            "--configurations",
-            "4W2T",
-            "--out",
-            "c",
+            "sweep --voltages=-33,-15,15 --slopes 0,5 --payloads 0 --configurations 4W2T --out c",
         ),
         code=0,
     )
     assert json.loads((tmp_path / "c" / "result.json").read_text())["statuses"]["reverses"] == 4
     assert "-33 V" in (tmp_path / "c" / "report.html").read_text()
     ends(
-        mmrjax("simulate", "--voltage", 0, "--slope", 20, "--model", "drive", "--no-report", "--out", "d"),
+        mmrjax("simulate --voltage", 0, "--slope", 20, "--model", "drive", "--no-report", "--out", "d"),
         "No operating point: gravity drives the robot",
         code=0,
     )
-    ends(mmrjax("simulate", "--voltage", "-10001"), "supply_voltage_V: got -10001; expected -10000 to 10000")
+    ends(mmrjax("simulate --voltage -10001"), "supply_voltage_V: got -10001; expected -10000 to 10000")
 
 
 COLUMNS = "configuration,supply_voltage_V,total_mass_kg,payload_kg,slope_deg,total_current_A,motor_speed_rpm"
@@ -214,7 +202,7 @@ def test_readings_without_a_sign_are_refused_backward(tmp_path, row, sentence):
 @pytest.mark.slow
 def test_compare_takes_readings_with_their_signs(mmrjax, tmp_path):
     (tmp_path / "mine.csv").write_text(f"{COLUMNS}\n6T2A,15,13.1,0,0,2.1,5292\n6T2A,-15,13.1,0,0,-2.1,-5292\n")
-    _, out, _ = ends(mmrjax("compare", "mine.csv", "--no-report", "--out", "a"), code=0)
+    _, out, _ = ends(mmrjax("compare mine.csv --no-report --out a"), code=0)
     assert "did not converge" not in out
     rows = table(tmp_path / "a" / "comparison.csv")
     # An error is simulated less measured, with its sign, over the size of the channel.
@@ -235,7 +223,7 @@ def test_a_history_has_the_peak_of_the_inrush(climb, mmrjax, tmp_path):
     fine = drive_batch(paper_robots.nominal(), api.Conditions(0, [33.0], 10.0), np.linspace(0.0, 2e-3, 2001))
     peak = float(np.max(np.asarray(fine.signals.total_current)))
     assert float(np.max(np.asarray(found.history.signals.total_current[0]))) == pytest.approx(peak, rel=2e-3)
-    _, out, _ = ends(mmrjax("simulate", "--model", "drive", "--slope", 10, "--no-report", "--out", "a"), code=0)
+    _, out, _ = ends(mmrjax("simulate --model drive --slope", 10, "--no-report", "--out", "a"), code=0)
     assert re.search(rf"peak current, all motors \[A\] +{peak:.1f}", out)
     (row,) = table(tmp_path / "a" / "runs.csv")
     assert float(row[PEAK]) == pytest.approx(peak, rel=1e-4)
@@ -264,15 +252,15 @@ def test_a_start_is_drawn_of_the_run_that_was_asked_for(climb):
 
 @pytest.mark.slow
 def test_what_was_reached_is_shown_when_the_battery_ends(mmrjax, tmp_path):
-    asked = ("simulate", "--battery", "--model", "drive", "--discharge", "2190", "--duration")
-    _, out, _ = ends(mmrjax(*asked, "60", "--out", "a"), code=0)
+    asked = "simulate --battery --model drive --discharge 2190 --duration"
+    _, out, _ = ends(mmrjax(asked, "60", "--out", "a"), code=0)
     (row,) = table(tmp_path / "a" / "runs.csv")
     assert row["status"] == "battery_empty" and float(row["speed_mm_s"]) > 500 and float(row["total_current_A"]) > 1
     when, far = float(row["time_end_s"]), float(row["displacement_m"])
     assert f"after {when:.1f} s and {far:.2f} m" in out and re.search(rf"displacement.* \[m\] +{far:.2f}\n", out)
     # The same run, ended just before and just after: where the charge runs out does not depend on the samples.
-    assert mmrjax(*asked, f"{when - 0.01:.4f}", "--no-report", "--out", "b")[0] == 0
-    assert mmrjax(*asked, f"{when + 0.01:.4f}", "--no-report", "--out", "c")[0] == 0
+    assert mmrjax(asked, f"{when - 0.01:.4f}", "--no-report", "--out", "b")[0] == 0
+    assert mmrjax(asked, f"{when + 0.01:.4f}", "--no-report", "--out", "c")[0] == 0
     (before,) = table(tmp_path / "b" / "runs.csv")
     assert float(before["displacement_m"]) == pytest.approx(far, abs=0.01)
     charge = 3.6 * 10 - np.trapezoid(
@@ -281,7 +269,7 @@ def test_what_was_reached_is_shown_when_the_battery_ends(mmrjax, tmp_path):
     )
     assert charge == pytest.approx(0.01 * (float(row["total_current_A"]) + 1.5), abs=0.05)
     ends(
-        mmrjax("simulate", "--battery", "--model", "drive", "--discharge", "2300", "--no-report"),
+        mmrjax("simulate --battery --model drive --discharge 2300 --no-report"),
         "battery_empty: empty before the start",
         code=0,
     )
@@ -291,9 +279,9 @@ def test_what_was_reached_is_shown_when_the_battery_ends(mmrjax, tmp_path):
 def test_a_run_may_last_a_day(mmrjax):
     found = api.simulate(paper_robots.nominal(), api.Conditions(0, 33.0), "drive", duration=86_400.0, history=False)
     assert found.statuses == "converged"
-    ends(mmrjax("simulate", "--model", "drive", "--duration", "86401"), "86400")
+    ends(mmrjax("simulate --model drive --duration 86401"), "86400")
     ends(
-        mmrjax("simulate", "--model", "track", "--duration", "3601"),
+        mmrjax("simulate --model track --duration 3601"),
         "--duration: got 3601; --model track takes at most 3600 s",
     )
 
@@ -350,10 +338,10 @@ def test_bad_limits_and_switches_are_refused(values, sentence):
 
 @pytest.mark.slow
 def test_a_switch_can_be_set_on_the_command_line(mmrjax, tmp_path):
-    ends(mmrjax("simulate", "--set", "gearbox.mesh_theory=true", "--no-report", "--out", "a"), code=0)
+    ends(mmrjax("simulate --set gearbox.mesh_theory=true --no-report --out a"), code=0)
     assert "mesh_theory = true" in (tmp_path / "a" / "robot.toml").read_text()
     assert '"gearbox.mesh_theory" = true' in (tmp_path / "a" / "config.resolved.toml").read_text()
-    ends(mmrjax("simulate", "--set", "gearbox.mesh_theory=2", "--out", "b"), "expected true or false")
+    ends(mmrjax("simulate --set gearbox.mesh_theory=2 --out b"), "expected true or false")
 
 
 def test_rated_limits_stand_in_the_report():
@@ -377,7 +365,7 @@ def test_a_film_begins_at_the_start_and_a_start_that_still_gains_speed_is_done(m
     monkeypatch.setattr(
         render.rendering, "render", lambda view, file, begin, *rest: (file.touch(), drawn.append(begin))
     )
-    code, out, _ = mmrjax("render", "start.gif", "--slope", 10, "--duration", 0.1)
+    code, out, _ = mmrjax("render start.gif --slope", 10, "--duration", 0.1)
     assert (code, drawn) == (0, [0.0]) and "not_settled" in out
 
 

@@ -25,8 +25,3 @@ def test_track_loss_of_three_and_one_is_table3(robot):
     # 350 + 16 ω and 70 + 3 ω mN·m at 20 rad/s
     assert_allclose(robot.configurations["6T2A"].track.torque_loss(20.0, 1.0), 0.670, rtol=1e-12)
     assert_allclose(robot.configurations["4W2T"].track.torque_loss(20.0, 1.0), 0.130, rtol=1e-12)
-
-
-def test_track_without_friction_loses_nothing():
-    track = Track(loss_coulomb=0.0, loss_viscous=0.0, guide_friction=0.0, guide_share=1.0)
-    assert float(track.torque_loss(20.0, 1.0)) == 0.0 and float(track.force_guide(90.0, 1.0)) == 0.0

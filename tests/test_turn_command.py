@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from pages import recorded
 
 import mmrjax as mm
 from calibration.data import runs as records
@@ -16,7 +17,7 @@ from mmrjax.derived import requirements
 from mmrjax.derived import turning_figures as derived
 from mmrjax.errors import UsageError
 from mmrjax.missions.profile import profile
-from mmrjax.model import paper_robots
+from mmrjax.model import paper_robots, params
 from mmrjax.model.channels import SIDES
 from mmrjax.model.quantities import HEAT
 from sweeps import config, inputs
@@ -33,7 +34,7 @@ from tests.commands import ends, rows
 
 @pytest.mark.slow
 def test_settled_turn_leaves_its_folder(tmp_path, mmrjax):
-    _, out, _ = ends(mmrjax("simulate", "--left", "33", "--right", "15", "--out", str(tmp_path / "run")), code=0)
+    _, out, _ = ends(mmrjax("simulate --left 33 --right 15 --out", str(tmp_path / "run")), code=0)
     assert "Turns to the right: a circle of 442 mm radius at 642 mm/s ahead" in out
     folder = tmp_path / "run"
     (row,) = rows(folder / "runs.csv")
@@ -162,7 +163,7 @@ def test_bad_turns_are_refused_in_a_sentence(tmp_path, mmrjax, case):
     one = tmp_path / "one.toml"
     one.write_text('base = "nominal"\nsides = 1\n')
     shaft = tmp_path / "shaft.toml"
-    mmrjax("rig", "new", str(shaft), "--kind", "bench")
+    mmrjax("rig new", str(shaft), "--kind", "bench")
     told = [{"ONE": str(one), "SHAFT": str(shaft)}.get(word, word) for word in told]
     code, _, err = mmrjax("simulate", *told, "--out", str(tmp_path / "run"))
     assert code == 2
@@ -220,7 +221,7 @@ def test_runs_of_a_table_whose_sides_are_driven_apart_show_both_sides(tmp_path, 
     path = tmp_path / "turns.csv"
     for cells, turns in (("33,0,0", False), ("33,0,0,1,0.5", True)):
         path.write_text(f"{HEADER if turns else HEADER.strip(',')}{SIDED if turns else ''}\n6T2A,{cells}\n")
-        assert mmrjax("simulate", "--runs", path)[0] == 4
+        assert mmrjax("simulate --runs", path)[0] == 4
         assert ({"yaw_rate", "motor_current_left", "motor_current_right"} <= set(shown)) == turns
     table = {"total_current_A": [1.8], "motor_current_left_A": [-1.8], "motor_current_right_A": [0.1]}
     assert simulate.motor_currents(paper_robots.nominal(), table) == pytest.approx([1.8])
@@ -231,7 +232,7 @@ def test_options_of_one_run_are_refused_beside_a_table(tmp_path, mmrjax):
     path.write_text(f"{HEADER}{SIDED}\n6T2A,33,0,0,1,0.5\n")
     for more in ((), ("--profile", "patrol", "--battery")):
         ends(
-            mmrjax("simulate", "--runs", path, "--voltage", "4", "--mass", "12", *more),
+            mmrjax("simulate --runs", path, "--voltage", "4", "--mass", "12", *more),
             "--voltage, --mass: not allowed with --runs",
         )
 
@@ -245,7 +246,7 @@ def test_options_of_one_run_are_refused_beside_a_table(tmp_path, mmrjax):
 )
 def test_a_sweep_refuses_what_leaves_open_what_drives_a_side(tmp_path, mmrjax, told, said):
     (tmp_path / "plan.toml").write_text(PLAN.replace("[axes]", f"{told}\n[axes]"))
-    ends(mmrjax("sweep", "plan.toml", "--no-report", "--out", "run"), said)
+    ends(mmrjax("sweep plan.toml --no-report --out run"), said)
 
 
 def test_a_robot_that_cannot_turn_is_refused_wherever_it_is_asked_to(tmp_path, mmrjax):
@@ -267,7 +268,7 @@ def test_results_of_turns_show_both_sides():
 def test_a_surface_of_which_nothing_is_known_is_refused(mmrjax):
     for more in ((), ("--left", "24", "--right", "10"), ("--model", "drive")):
         ends(
-            mmrjax("simulate", "--surface", "ice", *more),
+            mmrjax("simulate --surface ice", *more),
             "--surface: got ice, whose friction is not known; allowed: linoleum",
         )
 
@@ -280,50 +281,51 @@ def test_one_imposed_speed_of_two_sides_is_refused():
 def test_a_sweep_refuses_turns_on_a_slope_which_have_no_steady_state(tmp_path, mmrjax):
     (tmp_path / "plan.toml").write_text(PLAN.replace("[axes]", "slope_deg = 10\n[axes]"))
     ends(
-        mmrjax("sweep", "plan.toml", "--no-report", "--out", "run"),
+        mmrjax("sweep plan.toml --no-report --out run"),
         "duty_left -1: got a slope of 10 deg for a robot that turns",
     )
     assert not (tmp_path / "run").exists()
 
 
-def test_turns_are_told_in_plain_words():
-    from mmrjax.model import paper_robots, params
+SLOPING = {"slope_deg": 10.0, "yaw_rate_rad_s": -0.04}
+NOTHING = {name: float("nan") for name, value in row().items() if isinstance(value, float)}
+ENDED = {"time_s": 2.0, "displacement_m": 0.3, "turned_deg": -90.0}
+#: What is turned → changes of a usual turn.
+TOLD = {
+    "left": {}, "on the spot": {"yaw_rate_rad_s": -0.5, "speed_mm_s": 0.2},
+    "straight": {"turning_radius_mm": float("inf"), "yaw_rate_rad_s": 0.0}, "on a slope": SLOPING,
+    "straight on a slope": {"slope_deg": 10.0, "turning_radius_mm": float("inf"), "yaw_rate_rad_s": 0.0},
+    "stalled": {"status": "stalled"}, "not settled": {"status": "not_settled"}, "no numbers": {"status": "not_settled", **NOTHING},
+    "beyond limits": {"flags": "gearbox_overspeed;winding_hot"},
+    "hot, a side that gives back": {"winding_left_C": float("inf"), "power_right_W": -0.01},
+    "a side that stands": {"motor_speed_right_rpm": 0.2},
+    "a side that is driven": {"motor_current_left_A": -0.4, "motor_speed_left_rpm": 900.0, "power_left_W": -3.0},
+}  # fmt: skip
 
+
+def told(robot, name, ended=None):
+    """Lines of what is said of a turn, and of the table of its sides."""
+    turn = row(**TOLD[name])
+    yield f"{name}: {turn_words.turn_answer(turn, ended)}"
+    yield from turn_words.turn_notes(robot, turn)
+    yield from (" | ".join(map(str, side)) for side in turn_report.sides_table(robot, turn).rows)
+
+
+def test_turns_are_told_as_recorded():
     robot = paper_robots.nominal()
-
-    def said(ended=None, **changes):
-        turn = row(**changes)
-        return " ".join((turn_words.turn_answer(turn, ended), *turn_words.turn_notes(robot, turn)))
-
-    assert "to the left: a circle of 400 mm radius" in said()
-    assert "on the spot to the right at 0.50 rad/s, 4.8 turns a minute" in said(yaw_rate_rad_s=-0.5, speed_mm_s=0.2)
-    assert "Straight at 200 mm/s" in said(turning_radius_mm=float("inf"), yaw_rate_rad_s=0.0)
-    sloping = said(slope_deg=10.0, yaw_rate_rad_s=-0.04)
-    assert "0.04 rad/s to the right: on a slope the heading changes, and no turn is a circle." in sloping
-    assert "track width" in said() and "track width" not in sloping
-    assert "Straight at 200 mm/s" in said(slope_deg=10.0, turning_radius_mm=float("inf"), yaw_rate_rad_s=0.0)
-    assert "stalled" in said(status="stalled")
-    assert "track width" not in said(status="not_settled")
-    assert "winding_hot: winding hotter than permitted" in said(flags="gearbox_overspeed;winding_hot")
-    hot = turn_report.sides_table(robot, row(winding_left_C=float("inf"), power_right_W=-0.01)).rows
-    assert hot[-2:] == [("electrical power [W]", "5.0", "0.0"), (hot[-1][0], "none settles", "40")]
+    wide = params.replace(robot, {"6T2A.turning.width": 0.5})
     unknown = dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, unknown=HEAT[-1:]))
-    assert [side[0] for side in turn_report.sides_table(unknown, row()).rows] == [side[0] for side in hot[:-1]]
-    nothing = {name: float("nan") for name, value in row().items() if isinstance(value, float)}
-    none = row(status="not_settled", **nothing)
-    answer = turn_words.turn_answer(none, None)
-    assert answer.startswith("not_settled: ") and "no settled turn" in answer and "--duration" not in answer
-    assert not turn_report.sides_table(robot, none).rows and not turn_words.is_going(none)
-    assert "parts allow" not in said()
-    robot = params.replace(robot, {"6T2A.turning.width": 0.5})
-    assert "500 mm between the sides is outside the range of the packaged robot's parts, 208 to 278 mm" in said()
-    assert "the right motor stands at 1.00 A" in said(motor_speed_right_rpm=0.2)
-    back = said(motor_current_left_A=-0.4, motor_speed_left_rpm=900.0, power_left_W=-3.0)
-    assert "the left motor is driven by the turn: 0.40 A brake it, 3.0 W go back to the supply" in back
-    ended = {"time_s": 2.0, "displacement_m": 0.3, "turned_deg": -90.0}
-    assert said(ended, status="not_settled").startswith(
-        "After 2 s: 0.30 m from the start, turned by -90°. Not settled"
-    )
+    lines = [line for name in TOLD for line in told(robot, name)]
+    lines += [
+        *told(robot, "not settled", ENDED),
+        "# wide",
+        *told(wide, "left"),
+        "# heat is not known",
+        *told(unknown, "left"),
+    ]
+    text = "\n".join(lines) + "\n"
+    assert text == recorded("turns", text)
+    assert not turn_words.is_going(row(**TOLD["no numbers"]))
 
 
 PLAN = '[conditions]\nconfiguration = "6T2A"\nvoltage = 24\nduty_right = 1\n[axes]\nduty_left = [-1, 1]\n'

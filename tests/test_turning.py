@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from scipy.optimize import brentq
 from worlds import turning as world
 
 import mmrjax as mm
@@ -17,7 +16,7 @@ from mmrjax.model.contact import Friction
 from mmrjax.model.signals import STATUSES
 from mmrjax.turning import circling as turning
 from mmrjax.turning import two_sides as room
-from mmrjax.turning.two_sides import SIDES, Stance
+from mmrjax.turning.two_sides import Stance
 
 grip = jax.jit(room.grip)
 CONFIGURATIONS = ("6T2A", "4W2T")
@@ -180,22 +179,6 @@ def test_rates_are_those_of_a_second_implementation(robot, configuration):
         assert_allclose(mine[place][:10], theirs[:10], rtol=1e-8, atol=1e-8)
 
 
-@pytest.mark.quick(1)
-@pytest.mark.parametrize("configuration", CONFIGURATIONS)
-def test_settled_turns_of_a_second_implementation_are_settled(robot, configuration):
-    other = of_world(robot, configuration)
-    size = np.asarray(turning._UNITS)
-    law = jax.jit(
-        lambda left, right, y: turning.turning_rates(
-            robot, mm.Conditions(CONFIGURATIONS.index(configuration), duty_left=left, duty_right=right), y
-        )
-    )
-    for left, right in DUTIES:
-        found = world.circling(other, world.Inputs(left, right, kind="duty", supply=33.0))
-        y = np.array([*found.I, *found.w, found.v_x, found.v_y, found.omega, 0, 0, 0, 0]) / size
-        assert np.abs(np.asarray(law(left, right, jnp.asarray(y)))[:7]).max() < 1e-5  # of some 1e4 /s that each is of
-
-
 @pytest.mark.nightly
 @pytest.mark.slow
 def test_run_over_time_is_that_of_a_second_implementation(robot):
@@ -252,30 +235,6 @@ def test_turning_numbers_are_those_of_the_paper(robot):
         low, high = world.HEIGHT[name]
         mass = float(chassis.mass)
         assert height == pytest.approx((mass * low + 8 * high) / (mass + 8), abs=1e-3)
-
-
-def width_on_the_spot(wheeled, friction, lateral, speed, nodes=16):
-    """(r ω_k,right - r ω_k,left) / (ω B) at which no moment is left, the sides rolling at ± speed [m/s]."""
-    length, width, load = 0.3, 0.243, 100.0
-    stance = Stance(length, width, 0.0, 0.0, 0.0 if wheeled else 1.0, lateral, 1.0, nodes)
-
-    @jax.jit
-    def moment(rate):
-        sliding = speed * jnp.array([-1.0, 1.0]) + rate * width * SIDES
-        held = grip(stance, friction, 1.0, load, sliding, 0.0, rate, jnp.zeros(2))
-        return jnp.sum(held.moment - width * SIDES * held.ahead)
-
-    rate = brentq(lambda w: float(moment(w)), 1e-3 * speed / width, 2 * speed / width, xtol=1e-15)
-    return 2 * speed / rate / width
-
-
-@pytest.mark.quick(1)
-@pytest.mark.parametrize(("wheeled", "share"), [(False, 1 / 3), (True, 1.0)], ids=["tracks", "wheels"])
-@pytest.mark.parametrize("lateral", [1.0, 1.1875])
-def test_spot_turn_in_creep_has_the_width_of_its_closed_form(wheeled, share, lateral):
-    friction = Friction(static=0.32, dynamic=0.25)
-    found = width_on_the_spot(wheeled, friction, lateral, 1e-6)
-    assert found == pytest.approx(1 + lateral * share * (0.3 / 0.243) ** 2, rel=1e-6)
 
 
 @pytest.mark.parametrize("rule", [1.0, 2.0])
@@ -338,14 +297,3 @@ def pressure(stance, centre):
     line, weight = np.polynomial.legendre.leggauss(stance.nodes)
     place, share = (line, weight / 2) if stance.on_tracks else (np.array([-1, 1]), 0.5)
     return middle + place * half, share * (1 + tilt * place)
-
-
-@pytest.mark.parametrize("centre", [0.0, 0.03, -0.05, 0.08, -0.12])
-@pytest.mark.parametrize("on_tracks", [0.0, 1.0])
-def test_pressure_has_its_sum_and_its_centre(centre, on_tracks):
-    stance = Stance(0.3, 0.243, 0.0, 0.0, on_tracks, 1.0, 1.0)
-    place, share = pressure(stance, jnp.asarray(centre))
-    assert float(jnp.sum(share)) == pytest.approx(1.0, rel=1e-12)
-    assert float(jnp.sum(share * place)) == pytest.approx(centre, abs=1e-12)
-    assert float(jnp.min(share)) >= 0
-    assert float(jnp.max(jnp.abs(place))) <= 0.15 + 1e-12

@@ -161,7 +161,7 @@ def test_a_study_of_what_is_unknown_is_refused(tmp_path):
 @pytest.mark.slow
 def test_commands_leave_out_what_is_unknown_and_say_so(mmrjax, tmp_path):
     read(tmp_path, BENCH, "motor_speed")
-    _, out, _ = ends(mmrjax("simulate", "--robot", "rig.toml", "--motor-speed", "3000", "--out", "run"), code=0)
+    _, out, _ = ends(mmrjax("simulate --robot rig.toml --motor-speed 3000 --out run"), code=0)
     (head, _) = (tmp_path / "run" / "runs.csv").read_text(encoding="utf-8").splitlines()
     columns = {"voltage_V", "power_supply_W", "efficiency_motor", "winding_settled_C", "permissible_time_s"}
     assert columns.isdisjoint(head.split(",")) and "power_motor_W" in head

@@ -10,9 +10,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from calibration.data import Names
-from calibration.data.columns import Column
+from calibration.data.columns import TIME, Column
 from calibration.data.input_errors import bound_text
-from calibration.data.named_arrays import Raw, column_numbers
+from calibration.data.named_arrays import NamedArrays, Raw, column_numbers, missing_readings
+from mmrjax.errors import count_noun
 
 #: Numbers of binary digits after which counters wrap; of a 32-bit counter also in seconds, from ms, µs and ns.
 DIGITS = (15, 16, 24, 31, 32)
@@ -94,6 +95,34 @@ _SOME_DAY, _DAY = "1970-01-01T", 86400.0
 EPOCH, PARTS = (6.3e8, 4.2e9), {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 #: A date as 25.11.2026.
 _WITH_POINTS = re.compile(r"(\d\d)\.(\d\d)\.(\d{4})(?=[ T])")
+
+
+def recorded_rows(arrays: NamedArrays, meanings: Sequence[Column | None]) -> NamedArrays:
+    """Returns the columns without rows that nothing was recorded in, which a note counts.
+
+    Every cell of such a row is missing, or it is at the end of a log whose clock is back at 0 there: a logger writes
+    all of its memory.
+    """
+    empty = np.arange(len(arrays))
+    for raw in arrays.values:
+        empty = empty[missing_readings(raw, empty)]
+    if len(arrays) > len(empty) > 0:
+        kept = np.ones(len(arrays), bool)
+        kept[empty] = False
+        arrays = arrays.rows(
+            kept, f"{count_noun(len(empty), 'row')} without any reading left out; others are counted"
+        )
+    stated = [None if m is None else m.column for m in meanings]
+    clock = next((raw for c, raw in zip(stated, arrays.values, strict=True) if c in TIME), None)
+    if clock is None or "run_id" in stated or not len(arrays):
+        return arrays
+    count = column_numbers(clock)
+    used = np.flatnonzero(count != 0)
+    if not len(used) or used[-1] == len(count) - 1 or not np.nanmax(count) > 0:
+        return arrays
+    kept = np.arange(len(count)) <= used[-1]
+    note = f"{count_noun(int((~kept).sum()), 'row')} at the end left out: the clock is back at 0 there"
+    return arrays.rows(kept, note)
 
 
 def from_the_first(name: str, meaning: Column, raw: Raw, runs: Sequence[str] | None) -> tuple[Raw, Names]:

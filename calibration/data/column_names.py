@@ -275,7 +275,7 @@ def check_units(arrays: NamedArrays, meanings: Sequence[Column | None]) -> None:
         if meaning is None or meaning.column in WORDS:
             continue
         known = meaning.quantity.columns().values()
-        if unit and unit not in known:
+        if unit and unit not in known and abs(meaning.factor) == 1.0:  # a factor states the unit
             allowed = ", ".join(filter(None, known))
             raise BadData(
                 f"{arrays.name}, {meaning.shown}: got {unit} in {arrays.units_from}; "

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import math
+import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,11 +16,13 @@ from calibration.data.columns import Layout
 from calibration.data.input_errors import BadData
 from calibration.data.named_arrays import NamedArrays, column_numbers
 from calibration.data.sources import one_clock, opening
-from calibration.data.sources.recorded_signals import Clock, Signal, Source, unit_of_clock, values_in_memory
+from calibration.data.sources.recorded_signals import UNITS, Clock, Signal, Source, unit_of_clock, values_in_memory
 from mmrjax.model import channels
 
 #: Least gap between samples, in usual steps.
 GAP = 5.0
+#: Names of counts of time, and the least share of rows in which such a count rises.
+_COUNT, RISING = re.compile(r"time|tick|stamp"), 0.9
 
 
 @dataclasses.dataclass(frozen=True)
@@ -190,12 +194,43 @@ def _seconds(clock: Clock) -> tuple[np.ndarray, str] | str:
 def _proposed(signals: Sequence[Signal]) -> Iterator[tuple[str, str]]:
     """Paths of signals that may be columns, each with its line of a table `[columns]`: the time, then the others."""
     spelled = set(Layout(channels=channels.EVERY).spellings())
-    if not any(s.name in spelled and s.name.startswith("time_") for s in signals):
-        time = next(
-            (s for s in signals if _unit_of_time(s.name) is not None and s.clock is None and not s.refused), None
-        )
-        if time is not None:
-            unit = "s" if time.words else _unit_of_time(time.name)
-            unit = unit or one_clock.guessed_unit(np.asarray(time.load(), float))
-            yield time.path, f'time_{unit} = "{time.path}"'
-    yield from proposals.propose_columns([s for s in signals if _unit_of_time(s.name) is None], spelled)
+    own = [s for s in signals if s.clock is None and not s.refused]
+    named = next((s for s in own if _unit_of_time(s.name) is not None), None)
+    clock = named or next((s for s in own if _rises(s)), None)
+    rest = [s for s in signals if _unit_of_time(s.name) is None and s is not clock]
+    elapsed = None
+    if clock is not None:
+        unit = _unit_of_time(clock.name) or ("s" if clock.words else one_clock.guessed_unit(clock.load()))
+        elapsed = None if clock.words else np.asarray(clock.load(), float) * UNITS[unit]
+        line = f'time_{unit} = "{clock.path}"'
+        if named is None and elapsed is not None:
+            each = proposals.seconds_of_a_count(rest, np.asarray(clock.load(), float))
+            question = f"by a place and its rate it counts {1 / each:.3g} a second"
+            if math.isnan(each):
+                each, question = UNITS[unit], "counts of what? give the seconds of one"
+            each = float(f"{each:.3g}")
+            elapsed = np.asarray(clock.load(), float) * each
+            line = f'time_s = {{column = "{clock.path}", factor = {each:g}}}  # {question}'
+        elif not _unit_of_time(clock.name) and elapsed is not None and unit != "s":
+            step = np.diff(elapsed)
+            usual = float(np.median(step[step > 0])) if (step > 0).any() else np.nan
+            line += f"  # unit not stated: in {unit}, rows are {usual:.3g} s apart; check it"
+        if not (clock.name in spelled and clock.name.startswith("time_")):
+            yield clock.path, line
+
+    def seconds(signal: Signal) -> np.ndarray | None:
+        if signal.clock is None:
+            return elapsed
+        found = _seconds(signal.clock)
+        return None if isinstance(found, str) else found[0]
+
+    yield from proposals.propose_columns(rest, spelled, seconds)
+
+
+def _rises(signal: Signal) -> bool:
+    """True if a signal is named after a count of time and rises from nearly every row to the next."""
+    if signal.words or not _COUNT.search(signal.name.casefold()):
+        return False
+    step = np.diff(np.asarray(signal.load(), float))
+    step = step[np.isfinite(step)]
+    return len(step) > 1 and float(np.mean(step > 0)) > RISING

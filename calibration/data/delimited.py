@@ -15,7 +15,7 @@ import numpy as np
 from calibration.data import Names, input_files
 from calibration.data.columns import WORDS
 from calibration.data.input_errors import BadData
-from calibration.data.named_arrays import NamedArrays, Raw, cell_number
+from calibration.data.named_arrays import MISSING, NamedArrays, Raw, cell_number
 from calibration.data.writing import cell_word
 from mmrjax.errors import count_noun
 from mmrjax.model import channels, quantities
@@ -165,7 +165,7 @@ def below_comments(lines: Sequence[str]) -> list[str]:
     if all(line.endswith(";") for line in below) and "," in below[0]:  # the end of a row in MATLAB
         below = [line[:-1] for line in below]
     cells = re.split(_SEPARATOR, below[0])
-    if not any(map(math.isfinite, map(cell_number, cells))):
+    if not any(math.isfinite(cell_number(cell)) or cell.strip().lower() in MISSING for cell in cells):
         return below
     above = [line.lstrip("#% ") for line in lines[:first]]
     alike = [line for line in above if len(re.split(_SEPARATOR, line)) == len(cells)] or above[-1:]

@@ -43,6 +43,16 @@ class NamedArrays:
     def __len__(self) -> int:
         return len(self.values[0]) if self.values else 0
 
+    def rows(self, kept: np.ndarray, note: str) -> NamedArrays:
+        """Copy with some of the rows, and a note on the others.
+
+        Args:
+            kept: True for each row that is kept, shape (rows,).
+        """
+        index = np.flatnonzero(kept)
+        values = tuple(v[index] if isinstance(v, np.ndarray) else [v[k] for k in index] for v in self.values)
+        return dataclasses.replace(self, values=values, notes=(*self.notes, f"{self.name}: {note}"))
+
     def row(self, index: int) -> str:
         """Name of a row in messages, by its index from 0."""
         return f"{self.name} row {index + 1}"

@@ -5,8 +5,9 @@ from __future__ import annotations
 import collections
 import dataclasses
 import itertools
+import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -38,7 +39,7 @@ class Meaning(NamedTuple):
 
 #: The first match wins.
 MEANINGS = tuple(Meaning(quantity, re.compile(pattern)) for quantity, pattern in (
-    ("duty", r"duty|pwm"),
+    ("duty", r"duty|pwm|throttle|motor_?(cmd|command)$"),
     ("supply_voltage", r"(bat|bus|supply|input|pack|dc)[^/]*volt|vbat|vbus|u_?bat|\bvin\b"),
     ("motor_voltage", r"(motor|phase|winding|terminal)[^/]*(volt|_v\b)"),
     ("supply_voltage", r"volt|\bu\b|^v$"),
@@ -47,13 +48,30 @@ MEANINGS = tuple(Meaning(quantity, re.compile(pattern)) for quantity, pattern in
     ("total_current", r"cur|amps?\b|\bi\b"),
     ("output_speed", r"(wheel|output|joint|load)[^/]*(vel|speed|rpm|omega)"),
     ("motor_speed", r"(?<!e)rpm|omega|vel|speed|drehzahl|^n$|\bn_?mot"),
+    ("speed", r"(?<!e)vel|speed"),
     ("output_torque", r"torque|\btau\b|moment|effort"),
     ("output_angle", r"angle|theta|position|\bpos\b"),
+    ("position", r"position|\bpos\b|distance|odometer|travel"),
     ("slope", r"slope|incline|grade"),
     ("payload", r"payload"),
     ("winding_temperature", r"winding|wicklung|motor[^/]*temp"),
     ("run_id", r"run_?id|episode|trial"),
 ))  # fmt: skip
+#: Numbers that stand for a whole duty in commands without a unit.
+WHOLE = (127, 128, 255, 256, 400, 511, 512, 1000, 1023, 1024, 2047, 4095, 8191, 32767)
+#: Largest number of a speed without a unit that is read in m/s: without its place, and with it.
+SLOW, LARGEST_M_S = 10.0, 30.0
+#: Units of a place, of its rate, and the first in one of the second times a second.
+RATES = (
+    ("m", "m_s", 1.0), ("turns", "turns_s", 1.0), ("deg", "deg_s", 1.0), ("rad", "rad_s", 1.0), ("mm", "mm_s", 1.0),
+    ("turns", "rpm", 1 / 60), ("deg", "rpm", 6.0), ("rad", "rpm", math.pi / 30), ("deg", "rad_s", 180 / math.pi),
+    ("turns", "rad_s", 0.5 / math.pi), ("rad", "turns_s", 2 * math.pi), ("deg", "turns_s", 360.0),
+    ("mm", "m_s", 1e3), ("m", "mm_s", 1e-3),
+)  # fmt: skip
+#: Units that only quantities of places have, and that only their rates have.
+_PLACES, _SPEEDS = {"m", "turns"}, {"m_s", "turns_s"}
+#: Largest relative difference of a rate from one of these, and of a place from the integral of its rate.
+SAME_RATE, INTEGRAL = 0.03, 0.05
 #: Quantities of which the only signal in one of their units is taken if its name has no meaning.
 BY_UNIT = ("supply_voltage", "total_current", "motor_speed", "winding_temperature")
 
@@ -80,11 +98,13 @@ class Candidate:
         return f"{self.column} = {stated}{f'  # {question}' if question else ''}"
 
 
-def propose_columns(signals: Sequence[Signal], spelled: set[str]) -> Iterator[tuple[str, str]]:
+def propose_columns(
+    signals: Sequence[Signal], spelled: set[str], seconds: Callable[[Signal], np.ndarray | None]
+) -> Iterator[tuple[str, str]]:
     """Paths of signals that may be columns, each with its line of a table `[columns]`.
 
     Args:
-        signals: those that change first; spelled: names that already are columns.
+        signals: those that change first; spelled: names that already are columns; seconds: times of a signal [s].
     """
     columns = {q.stem or q.name: q.columns() for q in Layout(channels=channels.EVERY).quantities().values()}
     taken = {signal.name.rpartition("_")[0] for signal in signals if signal.name in spelled}
@@ -98,8 +118,9 @@ def propose_columns(signals: Sequence[Signal], spelled: set[str]) -> Iterator[tu
         and (unit is None or unit in known)
         and (candidate := _candidate(signal, unit, count[unit] == 1, columns)) is not None
     ]
+    units_of = dict(zip((signal.path for signal in signals), units, strict=True))
     groups: dict[str, list[Candidate]] = {}
-    for candidate in _by_power(pool):
+    for candidate in _by_power(_by_rate(pool, units_of, columns, seconds)):
         groups.setdefault(candidate.quantity, []).append(candidate)
     for quantity, group in groups.items():
         if quantity in taken:
@@ -156,7 +177,14 @@ def _candidate(
     if quantity == "duty":
         if unit == "percent" or re.search(r"pct|percent|%", name) or 1.0 < largest <= 100.0:
             return Candidate(signal, quantity, "duty", "", 0.01)
-        return Candidate(signal, quantity, "duty") if largest <= 1.0 else None
+        if largest <= 1.0:
+            return Candidate(signal, quantity, "duty")
+        whole = next((w for w in WHOLE if largest <= w <= 1.05 * largest), None)
+        if whole is None or values.min() > 0.4 * largest:  # the width of a pulse has a large least value
+            return None
+        return Candidate(signal, quantity, "duty", f"is {whole} a whole duty?", float(f"{1 / whole:.8g}"))
+    if unit is None and quantity == "motor_speed" and largest < SLOW:
+        return Candidate(signal, "speed", "speed_m_s", f"numbers up to {largest:.3g}: m/s?")
     if unit is None:
         unit, question = next(iter(units.values())), "unit not stated: check it"
         if largest > {"V": LARGEST_V, "A": LARGEST_A}.get(unit, np.inf):
@@ -190,11 +218,104 @@ def _is_reading(values: np.ndarray) -> bool:
     if np.isin(values, (0.0, 1.0)).all():
         return False
     steps = np.diff(values)
-    return not (len(steps) > 3 and (steps == steps[0]).all() and float(steps[0]).is_integer())
+    return not (len(steps) > 3 and values.min() >= 0 and (steps == steps[0]).all() and float(steps[0]).is_integer())
 
 
-def _by_power(pool: Sequence[Candidate]) -> Iterator[Candidate]:
+def seconds_of_a_count(signals: Sequence[Signal], count: np.ndarray) -> float:
+    """Seconds between numbers of a clock, from a place and its rate that state their units; NaN without such two.
+
+    Args:
+        count: numbers of the clock, shape (rows,).
+    """
+    known = {unit for units in RATES for unit in units[:2] if isinstance(unit, str)}
+    stated = {signal.path: _unit(signal, known) for signal in signals if not (signal.refused or signal.words)}
+    pairs = {(of_place, of_rate): one for of_place, of_rate, one in RATES}
+    for place, rate in itertools.permutations([s for s in signals if stated.get(s.path)], 2):
+        one = pairs.get((str(stated[place.path]), str(stated[rate.path])))
+        if one is not None and place.length == rate.length == len(count):
+            factor = _integral_factor(count, np.asarray(place.load(), float), np.asarray(rate.load(), float))
+            if math.isfinite(factor) and factor > 0:
+                return factor / one
+    return math.nan
+
+
+def _by_rate(
+    pool: Sequence[Candidate],
+    stated: Mapping[str, str | None],
+    columns: Mapping[str, Mapping[str, str]],
+    seconds: Callable[[Signal], np.ndarray | None],
+) -> Iterator[Candidate]:
+    """Candidates; a place and its rate have units that agree with each other.
+
+    Args:
+        stated: unit of each signal, by its path; columns: as of `_candidate`.
+    """
+    agreed: dict[str, Candidate] = {}
+    for place, rate in itertools.product(pool, pool):
+        if not _PLACES & {*columns[place.quantity].values()} or not _SPEEDS & {*columns[rate.quantity].values()}:
+            continue
+        if place.signal.path in agreed:
+            continue
+        time = seconds(rate.signal) if place.signal.length == rate.signal.length else None
+        if time is None or len(time) != rate.signal.length or "motor" in rate.signal.path.casefold():
+            continue
+        known = [stated[c.signal.path] for c in (place, rate)]
+        units = _units_of_place_and_rate(time, place.signal, rate.signal, known)
+        if not units:
+            continue
+        *others, words = ["", *(f"{p} and {v.replace('_', '/')}" for p, v in reversed(units[:4]))]
+        either = f"; or {' or '.join(reversed(others[1:]))}?" if others[1:] else ""
+        straight = units[0][0] in ("m", "mm")
+        quantities_of_both = ("position", "speed") if straight else ("output_angle", "output_speed")
+        for k, candidate in enumerate((place, rate)):
+            quantity, other = quantities_of_both[k], (rate, place)[k]
+            column = next(c for c, u in columns[quantity].items() if u == units[0][k])
+            question = "" if None not in known else f"by {other.signal.path}, in {words}{either}"
+            agreed[candidate.signal.path] = Candidate(candidate.signal, quantity, column, question)
+    yield from (agreed.get(c.signal.path, c) for c in pool)
+
+
+def _units_of_place_and_rate(
+    time: np.ndarray, place: Signal, rate: Signal, stated: Sequence[str | None]
+) -> list[tuple[str, str]]:
+    """Units in which a place is the integral of its rate; empty if it is not.
+
+    Args:
+        time: of both [s]; stated: unit of each, None if it states none.
+    """
+    turned = np.asarray(rate.load(), float)
+    factor = _integral_factor(time, np.asarray(place.load(), float), turned)
+    turns = re.search(r"angle|theta|omega|rpm", _words(f"{place.path} {rate.path}"))
+    no_length = not any(stated) and (bool(turns) or float(np.nanmax(np.abs(turned))) > LARGEST_M_S)
+    return [
+        (of_place, of_rate)
+        for of_place, of_rate, one in RATES
+        if abs(factor / one - 1) < SAME_RATE
+        and stated[0] in (None, of_place)
+        and stated[1] in (None, of_rate)
+        and not (no_length and of_place in ("m", "mm"))
+    ]
+
+
+def _integral_factor(time: np.ndarray, place: np.ndarray, rate: np.ndarray) -> float:
+    """Factor from the integral of a rate to its place; NaN if the place is not that integral."""
+    step = np.diff(time)
+    sound = np.isfinite(step) & (step > 0) & np.isfinite(np.diff(place)) & np.isfinite(rate[1:] + rate[:-1])
+    if sound.sum() < 3:
+        return math.nan
+    sound &= step <= 5 * np.median(step[sound])
+    moved = np.cumsum(np.where(sound, np.diff(place), 0.0))
+    turned = np.cumsum(np.where(sound, 0.5 * (rate[1:] + rate[:-1]) * step, 0.0))
+    if not np.any(turned):
+        return math.nan
+    factor = float(moved @ turned / (turned @ turned))
+    rest = np.abs(moved - factor * turned).max() / max(float(np.abs(moved).max()), 1e-300)
+    return factor if rest < INTEGRAL else math.nan
+
+
+def _by_power(pool: Iterable[Candidate]) -> Iterator[Candidate]:
     """Candidates; of two currents next to a duty, that of the supply is the motor's times the duty."""
+    pool = [*pool]
     duty = next((c for c in pool if c.quantity == "duty"), None)
     currents = [c for c in pool if c.quantity in ("total_current", "motor_current")]
     load: Callable[[Candidate], np.ndarray] = lambda c: np.abs(np.asarray(c.signal.load(), float) * c.factor)  # noqa: E731

@@ -13,6 +13,7 @@ from calibration.data.columns import CURRENT, LOAD, SPEED, SUPPLY
 from calibration.data.courses import applied_drive, changing_columns, course_stretches
 from calibration.data.input_errors import three_digits
 from calibration.data.robot_file import RobotFile
+from calibration.data.row_checks import time_constant
 from calibration.data.runs import Runs
 from mmrjax.errors import count_noun
 from mmrjax.model import channels, params
@@ -492,20 +493,6 @@ def log_doubts(runs: Runs, robot: Robot) -> Names:
         doubtful_speed(runs, robot),
     )
     return tuple(filter(None, every))
-
-
-def time_constant(robot: Robot) -> float:
-    """Time constant J R/k² of the motors' speed with the slowest load [s]; infinite if it is unknown."""
-    motor, sides, found = robot.motor, float(robot.sides), 0.0
-    if not robot.knows(VOLTAGE):
-        return math.inf
-    for load in robot.configurations.members:
-        if float(load.torque_gravity if isinstance(load, Shaft) else 0.0) > 0:
-            return math.inf
-        moved = 0.0 if isinstance(load, Shaft) else float(load.mass) * float(load.radius) ** 2 / sides
-        carried = (float(load.inertia) + moved) / float(robot.gearbox.ratio) ** 2
-        found = max(found, float(motor.inertia) + carried)
-    return found * float(motor.resistance) / float(motor.torque_constant) ** 2
 
 
 @dataclasses.dataclass(frozen=True)

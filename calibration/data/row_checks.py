@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -20,11 +21,13 @@ from calibration.data.columns import (
     WHEN,
     Layout,
 )
-from calibration.data.input_errors import BadData, bound_text
+from calibration.data.input_errors import BadData, bound_text, three_digits
 from calibration.data.table import driven_on
 from mmrjax.model import channels
 from mmrjax.model.channels import Channel
+from mmrjax.model.quantities import VOLTAGE
 from mmrjax.model.rig import Instrument
+from mmrjax.model.robot import Robot
 
 #: Least rows between two readings of a slow sensor, and least number of its readings.
 APART, FEWEST = 2, 12
@@ -99,6 +102,8 @@ def used_once(values: np.ndarray, time: np.ndarray, run: np.ndarray | None = Non
 SIGN_SDS, SIGN_SHARE = 4.0, 0.05
 #: Fewest levels of the drive that show whether readings have signs.
 LEVELS_OF_SIGN = 3
+#: Least time between settled points [s], and in time constants of the motors with their load.
+SECONDS_APART, CONSTANTS_APART = 0.5, 5.0
 #: Share of the largest reading of a speed below which an undriven motor counts as at rest.
 STILL = 0.02
 
@@ -227,6 +232,67 @@ def _check_deviations(name: str, columns: Columns, shown: tuple[Channel, ...]) -
                     f"{name} row {int(np.flatnonzero(lost)[0]) + 1}, {channel.sd_column}: got an empty cell next "
                     f"to a reading; expected its sd, more than 0 {channel.unit}"
                 )
+
+
+def settled_points(name: str, columns: Columns, layout: Layout, robot: Robot) -> tuple[Columns, Names]:
+    """Returns columns without the time if each row is a settled run, and a note that says so.
+
+    Rows are `SECONDS_APART` and `CONSTANTS_APART` time constants of the motors after one another, and half of them
+    have another setting than the row before. Readings follow the setting of their own row as well as that of the
+    row before. They do not if a setting begins at its row.
+    """
+    kept, time = dict(columns), columns.get("time_s")
+    if time is None or len(time) < 3 or layout.imposed != "voltage" or SUPPLY not in columns:
+        return kept, ()
+    if {"held", "mode", *layout.sides} & set(columns):
+        return kept, ()
+    shown = [c for c in layout.channels if c.column in columns]
+    constant, step = time_constant(robot), np.diff(time)
+    apart = float(step[step > 0].min(initial=math.inf))
+    if not all(c.settled for c in shown) or not math.inf > apart >= max(SECONDS_APART, CONSTANTS_APART * constant):
+        return kept, ()
+    settings = [c for c in (SUPPLY, "duty", LOAD, "slope_deg", "payload_kg") if c in columns]
+    changed = np.any([np.diff(columns[c]) != 0 for c in settings], 0) if settings else np.zeros(1, bool)
+    if changed.mean() < 0.5:
+        return kept, ()
+    drive = columns[SUPPLY] * columns.get("duty", 1.0)
+    others = [columns[c] for c in settings if c not in (SUPPLY, "duty")]
+    for channel in shown:
+        own, before = (
+            _unexplained(columns[channel.column][1:], [x[k : len(x) - 1 + k] for x in (drive, *others)])
+            for k in (1, 0)
+        )
+        if own > 2 * before:
+            return kept, ()
+    for column in (*TIME, "run_id"):
+        kept.pop(column, None)
+    said = f"rows are {three_digits(apart)} s apart or more, most at another setting"
+    settle = f", and the motors settle in about {three_digits(CONSTANTS_APART * constant)} s" if constant > 0 else ""
+    return kept, (f"{name}: {said}{settle}: each row is read as a settled run, without its time",)
+
+
+def _unexplained(readings: np.ndarray, settings: Sequence[np.ndarray]) -> float:
+    """Sum of squares of readings that no linear function of the settings explains."""
+    a = np.stack([np.ones(len(readings)), *settings], 1)
+    sound = np.isfinite(readings)
+    if sound.sum() < 3:
+        return 0.0
+    a, readings = a[sound], readings[sound]
+    return float(np.sum((readings - a @ np.linalg.lstsq(a, readings, rcond=None)[0]) ** 2))
+
+
+def time_constant(robot: Robot) -> float:
+    """Time constant J R/k² of the motors' speed with the slowest load [s]; infinite if it is unknown."""
+    motor, sides, found = robot.motor, float(robot.sides), 0.0
+    if not robot.knows(VOLTAGE):
+        return math.inf
+    for load in robot.configurations.members:
+        if not robot.has_ground and float(load.torque_gravity) > 0:
+            return math.inf
+        moved = float(load.mass) * float(load.radius) ** 2 / sides if robot.has_ground else 0.0
+        carried = (float(load.inertia) + moved) / float(robot.gearbox.ratio) ** 2
+        found = max(found, float(motor.inertia) + carried)
+    return found * float(motor.resistance) / float(motor.torque_constant) ** 2
 
 
 def driven_rows(name: str, columns: Columns, layout: Layout) -> tuple[Columns, np.ndarray, Names]:

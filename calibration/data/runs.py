@@ -150,8 +150,12 @@ def of_arrays(
     column_names.check_units(arrays, meanings)
     if not len(arrays):
         raise BadData(f"{name}: a header and no rows; expected at least one run")
+    arrays = clock.recorded_rows(arrays, meanings)
     columns, changed = _columns(arrays, meanings, layout, battery)
-    notes = (*arrays.notes, *sides.of_volts(name, columns, battery))
+    settled: tuple[str, ...] = ()
+    if measured and robot is not None:
+        columns, settled = row_checks.settled_points(name, columns, layout, robot)
+    notes = (*arrays.notes, *settled, *sides.of_volts(name, columns, battery))
     kept, copied = row_checks.without_copies(name, columns)
     columns = columns if kept.all() else {c: values[kept] for c, values in columns.items()}
     if measured:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from calibration.data import Names
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import Diagnosis
 from calibration.discovery.candidates import Candidate, fit_candidates, start_of_fit
@@ -35,9 +36,9 @@ class Classes:
         ladder: all candidates that were fitted, including those of the search.
     """
 
-    members: tuple[tuple[str, ...], ...]
+    members: tuple[Names, ...]
     stated: tuple[tuple[Shift, ...], ...]
-    families: tuple[tuple[str, ...], ...]
+    families: tuple[Names, ...]
     ladder: tuple[Candidate, ...]
 
     @property
@@ -74,7 +75,7 @@ def find_classes(
     cosine, names = signature_cosines(space, left.scores), space.library.names
     fewer = [base] if len(best.effects) == 1 else without_each(space, best, settings, ladder)
     gains = [2 * (c.cost - best.cost) for c in fewer]
-    wanted: list[tuple[int, str, tuple[str, ...]]] = []
+    wanted: list[tuple[int, str, Names]] = []
     for slot, name in enumerate(best.effects):
         k = names.index(name)
         for j in np.argsort(-cosine[k])[:TRIED]:
@@ -116,6 +117,6 @@ def find_classes(
     return Classes(tuple(members), tuple(stated), tuple(families_of_members(space, same) for same in members), whole)
 
 
-def families_of_members(space: CandidateSpace, members: Sequence[str]) -> tuple[str, ...]:
+def families_of_members(space: CandidateSpace, members: Sequence[str]) -> Names:
     """Families of the members of a class, the leader's first."""
     return tuple(dict.fromkeys(space.library[m].family() for m in members))

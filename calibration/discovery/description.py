@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from calibration.data import Names
 from calibration.data.runs import Runs
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.loop_notes import Missed
@@ -88,7 +89,7 @@ def _error_shares(
     return error / np.maximum(size, 1e-300), np.sqrt(np.sum(off**2, 0) / np.maximum(counts.sum(0), 1))
 
 
-def unused_inputs(runs: Runs) -> tuple[str, ...]:
+def unused_inputs(runs: Runs) -> Names:
     """Columns of numbers that vary and have no role, and an output torque that a brake may impose."""
     torques = (f"{note.theirs} as a condition" for note in unused_room.unexplained_torque_notes(runs))
     return (*unused_room.unused_columns(runs), *torques)

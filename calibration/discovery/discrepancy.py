@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from calibration.data import Names
 from calibration.discovery.active_set import ActiveSet, CandidateSpace
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import Candidate
@@ -91,9 +92,7 @@ def locate_discrepancy(left: Diagnosis, bases: Bases, included: np.ndarray) -> D
     return DiscrepancyLocation(place, variable, tuple(itertools.chain(*alike)), also, strength, strongest)
 
 
-def similar_variables(
-    names: Sequence[tuple[str, str]], deviate: np.ndarray, place: str, variable: str
-) -> tuple[str, ...]:
+def similar_variables(names: Sequence[tuple[str, str]], deviate: np.ndarray, place: str, variable: str) -> Names:
     """Other variables with curves of similar significance in a place, the most significant first."""
     by_variable = {names[j][1]: deviate[j] for j in np.argsort(-deviate) if names[j][0] == place}
     by_variable.pop(bases_room.CONDITIONS, None)
@@ -155,7 +154,7 @@ class Shaped(eqx.Module):
     fitted_once: ClassVar[bool] = True
     base: Coordinates | ActiveSet
     root: Float[Array, "ordinates ordinates"]
-    names: tuple[str, ...] = eqx.field(static=True)
+    names: Names = eqx.field(static=True)
 
     def __len__(self) -> int:
         return len(self.base) + len(self.names)

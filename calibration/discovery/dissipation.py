@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from calibration.data import Names
 from calibration.discovery.active_set import CandidateSpace
 from calibration.inference.observers import Observer
 from mmrjax.compile.compiling import SELDOM, compiled
@@ -25,9 +26,7 @@ SINK = {
 ROUNDING = 1e-9
 
 
-def supplying_effects(
-    space: CandidateSpace, active: Sequence[str], amplitude: np.ndarray, z: np.ndarray
-) -> tuple[str, ...]:
+def supplying_effects(space: CandidateSpace, active: Sequence[str], amplitude: np.ndarray, z: np.ndarray) -> Names:
     """Dissipative effects of negative amplitude with a balance that would supply power in an included row.
 
     An effect corrects the law of its balance; a negative one means that the law takes too much. Histories and turns

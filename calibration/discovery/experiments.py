@@ -25,6 +25,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.special import ndtr
 
+from calibration.data import Names
 from calibration.discovery import menu, predicted
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.candidates import Candidate
@@ -70,7 +71,7 @@ class PredictedReadings:
         settings: thresholds of the separation.
     """
 
-    names: tuple[str, ...]
+    names: Names
     experiments: tuple[menu.Experiment, ...]
     value: np.ndarray
     half: np.ndarray
@@ -103,9 +104,9 @@ class Ranked:
         settings: thresholds of the separation.
     """
 
-    experiments: tuple[str, ...]
+    experiments: Names
     sigma: tuple[float, ...]
-    separates: tuple[str, ...]
+    separates: Names
     settings: Settings
 
     @property
@@ -138,9 +139,9 @@ class Proposal:
         table: the whole menu, the most useful experiment first.
     """
 
-    experiments: tuple[str, ...]
+    experiments: Names
     instruction: Instruction
-    separates: tuple[str, ...]
+    separates: Names
     expected_sigma: float
     settles: bool
     table: tuple[Ranked, ...]

@@ -7,6 +7,7 @@ import itertools
 
 import numpy as np
 
+from calibration.data import Names
 from calibration.discovery.projection import Projection
 from calibration.discovery.smooth import Smooth
 from calibration.inference.bases import ORDERS, place_signature
@@ -82,7 +83,7 @@ class Monomial:
         return sum(1 + 0.1 * abs(p - 1) for _, p in self.factors)
 
     @property
-    def variables(self) -> tuple[str, ...]:
+    def variables(self) -> Names:
         """Signals of the monomial."""
         return tuple(self.ratios[k].of for k, _ in self.factors)
 
@@ -143,7 +144,7 @@ class Proposal:
     terms: tuple[Monomial, ...]
     coefficients: tuple[float, ...]
     sds: tuple[float, ...]
-    variables: tuple[str, ...]
+    variables: Names
     explained: float
     gain: float
     tried: int

@@ -23,7 +23,9 @@ def headline(said: Summary, others: Sequence[tuple[float, Summary]] = ()) -> Hea
     laws, _ = _shared_claims([[m.names for m in s.missing if m.established] for s in every])
     if laws:
         alone = all(len(names) == 1 for names in laws) and not any(m.values for s in every for m in s.missing)
-        return Headline("named" if alone else "class", laws, factors)
+        found = [next(m for m in said.missing if m.established and set(m.names) & set(names)) for names in laws]
+        families, values = tuple(m.families for m in found), tuple(m.values for m in found)
+        return Headline("named" if alone else "class", laws, factors, (), families, values)
     mechanisms, shared = _shared_claims([_mechanisms(s) for s in every])
     if mechanisms:
         return Headline("mechanism", mechanisms, factors, shared)

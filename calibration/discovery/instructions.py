@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+from calibration.data import Names
 from calibration.discovery.menu import Experiment
 from calibration.discovery.reach import Reach
 
@@ -24,7 +25,7 @@ class NoMenu:
 class NothingTells:
     """No experiment of the menu separates the alternatives by at least `sigma` [σ]."""
 
-    names: tuple[str, ...]
+    names: Names
     sigma: float
 
 

@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 
+from calibration.data import Names
 from calibration.data.columns import SUPPLY
 from calibration.data.runs import Runs
 from calibration.inference import bases
@@ -43,8 +44,8 @@ class DiscrepancyLocation:
     JSON = ("balance", "channel", "balances_alike", "variable", "variables_alike")
     place: str
     variable: str
-    alike: tuple[str, ...]
-    variables_alike: tuple[str, ...]
+    alike: Names
+    variables_alike: Names
     explained: float
     strongest: float
     by_duty: bool = dataclasses.field(default=False, kw_only=True)
@@ -60,7 +61,7 @@ class DiscrepancyLocation:
         return self.place if bases.is_channel_place(self.place) else ""
 
     @property
-    def balances_alike(self) -> tuple[str, ...]:
+    def balances_alike(self) -> Names:
         """Balances of the places that act alike."""
         return tuple(dict.fromkeys(map(bases.balance_of, self.alike)))
 

@@ -288,12 +288,15 @@ class Headline:
         factors: on the noise.
         shared: number of the first members of each mechanism or place that hold at every noise; at some noises the
             others cannot be separated from these.
+        families: of each law, equation and driver in words; values: stated values that may be wrong instead of it.
     """
 
     level: str
     claims: tuple[tuple[str, ...], ...]
     factors: tuple[float, ...]
     shared: tuple[int, ...] = ()
+    families: tuple[tuple[str, ...], ...] = ()
+    values: tuple[tuple[FreedValue, ...], ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)

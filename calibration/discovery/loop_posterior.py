@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 
+from calibration.data import Names
 from calibration.data.posterior_file import ANGLE, LOG, NORMAL, Posterior, join_posteriors
 from calibration.discovery.active_set import ActiveSet, CandidateSpace
 from calibration.discovery.discrepancy import Discrepancy, Shaped
@@ -18,9 +19,7 @@ from mmrjax.model import params
 from mmrjax.model.params import Spec
 
 
-def posterior_of_fit(
-    space: CandidateSpace, active: tuple[str, ...], z: np.ndarray, linear: Linearization
-) -> Posterior:
+def posterior_of_fit(space: CandidateSpace, active: Names, z: np.ndarray, linear: Linearization) -> Posterior:
     """Posterior of a fit of the base with the active effects, from its linearization.
 
     Args:
@@ -35,7 +34,7 @@ def posterior_of_fit(
     return _of(problem.coordinates, space, active, np.asarray(z)[:size], covariance)
 
 
-def posterior_of_curve(space: CandidateSpace, active: tuple[str, ...], curve: Discrepancy) -> Posterior:
+def posterior_of_curve(space: CandidateSpace, active: Names, curve: Discrepancy) -> Posterior:
     """Posterior of a fit with a curve; the ordinates, linear in their coordinates, come last."""
     shaped: Shaped = curve.problem.coordinates
     inner = len(shaped.base)
@@ -54,7 +53,7 @@ def posterior_of_curve(space: CandidateSpace, active: tuple[str, ...], curve: Di
 def _of(
     coordinates: Coordinates | ActiveSet,
     space: CandidateSpace,
-    active: tuple[str, ...],
+    active: Names,
     z: np.ndarray,
     covariance: np.ndarray,
 ) -> Posterior:
@@ -63,7 +62,7 @@ def _of(
 
 
 def _parts(
-    coordinates: Coordinates | ActiveSet, space: CandidateSpace, active: tuple[str, ...], z: np.ndarray
+    coordinates: Coordinates | ActiveSet, space: CandidateSpace, active: Names, z: np.ndarray
 ) -> tuple[list[Posterior], list[int]]:
     """Posteriors of a fit's groups of coordinates, and their indices in z, without empty slots and missing shapes."""
     if not isinstance(coordinates, ActiveSet):
@@ -99,7 +98,7 @@ def _parts(
     return parts, kept
 
 
-def _clipped_parameters(names: tuple[str, ...], specs: list[Spec], mean: np.ndarray) -> Posterior:
+def _clipped_parameters(names: Names, specs: list[Spec], mean: np.ndarray) -> Posterior:
     """Posterior of parameters that are their own coordinates, clipped at their bounds."""
     size = len(names)
     return Posterior(

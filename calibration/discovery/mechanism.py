@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from calibration.data import Columns, Names
 from calibration.data.runs import Runs
 from calibration.discovery import prediction
 from calibration.discovery.active_set import CandidateSpace
@@ -180,7 +181,7 @@ def _of_one_family(space: CandidateSpace, ladder: Sequence[Candidate]) -> dict[s
     return best
 
 
-def _in_equations_alike(family: str, where: DiscrepancyLocation) -> tuple[str, ...]:
+def _in_equations_alike(family: str, where: DiscrepancyLocation) -> Names:
     """Family with the same driver in each equation that these data cannot separate from its own."""
     places = [p for p in where.alike if not bases_room.is_channel_place(p)]  # instruments are excluded
     equations = [dataclasses.replace(where, place=p).family.partition(" that ") for p in places]
@@ -189,7 +190,7 @@ def _in_equations_alike(family: str, where: DiscrepancyLocation) -> tuple[str, .
     return tuple(f"{other}{joint}{driver}" for other in alike) if what in alike else ()
 
 
-def _families_of(where: DiscrepancyLocation) -> tuple[str, ...]:
+def _families_of(where: DiscrepancyLocation) -> Names:
     """Family of a curve, and those of the places and variables with curves of similar significance."""
     places = [dataclasses.replace(where, place=p) for p in where.alike]
     others = [dataclasses.replace(where, variable=v) for v in where.variables_alike]
@@ -271,7 +272,7 @@ def scored_once(space: CandidateSpace, runs: Runs, candidate: Candidate, predict
     return score
 
 
-def _scored(space: CandidateSpace, runs: Runs, reading: dict[str, np.ndarray]) -> HeldOutScore:
+def _scored(space: CandidateSpace, runs: Runs, reading: Columns) -> HeldOutScore:
     data, rows = space.equipped.data, len(runs)
     measured, sd, counts = (np.asarray(x)[:rows] for x in (data.measured, data.sd, space.weight > 0))
     return prediction.score_readings(reading, measured, sd, counts, blocks_room.predictable_blocks(runs, space.bare))

@@ -119,6 +119,8 @@ def round_significant(value: float, digits: int = 2) -> float:
     return float(f"{value:.{digits - 1}e}")
 
 
+#: Least setting of a speed, current or voltage, as a share of the largest of a table.
+LEAST_SETTING = 0.05
 #: Usual steps of settings, times powers of ten.
 STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)
 #: Tolerance of a setting above the table's largest, because readings scatter [-].
@@ -345,8 +347,9 @@ def _shaft_runs(reach: Reach, used: Used) -> tuple[Run, ...]:
     """Runs of a load on a shaft, or with imposed speed or current: at other levels, and in the other direction."""
     others_of = {"voltage": "other voltages", "motor_speed": "other speeds", "motor_current": "other currents"}
     levels = used.voltages if reach.imposed == "voltage" else reach.levels
-    sizes = tuple(sorted({round_significant(abs(x)) for x in levels if x})) or (1.0,)
-    low, high = 0.4 * sizes[0], sizes[-1]
+    high = round_significant(max(map(abs, levels), default=0.0)) or 1.0
+    sizes = tuple(sorted({x for v in levels if (x := round_significant(abs(v))) >= LEAST_SETTING * high})) or (high,)
+    low = max(0.4 * sizes[0], LEAST_SETTING * high)
     allowed = {"voltage": reach.voltage, "motor_speed": reach.geared}.get(reach.imposed, math.inf)
     top = round_significant(1.3 * high) if 1.3 * high < allowed else floor_significant(max(allowed, high))
     between = 0.5 * (sizes[0] + high) if top > high else 0.5 * (low + high)

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from calibration.data import Names
 from calibration.discovery import setups
 from calibration.discovery.menu import Act, Experiment, Run
 from calibration.discovery.setups import Setup
@@ -67,7 +68,7 @@ class Predicted(eqx.Module):
     speed: Float[Array, " runs"]
 
 
-def batch_experiments(experiments: Sequence[Experiment], shown: tuple[str, ...]) -> Batch:
+def batch_experiments(experiments: Sequence[Experiment], shown: Names) -> Batch:
     """These experiments as one batch, for a robot with these channels."""
     acts = [e for e in experiments if isinstance(e, Act)]
     runs = [e for e in experiments if isinstance(e, Run)]

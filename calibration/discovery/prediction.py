@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 
+from calibration.data import Columns, Names
 from calibration.data.runs import Runs
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.candidates import Candidate
@@ -39,7 +40,7 @@ class HeldOutScore:
     """
 
     by_kind: dict[str, Readings]
-    blocks: dict[str, np.ndarray]
+    blocks: Columns
     reading: dict[str, Readings] = dataclasses.field(default_factory=dict)
 
     def only(self, kind: str) -> HeldOutScore:
@@ -125,7 +126,7 @@ def score_readings(
 Predicted = dict[tuple[tuple[str, ...], bytes], dict[str, Readings]]
 
 
-def candidate_key(candidate: Candidate) -> tuple[tuple[str, ...], bytes]:
+def candidate_key(candidate: Candidate) -> tuple[Names, bytes]:
     """Key of a candidate's hold-out predictions."""
     return candidate.active, np.asarray(candidate.z).tobytes()
 

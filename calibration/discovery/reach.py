@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 
+from calibration.data import Names
 from calibration.discovery.active_set import CandidateSpace
 from calibration.inference.operating import operating_readings
 from mmrjax.model import channels
@@ -71,7 +72,7 @@ class Reach:
     """
 
     used: tuple[Used, ...]
-    measured: tuple[str, ...]
+    measured: Names
     voltage: float
     geared: float
     alone: float
@@ -100,7 +101,7 @@ def _levels(x: np.ndarray) -> tuple[float, ...]:
     return tuple(np.unique(np.round(x, 6)).tolist())
 
 
-def reach_of_table(robot: Robot, conditions: Conditions, measured: tuple[str, ...]) -> Reach:
+def reach_of_table(robot: Robot, conditions: Conditions, measured: Names) -> Reach:
     """Limits of the next experiments with a table's robot.
 
     Args:

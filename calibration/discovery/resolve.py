@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from scipy.special import chdtrc
 
+from calibration.data import Names
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.runs import Runs
 from calibration.discovery.loop_notes import Asked
@@ -109,7 +110,7 @@ def resolve(
     size = POPULATION if population is None else population
     most = GENERATIONS if generations is None else generations
 
-    def fit(free: tuple[str, ...], file: Path | None = None) -> CalibrationResult:
+    def fit(free: Names, file: Path | None = None) -> CalibrationResult:
         return calibrate(
             rows, robot, free=free, noise=sds, model="track", population=size, generations=most, members=file,
             seed=seed, profiles=False, blocks=False, tell=tell,

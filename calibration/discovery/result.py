@@ -540,7 +540,12 @@ class DiscoveryResult:
 
     @property
     def statement(self) -> str:
-        """The verdict as a sentence."""
+        """The answer in a sentence or two."""
+        return describe(self.headline)
+
+    @property
+    def verdict_statement(self) -> str:
+        """The verdict at the noise of the fit, with its evidence."""
         return describe(self.summary)
 
     @property
@@ -622,8 +627,12 @@ class DiscoveryResult:
                 if self.summary.mechanism is None
                 else _mechanism(self.summary.mechanism, self.unnamed),
                 "missed": [m._asdict() for m in self.summary.missed],
-                "headline": vars(self.headline) | {"statement": describe(self.headline)},
+                "headline": {
+                    **{name: getattr(self.headline, name) for name in ("level", "claims", "factors", "shared")},
+                    "statement": self.statement,
+                },
                 "statement": self.statement,
+                "verdict_statement": self.verdict_statement,
                 "rows": len(self.runs),
                 "rows_used": int(self.included.sum()),
                 "rows_unusable": self.unusable,

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from calibration.data import Names
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import Candidate, fill_slots, fit_candidates, fit_in_addition, start_of_fit
@@ -38,7 +39,7 @@ class Search:
     diagnosis: Diagnosis | None
     asked: int = 0
     otherwise: int = 0
-    room: tuple[str, ...] = ()
+    room: Names = ()
 
 
 def diagnose_candidate(
@@ -148,7 +149,7 @@ def _singles(space: CandidateSpace, base: Candidate, left: Diagnosis, settings: 
 
 
 def _fit_sets(
-    space: CandidateSpace, wanted: Sequence[tuple[tuple[str, ...], Candidate, Diagnosis]], settings: Settings
+    space: CandidateSpace, wanted: Sequence[tuple[Names, Candidate, Diagnosis]], settings: Settings
 ) -> Confirmed:
     """Sets of effects, each in addition to another fit and its diagnosis; for long runs first screened by
     regression."""

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array
 from numpy.polynomial import legendre
 
+from calibration.data import Names
 from calibration.discovery.projection import Projection
 from calibration.inference.bases import ORDERS, place_signature, scale_to_unit_range, window_from_name
 from calibration.inference.linearization import Linearization
@@ -62,7 +63,7 @@ class Smooth:
         return window_from_name(self.variable) is not None
 
     @property
-    def ordinates(self) -> tuple[str, ...]:
+    def ordinates(self) -> Names:
         """Parameters of the effect that define its shape."""
         return ("y_sin", "y_cos") if self.wave else ORDINATES
 

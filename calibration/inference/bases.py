@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.polynomial import legendre
 
+from calibration.data import Names
 from calibration.data.columns import CURRENT, LOAD, SPEED, Layout
 from calibration.inference.linearization import Linearization
 from mmrjax.effects.curve import DRIFT, EVERY_VARIABLE, READ_BY, WAYS, direction_signal, in_travel_frame, sign_factor
@@ -76,8 +77,8 @@ class Basis(eqx.Module):
     """
 
     columns: Float[Array, "families rows terms"]
-    places: tuple[str, ...] = eqx.field(static=True)
-    variables: tuple[str, ...] = eqx.field(static=True)
+    places: Names = eqx.field(static=True)
+    variables: Names = eqx.field(static=True)
 
     @staticmethod
     def of(columns: np.ndarray, names: Sequence[tuple[str, str]]) -> Basis:
@@ -137,7 +138,7 @@ def scale_to_unit_range(x: np.ndarray, weight: np.ndarray) -> np.ndarray:
     return np.clip((2 * x - low - high) / (high - low), -1, 1) if high - low > 1e-9 * max(abs(high), 1e-9) else 0 * x
 
 
-def balances_of(robot: Robot | None, among: Sequence[str] = BALANCES) -> tuple[str, ...]:
+def balances_of(robot: Robot | None, among: Sequence[str] = BALANCES) -> Names:
     """Balances of `among` that a robot has; all for None."""
     if robot is None:
         return tuple(among)
@@ -149,7 +150,7 @@ def channels_of(robot: Robot | None) -> tuple[Channel, ...]:
     return Layout.of(robot).channels
 
 
-def axes_of(robot: Robot | None) -> tuple[str, ...]:
+def axes_of(robot: Robot | None) -> Names:
     """Columns of conditions that are variables of a robot's curves; for None, of the packaged robot's."""
     axes = Layout.of(robot).axes
     return tuple(c for c in (SPEED, CURRENT, *EVERY_AXIS) if c in axes)
@@ -159,8 +160,8 @@ def axes_of(robot: Robot | None) -> tuple[str, ...]:
 class Scope:
     """Scope of a search for curves: balances that can have a defect, and columns of the conditions."""
 
-    balances: tuple[str, ...]
-    axes: tuple[str, ...]
+    balances: Names
+    axes: Names
 
     @classmethod
     def of(cls, robot: Robot | None) -> Scope:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from calibration.data import Columns, Names
 from calibration.data.columns import CURRENT, LOAD, SPEED
 from calibration.data.courses import rows_of_varying_runs
 from calibration.data.runs import Runs
@@ -14,7 +15,7 @@ from calibration.inference import held_out as refits
 from calibration.inference.problem import Problem
 
 #: Kinds of blocks by name, with the columns that distinguish their blocks.
-BLOCKS: dict[str, tuple[str, ...]] = {
+BLOCKS: dict[str, Names] = {
     "slope": ("slope_deg",),
     "voltage": ("supply_voltage_V",),
     "duty": ("duty",),
@@ -62,7 +63,7 @@ def group_into_levels(x: np.ndarray) -> np.ndarray:
     return level_of_row
 
 
-def blocks_by_sharpness(runs: Runs) -> dict[str, np.ndarray]:
+def blocks_by_sharpness(runs: Runs) -> Columns:
     """Label → mask of its rows, for `PARTS` groups of turns from turning on the spot to straight travel.
 
     Turns are sorted by the drive of the slower side over that of the faster side, -1 to 1.
@@ -74,7 +75,7 @@ def blocks_by_sharpness(runs: Runs) -> dict[str, np.ndarray]:
     return {f"{share[mine].min():.2g} to {share[mine].max():.2g}": mine for mine in rows} if len(rows) > 1 else {}
 
 
-def blocks_of_kind(runs: Runs, by: str) -> dict[str, np.ndarray]:
+def blocks_of_kind(runs: Runs, by: str) -> Columns:
     """Label → mask of its rows, for each block of `by`; empty if the data do not vary in it.
 
     A run of a history in which the quantity changes is a block of its own; empty if it changes in all runs.
@@ -97,9 +98,9 @@ def blocks_of_kind(runs: Runs, by: str) -> dict[str, np.ndarray]:
     return {name: labels == name for name in names} if len(names) > 1 and not single else {}
 
 
-def distinct_blocks(runs: Runs, kinds: Sequence[str]) -> dict[str, dict[str, np.ndarray]]:
+def distinct_blocks(runs: Runs, kinds: Sequence[str]) -> dict[str, Columns]:
     """Kind → blocks, for kinds that the data have, without kinds that divide the rows as an earlier one does."""
-    blocks: dict[str, dict[str, np.ndarray]] = {}
+    blocks: dict[str, Columns] = {}
     divided = []
     for kind in kinds:
         by = blocks_of_kind(runs, kind)
@@ -110,7 +111,7 @@ def distinct_blocks(runs: Runs, kinds: Sequence[str]) -> dict[str, dict[str, np.
     return {kind: by for kind, by in blocks.items() if by}
 
 
-def predictable_blocks(runs: Runs, problem: Problem) -> dict[str, dict[str, np.ndarray]]:
+def predictable_blocks(runs: Runs, problem: Problem) -> dict[str, Columns]:
     """Kind → blocks as from `distinct_blocks`, of the kinds of a problem's observer, that the other rows can predict.
 
     A block is omitted if it holds all rows of a configuration with free parameters of its own.
@@ -128,7 +129,7 @@ def predictable_blocks(runs: Runs, problem: Problem) -> dict[str, dict[str, np.n
     return {kind: by for kind, by in kinds.items() if by}
 
 
-def unpredictable_kinds(runs: Runs, problem: Problem) -> tuple[str, ...]:
+def unpredictable_kinds(runs: Runs, problem: Problem) -> Names:
     """Kinds with at least one block that the other rows cannot predict."""
     every, told = distinct_blocks(runs, problem.observe.blocks), predictable_blocks(runs, problem)
     return tuple(kind for kind, by in every.items() if len(told.get(kind, {})) < len(by))
@@ -153,7 +154,7 @@ class HeldOut:
         converged: of each block's fit.
     """
 
-    labels: tuple[str, ...]
+    labels: Names
     block: np.ndarray
     reading: np.ndarray
     status: np.ndarray
@@ -161,9 +162,7 @@ class HeldOut:
     converged: np.ndarray
 
 
-def hold_out_by_kind(
-    problem: Problem, start: np.ndarray, masks: dict[str, dict[str, np.ndarray]]
-) -> dict[str, HeldOut]:
+def hold_out_by_kind(problem: Problem, start: np.ndarray, masks: dict[str, Columns]) -> dict[str, HeldOut]:
     """Refit without each block of each kind in turn (with the given sds), and predict the omitted rows.
 
     Args:

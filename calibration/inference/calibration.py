@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data import surfaces
+from calibration.data import Names, surfaces
 from calibration.data.columns import ROWS
 from calibration.data.input_errors import SEEDS, BadConfiguration, stated_count
 from calibration.data.runs import Runs
@@ -152,7 +152,7 @@ class _Plan:
     fidelity: str
     starts: int
     profiles: bool
-    kinds: tuple[str, ...]
+    kinds: Names
 
 
 def _make_plan(
@@ -175,7 +175,7 @@ def _free_names(
     free: Sequence[str],
     fix: Sequence[str],
     prepared: Prepared,
-) -> tuple[str, ...]:
+) -> Names:
     """Names of the free parameters.
 
     Raises:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from calibration.data import Names
 from calibration.data.courses import rows_of_varying_runs
 from calibration.data.runs import Runs
 from calibration.inference import observers
@@ -54,5 +55,5 @@ def conduct_notes(runs: Runs, robot: Robot) -> list[Remark]:
     return said
 
 
-def _run_names(names: np.ndarray, which: np.ndarray) -> tuple[str, ...]:
+def _run_names(names: np.ndarray, which: np.ndarray) -> Names:
     return tuple(str(n) for n in names[which])

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import abc
 import dataclasses
-from typing import Any
 
-import numpy as np
+from calibration.data import Columns, Json, Names
 
 
 @dataclasses.dataclass(frozen=True)
@@ -14,10 +13,10 @@ class Detail(abc.ABC):
     """Further findings of one kind of data; reports select their section by its type."""
 
     @abc.abstractmethod
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Json:
         """Entries of `result.json`."""
 
-    def columns(self) -> dict[str, np.ndarray]:
+    def columns(self) -> Columns:
         """Columns of `rows.csv`, shape (rows,)."""
         return {}
 
@@ -31,13 +30,13 @@ class EquationDefects(Detail):
             (rows,), that would cancel the readings' residuals.
     """
 
-    before: dict[str, np.ndarray]
-    after: dict[str, np.ndarray]
+    before: Columns
+    after: Columns
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Json:
         return {"series": None}
 
-    def columns(self) -> dict[str, np.ndarray]:
+    def columns(self) -> Columns:
         both = (("before", self.before), ("after", self.after))
         return {f"defect_{when}_{balance}": values for when, by in both for balance, values in by.items()}
 
@@ -76,7 +75,7 @@ class TimeSide:
     orders: dict[tuple[str, float], Strongest]
     drift: Strongest | None
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Json:
         """Entries of `result.json`."""
         orders = [{"order": w, "a_turn": n, **vars(s)} for (w, n), s in self.orders.items()]
         return {"memory": self.memory, "orders": orders, "drift": self.drift}
@@ -93,9 +92,9 @@ class TimeStatistics(Detail):
 
     runs: int
     samples: int
-    orders_unresolved: tuple[str, ...]
+    orders_unresolved: Names
     before: TimeSide
     after: TimeSide
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Json:
         return {"series": vars(self)}

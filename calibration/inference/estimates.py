@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from calibration.data import Columns
 from calibration.data.columns import DRIVING
 from calibration.data.runs import Runs
 from calibration.inference import blocks as holdout
@@ -194,7 +195,7 @@ def chi_square(
     return ChiSquare(float(np.sum(misfit**2)), freedom, not bool(known.estimated.any()))
 
 
-def condition_columns(observe: type[Observer], runs: Runs) -> dict[str, np.ndarray]:
+def condition_columns(observe: type[Observer], runs: Runs) -> Columns:
     """Columns that identify the rows."""
     others = (axis for axis in observe.axes_of(runs) if axis not in runs.axes)
     columns = ("run_id", *others, "configuration", *runs.axes, *DRIVING, "surface")

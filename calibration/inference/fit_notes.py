@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
+from calibration.data import Json, Names
 from calibration.described import describe
 
 
@@ -19,7 +20,7 @@ class Remark:
     """
 
     code: str
-    values: dict[str, Any] = dataclasses.field(hash=False)
+    values: Json = dataclasses.field(hash=False)
 
     def __init__(self, code: str, **values: Any) -> None:
         vars(self).update(code=code, values=values)
@@ -72,7 +73,7 @@ class Determination(NamedTuple):
     """
 
     held: bool
-    others: tuple[str, ...]
+    others: Names
 
     @classmethod
     def of(cls, name: str, held: bool, pairs: Iterable[Pair]) -> Determination:

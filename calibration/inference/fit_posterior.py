@@ -6,6 +6,7 @@ from collections.abc import Collection
 
 import numpy as np
 
+from calibration.data import Names
 from calibration.data.posterior_file import LOG, NORMAL, Posterior
 from calibration.inference.fit_notes import Pair
 from calibration.inference.priors import SOFTNESS, Coordinates
@@ -59,7 +60,7 @@ def determined_together(posterior: Posterior, held: Collection[str] = ()) -> tup
     return tuple(sorted(groups, key=lambda pair: -abs(pair.correlation)))
 
 
-def undetermined_names(held: Collection[str], pairs: Collection[Pair]) -> tuple[str, ...]:
+def undetermined_names(held: Collection[str], pairs: Collection[Pair]) -> Names:
     """Names held by priors, without names in a pair with a determined combination."""
     paired = {name for pair in pairs for name in (pair.one, pair.other)}
     return tuple(name for name in held if name not in paired)

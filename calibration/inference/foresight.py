@@ -7,6 +7,7 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 
+from calibration.data import Names
 from calibration.data.columns import ROWS
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.runs import Runs
@@ -58,8 +59,8 @@ class Foresight:
     """
 
     parameters: tuple[Determined, ...]
-    status: tuple[str, ...]
-    noise: tuple[str, ...]
+    status: Names
+    noise: Names
     alike: tuple[tuple[str, str, float], ...]
     together: tuple[Pair, ...]
     robot: Robot

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from calibration.data import Names
 from calibration.inference import optimizers
 from calibration.inference.optimizers import Pin
 from calibration.inference.problem import Data, Problem
@@ -51,7 +52,7 @@ class Identifiability:
         jacobian: of the whitened readings, row by row, shape (rows · channels, parameters).
     """
 
-    names: tuple[str, ...]
+    names: Names
     covariance: np.ndarray
     sd: np.ndarray
     singular_values: np.ndarray

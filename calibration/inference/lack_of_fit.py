@@ -16,6 +16,7 @@ import numpy as np
 from numpy.polynomial import legendre
 from scipy.special import chdtrc, fdtrc, ndtr
 
+from calibration.data import Names
 from calibration.data.courses import course_of_each_row
 from calibration.data.runs import DUTY, Runs
 from calibration.described import describe
@@ -279,7 +280,7 @@ def _replicate_test(fit: Residuals) -> tuple[float, Shown] | None:
     observe, runs, residual, counts = fit.observe, fit.runs, fit.whitened, fit.counts
     freedom, chi2 = float(fit.freedom.sum()), float(fit.chi2.sum())
     columns = [c for c in ("configuration", *observe.axes_of(runs), "surface") if runs.has(c)]
-    groups: dict[tuple[str, ...], list[int]] = {}
+    groups: dict[Names, list[int]] = {}
     past = course_of_each_row(runs).tolist()  # replicates share their past too
     for row, key in enumerate(zip(past, *(runs[c].astype(str).tolist() for c in columns), strict=True)):
         groups.setdefault(key, []).append(row)

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 from jaxtyping import Float
 
+from calibration.data import Names
 from calibration.data.input_errors import BadConfiguration, BadData, allowed_words
 from calibration.data.runs import Runs
 from calibration.inference import series_noise
@@ -40,7 +41,7 @@ class Noise:
     channels: tuple[Channel, ...]
     sd: np.ndarray
     estimated: np.ndarray
-    source: tuple[str, ...]
+    source: Names
     along_series: tuple[SeriesNoise, ...] = ()
 
     @property

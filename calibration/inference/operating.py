@@ -9,6 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from calibration.data import Names
 from mmrjax.compile.compiling import SELDOM, compiled
 from mmrjax.fidelities.steady import results_of_rows, steady
 from mmrjax.model import channels, params
@@ -23,7 +24,7 @@ GRIPPING = 20.0
 
 
 def operating_readings(
-    robot: Robot, conditions: Conditions, names: tuple[str, ...] | None = None
+    robot: Robot, conditions: Conditions, names: Names | None = None
 ) -> Float[np.ndarray, "runs channels"]:
     """Readings of steady travel on a surface that grips, and of turns on their own surface [SI].
 

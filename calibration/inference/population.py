@@ -14,7 +14,7 @@ import os
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from calibration.data import Json, Names
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.writing import replacing
 from calibration.described import describe
@@ -173,9 +174,7 @@ class Members:
         if self._file is None:
             return
         z = np.array([np.frombuffer(key) for key in self._kept])
-        kept: dict[str, Any] = dict(
-            zip(KEPT, (z, *map(np.array, zip(*self._kept.values(), strict=True))), strict=True)
-        )
+        kept: Json = dict(zip(KEPT, (z, *map(np.array, zip(*self._kept.values(), strict=True))), strict=True))
         try:
             with replacing(self._file) as aside, aside.open("wb") as out:
                 np.savez(out, **kept, identity=np.array(self._own))
@@ -367,7 +366,7 @@ class Searched:
 
     found: Population
     at: int
-    apart: tuple[str, ...]
+    apart: Names
     slope: np.ndarray | None
     left: float
     edge: dict[str, Edge] = dataclasses.field(default_factory=dict)
@@ -383,7 +382,7 @@ class Searched:
     def _jumps(flags: np.ndarray) -> np.ndarray:
         return (flags >> FLAGS.index("jumps") & 1).astype(bool)
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Json:
         """Entries of result.json."""
         return {
             "members": len(self.found.z),

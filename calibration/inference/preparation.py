@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 
-from calibration.data import instruments, own_mass, rig_facts, surfaces
+from calibration.data import Names, instruments, own_mass, rig_facts, surfaces
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.runs import Runs
 from calibration.inference import checks, observers, repeats
@@ -41,7 +41,7 @@ class Prepared:
     observe: type[Observer]
     noise: Noise
     stated: dict[str, tuple[float, float]]
-    names: tuple[str, ...]
+    names: Names
     foreign: Notes
     checked: Notes
     begins: Notes

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from calibration.data import Names
 from calibration.data.input_errors import BadConfiguration, allowed_words, bound_text
 from calibration.data.surfaces import GROUND
 from mmrjax.compile.compiling import SELDOM, compiled
@@ -101,8 +102,8 @@ class Coordinates(eqx.Module):
     spread: Float[Array, " parameters"]
     low: Float[Array, " parameters"]
     high: Float[Array, " parameters"]
-    names: tuple[str, ...] = eqx.field(static=True)
-    units: tuple[str, ...] = eqx.field(static=True)
+    names: Names = eqx.field(static=True)
+    units: Names = eqx.field(static=True)
     scale: tuple[bool, ...] = eqx.field(static=True)
     ratios: Float[Array, " followers"]
     followers: tuple[tuple[str, int], ...] = eqx.field(static=True, default=())
@@ -166,7 +167,7 @@ def parameters_by_name(robot: Robot) -> dict[str, Parameter]:
     return {p.name: p for p in params.walk_parameters(robot)}
 
 
-def friction_names(robot: Robot, configuration: str) -> tuple[str, ...]:
+def friction_names(robot: Robot, configuration: str) -> Names:
     """Friction parameters of a configuration that are free by default.
 
     Parameters that are zero, or that no channel can show, are fixed. The ground's friction shows in the speed, as
@@ -180,7 +181,7 @@ def friction_names(robot: Robot, configuration: str) -> tuple[str, ...]:
     return _uncertain(robot, (f"{configuration}.{name}" for name in names))
 
 
-def _uncertain(robot: Robot, names: Iterable[str]) -> tuple[str, ...]:
+def _uncertain(robot: Robot, names: Iterable[str]) -> Names:
     """Uncertain ones of a robot's parameters: neither exact in the rig's file nor zero.
 
     A zero is uncertain if the file states its sd. The delay of a rig is uncertain unless it is exact, because a log
@@ -192,7 +193,7 @@ def _uncertain(robot: Robot, names: Iterable[str]) -> tuple[str, ...]:
     return tuple(n for n in mine if float(fields[n].value) != 0.0 or n in stated)
 
 
-def stated_names(robot: Robot, configurations: Iterable[str], idle: tuple[str, ...] = ()) -> tuple[str, ...]:
+def stated_names(robot: Robot, configurations: Iterable[str], idle: Names = ()) -> Names:
     """Parameters that a robot's file states with a ± other than 0, which is a request to fit them.
 
     They must be parameters of the robot, belong to configurations in the data, show in the data, and follow no other
@@ -209,14 +210,14 @@ def stated_names(robot: Robot, configurations: Iterable[str], idle: tuple[str, .
     return _drive(robot, (n for n in mine if _leader(robot, n) is None and not n.endswith(idle)))
 
 
-def delay_names(robot: Robot, names: Iterable[str]) -> tuple[str, ...]:
+def delay_names(robot: Robot, names: Iterable[str]) -> Names:
     """The delay among `names`, for a rig with a file that states its sd."""
     return tuple(n for n in names if n == DELAY and n in robot.rig.stated - robot.rig.exact)
 
 
 def default_names(
     configurations: Iterable[str], robot: Robot, *, computed: Sequence[str] = (), turns: bool = False
-) -> tuple[str, ...]:
+) -> Names:
     """Default set of free parameters for data of these configurations.
 
     Args:
@@ -234,7 +235,7 @@ def default_names(
     return (*names, *(f"effects.{e.name}.amplitude" for e in robot.effects), *initial_state_names(robot))
 
 
-def initial_state_names(robot: Robot) -> tuple[str, ...]:
+def initial_state_names(robot: Robot) -> Names:
     """Initial speeds and angles of histories, if a rig leaves them free."""
     if robot.rig.begins is None or robot.rig.start != "free":
         return ()
@@ -259,8 +260,8 @@ def free_names(
     configurations: Iterable[str],
     drive: Sequence[str] = (),
     chassis: Sequence[str] = (),
-    idle: tuple[str, ...] = OVER_TIME,
-) -> tuple[str, ...]:
+    idle: Names = OVER_TIME,
+) -> Names:
     """Parameters that the loop frees for data of these configurations, among them all that the file states with ±.
 
     Args:
@@ -301,7 +302,7 @@ def _has_nonzero(robot: Robot, configuration: str, name: str) -> bool:
     return field is not None and float(field.value) != 0.0
 
 
-def _radius(robot: Robot, configuration: str) -> tuple[str, ...]:
+def _radius(robot: Robot, configuration: str) -> Names:
     """Radius of a configuration, unless no channel shows the travel of its shaft."""
     return (f"{configuration}.radius",) if robot.shows_travel else ()
 
@@ -310,7 +311,7 @@ def _radius(robot: Robot, configuration: str) -> tuple[str, ...]:
 ELECTRICAL = ("motor.resistance", "motor.inductance")
 
 
-def _drive(robot: Robot, names: Iterable[str]) -> tuple[str, ...]:
+def _drive(robot: Robot, names: Iterable[str]) -> Names:
     """Parameters of the drive, without those of the voltage if it is neither imposed nor measured."""
     if robot.rig.shows_voltage:
         return tuple(names)
@@ -338,7 +339,7 @@ def with_guide_share(robot: Robot, configuration: str) -> tuple[Robot, dict[str,
 
 def choose_free_names(
     robot: Robot, default: Sequence[str], free: Sequence[str] = (), fix: Sequence[str] = ()
-) -> tuple[str, ...]:
+) -> Names:
     """Names of the free parameters: `free` if it has any, else the default set; less `fix`.
 
     In `free`, `default` means the default set. A name that ends in `.*` means all parameters below it.

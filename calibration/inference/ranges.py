@@ -7,6 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from calibration.data import Names
 from calibration.data.input_errors import BadData, bound_text
 from calibration.data.runs import Runs
 from calibration.described import describe
@@ -244,7 +245,7 @@ def _slopes(runs: Runs, measured: np.ndarray, possible: np.ndarray, robot: Robot
     columns = [
         c for c in ("configuration", runs.layout.imposed_column, "payload_kg", "surface", "duty") if runs.has(c)
     ]
-    groups: dict[tuple[str, ...], list[int]] = {}
+    groups: dict[Names, list[int]] = {}
     for row in np.flatnonzero(finite):
         groups.setdefault(tuple(str(runs[c][row]) for c in columns), []).append(int(row))
     several = [g for g in groups.values() if np.ptp(slope[g]) > 0]

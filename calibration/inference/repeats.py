@@ -8,6 +8,7 @@ import math
 import numpy as np
 from jaxtyping import Int
 
+from calibration.data import Names
 from calibration.data.runs import Runs
 from calibration.inference.fit_notes import Remark
 from calibration.inference.noise import UNSTATED, Noise
@@ -23,7 +24,7 @@ MEDIAN = 0.6745
 def rows_of_same_conditions(runs: Runs) -> list[Int[np.ndarray, " rows"]]:
     """Rows of each set of equal conditions, including single rows."""
     columns = [c for c in ("configuration", *runs.axes, "surface") if runs.has(c)]
-    alike: dict[tuple[str, ...], list[int]] = {}
+    alike: dict[Names, list[int]] = {}
     for row, key in enumerate(zip(*(runs[c].astype(str).tolist() for c in columns), strict=True)):
         alike.setdefault(key, []).append(row)
     return [np.array(rows) for rows in alike.values()]

@@ -20,6 +20,7 @@ from datetime import datetime
 import numpy as np
 from scipy.special import fdtrc
 
+from calibration.data import Columns, Names
 from calibration.data.runs import CONDITIONS, WHEN, Runs
 from calibration.described import describe
 from calibration.inference.lack_of_fit import CLEAR, Residuals
@@ -89,7 +90,7 @@ class ResidualCluster:
     levels: tuple[LevelMean, ...]
     correlation: float | None
     p: float
-    alike: tuple[str, ...]
+    alike: Names
     coarser: tuple[tuple[str, float], ...]
     at: np.ndarray
     residual: np.ndarray
@@ -228,7 +229,7 @@ def _by_run(fit: Residuals) -> _Units:
     )
 
 
-def _without_role(whole: _Units) -> dict[str, np.ndarray]:
+def _without_role(whole: _Units) -> Columns:
     """Columns to test: with more than one level, and no ids, times or aliases of a condition."""
     runs, kept = whole.runs, {}
     # Simulated readings depend only on the conditions.
@@ -372,7 +373,7 @@ def _orthonormal(columns: np.ndarray, least: float = CLEAR) -> np.ndarray:
     return directions[:, size > least]
 
 
-def _channel(whole: _Units, k: int, columns: dict[str, np.ndarray]) -> _Channel | None:
+def _channel(whole: _Units, k: int, columns: Columns) -> _Channel | None:
     """A channel and its tests; None with too few readings."""
     counts = whole.counts[:, k]
     if counts.sum() < FEWEST:
@@ -484,7 +485,7 @@ def _permuted(made: Sequence[tuple[int, _Channel]], seed: int) -> np.ndarray:
     return strongest
 
 
-def _report_cluster(whole: _Units, k: int, test: _Comparison, p: float, alike: tuple[str, ...]) -> ResidualCluster:
+def _report_cluster(whole: _Units, k: int, test: _Comparison, p: float, alike: Names) -> ResidualCluster:
     """A finding in the units of its channel."""
     channel, counts = whole.runs.channels[k], whole.counts[:, k]
     cells, residual = whole.runs.extras[test.column][counts], whole.residual[counts, k] / channel.factor

@@ -5,12 +5,11 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from calibration.data import Columns, Json, Names, writing
 from calibration.data import posterior_file as posterior
-from calibration.data import writing
 from calibration.data.posterior_file import Posterior
 from calibration.described import describe, sentences
 from calibration.inference.fit_notes import Determination, Notes, Pair, Remark
@@ -46,7 +45,7 @@ class Prior:
     interval: Interval
     source: str
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Json:
         """As in result.json."""
         return {**dataclasses.asdict(self), "source": describe(self)}
 
@@ -119,7 +118,7 @@ class Estimate:
     profile: ProfileCurve | None = None
     with_steady: SteadyEstimate | None = None
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Json:
         """Entry of `parameters` in result.json."""
         found = {name: getattr(self, name) for name in ENTRIES} | {"shift_in_prior_sd": self.shift}
         return found if self.with_steady is None else {**found, "with_steady": self.with_steady}
@@ -189,7 +188,7 @@ class Block:
     unreachable_rows: tuple[int, ...]
     converged: bool
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Json:
         """Entry of `held_out_by` in result.json."""
         return {
             **self.errors,
@@ -212,7 +211,7 @@ class HeldOut:
     errors: Errors
     unreachable_rows: tuple[int, ...]
     blocks: dict[str, Block]
-    reading: dict[str, np.ndarray]
+    reading: Columns
 
 
 @dataclasses.dataclass(frozen=True)
@@ -281,7 +280,7 @@ class CalibrationResult:
     errors_before: Errors
     errors_after: Errors
     held_out: dict[str, HeldOut]
-    conditions: dict[str, np.ndarray]
+    conditions: Columns
     readings: dict[str, ChannelReadings]
     status_before: np.ndarray
     status: np.ndarray
@@ -302,7 +301,7 @@ class CalibrationResult:
         return len(self.status)
 
     @property
-    def notes(self) -> tuple[str, ...]:
+    def notes(self) -> Names:
         """Remarks as sentences."""
         return sentences(self.remarks)
 
@@ -312,7 +311,7 @@ class CalibrationResult:
         return any(p.profile is not None for p in self.parameters.values())
 
     @property
-    def held_by_prior(self) -> tuple[str, ...]:
+    def held_by_prior(self) -> Names:
         """Names of the parameters held by their priors."""
         return tuple(name for name, p in self.parameters.items() if p.held_by_prior)
 
@@ -322,7 +321,7 @@ class CalibrationResult:
         return determined_together(self.posterior, self.held_by_prior)
 
     @property
-    def undetermined(self) -> tuple[str, ...]:
+    def undetermined(self) -> Names:
         """Names of the parameters that only their priors determine, without those of a pair in `together`."""
         return undetermined_names(self.held_by_prior, self.together)
 
@@ -336,10 +335,10 @@ class CalibrationResult:
         return _counts(self.status)
 
     @property
-    def held_out_alike(self) -> dict[str, tuple[str, ...]]:
+    def held_out_alike(self) -> dict[str, Names]:
         """Distinct kinds of blocks, each with the later kinds that predict every row in the same way (to 1 % of a
         reading's sd)."""
-        found: dict[str, tuple[str, ...]] = {}
+        found: dict[str, Names] = {}
         for kind, held in self.held_out.items():
             like = next((k for k in found if self._same(self.held_out[k], held)), None)
             found |= {kind: ()} if like is None else {like: (*found[like], kind)}
@@ -364,7 +363,7 @@ class CalibrationResult:
             fits["held_out"] = self.main_blocks.errors
         return {fit: {name: e.rms for name, e in by.items() if e.rows} for fit, by in fits.items()}
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Json:
         """Entries of result.json, docs/schemas/calibrate.schema.json."""
         about, main = self.identifiability, self.main_blocks
         return writing.json_value(
@@ -417,11 +416,11 @@ class CalibrationResult:
             }
         )
 
-    def rows(self) -> dict[str, np.ndarray]:
+    def rows(self) -> Columns:
         """Table of the rows: conditions, readings before, after and held out, errors in percent and in σ."""
         return {**self.conditions, **dict(self._readings()), "status": self.status}
 
-    def rows_table(self) -> dict[str, np.ndarray]:
+    def rows_table(self) -> Columns:
         """Result of `rows`, under the name that all results have."""
         return self.rows()
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import nnls
 
+from calibration.data import Names
 from calibration.data.columns import LOAD, SPEED
 from calibration.data.courses import applied_drive
 from calibration.data.runs import Runs
@@ -25,7 +26,7 @@ def unused_notes(runs: Runs) -> tuple[Remark, ...]:
     return (Remark("unused", source=runs.source, columns=columns),) if columns else ()
 
 
-def unused_columns(runs: Runs) -> tuple[str, ...]:
+def unused_columns(runs: Runs) -> Names:
     """Names of the columns of numbers that vary and have no role."""
     return tuple(name for name, cells in runs.extras.items() if _varies(name, cells))
 

@@ -91,29 +91,6 @@ def of_rows(rows: tuple[int, ...], what: str, share: float = 0.0) -> str:
     return f"{listed}: {what} with the calibrated robot"
 
 
-def product_alone(friction: str, share: str, free: bool) -> str:
-    """Sentence on two parameters that act only as a product."""
-    if free:
-        return f"only the product {friction} x {share} acts; the priors alone divide it"
-    return f"{share} is found with {friction} held: only their product acts"
-
-
-def no_prediction(kind: str, rows: int, total: int) -> str:
-    """Rows that a fit without their block does not predict."""
-    return (
-        f"held out by {blocks.kind_in_words(kind)}: {rows} of {total} rows have no prediction, because "
-        "the robot fitted without them slides there; the errors leave them out"
-    )
-
-
-def same_predictions(kind: str, others: Names) -> str:
-    """Kinds of blocks that give the same predictions."""
-    return (
-        f"held out by {' or by '.join(blocks.kind_in_words(k) for k in others)}: the same predictions as held "
-        f"out by {blocks.kind_in_words(kind)}, shown in their place; these runs do not vary them separately"
-    )
-
-
 def search_agreement(starts: int, agree: int, elsewhere: int, more: float, open: int) -> str:
     """Agreement of searches from many starts."""
     if starts == 1:
@@ -173,12 +150,6 @@ def prior_edge(at: fit_notes.Edge) -> str:
     if at.bound:
         return f"at its {at.bound} bound"
     return f"{abs(at.sds):.1f} prior sd {'below' if at.sds < 0 else 'above'} the middle of its prior"
-
-
-def ended_at_edge(edge: dict[str, fit_notes.Edge]) -> str:
-    """A search that ended at the edge of what was allowed."""
-    named = ", ".join(f"{name} {prior_edge(at)}" for name, at in edge.items())
-    return f"the search ended at the edge of what was allowed: its best member has {named}"
 
 
 # --- what residuals show --------------------------------------------------------------------------------
@@ -316,12 +287,22 @@ SAID: dict[str, str | Callable[..., str]] = {
     "with steady; furthest apart is {furthest}, {sds:.2f} sd",
     "of_rows": of_rows,
     "at_bound": "{name} is at its {side} bound",
-    "product_alone": product_alone,
+    "product_alone": lambda friction, share, free: (
+        f"only the product {friction} x {share} acts; the priors alone divide it"
+        if free
+        else f"{share} is found with {friction} held: only their product acts"
+    ),
     "prior_of_product": "{name}: its prior, {mean:.3g} ± {sd:.2g}, is that of its product with "
     "the share of the "
     "guides in the other fidelities; the track model puts {share:.0%} of the weight on them",
-    "no_prediction": no_prediction,
-    "same_predictions": same_predictions,
+    "no_prediction": lambda kind, rows, total: (
+        f"held out by {blocks.kind_in_words(kind)}: {rows} of {total} rows have no prediction, because "
+        "the robot fitted without them slides there; the errors leave them out"
+    ),
+    "same_predictions": lambda kind, others: (
+        f"held out by {' or by '.join(blocks.kind_in_words(k) for k in others)}: the same predictions as held "
+        f"out by {blocks.kind_in_words(kind)}, shown in their place; these runs do not vary them separately"
+    ),
     "block_not_converged": "a search without a block of {kind} did not converge",
     "agreement": search_agreement,
     "unsettled": unsettled_search,
@@ -331,7 +312,10 @@ SAID: dict[str, str | Callable[..., str]] = {
     "generations": search_generations,
     "lost_rows": lost_rows,
     "members_jump": members_jump,
-    "ended_at_edge": ended_at_edge,
+    "ended_at_edge": lambda edge: (
+        "the search ended at the edge of what was allowed: its best member has "
+        + ", ".join(f"{name} {prior_edge(at)}" for name, at in edge.items())
+    ),
     "read_from_members": "derivatives of the run by {names} are not those of its differences "
     "(contacts open and "
     "close): what the rows determine is read from a regression over the members near the best, which leaves "

@@ -99,24 +99,35 @@ def _evidence(said: loop_notes.Summary) -> str:
     return f"family-wise p {p_value(said.p)}{unseen}"
 
 
-def loop_headline(found: loop_notes.Headline) -> str:
-    """Sentence on the claim that holds at every noise factor tried."""
+def loop_answer(found: loop_notes.Headline) -> str:
+    """Answer of the loop: the deepest claim that holds at every noise factor tried.
+
+    Terminal, page, result.json and robot files state this sentence, and no other level.
+    """
     *first, last = [f"{f:g}" for f in found.factors]
-    at = f"At {', '.join(first)} and {last} times the noise" if first else "At the stated noise"
+    at = f" at {', '.join(first)} and {last} times the noise" if first else ""
     claims = " and ".join(
         _claim(c[: n or len(c)], c[n:] if n else ()) for c, n in zip(found.claims, found.shared, strict=False)
     )
-    laws = " and ".join(" or ".join(c) for c in found.claims)
-    held = {
-        "none": "nothing is missing",
-        "undescribed": "this model does not describe these runs",
-        "open": "the answer differs: whether anything is missing depends on the noise",
-        "named": f"{laws} is established as a law",
-        "class": f"one of {laws} is established",
-        "mechanism": f"{claims} is established as a mechanism",
-        "place": f"{claims or 'something'} is missing, and no more is established",
-    }
-    return f"{at} {held[found.level]}"
+    laws = " and ".join(
+        _law(*law) for law in zip(found.claims, found.families, found.values, strict=False)
+    )  # fmt: skip
+    return {
+        "none": f"Yes, as far as these runs can show{at}: the residuals are consistent with noise.",
+        "undescribed": f"No verdict{at}: this model does not describe these runs.",
+        "open": f"Perhaps. The answers{at} differ: whether anything is missing depends on the noise.",
+        "named": f"No{at}: missing is {laws}.",
+        "class": f"No{at}: missing is {laws}.",
+        "mechanism": f"No{at}: missing is {claims}. Its exact law is not established.",
+        "place": f"No{at}: missing is {claims or 'something'}, and no more is established.",
+    }[found.level]
+
+
+def _law(names: Sequence[str], families: Sequence[str], values: Sequence[loop_notes.FreedValue]) -> str:
+    """`a loss torque that changes with speed (churning or windage; these data cannot tell which)`."""
+    each = [*map(freed_value, values), *names]
+    which = "; these data cannot tell which" if len(each) > 1 else ""
+    return f"{' or '.join(map(with_article, families))} ({' or '.join(each)}{which})"
 
 
 def with_article(noun: str) -> str:
@@ -256,18 +267,18 @@ def _tentative(those: Sequence[loop_notes.Missing], support: loop_notes.NameSupp
 
 
 def verdict_line(stages: LoopStages) -> str:
-    """The verdict as soon as it is known: `verdict: class, series_resistance or supply_sag`."""
+    """The verdict at one noise: `at one noise: class, series_resistance or supply_sag`."""
     sure = [" or ".join(members) for members in stages.members] or [
         with_article(family) for family in stages.families
     ]
-    return f"verdict: {', '.join((stages.verdict, *sure))}"
+    return f"at one noise: {', '.join((stages.verdict, *sure))}"
 
 
 def ranking_lines(found: Ranking, most: int = 5) -> list[str]:
     """Lines of the ranking by regression: whether an effect is missing, and the strongest effects."""
     by = f"by regression on {found.windows} windows of the log" if found.windows else "by regression"
     if not found.missing:
-        return [f"{by}: nothing is missing (family-wise p = {found.p_value:.2g})"]
+        return [f"{by}, not yet confirmed: nothing exceeds chance (family-wise p = {found.p_value:.2g})"]
     first = f"{by}, not yet confirmed: something is missing (family-wise p {p_value(found.p_value)})"
     beyond = [e for e in found.effects if e.score > found.chance and not e.supplies][:most]
     if not beyond:
@@ -344,34 +355,6 @@ def cluster_sentence(c: Cluster) -> str:
 
 
 # --- the first screen -----------------------------------------------------------------------------------
-
-
-def completeness_answer(found: DiscoveryResult) -> str:
-    """Answer to the question if the model is complete."""
-    if found.verdict == "none":
-        return "Yes, as far as these runs can show: the residuals are consistent with noise."
-    if found.verdict == "undescribed":
-        return "No verdict: this model does not describe these runs."
-    sure, weak = ([e for e in found.effects if is_established(found, e) == want] for want in (True, False))
-    lacks, stated = found.unnamed, found.summary.mechanism
-    if found.verdict == "mechanism" and stated is not None:
-        over = ""
-        if lacks is not None:
-            over = f", which {curve_course(lacks)}" if curve_course(lacks) else _within(lacks)
-        return f"No: missing is a {' or a '.join(stated.families)}{over}. Its exact law is not established."
-    if lacks is not None and not weak:
-        place = bases.place_in_words(lacks.channel or lacks.balance)
-        return f"No. Something is missing in the {place}, and nothing in the library explains it."
-    kinds = list(dict.fromkeys(map(_kind_of, sure)))
-    perhaps = [k for k in dict.fromkeys(map(_kind_of, weak)) if k not in kinds]
-    parts = [f"missing is {' and '.join(kinds)}"] * bool(kinds)
-    parts += [f"{'perhaps also' if kinds else 'perhaps'} {' and '.join(perhaps)}"] * bool(perhaps)
-    return f"No: {'; '.join(parts)}."
-
-
-def _kind_of(effect: FoundEffect) -> str:
-    """`a voltage drop that changes with current`."""
-    return with_article(" or ".join(effect.families))
 
 
 def is_established(found: DiscoveryResult, effect: FoundEffect) -> bool:
@@ -601,6 +584,13 @@ def stated_value(name: str, s: StatedValue) -> str:
     )
 
 
+def moved_parameter(name: str, value: float, stated: float, unit: str, shift: float) -> str:
+    """`motor.friction_viscous is 1.2e-05 N·m·s, 3 times the stated 4e-06 (+2.3 prior sds)`."""
+    ratio = f"{value / stated:.2g} times the " if stated and value / stated > 0 else ""
+    now = freed_value(loop_notes.FreedValue(f"`{name}`", value, unit))
+    return f"{now}, {ratio}stated {stated:.3g} ({shift:+.1f} prior sds)"
+
+
 def effect_amplitude(e: FoundEffect) -> str:
     """Amplitude of an effect: `-0.0154 ± 0.00014`, with its unit where it has one."""
     return _estimate(e.parameters["amplitude"])
@@ -726,12 +716,6 @@ def kept_out(rows: tuple[int, ...], why: str) -> str:
     return f"rows {', '.join(map(str, rows))} {reasons[why]}"
 
 
-def still_lacks(place: str, variable: str) -> str:
-    """Sentence on the discrepancy that remains with the effects found."""
-    where, over = bases.place_in_words(place), variable.replace("_", " ")
-    return f"not everything is explained: an error in the {where} that varies with {over} remains"
-
-
 def imposed_delay(delay: float, sd: float) -> str:
     """Delay of the imposed quantity, and the line for the rig's file."""
     when = "later" if delay > 0 else "earlier"
@@ -799,15 +783,6 @@ def unwritten_reason(curve: bool, gain: float, se: float) -> str:
     )
 
 
-def outstanding_verdicts(factors: tuple[float, ...], word: str) -> str:
-    """Verdicts that are not there yet."""
-    at = " and ".join(f"{f:g}" for f in factors)
-    return (
-        f"out of time: whether the verdict stands with {at} times the {word} noise is not known; run the same "
-        "command without --within"
-    )
-
-
 #: Code of a remark → a sentence with its values, or a function that makes one.
 SAID: dict[str, str | Callable[..., str]] = {
     "assumed_noise": "no sd is stated for {channels}: {usual} is assumed; state yours with --noise",
@@ -819,7 +794,10 @@ SAID: dict[str, str | Callable[..., str]] = {
     "kept_out": kept_out,
     "phases_differ": "the wave stands at another angle in each run (it explains {free:.0f} σ² free in each, "
     "{held:.0f} with one phase): robot.toml holds the mean; start runs from a mark",
-    "still_lacks": still_lacks,
+    "still_lacks": lambda place, variable: (
+        f"not everything is explained: an error in the {bases.place_in_words(place)} that varies with "
+        f"{variable.replace('_', ' ')} remains"
+    ),
     "late": imposed_delay,
     "led": leader_choice,
     "not_predictable": lambda kinds: (
@@ -828,7 +806,10 @@ SAID: dict[str, str | Callable[..., str]] = {
         "with parameters of its own"
     ),
     "lost_replicates": "only {settled} of {asked} bootstrap tables could be fitted again; the thresholds are theirs",
-    "outstanding": outstanding_verdicts,
+    "outstanding": lambda factors, word: (
+        f"out of time: whether the verdict stands with {' and '.join(f'{f:g}' for f in factors)} times the {word} "
+        "noise is not known; run the same command without --within"
+    ),
     "too_few_replicates": "{settled} bootstrap tables are too few for every kind of evidence "
     "to count; use 500 or "
     "more",

@@ -89,30 +89,20 @@ def _in_words(points: Points, mask: np.ndarray) -> str:
     return " and ".join([words] * bool(words) + [f"{others} more" if words else str(others)] * bool(others))
 
 
-def sampling_scope(method: str, points: int) -> str:
-    """Distribution of the inputs that a method samples."""
-    return f"{METHODS[method]}, over {points} operating points"
-
-
 def points_left_out(points: int, total: int, sampled: bool, outputs: Names) -> str:
     """Points that are left out."""
     who = "too many robots of the sample do" if sampled else "the robot does"
     return f"{points} of {total} operating points are left out, since {who} not travel there ({', '.join(outputs)})"
 
 
-def sample_left_out(points: int, share: float, outputs: Names) -> str:
-    """Operating points with part of the sample left out."""
-    return (
-        f"at {points} operating points up to {100 * share:.1f} % of the sample is left out, since the "
-        f"robot does not travel there: the indices are of robots that do ({', '.join(outputs)})"
-    )
-
-
 #: Code of a remark → a sentence with its values, or a function that makes one.
 SAID: dict[str, str | Callable[..., str]] = {
-    "sampling": sampling_scope,
+    "sampling": lambda method, points: f"{METHODS[method]}, over {points} operating points",
     "points_left_out": points_left_out,
-    "sample_left_out": sample_left_out,
+    "sample_left_out": lambda points, share, outputs: (
+        f"at {points} operating points up to {100 * share:.1f} % of the sample is left out, since the "
+        f"robot does not travel there: the indices are of robots that do ({', '.join(outputs)})"
+    ),
     "inert": "not sampled, because every computed derivative by them is zero: {inputs}",
     "tied": "kept at their ratio to another input, and part of what it does: {inputs}",
 }

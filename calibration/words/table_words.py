@@ -39,11 +39,6 @@ def would_measure(name: str) -> str:
     return "runs under conditions in which it acts"
 
 
-def unmeasured_parameter(name: str) -> str:
-    """A free parameter that moves no reading."""
-    return f"{name}: nothing in these data measures it; its value is its prior's. {would_measure(name)} would"
-
-
 def differing_repeats(
     source: str,
     rows: tuple[int, int],
@@ -111,12 +106,6 @@ def copied_channel(source: str, column: str, other: str, intercept: float, slope
     return f"{said}: it is computed from it and no reading; remove it from channels and table, or read an instrument"
 
 
-def constant_condition(column: str, value: float, alike: str) -> str:
-    """A condition that does not vary."""
-    here = f"{column} is {bound_text(value)} in every row"
-    return f"{here}: {ALIKE[alike]}, and only their priors tell them apart"
-
-
 def ends_early(runs: Names, lasts: float, share: float) -> str:
     """Histories that end before the robot is under way."""
     at = "" if math.isnan(share) else f", at {share:.0%} of the speed of steady travel"
@@ -126,24 +115,8 @@ def ends_early(runs: Names, lasts: float, share: float) -> str:
     )
 
 
-def never_grips(runs: Names, share: float) -> str:
-    """Histories in which the movers slide to the end."""
-    return (
-        f"{_runs(runs, 'never grips', 'never grip')}: in the end the robot travels at {share:.0%} of the "
-        "speed of its movers, so what the ground holds before it slides is not measured there"
-    )
-
-
 def _runs(names: Names, one: str, several: str) -> str:
     return f"run {names[0]} {one}" if len(names) == 1 else f"runs {', '.join(names)} {several}"
-
-
-def coarse_steps(lasts: float, step: float) -> str:
-    """Steps that do not resolve waves."""
-    return (
-        f"runs of {lasts:.0f} s are followed in steps of {1e3 * step:.0f} ms: waves of a shaft faster than "
-        "some ten steps are not resolved; cut the runs to look for them"
-    )
 
 
 def inherited_priors(part: str, changed: tuple[tuple[str, float, float], ...], kept: Names) -> str:
@@ -169,8 +142,12 @@ def off_by(column: str, unit: str, factor: float, units: Names, others: Names, i
 
 #: Code of a remark → a sentence with its values, or a function that makes one.
 SAID: dict[str, str | Callable[..., str]] = {
-    "unmeasured": unmeasured_parameter,
-    "constant": constant_condition,
+    "unmeasured": lambda name: (
+        f"{name}: nothing in these data measures it; its value is its prior's. {would_measure(name)} would"
+    ),
+    "constant": lambda column, value, alike: (
+        f"{column} is {bound_text(value)} in every row: {ALIKE[alike]}, and only their priors tell them apart"
+    ),
     "repeats": differing_repeats,
     "larger_noise": "{channel}: {pairs} pairs of rows at the same conditions scatter "
     "{factor:.2g} times as much "
@@ -192,13 +169,19 @@ SAID: dict[str, str | Callable[..., str]] = {
     'inertia and delay do not explain: backlash, play or a soft coupling; state backlash = "{angle:.2g} ± 30 %" [rad '
     "at the output] of the load in the robot's file",
     "ends_early": ends_early,
-    "never_grips": never_grips,
+    "never_grips": lambda runs, share: (
+        f"{_runs(runs, 'never grips', 'never grip')}: in the end the robot travels at {share:.0%} of the "
+        "speed of its movers, so what the ground holds before it slides is not measured there"
+    ),
     "thinned": "{source}: readings of {kept} of {rows} rows are used, evenly in time, and "
     "what drives the runs "
     "in all of them; --rows uses more or fewer, and settle uses all",
     "thinned_table": "{source}: {kept} of {rows} rows are used, spread evenly over the conditions; row "
     "numbers count these; --rows uses more or fewer",
-    "coarse_steps": coarse_steps,
+    "coarse_steps": lambda lasts, step: (
+        f"runs of {lasts:.0f} s are followed in steps of {1e3 * step:.0f} ms: waves of a shaft faster than "
+        "some ten steps are not resolved; cut the runs to look for them"
+    ),
     "stops_on_slope": "run {runs}: the motors are not driven on a slope; histories have smooth "
     "friction at rest, "
     "and a robot that should stand there creeps by some mm/s. Leave rows at rest out where their readings are finer "

@@ -161,7 +161,7 @@ def run_missions(robot: Robot, runs: records.Runs, source: ProfileTable, config:
     """Runs over a profile."""
     conditions = _commanded(robot, runs, source, config)
     profile = source.profile(robot, conditions)
-    names = runs["run_id"] if runs.has("run_id") else np.array([f"run-{k + 1}" for k in range(len(runs))])
+    names = run.run_names(runs)
     rows = max(LEAST_ROWS, min(MOST_ROWS, ALL_ROWS // len(runs)))
     tables: list[Columns] = []
     segments: list[Columns] = []

@@ -114,7 +114,7 @@ def _simulated(
         loads = batch.history.reactions
         assert loads is not None  # the fidelity resolves them
         table = {
-            "run_id": np.repeat(_names(runs), batch.history.time.shape[-1]),
+            "run_id": np.repeat(run.run_names(runs), batch.history.time.shape[-1]),
             "time_s": np.ravel(batch.history.time),
             "guide_N": np.ravel(loads.guided.sum(-1)),
             "front_N": np.ravel(loads.support[..., 0]),
@@ -236,17 +236,13 @@ def run_remarks(robot: Robot, table: Columns) -> list[str]:
     return said[:_SHOWN] + ([f"... and {len(said) - _SHOWN} more remarks"] if len(said) > _SHOWN else [])
 
 
-def _names(runs: records.Runs) -> np.ndarray:
-    return runs["run_id"] if runs.has("run_id") else np.array([f"run-{k + 1}" for k in range(len(runs))])
-
-
 def history_table(robot: Robot, history: History, runs: records.Runs) -> Columns:
     """Time histories of a batch as one table, a row a sample; the columns that series are read with."""
     signals = history.signals
     of_rig = {*robot.rig.channels, *(OF_VEHICLE if robot.has_ground else OF_SHAFT)}
     shown = [c for c in channels.EVERY if c.over_time and c.name in of_rig]
     return {
-        "run_id": np.repeat(_names(runs), history.time.shape[-1]),
+        "run_id": np.repeat(run.run_names(runs), history.time.shape[-1]),
         "time_s": np.ravel(history.time),
         **{c.column: np.ravel(history.reading[c.name]) / c.factor for c in shown},
         "theoretical_speed_mm_s": np.ravel(signals.speed_theoretical) / quantities.MM,
@@ -266,5 +262,5 @@ def starts_from_standstill(robot: Robot, batch: Run, runs: records.Runs) -> list
     under_way = [STATUSES[int(s)] in words.UNDER_WAY for s in np.asarray(batch.result.status)]
     return [
         {"run_id": str(name), **(s.to_json() if s is not None and goes else nothing)}
-        for name, s, goes in zip(_names(runs), found, under_way, strict=True)
+        for name, s, goes in zip(run.run_names(runs), found, under_way, strict=True)
     ]

@@ -24,11 +24,10 @@ from sweeps.console import print_message, print_output, progress_bar
 from sweeps.inputs import beside_robot, load_robot
 from sweeps.pages import words
 from sweeps.points import axes, grid, run, scale, uncertainty
-from sweeps.points.identity import Identity, job_identity
 from sweeps.points.job import laid_out, prepare_job, showing_turns
 from sweeps.points.sampled_design import Blocks
 from sweeps.points.tasks import task_of
-from sweeps.points.zarr_store import STORE, Done, Layout, SweepStore
+from sweeps.points.zarr_store import STORE, Done, Identity, Layout, SweepStore, job_identity
 from sweeps.report import campaign_report, sweep_report
 from sweeps.report.document import Column, Table
 from sweeps.report.run_tables import endings_table

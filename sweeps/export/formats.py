@@ -16,9 +16,8 @@ from mmrjax.compile.precision import in_double
 from mmrjax.errors import count_noun
 from sweeps.export import comparison, feed_forward, jax_actuator, mjlab, mujoco, onnx, randomization
 from sweeps.export.comparison import Comparison, Fate
-from sweeps.export.constants import constants_of, posterior_of
 from sweeps.export.joint import Joint, joint_of_robot
-from sweeps.export.law_source import Constant
+from sweeps.export.law_source import Constant, constants_of, posterior_of
 from sweeps.export.situation import AtJoint, Situation, situation_of_joint
 
 #: Names of formats and their uses.

@@ -133,6 +133,13 @@ def legend_columns(labels: Iterable[str], most: int = 99) -> int:
     return max(1, min(len(lengths), most, int(72 * NARROW // (0.62 * LEAST_NARROW * max(lengths, default=1) + 40))))
 
 
+def outer_legend(axes: Axes, place: str) -> None:
+    """Legend of axes at a place outside of all panels, such as `upper center`."""
+    handles, labels = axes.get_legend_handles_labels()
+    where: Any = f"outside {place}"
+    axes.figure.legend(handles, labels, loc=where, ncols=legend_columns(labels))
+
+
 def can_stack(fig: Figure) -> bool:
     """True for a figure that `new_figure` made, which can be drawn for a phone."""
     return pages.FOR_PHONES and hasattr(fig, "panels")

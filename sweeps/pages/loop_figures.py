@@ -27,8 +27,8 @@ from sweeps.pages.figure_style import (
     configuration_looks,
     corner_note,
     is_narrow,
-    legend_columns,
     new_figure,
+    outer_legend,
 )
 from sweeps.pages.words import short_name
 from sweeps.report.fit_tables import Change
@@ -90,8 +90,7 @@ def before_after(table: Columns, channels: Sequence[Channel], verdict: str) -> F
         for edge in edges:
             axes.axvline(edge - 0.5, color="#bbbbbb", lw=0.8, ls=":")
         axes.set_ylabel(f"{channel.label} [σ]")
-    handles, labels = grid[0, 0].get_legend_handles_labels()
-    fig.legend(handles, labels, loc="outside upper left", ncols=legend_columns(labels))
+    outer_legend(grid[0, 0], "upper left")
     starts = [0, *edges]
     told = [groups[a] for a in starts]
     grid[-1, 0].set_xticks([(a + b - 1) / 2 for a, b in zip(starts, [*edges, len(order)], strict=True)], told,
@@ -238,8 +237,7 @@ def draw_errors(found: DiscoveryResult) -> Figure:
         axes.grid(axis="y", visible=False)
         axes.set_title(channel.label)
         axes.set_xlabel("rms error [%]")
-    labels = grid[0, 0].get_legend_handles_labels()[1]
-    fig.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside upper right", ncols=legend_columns(labels))
+    outer_legend(grid[0, 0], "upper right")
     return fig
 
 
@@ -368,11 +366,7 @@ def draw_defects(table: Columns, verdict: str, crosses_zero: bool = False) -> Fi
             if row == len(whens) - 1:
                 axes.set_xlabel(label)
                 axes.locator_params(axis="x", nbins=5)
-    fig.legend(
-        *grid[0, 0].get_legend_handles_labels(),
-        loc="outside upper right",
-        ncols=legend_columns(grid[0, 0].get_legend_handles_labels()[1]),
-    )
+    outer_legend(grid[0, 0], "upper right")
     return fig
 
 

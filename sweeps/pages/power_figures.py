@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from calibration.data import Columns
-from sweeps.pages.figure_style import BLUE, GREEN, INK, ORANGE, PURPLE, SKY, legend_columns, new_figure
+from sweeps.pages.figure_style import BLUE, GREEN, INK, ORANGE, PURPLE, SKY, new_figure, outer_legend
 
 #: Where power goes, with its colour: losses in the order of the chain, then what is left.
 ITEMS = {
@@ -76,9 +76,5 @@ def draw_power_chain(runs: Columns, names: list[str], has_ground: bool = True) -
     axes.grid(False)
     beyond = 1.35 if (slope > 1e-6).any() else 1.1
     axes.set(xlabel="power [W]", xlim=(0, beyond * float(total.max())))
-    fig.legend(
-        *axes.get_legend_handles_labels(),
-        loc="outside upper center",
-        ncols=legend_columns(axes.get_legend_handles_labels()[1]),
-    )
+    outer_legend(axes, "upper center")
     return fig

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from mmrjax.model.quantities import MM
-from mmrjax.undercarriage.ripple_peaks import MATTERS, SIGNALS, strongest_resonances
+from mmrjax.undercarriage.ripple_peaks import MATTERS, SIGNALS
 from sweeps.pages import words
 from sweeps.pages.figure_style import (
     BLUE,
@@ -48,10 +48,6 @@ def resonance_map(found: ResonanceResult) -> Figure:
     return fig
 
 
-def _strong(found: ResonanceResult) -> set[tuple[str, int, str]]:
-    return {(r.mode, r.order, r.signal) for r in strongest_resonances(found.resonances)}
-
-
 def _top(found: ResonanceResult) -> float:
     """Greatest frequency drawn [Hz]."""
     bands = [m.high for modes in found.modes.values() for m in modes if m.resonant]
@@ -85,8 +81,7 @@ def draw_campbell_diagram(axes: Axes, found: ResonanceResult) -> None:
             s=4 + 60 * (ripple / max(float(np.nanmax(ripple)), 1e-9)) ** 2, marker=marker, color=colour, alpha=0.55,
             lw=0, zorder=3, label=f"{SIGNALS[name].label}, up to {ripple_percent(float(np.nanmax(ripple)))}",
         )  # fmt: skip
-    strong = _strong(found)
-    hits = [p for p in found.peaks if p.mode and (p.mode, p.order, p.signal) in strong]
+    hits = [p for p in found.strong if p.mode]
     axes.scatter(
         [p.speed / MM for p in hits], [p.frequency for p in hits], s=130, marker="*", color="white",
         edgecolor=INK, lw=0.9, zorder=4, label="ripple peaks at a natural frequency: avoid" if hits else None,
@@ -156,9 +151,8 @@ def ripple_map(axes: Axes, found: ResonanceResult, name: str) -> None:
             if status != "converged" and np.isfinite(guess[k]):
                 marker = _UNREAD.get(status, ".")
                 axes.scatter(guess[k], row, marker=marker, s=14, color=INK, lw=0.9, zorder=4)
-    strong = _strong(found)
-    for p in found.peaks:
-        if p.signal == name and (p.mode, p.order, p.signal) in strong:
+    for p in found.strong:
+        if p.signal == name:
             place = (p.low / MM, payloads.index(p.payload) - 0.5)
             axes.add_patch(Rectangle(place, (p.high - p.low) / MM, 1.0, fill=False, ec=INK, lw=1.3, zorder=3,
                                      ls="-" if p.mode else ":"))  # fmt: skip

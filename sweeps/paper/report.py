@@ -4,17 +4,156 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 
-from calibration.data import Columns, Json
+from calibration.data import Columns, Json, runs
 from calibration.data.robot_file import RobotFile
 from calibration.inference import simulation_errors
+from mmrjax.model.channels import find_channel
 from mmrjax.model.paper_robots import ROBOTS
-from mmrjax.model.paper_tables import TRACKED
+from mmrjax.model.paper_tables import CONFIGURATIONS, TRACKED, WHEELED
+from mmrjax.model.quantities import MM, RPM
 from mmrjax.model.robot import Robot
 from sweeps.pages import history_figures, page
 from sweeps.pages.words import words_shown
-from sweeps.paper import components, data, error_tables, run_figures
+from sweeps.paper import components, data, run_figures
+from sweeps.report.run_tables import reading_text
+
+
+def variant_errors(variants: Columns, rows: data.Rows) -> list[Json]:
+    """Rms and worst error (35) of each variant (errors of shape (rows, channels)), all rows and by group."""
+    kind = rows.conditions["configuration"]
+    answer = []
+    for name, values in variants.items():
+        for group in ("all", *rows.ratio):
+            pick = np.ones(len(kind), bool) if group == "all" else kind == group
+            cells = [simulation_errors.error_summary(values[pick, k]) for k in range(values.shape[1])]
+            answer.append(
+                {"variant": name, "group": group, "rows": cells[0]["rows"], "of": int(pick.sum()), "cells": cells}
+            )
+    return answer
+
+
+def error_answer(every: list[Json]) -> str:
+    """Sentence on the rms errors (35) over all rows, from `variant_errors`: the robot's and the paper's."""
+    own, _, raised, *_, paper = (e for e in every if e["group"] == "all")
+    labels = [c.label for c in data.channels_of_paper()]
+    mine, theirs = (
+        ", ".join(f"{c['rms_percent']:.1f} % {label}" for c, label in zip(e["cells"], labels, strict=True))
+        for e in (raised, paper)
+    )
+    few = f", with adhesion raised ({own['rows']} rows settle on its own)" if own["rows"] < own["of"] else ""
+    return (
+        f"rms error against {raised['rows']} of {raised['of']} measured rows: {mine}{few}. "
+        f"The paper's own simulation: {theirs}."
+    )
+
+
+def implied_resistance(robot: Robot, table: runs.Runs) -> np.ndarray:
+    """Resistance [Ω] in series with each motor that current and speed of each row imply by (15)."""
+    current = table["total_current_A"]
+    back = np.asarray(robot.motor.voltage_back(jnp.asarray(table["motor_speed_rpm"] * RPM)))
+    return robot.sides * (table["supply_voltage_V"] - back) / current
+
+
+def row_by_row(nominal: Robot, rows: data.Rows) -> list[Json]:
+    """The 20 rows: bench, the paper's simulation, the nominal robot three ways, and letters that say why."""
+    table = rows.conditions
+    own, raised, weighed = (data.stack_channels(t) for t in (rows.plain, rows.raised, rows.weighed))
+    resistance = implied_resistance(nominal, runs.read_runs("simulated_by_paper"))
+    limit = float(nominal.motor.resistance)
+    answer = []
+    for k in range(len(table)):
+        wheeled = table["configuration"][k] == WHEELED
+        reasons = []
+        if rows.plain["status"][k] == "slides":
+            reasons.append("A")
+        if wheeled and abs(rows.weighed["total_mass_kg"][k] - table["total_mass_kg"][k]) > 0.05:
+            reasons.append("M")
+        if wheeled and abs(weighed[k, 0] - rows.paper[k, 0]) > 0.03 * rows.paper[k, 0]:
+            reasons.append("W")
+        if not wheeled and abs(raised[k, 0] - rows.paper[k, 0]) > 0.01 * rows.paper[k, 0]:
+            reasons.append("G")
+        if resistance[k] > 1.1 * limit:
+            reasons.append("E")
+        if raised[k, 1] > 1.03 * rows.measured[k, 1]:
+            reasons.append("B")
+        following = (table["slope_deg"] == table["slope_deg"][k] + 5) & (
+            (table["configuration"] == table["configuration"][k])
+            & (table["supply_voltage_V"] == table["supply_voltage_V"][k])
+        )
+        if following.any() and rows.paper[following, 1][0] > rows.paper[k, 1]:
+            reasons.append("N")
+        creep = rows.raised["theoretical_speed_mm_s"][k] * rows.raised["slip"][k]
+        radius = float(nominal.configurations[str(table["configuration"][k])].radius) / float(nominal.gearbox.ratio)
+        creep_paper = rows.paper[k, 1] * RPM * radius / MM - rows.paper[k, 2]
+        if creep_paper > 1.5 * creep + 2:
+            reasons.append("S")
+        answer.append(
+            {
+                "configuration": table["configuration"][k],
+                "voltage": table["supply_voltage_V"][k],
+                "mass": table["total_mass_kg"][k],
+                "own_mass": float(rows.weighed["total_mass_kg"][k]),
+                "slope": table["slope_deg"][k],
+                "status": str(rows.plain["status"][k]),
+                "reasons": reasons,
+                "channels": [
+                    _cells(
+                        channel.name, rows.measured[k, c], rows.paper[k, c], own[k, c], raised[k, c], weighed[k, c]
+                    )
+                    for c, channel in enumerate(data.channels_of_paper())
+                ],
+            }
+        )
+    return answer
+
+
+def _cells(channel: str, measured: float, paper: float, own: float, raised: float, weighed: float) -> Json:
+    """Texts of one channel in a row; differences by (35) of the nominal (raised, own mass) from paper and bench."""
+    return {
+        "measured": reading_text(measured, find_channel(channel)),
+        "paper": reading_text(paper, find_channel(channel)),
+        "own": reading_text(own, find_channel(channel)) if np.isfinite(own) else "slides",
+        "raised": reading_text(raised, find_channel(channel)) if np.isfinite(raised) else "no number",
+        "weighed": reading_text(weighed, find_channel(channel)) if np.isfinite(weighed) else "no number",
+        "to_paper": float(simulation_errors.relative_error(np.array(raised), np.array(paper))),
+        "to_paper_weighed": float(simulation_errors.relative_error(np.array(weighed), np.array(paper))),
+        "to_measured": float(simulation_errors.relative_error(np.array(raised), np.array(measured))),
+        "to_measured_weighed": float(simulation_errors.relative_error(np.array(weighed), np.array(measured))),
+    }
+
+
+def row_by_row_facts(nominal: Robot, rows: data.Rows) -> Json:
+    """The numbers behind the letters of `row_by_row`, for the page to put into words."""
+    measured = rows.conditions
+    of_paper = implied_resistance(nominal, runs.read_runs("simulated_by_paper"))
+    tracked = measured["configuration"] == TRACKED
+    slow, slope = measured["supply_voltage_V"] == 15.0, measured["slope_deg"]
+    used = rows.plain["adhesion_used"]
+    extra = rows.weighed["total_current_A"] - rows.paper[:, 0]
+    gap = 100 * (rows.raised["total_current_A"] - rows.paper[:, 0])[tracked] / rows.paper[tracked, 0]
+
+    def span(values: np.ndarray) -> tuple[float, float]:
+        return float(values.min()), float(values.max())
+
+    return {
+        "adhesion": tuple(float(nominal.configurations[c].ground.friction.static) for c in CONFIGURATIONS),
+        "used_tracked_15": float(used[tracked & (slope == 15)][0]),
+        "used_tracked_20": float(used[tracked & (slope == 20)][0]),
+        "used_wheeled_20": float(used[~tracked & (slope == 20)][0]),
+        "extra_slow": span(extra[~tracked & slow]),
+        "extra_fast": span(extra[~tracked & ~slow]),
+        "extra_flat": span(extra[~tracked & (slope == 0)]),
+        "guide_share": float(nominal.configurations[TRACKED].track.guide_share),
+        "gap": span(gap),
+        "resistance": float(nominal.motor.resistance),
+        "paper_slow": span(of_paper[tracked & slow]),
+        "paper_fast": span(of_paper[tracked & ~slow]),
+        "paper_wheeled": float(np.median(of_paper[~tracked])),
+        "bench": float(np.median(implied_resistance(nominal, measured))),
+    }
 
 
 def write_paper_page(folder: Path, file: RobotFile, *, model: str, gear: bool) -> tuple[Path, data.Rows | None]:
@@ -53,8 +192,8 @@ def write_paper_page(folder: Path, file: RobotFile, *, model: str, gear: bool) -
     album.add("fig11_motor_friction", lambda: components.motor_friction(robots))
     known["idle"] = album.add("fig18_idle_track", lambda: components.idle_track(robots))
     known |= {
-        "rows": error_tables.row_by_row(nominal, rows["nominal"]),
-        "facts": error_tables.row_by_row_facts(nominal, rows["nominal"]),
+        "rows": row_by_row(nominal, rows["nominal"]),
+        "facts": row_by_row_facts(nominal, rows["nominal"]),
         "raised_nominal": data.raised_words(nominal, rows["nominal"].ratio),
         "starts": starts,
         "split": data.SPLIT,
@@ -71,12 +210,12 @@ def _against_the_bench(album: page.Album, robots: dict[str, Robot], rows: dict[s
     certainty = album.add("fig28_current_over_slope", lambda: run_figures.current_over_slope(robot, mine))
     if TRACKED in mine.ratio:
         album.add("fig29_model_errors", lambda: run_figures.model_errors(robots, rows))
-    errors = error_tables.variant_errors(_variants(name, rows), mine)
+    errors = variant_errors(_variants(name, rows), mine)
     pick = mine.plain["status"] != "converged"
     table = mine.conditions
     shown = (table["configuration"], table["supply_voltage_V"], table["slope_deg"], mine.plain["status"])
     return {
-        "answer": error_tables.error_answer(errors),
+        "answer": error_answer(errors),
         "certainty": certainty,
         "errors": errors,
         "raised": data.raised_words(robot, mine.ratio),

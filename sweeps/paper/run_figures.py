@@ -23,6 +23,7 @@ from sweeps.pages.figure_style import (
     label_end,
     legend_columns,
     new_figure,
+    outer_legend,
 )
 from sweeps.pages.words import words_shown
 from sweeps.paper import data
@@ -199,11 +200,7 @@ def draw_energy(robot: Robot, ratio: dict[str, float]) -> tuple[Figure, list[Jso
     axes.grid(False)
     remark = "\n* slides on its own adhesion; shown with adhesion raised" if slides.any() else ""
     axes.set(xlabel=f"share of the power taken from the supply [%]{remark}", xlim=(0, 108), xticks=range(0, 101, 20))
-    fig.legend(
-        *axes.get_legend_handles_labels(),
-        loc="outside upper center",
-        ncols=legend_columns(axes.get_legend_handles_labels()[1]),
-    )
+    outer_legend(axes, "upper center")
     return fig, table
 
 
@@ -250,9 +247,5 @@ def row_parity(rows: data.Rows, name: str) -> Figure:
         axes.set_ylim(*span)
         axes.locator_params(nbins=5)
     corner_note(grid[0, 0], f"{words_shown(name)}; band ±5 %", fontsize=8.5)
-    fig.legend(
-        *grid[0, 0].get_legend_handles_labels(),
-        loc="outside lower center",
-        ncols=legend_columns(grid[0, 0].get_legend_handles_labels()[1]),
-    )
+    outer_legend(grid[0, 0], "lower center")
     return fig

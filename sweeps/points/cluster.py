@@ -19,8 +19,8 @@ from typing import Any
 
 from calibration.data import Columns, Json
 from calibration.data.input_errors import BadConfiguration, InputError
-from sweeps.points.identity import identity_differences, installed_versions, module_hashes
 from sweeps.points.scale import Job, Produced
+from sweeps.points.zarr_store import identity_differences, installed_versions, module_hashes
 from sweeps.store import PACKAGES
 
 #: Longest wait for a scheduler to answer, and for it to have a worker [s].

@@ -215,6 +215,11 @@ def condition_table(robot: Robot, runs: Runs) -> Columns:
     return {key: columns[key] for key in shown if key in columns}
 
 
+def run_names(runs: Runs) -> np.ndarray:
+    """Names of runs: those of their table, or else by number."""
+    return runs["run_id"] if runs.has("run_id") else np.array([f"run-{k + 1}" for k in range(len(runs))])
+
+
 def write_run_folder(
     folder: RunFolder,
     config: configuration.Simulate | configuration.Sweep | configuration.Compare,

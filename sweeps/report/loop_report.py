@@ -28,8 +28,10 @@ from sweeps.report.fit_tables import Change
 
 #: Change of an rms error that is marked [%].
 NOTABLE = 0.05
-#: Verdicts that leave something open.
-OPEN = ("class", "undescribed", *WITHOUT_NAME)
+#: Distance of a fitted parameter from its stated value that the first screen states [prior sds].
+MOVED = 2.0
+#: Levels that leave something open.
+OPEN = ("open", "class", "undescribed", *WITHOUT_NAME)
 
 
 def loop_document(found: DiscoveryResult, robot_name: str, changes: Mapping[str, Change]) -> Document:
@@ -39,12 +41,14 @@ def loop_document(found: DiscoveryResult, robot_name: str, changes: Mapping[str,
         robot_name: name or file of the robot that it began with; changes: of settled runs by each effect.
     """
     missing = found.verdict not in ("none", "undescribed")
+    moved = list(moved_parameters(found))
     rise = loop_words.rising_errors_sentence(found.held_out_worse, found.predicted)
     return Document(
         f"Is the {words.words_shown(Path(robot_name).name)} model complete?",
-        loop_answer(found),
+        found.statement,
         (
-            *([Note(tuple(_findings(found, changes)), name="found")] if found.effects else []),
+            *([Note(tuple(moved), name="moved", terminal=True)] if moved else []),
+            *([Note(tuple(_findings(found, changes)), name="found", terminal=True)] if found.effects else []),
             _summary(found),
             *([Note(rise, name="worse", terminal=True)] if rise else []),
             _advice(found),
@@ -52,17 +56,6 @@ def loop_document(found: DiscoveryResult, robot_name: str, changes: Mapping[str,
         ),
         tuple(_sections(found, changes, missing)),
     )
-
-
-def loop_answer(found: DiscoveryResult) -> str:
-    """The answer in one sentence or two: the claim that holds at every noise tried, and what is missing."""
-    first = found.headline
-    if len(first.factors) == 1:
-        return loop_words.completeness_answer(found)
-    claim = f"{loop_words.loop_headline(first)}."
-    if first.level == found.verdict:
-        return f"{loop_words.completeness_answer(found)} {claim}"
-    return f"{'Perhaps' if first.level == 'open' else 'No'}. {claim}"
 
 
 def rows_of(found: DiscoveryResult) -> Columns:
@@ -86,6 +79,18 @@ def _findings(found: DiscoveryResult, changes: Mapping[str, Change]) -> Iterable
         or_else = f" Or {other}." if other else ""
         kinds = ", or ".join(e.families)
         yield f"**{kinds}** (`{e.name}`): {size}; {loop_words.how_sure(found, e)}.{or_else}"
+
+
+def moved_parameters(found: DiscoveryResult) -> Iterable[str]:
+    """Parameters of the written robot that moved by more than `MOVED` prior sds, the farthest first."""
+    by_name = {
+        name: (p.after, p.shift_after) if found.written else (p.before, p.shift_before)
+        for name, p in found.base_shift.items()
+    }
+    for name, (value, shift) in sorted(by_name.items(), key=lambda item: -abs(item[1][1])):
+        if abs(shift) >= MOVED:
+            stated = found.base_shift[name]
+            yield loop_words.moved_parameter(name, value, stated.prior, stated.unit, shift)
 
 
 def _marked(text: str, change: float) -> Cell:
@@ -143,7 +148,7 @@ def held_out_table(found: DiscoveryResult) -> Table:
 
 
 def check_first(found: DiscoveryResult) -> list[str]:
-    """Points to check before use: the reading with the largest weight, parameters that moved far, contradictions."""
+    """Points to check before use: the reading with the largest weight, repeated values, contradictions."""
     far = [describe(note) for note in with_codes(found.remarks, "far_from_prior", "repeats", "copied")]
     against = [note for note in found.remarks if isinstance(note, str)]
     said = [loop_words.largest_share(found), *far, *against[:1]]
@@ -154,11 +159,11 @@ def check_first(found: DiscoveryResult) -> list[str]:
 def _advice(found: DiscoveryResult) -> Table:
     after = found.next_experiment
     if after is None:
-        known = {"none", "undescribed", "named"}
-        next_step = catalogue.text(f"loop.next-{found.verdict if found.verdict in known else 'other'}")
+        level, texts = found.headline.level, {"none", "undescribed", "named", "open"}
+        next_step = catalogue.text(f"loop.next-{level if level in texts else 'other'}")
     else:
         tells = f" Tells {', '.join(after.separates)}; expected separation {after.expected_sigma:.1f} σ."
-        undecided = " Some pairs stay undecided." if found.verdict == "class" and not after.settles else ""
+        undecided = " Some pairs stay undecided." if found.headline.level == "class" and not after.settles else ""
         next_step = f"**{after.name}**: {after.description}.{tells * bool(after.separates)}{undecided}"
     rows = [
         ("use it?", " ".join(loop_words.use_it(found)) or "No runs could be held out."),
@@ -197,13 +202,13 @@ def _certainty(found: DiscoveryResult, missing: bool) -> Table:
     (chi_before, chi_after), (before, after) = found.chi2_of_readings, found.chi2
     chi = f"{chi_before:.0f} → {chi_after:.0f}" if missing else f"{chi_before:.0f}"
     priors = f"{before:.0f} → {after:.0f}" if missing else f"{before:.0f}"
-    adequate = bool(found.after.adequate)
+    adequate, level = bool(found.after.adequate), found.headline.level
     left, set_aside = len(found.unusable), len(found.outliers)
     aside = f"{left} not reached by the fitted model, {set_aside} set aside as outliers"
     p = loop_words.p_value(found.before.p_value)
     rows = [
         (
-            Cell(catalogue.text(f"loop.verdict-{found.verdict}"), "fair" if found.verdict in OPEN else "good"),
+            Cell(catalogue.text(f"loop.verdict-{level}"), "fair" if level in OPEN else "good"),
             f"family-wise p {p}, from {found.replicates} bootstrap tables",
         ),
         (
@@ -249,8 +254,9 @@ def _certain(found: DiscoveryResult, missing: bool) -> Iterable[Section]:
     noise = loop_words.at_other_noise(found.sensitivity) if found.sensitivity else ""
     noises = {name: (n["median_percent"], n["source"]) for name, n in found.noise.items()}
     notes = [*found.notes, noise, fit_tables.noise_sentence(noises, found.channels)]
+    at = "" if found.headline.level == found.verdict else "At 1 times the noise alone: "
     blocks = [
-        Note(f"{found.verdict}: {found.statement}", name="statement", terminal=True),
+        Note(f"{at}{found.verdict_statement}", name="statement", terminal=True),
         *([Note(loop_words.cluster_sentence(found.cluster), name="cluster")] if found.cluster else []),
         *(Note(text, name=name, terminal=True) for name, text in reasons.items() if text),
         *remarks(also, "also"),
@@ -297,7 +303,7 @@ def _run_by_run(found: DiscoveryResult, table: Columns) -> Iterable[Block]:
         return
     lines = {"after_": "with what was found", "before_": "before"}
     lines = {"after_": "simulated"} if verdict == "none" else lines
-    yield catalogue.figure("fit.overlay", table, found.channels, lines, finding=loop_answer(found))
+    yield catalogue.figure("fit.overlay", table, found.channels, lines, finding=found.statement)
     runs = found.to_json()["series"]["runs"]
     some = f", of the first 8 of {runs} runs" if runs > 8 else ""
     yield catalogue.figure("loop.over_time", found.runs, table, found.channels, verdict, words=(some,))

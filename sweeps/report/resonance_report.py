@@ -65,6 +65,12 @@ class ResonanceResult:
         return group_resonances(self.peaks)
 
     @property
+    def strong(self) -> list[Peak]:
+        """Peaks of the strongest resonances."""
+        kinds = {(r.mode, r.order, r.signal) for r in strongest_resonances(self.resonances)}
+        return [p for p in self.peaks if (p.mode, p.order, p.signal) in kinds]
+
+    @property
     def read(self) -> np.ndarray:
         """Rows whose ripple is read."""
         return np.isfinite(self.table["reaction_ripple_percent"])
@@ -200,12 +206,7 @@ class ResonanceResult:
     def shaken(self, row: int | np.integer[Any]) -> bool:
         """True if a run is within one of the strongest peaks of its own payload."""
         speed, payload = self.table["speed_mean_mm_s"][row] * MM, self.table["payload_kg"][row]
-        strong = {(r.mode, r.order, r.signal) for r in strongest_resonances(self.resonances)}
-        return any(
-            p.low <= speed <= p.high
-            for p in self.peaks
-            if p.payload == payload and (p.mode, p.order, p.signal) in strong
-        )
+        return any(p.low <= speed <= p.high for p in self.strong if p.payload == payload)
 
     def to_avoid(self, row: int | np.integer[Any]) -> str:
         """Verdict on the speed of a run: avoid (`yes`), avoid `at other payloads` than its own, or `no`."""
@@ -338,10 +339,10 @@ def resonance_document(found: ResonanceResult, file: RobotFile) -> Document:
 
 
 def _peaks(found: ResonanceResult) -> Table:
-    strong = {(r.mode, r.order, r.signal) for r in strongest_resonances(found.resonances)}
+    strong = found.strong
     rows = [
         (
-            Cell(SIGNALS[p.signal].label, "bad" if (p.mode, p.order, p.signal) in strong else ""), p.payload,
+            Cell(SIGNALS[p.signal].label, "bad" if p in strong else ""), p.payload,
             p.speed / MM, f"{p.low / MM:.0f} to {p.high / MM:.0f}", 100 * p.ripple, 100 * p.rise, p.order or "none",
             p.frequency, p.mode or "none",
         )

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import rich.table
 from rich.text import Text
 
 from sweeps.console import print_output
 from sweeps.report.document import SIDE_BY_SIDE, TERMINAL_ROWS, Document, Note, Table, cell_tone, plain_text
 
+#: Longest text of a column that is never broken into lines.
+SHORT = 12
 #: Styles of cells by tone.
 TONES = {"bad": "red"}
 
@@ -35,9 +39,9 @@ def print_table(table: Table) -> None:
     kept = [k for k, column in enumerate(shown.columns) if column.terminal]
     for k in kept:
         column, number = shown.columns[k], bool(shown.columns[k].form)
-        printed.add_column(
-            plain_text(column.full_title), justify="right" if number else "left", no_wrap=number, overflow="fold"
-        )
+        short = number or max(len(plain_text(column.text(row[k]))) for row in rows) <= SHORT
+        justify: Literal["right", "left"] = "right" if number else "left"
+        printed.add_column(plain_text(column.full_title), justify=justify, no_wrap=short, overflow="fold")
     for row in rows:
         printed.add_row(
             *(Text(plain_text(shown.columns[k].text(row[k])), TONES.get(cell_tone(row[k]), "")) for k in kept)

@@ -76,6 +76,8 @@ def guessed_unit(raw: np.ndarray) -> str:
     if not len(steps) or (found % 1).any():
         return "s"
     usual = float(np.median(steps))
+    if usual % 100 == 0 and 1e2 < usual <= 1e5 and 1e6 % usual and not (steps % 100).any():
+        return "ms"  # rates in µs are whole numbers of Hz, and a count of µs has other last digits
     return next((unit for unit, largest in _STEPS.items() if usual <= largest), "s")
 
 

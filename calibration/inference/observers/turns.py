@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from calibration.data import Names
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.runs import Runs
 from calibration.inference import bases as bases_room
@@ -47,7 +48,7 @@ def signal_by_point(signals: Signals, name: str) -> Float[Array, " points"]:
 class TurnLinearization(SettledLinearization):
     """Linearization of settled turns: each side of each row is a point; `signals` have the sides as last axis."""
 
-    probed: ClassVar[tuple[str, ...]] = (*PROBED, *ROUND)
+    probed: ClassVar[Names] = (*PROBED, *ROUND)
 
     @property
     def points(self) -> int:
@@ -76,7 +77,7 @@ class SettledTurns(SettledRuns):
     """
 
     word: ClassVar[str] = "turns"
-    blocks: ClassVar[tuple[str, ...]] = ("run", TURN, "voltage", "payload", "configuration")
+    blocks: ClassVar[Names] = ("run", TURN, "voltage", "payload", "configuration")
     rows_tell: ClassVar[bool] = False  # a row has a defect on either side
     library: ClassVar[Mapping[str, type[Effect]]] = effects.OF_TURNS
     menu: ClassVar[bool] = False
@@ -108,7 +109,7 @@ class SettledTurns(SettledRuns):
         return cls.sizes(runs)
 
     @classmethod
-    def free(cls) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    def free(cls) -> tuple[Names, Names]:
         return (), priors.OF_TURNS
 
     def _observed(self, robot: Robot, result: Result) -> Observation:
