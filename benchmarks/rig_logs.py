@@ -4,12 +4,14 @@ Figures: false findings, right classes, wrong names, written robots that can be 
 compared with independent least squares.
 
     python benchmarks/rig_logs.py --clean 80 --library 80 --outside 40 --jobs 16 --cache runs/cache --limit 3000
+    python benchmarks/rig_logs.py --stratum varied --seed 700 --clean 80 --library 80 --outside 40 --brief --jobs 32
 
 Logs come from `tests/worlds/logs.py`, which shares no code with the simulator: four runs of 200 rows, 50 to
 200 Hz, of one drive and a load on a shaft; voltage, current or speed imposed in turn; some with a delay that no file
 states. The loop reads only `rig.toml` and `table.csv`; only the scorer reads the labels. Every log is one line
 of `--out`, and a restarted campaign continues where it ended. With `--brief` there is no
-hold-out.
+hold-out. In the stratum `varied` half of the tables have no sds, a quarter of the logs show an angle alone and a
+quarter have coarse instruments, and effects of the library leave 5 σ.
 """
 
 from __future__ import annotations
@@ -31,6 +33,7 @@ from worlds import laws, logs
 KINDS = ("clean", "library", "outside")
 #: Least and greatest sigmas of each effect.
 SIGMAS = {"library": (5.0, 15.0), "outside": (8.0, 15.0)}
+VARIED = {"library": (5.0, 5.5), "outside": (8.0, 15.0)}
 #: Rigs drawn until one can have an effect of the wanted strength.
 TRIES = 6
 #: Allowed excess of the loop's error over that of independent least squares.
@@ -44,27 +47,31 @@ def inputs(seed: int) -> tuple[str, float]:
 
 
 @functools.lru_cache(maxsize=2)
-def attempt(kind: str, seed: int) -> logs.Case | str:
-    """The case of a kind and a seed, or the reason why it is invalid."""
+def attempt(kind: str, seed: int, varied: bool = False) -> logs.Case | str:
+    """The case of a kind and a seed, or the reason why it is invalid; `varied` as the stratum."""
     rng = np.random.default_rng([41, KINDS.index(kind), seed])
     imposed, every = inputs(seed)
+    turn = seed // 2 % 4 if varied else 0
+    made = functools.partial(logs.rig, rng, imposed, every, alone=turn == 1, coarse=turn == 3)
+    stated, sigmas = not varied or seed % 2 == 0, (VARIED if varied else SIGMAS)
     if kind == "clean":
-        return logs.case(logs.rig(rng, imposed, every), "", 0.0, seed)
+        return logs.case(made(), "", 0.0, seed, stated=stated)
     pool = [n for n, x in (laws.LOGS if kind == "library" else laws.OUTSIDE_LOGS).items() if x.needs(imposed)]
     name, why = pool[(seed // len(logs.IMPOSED)) % len(pool)], ""
     for _ in range(TRIES):
-        case = logs.case(logs.rig(rng, imposed, every), name, float(rng.uniform(*SIGMAS[kind])), seed)
-        if not (why := refused(case.label, SIGMAS[kind][0])):
+        case = logs.case(made(), name, float(rng.uniform(*sigmas[kind])), seed, stated=stated)
+        if not (why := refused(case.label, sigmas[kind][0])):
             return case
     return f"{name} {why}"
 
 
 def work(task: Task) -> dict:
     """Makes a log, runs the loop on it and scores it against its label."""
-    case = attempt(task.kind, task.seed)
+    case = attempt(task.kind, task.seed, task.stratum == "varied")
     if isinstance(case, str):
         return {"skipped": case}
     given, found, line = looped(case, task)
+    line["intervals"] = intervals(found, case)
     if not task.brief:
         from calibration.data import robot_file
         from calibration.discovery.discover import assemble_result
@@ -77,6 +84,15 @@ def work(task: Task) -> dict:
             again = robot_file.read_robot(Path(folder) / "robot.toml")
         line["read_again"] = [e.name for e in again.effects] == [e.name for e in whole.robot.effects]
     return line
+
+
+def intervals(found, case: logs.Case) -> list[bool]:
+    """True for each base parameter with its truth in the 95 % interval of the proposed fit."""
+    space, best = found.screened.base.space, found.best
+    every, z, sd = space.coordinates.base, best.z[: space.free], best.sd[: space.free]
+    low, high = (np.asarray(every.value(z + side * 1.96 * sd)) for side in (-1, 1))
+    truth = {logs.PUBLIC[name]: x for name, x in case.label["constants"].items()}
+    return [bool(a <= truth[n] <= b) for n, a, b in zip(every.names, low, high, strict=True) if n in truth]
 
 
 def held_out(whole, case: logs.Case) -> dict:
@@ -99,9 +115,9 @@ def held_out(whole, case: logs.Case) -> dict:
     }
 
 
-def program(task: Task) -> tuple[str, float]:
-    """Properties that logs with the same programs share: the imposed quantity and the sampling interval."""
-    return inputs(task.seed)
+def program(task: Task) -> tuple[str, float, bool]:
+    """Properties that logs with the same programs share: what is imposed, the sampling interval, an angle alone."""
+    return *inputs(task.seed), task.stratum == "varied" and task.seed // 2 % 4 == 1
 
 
 def summary(lines: list[dict]) -> list[str]:
@@ -121,6 +137,11 @@ def summary(lines: list[dict]) -> list[str]:
     for imposed in logs.IMPOSED:
         some = [x for x in every if x["made"]["imposed"] == imposed]
         f.say(f"  {imposed}: clean without a finding, library right, outside without a name", some, right)
+    for name in ("alone", "coarse", "stated"):
+        some = [x for x in every if x["made"].get(name, name == "stated") != (name == "stated")]
+        f.say(f"  {'no ' if name == 'stated' else ''}{name}: the same", some, right)
+    held = [x for line in (*clean, *library) if right(line) for x in line.get("intervals", ())]
+    f.note(f"base parameters within their 95 % intervals (goal 90 to 98 %): {scores.interval(sum(held), len(held))}")
     f.say("robots read again (goal 100 %)", [x for x in every if "read_again" in x], lambda x: x["read_again"])
     compared = [x for x in every if x.get("held_out") and x["held_out"]["found"] is not None]
     f.say("held out: not below the refit's (goal >= 98 %)", compared,

@@ -127,7 +127,8 @@ def test_what_candidates_predict_is_kept_and_not_fitted_again(monkeypatch, runs)
     )
     before, after = (Fit(problem, c.z) for c in candidates)
     known = predicted[prediction.candidate_key(candidates[0])]
-    found = findings.readings_of_rows(runs, np.ones((12, 2)), before, after, known)
+    kinds = predictable_blocks(runs, problem)
+    found = findings.readings_of_rows(runs, np.ones((12, 2)), kinds, before, after, known)
     assert fitted == [1.0]
     assert_array_equal(found.held_out["slope"][0], known["slope"])
     assert_array_equal(found.held_out["slope"][1], -1.0)

@@ -148,7 +148,7 @@ class CandidateSpace:
     Attributes:
         bare: problem of the base only; equipped: of the base and the effects in the slots, whichever these are.
         library: the effects.
-        room: names of effects that the program of a fit of histories always includes, see `fitted_by`.
+        room: names of effects that the program of every fit of histories includes, see `fitted_by`.
         near: coordinates of fits of the same histories with other sds, by their effects. Fits then start there and
             take a few steps, and none has effects beyond `room`.
     """
@@ -228,9 +228,10 @@ class CandidateSpace:
     def fit_of(self, active: Sequence[str], z: np.ndarray) -> tuple[Problem, np.ndarray, tuple[int, ...] | None]:
         """Problem, coordinates and indices of the effects of a fit.
 
-        For a fit without effects, those of the base only: its steps cost at most a third.
+        For a fit without effects those of the base only, whose steps cost at most a third, unless the program of
+        `room` serves it too.
         """
-        if not any(active):
+        if not any(active) and not self.room:
             return self.bare, np.asarray(z)[: self.free], None
         problem, (indices,) = self.fitted_by([active])
         return problem, np.asarray(z), indices

@@ -29,6 +29,8 @@ FEWEST = 4
 ALIKE = 1e-9
 #: Gauss-Newton steps from one fit to another nearby.
 FEW = 6
+#: Distance of a regression from the prior above which a search begins at the prior mean too [prior sd].
+UNLIKELY = 4.0
 #: Rise of the objective above which a fit with more effects is worse than without [½σ²].
 STUCK = 0.1
 
@@ -132,8 +134,8 @@ def fit_base(space: CandidateSpace, settings: Settings, where: str, near: Candid
 
     Args:
         where: first words of the error message.
-        near: a fit of the same runs with other weights or sds, or by regression; for long runs, searches begin only
-            there and at the prior mean.
+        near: a fit of the same runs with other weights or sds, or by regression; for long runs the only start,
+            unless a regression is `UNLIKELY`.
 
     Raises:
         BadData: too few rows remain.
@@ -179,20 +181,28 @@ def _beyond_adhesion(space: CandidateSpace) -> np.ndarray:
 
 
 def _base_searches(space: CandidateSpace, settings: Settings, near: Candidate | None) -> tuple[Optimum, Observation]:
-    """Optima of the base's searches from the starts that its data propose, and their observations."""
-    observe = space.bare.observe
+    """Optima of the base's searches from the starts that its data propose, and their observations.
+
+    Fits of histories run in the program of `CandidateSpace.room`, if it is known, with empty slots.
+    """
+    observe, bare = space.bare.observe, space.bare
     few = bool(space.near)
-    if near is not None and few:
+    if near is not None and (few or observe.long):
         starts = near.z[None, : space.free]
-    elif near is not None and observe.long:
-        starts = np.stack([near.z[: space.free], np.zeros(space.free)])
         if not near.simulated:
-            starts = scans.place_at_minimum(space.bare, starts)
+            mean = [np.zeros(space.free)] if np.abs(starts).max() > UNLIKELY else []
+            starts = scans.place_at_minimum(bare, np.stack([*starts, *mean]))
     else:
-        starts = observe.starts(space.bare, np.random.default_rng(settings.seed), observe.policy.searches)
+        starts = observe.starts(bare, np.random.default_rng(settings.seed), observe.policy.searches)
     weights = np.repeat(space.weight[None], len(starts), 0)
-    given = jnp.asarray(starts), jnp.asarray(weights)
-    return jax.device_get(observe.search(space.bare, *given, rivals=not few, most=FEW if few else None))
+    problem, which = bare, None
+    if space.room:
+        problem, (empty,) = space.fitted_by([empty_slots(settings)])
+        starts = np.pad(starts, ((0, 0), (0, 2 * settings.slots)))
+        which = np.repeat(np.asarray(empty)[None], len(starts), 0)
+    given = jnp.asarray(starts), jnp.asarray(weights), which
+    most = FEW if few else None
+    return jax.device_get(observe.search(problem, *given, rivals=not few, most=most, scanned=bare))
 
 
 Proposal = tuple[tuple[str, ...], np.ndarray]

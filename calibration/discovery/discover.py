@@ -6,6 +6,7 @@ Each stage is a pure function of the results of the stages before it.
 from __future__ import annotations
 
 import concurrent.futures
+import contextlib
 import dataclasses
 import functools
 import math
@@ -153,9 +154,7 @@ def discover(
     distinct, known = ready.runs, ready.noise
     for note in ready.at_first:
         tell(note)
-    space = pose_candidates(distinct, ready.robot, known.sd, ready.settings, ready.stated, ready.library)
-    with compile_ahead(space, functools.partial(bases_at_fit, distinct), ready.settings) as later:
-        traced, notes = keep("verdict", lambda: ready.trace(progress=tell, later=later, keep=keep)), ready.notes
+    traced, notes = keep("verdict", lambda: ready.trace(progress=tell, ahead=True, keep=keep)), ready.notes
     silent = channels.channel_names(known.silent)
     factors = FACTORS.get(known.word, ())
     # Verdicts at other noises use the programs of the first one, so they run in parallel on other cores.
@@ -224,13 +223,13 @@ class LoopInput:
         noise: Noise | None = None,
         progress: Tell = lambda note: None,
         known: LoopStages | None = None,
-        later: Callable[[BaseFit], None] = lambda base: None,
+        ahead: bool = False,
         keep: Keep = kept.keep_nothing,
     ) -> LoopStages:
         """Stages up to a verdict, with this noise or another; other arguments as in the function `trace`."""
         sds = self.noise if noise is None else noise
         return trace(
-            self.runs, self.robot, sds, self.settings, self.stated, self.library, progress, known, later, keep
+            self.runs, self.robot, sds, self.settings, self.stated, self.library, progress, known, ahead, keep
         )
 
 
@@ -402,13 +401,13 @@ def trace(
     library: Library = effects.BY_NAME,
     progress: Tell = lambda note: None,
     known: LoopStages | None = None,
-    later: Callable[[BaseFit], None] = lambda base: None,
+    ahead: bool = False,
     keep: Keep = kept.keep_nothing,
 ) -> LoopStages:
     """Stages of the loop up to a verdict, in order, with known noise.
 
-    `later` is called with the base fit as soon as an effect is probably missing. A stored stage contains the results
-    of the stages before it.
+    With `ahead`, programs of later stages are compiled on other cores once a log's equations are ranked. A stored
+    stage contains the results of the stages before it.
 
     The bootstrap's statistics, in units of their sds, depend only weakly on the sds. If the stages of the same table
     with other sds are `known`, with the same included rows, their replicates are reused. Fits of histories then take
@@ -418,15 +417,29 @@ def trace(
     If the residuals have no structure and exceed the sds by the same factor everywhere, the sds are wrong. The
     stages are then repeated with sds from the residuals.
     """
-    task = _Task(runs, robot, noise, settings, stated, library, progress, known, later, keep)
     ranked = list[Ranking]()
-    screened, sds = keep("base", functools.partial(_fit_base_and_noise, task, ranked))
-    screened, left, searched = _search_until_clean(task, screened, sds, ranked)
-    if searched is None:
-        missed = missed_channels(screened.base.space, runs, sds.noise, left.linear)
-        word = "undescribed" if missed else "none"
-        return LoopStages(word, screened, left, sds, missed=missed, unused=unused_inputs(runs))
-    return _verdict(task, screened, left, sds, searched)
+    with contextlib.ExitStack() as others:
+        compiling = _Compiling(others) if ahead else None
+        task = _Task(runs, robot, noise, settings, stated, library, progress, known, compiling, keep)
+        screened, sds = keep("base", functools.partial(_fit_base_and_noise, task, ranked))
+        screened, left, searched = _search_until_clean(task, screened, sds, ranked)
+        if searched is None:
+            missed = missed_channels(screened.base.space, runs, sds.noise, left.linear)
+            word = "undescribed" if missed else "none"
+            return LoopStages(word, screened, left, sds, missed=missed, unused=unused_inputs(runs))
+        return _verdict(task, screened, left, sds, searched)
+
+
+class _Compiling:
+    """Programs that are compiled on other cores, until `others` is closed."""
+
+    def __init__(self, others: contextlib.ExitStack) -> None:
+        self.others, self.later = others, lambda base: None
+
+    def begin(self, task: _Task, space: CandidateSpace) -> None:
+        """Begin with the programs of a space."""
+        at = functools.partial(bases_at_fit, task.runs)
+        self.later = self.others.enter_context(compile_ahead(space, at, task.settings))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -441,45 +454,48 @@ class _Task:
     library: Library
     progress: Tell
     known: LoopStages | None
-    later: Callable[[BaseFit], None]
+    compiling: _Compiling | None
     keep: Keep
 
-    def screen(self, noise: Noise, near: Candidate | None, ranked: list[Ranking]) -> Screening:
-        """The base fit with this noise, from `near` if given, and its outliers; see `windows`."""
+    def screen(self, noise: Noise, before: BaseFit | None, ranked: list[Ranking]) -> Screening:
+        """The base fit with this noise, from one with another if given, and its outliers; see `windows`."""
         space = pose_candidates(self.runs, self.robot, noise.sd, self.settings, self.stated, self.library)
         known, at = self.known, functools.partial(bases_at_fit, self.runs)
+        if before is None:
+            space, near = self.windows(space, ranked)
+            if self.compiling is not None:
+                self.compiling.begin(self, space)
+        else:
+            space, near = space.with_room(before.space.room), before.candidate
+        self.progress(next_step("base"))
         if known is not None and space.bare.observe.long:  # the same rows are included here
             space = dataclasses.replace(space.without(np.array(known.screened.outliers, int)), near=known.simulated)
-            self.progress(next_step("base"))
             base = fit_base(space, self.settings, self.runs.source, near)
             return screen_known_rows(base, at, known.screened, self.settings)
-        if near is None:
-            near = self.windows(space, ranked)
-        self.progress(next_step("base"))
         return screen_outliers(fit_base(space, self.settings, self.runs.source, near), at, self.runs, self.settings)
 
-    def windows(self, space: CandidateSpace, ranked: list[Ranking]) -> Candidate | None:
-        """Start of the base fit from a log's equations in weak form; their ranking of the library is appended to
-        `ranked`."""
+    def windows(self, space: CandidateSpace, ranked: list[Ranking]) -> tuple[CandidateSpace, Candidate | None]:
+        """Program and start of the base fit from a log's equations in weak form; their ranking of the library is
+        appended to `ranked`."""
         found = screen_by_weak_form(space, self.settings)
         if found is None:
-            return None
+            return space, None
         make = functools.partial(findings.rank_by_weak_form, space, found, self.settings)
         ranked.append(self.keep("ranking", make))
-        return found.base
+        return space.with_room(found.room), found.base
 
 
 def _fit_base_and_noise(task: _Task, ranked: list[Ranking]) -> tuple[Screening, Sds]:
     """The base fit and the noise, rescaled if residuals without structure exceed it by one factor."""
     known, noise = task.known, task.noise
-    screened = task.screen(noise, None if known is None else known.screened.base.candidate, ranked)
+    screened = task.screen(noise, None if known is None else known.screened.base, ranked)
     residuals = residuals_of(screened, task.runs)
     factors = {} if screened.cluster is not None else common_factors(residuals)
     sds = Sds(noise, factors, tuple(noise_remarks(residuals, noise.word)))
     if factors:
         task.progress(next_step("sds"))
         sds = dataclasses.replace(sds, noise=noise.scaled(factors))
-        screened = task.screen(sds.noise, screened.base.candidate, ranked)
+        screened = task.screen(sds.noise, screened.base, ranked)
     return screened, sds
 
 
@@ -487,14 +503,11 @@ def _test_base(task: _Task, sds: Sds, screened: Screening) -> tuple[Screening, D
     """A base fit with the sets of effects to be simulated in its program, and the bootstrap of its residuals."""
     known, weight = task.known, screened.base.space.weight
     null = None if known is None or np.any(known.screened.base.space.weight != weight) else known.left.test.null
-    room = () if known is None else known.screened.base.space.room
     base, (linear, scores, _) = screened.base, screened.diagnosed
-    space = base.space.with_room(room)
-    if not room:
-        space = with_program_room(base.space, base.candidate, linear, scores, task.settings)
+    space = with_program_room(base.space, base.candidate, linear, scores, task.settings)
     screened = dataclasses.replace(screened, base=dataclasses.replace(base, space=space))
-    if np.max(np.abs(np.asarray(scores.single))) > LIKELY:
-        task.later(screened.base)
+    if task.compiling is not None and np.max(np.abs(np.asarray(scores.single))) > LIKELY:
+        task.compiling.later(screened.base)
     return screened, diagnosis_of_base(screened, task.settings, sds.noise.freedom, null)
 
 
@@ -720,12 +733,12 @@ def padded_rows(rows: int, sizes: tuple[int, ...]) -> tuple[np.ndarray, np.ndarr
 
 def bases_at_fit(runs: Runs, base: BaseFit) -> Bases:
     """Bases of curves over the fitted readings, because curves over measured ones would share their noise."""
-    problem = base.space.bare
+    problem, z, active = base.space.fit_of(base.candidate.active, base.candidate.z)
+    problem = problem if active is None else base.space.problem(base.candidate.active)
     index, _ = padded_rows(len(runs), problem.observe.sizes_padded)
     columns = dict(runs.where(index).columns)
     reading = np.where(np.isfinite(base.reading), base.reading, np.asarray(problem.data.measured))
     columns |= {c.column: reading[:, k] for k, c in enumerate(problem.channels)}
-    z = base.candidate.z[: base.space.free]
     observe = problem.observe.at_fit(problem, z)
     return observe.bases(columns, base.space.included, problem.robot(jnp.asarray(z)))
 
@@ -929,8 +942,9 @@ def assemble_result(
     written = _fit_of_verdict(traced, progress)
     progress(next_step("errors"))
     known = [traced.predicted.get(prediction.candidate_key(c)) for c in (base, best)]
+    kinds = blocks_room.predictable_blocks(runs, space.bare)
     seen = findings.readings_of_rows(
-        runs, noise.sd, written.before, written.after, known[0], None if best is base else known[1]
+        runs, noise.sd, kinds, written.before, written.after, known[0], None if best is base else known[1]
     )
     compared = traced.held_out
     nameless = traced.verdict in WITHOUT_NAME

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -47,7 +47,7 @@ from calibration.discovery.screening import Beforehand
 from calibration.discovery.search import single_p_value, without_each
 from calibration.discovery.settings import Settings
 from calibration.discovery.stated_values import Shift
-from calibration.inference import bases, blocks, priors
+from calibration.inference import bases, priors
 from calibration.inference.held_out import predict_unseen
 from calibration.inference.identifiability import held_by_prior
 from calibration.inference.linearization import Linearization, amplitude_of, shape_at, shape_of, shape_scales
@@ -395,6 +395,7 @@ HeldOutReadings = dict[str, np.ndarray]
 def readings_of_rows(
     runs: Runs,
     sd: np.ndarray,
+    kinds: Mapping[str, Mapping[str, np.ndarray]],
     before: Fitted,
     after: Fitted | None,
     known_before: HeldOutReadings | None = None,
@@ -403,6 +404,7 @@ def readings_of_rows(
     """Fitted and held-out readings, for every kind of block; `after` None is the same as before.
 
     Args:
+        kinds: blocks, as from `blocks.predictable_blocks`.
         known_before, known_after: hold-out readings, if they are already known.
     """
     rows = len(runs)
@@ -416,7 +418,7 @@ def readings_of_rows(
         return predict_unseen(fitted.problem, fitted.z, masks, fitted.active).reading
 
     held, labels = {}, {}
-    for kind, by in blocks.predictable_blocks(runs, before.problem).items():
+    for kind, by in kinds.items():
         masks = list(by.values())
         first = left_out(before, masks) if known_before is None else known_before[kind]
         later = first

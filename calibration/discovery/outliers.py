@@ -80,7 +80,8 @@ def compile_ahead(
 
     def foresee(base: BaseFit) -> None:
         if space.bare.observe.long:
-            jobs.append(others.submit(make_room, base))
+            if not space.room:
+                jobs.append(others.submit(make_room, base))
         elif space.bare.observe.menu:
             jobs.append(others.submit(predict_menu, base.space, {"": base.candidate}, settings))
 
@@ -189,7 +190,7 @@ def _diagnose_base(
 ) -> tuple[Bases, Diagnosed]:
     space, bases = base.space, bases_at(base)
     problem, z = space.problem(empty_slots(settings)), base.candidate.z
-    if problem.observe.long:  # by the program of its fit
+    if problem.observe.long and not space.room:  # by the program of its fit
         problem, z = space.bare, z[: space.free]
     return bases, jax.device_get(diagnose_fit(problem, jnp.asarray(z), space.library.scored, bases))
 
@@ -211,12 +212,13 @@ def _set_gross_aside(base: BaseFit, settings: Settings, where: str) -> tuple[Bas
     def off(reading: np.ndarray) -> np.ndarray:
         return np.max(np.abs((reading - measured) / sd) * (weight > 0), 1)
 
-    far, start = off(base.reading), base.candidate.z[: space.free]
+    problem, start, active = space.fit_of(base.candidate.active, base.candidate.z)
+    far = off(base.reading)
     if far[included].max() < settings.gross:
         return base, ()
     for _ in range(settings.reweightings):
         robust = space.weight / np.sqrt(1 + (far / settings.cauchy) ** 2)[:, None]
-        optima, seen = search_each(space.bare, [start], [robust])
+        optima, seen = search_each(problem, [start], [robust], None if active is None else [active])
         far, start = off(np.asarray(seen.reading[0])), np.asarray(optima.z[0])
     gross = included & (far > settings.gross * max(1.0, float(np.median(far[included]))))
     if not gross.any() or gross.sum() > settings.outliers(int(included.sum())):

@@ -22,7 +22,7 @@ from calibration.discovery.score_tests import ABSORBED, ScoreTable
 from calibration.discovery.settings import Settings
 from calibration.inference.linearization import Linearization
 from calibration.inference.optimizers import Optimum
-from calibration.inference.weak_form import weak_form
+from calibration.inference.weak_form import WeakForm, weak_form
 
 #: Number of sets that are simulated in a round: the first by regression and its nearest rivals, one of them from
 #: another family.
@@ -33,6 +33,10 @@ FURTHER = 3
 
 #: Largest initial amplitude of a fit [prior sds of a fit].
 FAR = 1.5
+#: Least gain by a set that needs another program, as a share of the largest gain of any set.
+ANOTHER = 0.05
+#: Most steps of all runs for which a base fit in the program with effects costs less than a program of its own.
+BRIEF = 10_000
 #: Number of effects in the first program of a log's fits, and of those among them that are similar to the first.
 ROOM, NEAR = 8, 5
 
@@ -62,7 +66,12 @@ class Regression:
     """
 
     def __init__(
-        self, space: CandidateSpace, at: Candidate, linear: Linearization, scores: ScoreTable, settings: Settings
+        self,
+        space: CandidateSpace,
+        at: Candidate,
+        linear: Linearization | WeakForm,
+        scores: ScoreTable,
+        settings: Settings,
     ) -> None:
         self.space, self.at, self.scores, self.settings = space, at, scores, settings
         self.jacobian, self.residual = np.asarray(linear.jacobian), np.asarray(linear.residual)
@@ -108,17 +117,20 @@ def confirm_by_simulation(space: CandidateSpace, screened: Sequence[Candidate], 
     """Simulate the first sets of a round that was screened by regression.
 
     These are the plausible set that explains most, its nearest rival, the nearest of another family, and any
-    implausible set that explains more. If the first explains less than its regression by more than
-    `Settings.same`, the simulation decides, and the next by regression is tried too. Further sets must be in the
-    program, or must promise more.
+    implausible set that explains more. If the program has the first, rivals outside it stay regressions. If the first
+    explains less than its regression by more than `Settings.same`, the simulation decides, and the next by
+    regression is tried too. Further sets must be in the program, or must promise more.
     """
     fits = lambda c: {*c.effects} <= {*space.room}  # noqa: E731
     # Sets outside the program need another program, and have to promise that much more. For verdicts at other noises
     # they are omitted.
     screened = [c for c in screened if fits(c)] if space.near else screened
-    order = sorted(screened, key=lambda c: c.cost + (0.0 if fits(c) else settings.same / 2))
+    costs = [c.cost for c in screened if np.isfinite(c.cost)]
+    more = max(settings.same / 2, ANOTHER * float(np.ptp(costs))) if costs else 0.0
+    order = sorted(screened, key=lambda c: c.cost + (0.0 if fits(c) else more))
     order = [c for c in order if np.isfinite(c.cost)]
-    first, found = _first_to_simulate(space, order), dict[tuple[str, ...], Candidate]()
+    within = [c for c in order if fits(c)] if order and fits(order[0]) else order
+    first, found = _first_to_simulate(space, within), dict[tuple[str, ...], Candidate]()
     space = space.with_room([*space.room, *(n for c in first for n in c.effects)])  # one program for all of them
     said = {c.active: c for c in order}
 
@@ -128,13 +140,13 @@ def confirm_by_simulation(space: CandidateSpace, screened: Sequence[Candidate], 
     def simulate(those: Sequence[Candidate]) -> None:
         """Simulate from the regression's coordinates.
 
-        Sets that explain less there, and the first of all, are repeated from the prior mean: a model error may have
-        led the fit without the effect elsewhere.
+        Sets that explain less there are repeated from the prior mean: a model error may have led the fit without the
+        effect elsewhere.
         """
         made = fit_candidates(space, [(c.active, _start_of_simulation(space, c)) for c in those], settings)
         found.update({c.active: c for c in made})
         new = [c for c in those if c.active not in space.near]
-        doubted = [c for c in new if less(found[c.active]) or c is first[0]]
+        doubted = [c for c in new if less(found[c.active])]
         at_mean = [np.where(np.arange(len(c.z)) < space.free, 0.0, _start_of_simulation(space, c)) for c in doubted]
         again = fit_candidates(space, [(c.active, z) for c, z in zip(doubted, at_mean, strict=True)], settings)
         found.update({c.active: c for c in again if c.cost < found[c.active].cost})
@@ -179,11 +191,13 @@ class Beforehand:
     Attributes:
         base: the fit without effects, by regression. None if the load may slide on its ground, which the
             equations do not show, so that a search should not begin there.
+        room: effects in the program of all fits, if the equations show that one is missing and the log is `BRIEF`.
         scores: of every instance; windows: number of equations.
         null: root of the strongest score of tables under the null hypothesis [σ], shape (replicates,).
     """
 
     base: Candidate | None
+    room: tuple[str, ...]
     scores: ScoreTable
     windows: int
     null: np.ndarray
@@ -205,7 +219,7 @@ def screen_by_weak_form(space: CandidateSpace, settings: Settings) -> Beforehand
     single = -ways.T @ found.residual
     none = np.zeros(0)
     amplitude = np.where(seen, single / np.where(seen, norm, 1.0), 0.0)
-    parts: tuple[Any, ...] = (single, amplitude, norm, *[none] * 6)
+    parts: tuple[Any, ...] = (single, amplitude, norm, none, ways.T @ ways, *[none] * 4)
     scores = ScoreTable(*parts)
     random = np.random.default_rng(settings.seed)
     null = np.max(np.abs(random.standard_normal((settings.replicates, len(ways))) @ ways), 1)
@@ -217,7 +231,10 @@ def screen_by_weak_form(space: CandidateSpace, settings: Settings) -> Beforehand
     at = Optimum(*of_fit)
     base = dataclasses.replace(candidate_of_fit(space, empty_slots(settings), at, settings), simulated=False)
     slides = problem.base.has_ground and problem.base.rig.imposed == "voltage"
-    return Beforehand(None if slides else base, scores, found.windows, null)
+    missing = np.mean(null >= np.max(np.abs(single))) < settings.family_wise_error
+    brief = problem.observe.times.size <= BRIEF  # type: ignore[attr-defined]  # of histories
+    room = _program_room(space, base, found, scores, settings) if missing and brief else ()
+    return Beforehand(None if slides else base, room, scores, found.windows, null)
 
 
 def fit_by_regression(
@@ -235,12 +252,19 @@ def fit_by_regression(
 def with_program_room(
     space: CandidateSpace, base: Candidate, linear: Linearization, scores: ScoreTable, settings: Settings
 ) -> CandidateSpace:
-    """Space with a program for the effects simulated first, for similar ones, and for the best of other families.
+    """Space with a program for the effects that are likely, see `_program_room`.
 
-    Unchanged unless runs are long.
+    Unchanged unless runs are long and their program is not known yet.
     """
-    if not space.bare.observe.long:
+    if not space.bare.observe.long or space.room:
         return space
+    return space.with_room(_program_room(space, base, linear, scores, settings))
+
+
+def _program_room(
+    space: CandidateSpace, base: Candidate, linear: Linearization | WeakForm, scores: ScoreTable, settings: Settings
+) -> tuple[str, ...]:
+    """Effects to be simulated first, similar ones, and the best of other families."""
     beside, library = Regression(space, base, linear, scores, settings), space.library
     order = sorted((beside((name, *empty_slots(settings)[1:])) for name in library.names), key=lambda c: c.cost)
     first = [c.active[0] for c in _first_to_simulate(space, order)]
@@ -249,4 +273,4 @@ def with_program_room(
     near = [library.names[k] for k in np.argsort(-alike) if alike[k] > settings.alike]
     best = {library[c.active[0]].family(): c for c in reversed(order)}  # of each family
     others = [c.active[0] for c in sorted(best.values(), key=lambda c: c.cost)]
-    return space.with_room([*dict.fromkeys((*first, *near[:NEAR], *others))][:ROOM])
+    return tuple(dict.fromkeys((*first, *near[:NEAR], *others)))[:ROOM]

@@ -508,8 +508,8 @@ def weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> WeakF
 
     sd = np.asarray(rows.sd)
 
-    def terms(rows: Rows, z: np.ndarray, effects: tuple[ScoredEffect, ...] = ()) -> Terms:
-        return jax.device_get(_terms(problem, plan, rows, jnp.asarray(z), effects))
+    def terms(rows: Rows, z: np.ndarray) -> Terms:
+        return jax.device_get(_terms(problem, plan, rows, jnp.asarray(z), effects))  # one program for all of them
 
     def whole(factors: list[np.ndarray], given: Terms) -> np.ndarray:
         each = zip(factors, cut, strict=True)
@@ -534,7 +534,7 @@ def weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> WeakF
 
         def at(z: np.ndarray) -> np.ndarray:
             if not last or np.any(last[0][0] != z):
-                mine = whole(factors, terms(smooth, z, effects))
+                mine = whole(factors, terms(smooth, z))
                 mine[:, 0] += offset
                 rest = np.zeros((len(z), mine.shape[1]))
                 rest[:, 0], rest[:, 1 : len(z) + 1] = z - centre, np.eye(len(z))

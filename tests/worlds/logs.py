@@ -41,6 +41,8 @@ CHANNELS = {
     "motor_speed": ("motor_speed_rpm", RPM, 0.01),
     "output_angle": ("output_angle_deg", np.pi / 180, 0.003),
 }
+#: Step of a coarse instrument: of a 10-bit encoder [deg], and of other channels in sds of their noise.
+ENCODER, COARSE = 360 / 1024, 2.5
 
 
 LAWS = laws.LOGS | laws.OUTSIDE_LOGS
@@ -61,6 +63,8 @@ class Rig:
         every: sampling step [s]; inputs: of each run at each row [SI], shape (runs, rows); delay: of the readings [s].
         sd: of each channel [unit of the column].
         load_torque: of a brake at each row, held until the next [N·m], shape (runs, rows); None: none.
+        alone: True if the output's angle is the only reading (with a voltage or a current imposed).
+        steps: of the readings of coarse instruments [unit of the column]; `sd` then includes their rounding.
     """
 
     imposed: str
@@ -76,9 +80,13 @@ class Rig:
     delay: float
     sd: dict[str, float]
     load_torque: np.ndarray | None = None
+    alone: bool = False
+    steps: dict[str, float] = dataclasses.field(default_factory=dict)
 
     @property
     def channels(self) -> tuple[str, ...]:
+        if self.alone:
+            return ("output_angle",)
         own = {"voltage": ("total_current", "motor_speed"), "motor_current": ("motor_speed", "output_angle")}
         return own.get(self.imposed, ("total_current",))
 
@@ -93,11 +101,14 @@ class Rig:
         return SimpleNamespace(rated=self.rated, torque=self.torque, w_k=self.w_k, supply=self.supply, **self.p)
 
 
-def rig(rng: np.random.Generator, imposed: str, every: float | None = None) -> Rig:
+def rig(
+    rng: np.random.Generator, imposed: str, every: float | None = None, *, alone: bool = False, coarse: bool = False
+) -> Rig:
     """A random rig; its readings' noise is set by what they show without effects.
 
     Args:
-        every: sampling step [s]; None: a random one.
+        every: sampling step [s]; None: a random one; alone: as of `Rig`, unless a speed is imposed.
+        coarse: True for instruments with steps.
     """
     supply, fast = float(rng.choice([6.0, 12.0, 24.0, 48.0])), rng.uniform(300.0, 800.0)
     stall, ratio = between(rng, 3, 30), float(np.round(between(rng, 15, 60)))
@@ -122,9 +133,14 @@ def rig(rng: np.random.Generator, imposed: str, every: float | None = None) -> R
     # The current of an imposed speed jumps from row to row with its slope: late by whole rows it is not read in between.
     delay = every * (round(late) if imposed == "motor_speed" else late)
     made = Rig(imposed, p, stated, ratio, supply, rated, torque, w_k, every, inputs, delay, {})
+    made = dataclasses.replace(made, alone=alone and imposed != "motor_speed")
     shown = histories(made, [p])[0]
     sd = {n: typed(CHANNELS[n][2] * np.sqrt(np.mean(shown[n] ** 2)), 2) for n in made.channels}
-    return dataclasses.replace(made, sd=sd)
+    if not coarse:
+        return dataclasses.replace(made, sd=sd)
+    steps = {n: ENCODER if n == "output_angle" else typed(COARSE * x, 2) for n, x in sd.items()}
+    sd = {n: typed(float(np.hypot(x, steps[n] / 12**0.5)), 3) for n, x in sd.items()}
+    return dataclasses.replace(made, sd=sd, steps=steps)
 
 
 def _inputs(rng, imposed, every, supply, rated, fast) -> np.ndarray:
@@ -322,9 +338,13 @@ def oracle(r: Rig, term: Term, y: np.ndarray, columns: np.ndarray) -> dict[str, 
     return told_apart(apart, size, term.law.cls)
 
 
-def case(r: Rig, name: str, sigmas: float, seed: int) -> Case:
+def case(r: Rig, name: str, sigmas: float, seed: int, *, stated: bool = True) -> Case:
     """A case; `name` empty is a clean one. Effects are sized so that a linear refit of the constants leaves `sigmas`;
-    the label says how many a refit really leaves."""
+    the label says how many a refit really leaves.
+
+    Args:
+        stated: True for a table with the sds of its readings.
+    """
     rng = np.random.default_rng([98, seed])
     terms: tuple[Term, ...] = ()
     effects = []
@@ -342,7 +362,7 @@ def case(r: Rig, name: str, sigmas: float, seed: int) -> Case:
         terms = (term,)
         effects.append(term.label | {"sigmas": left_over(r, term), **oracle(r, term, y, columns)})
     shown = histories(r, [r.p], [terms])[0]
-    measured = {n: x + r.sd[n] * rng.standard_normal(x.shape) for n, x in shown.items()}
+    measured = {n: _read(r, n, x, rng) for n, x in shown.items()}
     column = {"voltage": "supply_voltage_V", "motor_current": "motor_current_A", "motor_speed": "motor_speed_rpm"}
     t = np.round(np.arange(ROWS) * r.every, 6)
     table: dict[str, np.ndarray] = {
@@ -355,13 +375,22 @@ def case(r: Rig, name: str, sigmas: float, seed: int) -> Case:
     for n in r.channels:
         head, _, unit = CHANNELS[n][0].rpartition("_")
         table[CHANNELS[n][0]] = np.array([typed(x, 9) for x in measured[n].ravel()])
-        table[f"{head}_sd_{unit}"] = np.full(RUNS * ROWS, r.sd[n])
+        if stated:
+            table[f"{head}_sd_{unit}"] = np.full(RUNS * ROWS, r.sd[n])
     label = {
         "kind": "clean" if not name else "library" if LAWS[name].cls else "outside", "seed": seed, "stratum": r.imposed, "imposed": r.imposed,
-        "every": r.every, "delay": r.delay, "effects": effects, "constants": r.p,
+        "every": r.every, "delay": r.delay, "effects": effects, "constants": r.p, "alone": r.alone,
+        "coarse": bool(r.steps), "stated": stated,
         "sound": bool(all(np.isfinite(x).all() for x in shown.values())),
     }  # fmt: skip
     return Case(table, label, toml(r), r, terms, whitened(r, measured))
+
+
+def _read(r: Rig, name: str, shown: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Readings of a channel: with noise, and rounded by a coarse instrument."""
+    step = r.steps.get(name, 0.0)
+    noisy = shown + np.sqrt(r.sd[name] ** 2 - step**2 / 12) * rng.standard_normal(shown.shape)
+    return step * np.round(noisy / step) if step else noisy
 
 
 def left_over(r: Rig, term: Term) -> float:
@@ -474,4 +503,5 @@ def toml(r: Rig) -> str:
         if name != "resistance" or r.imposed == "voltage":
             table, _, key = PUBLIC[name].partition(".")
             tables[table][key] = f"{r.stated[name]!r} ± {100 * RELATIVE[name]:g} %"
+    tables |= {f"instruments.{name}": {"quantum": "free"} for name in r.steps}
     return robot_toml(tables)

@@ -331,6 +331,7 @@ class Observer(eqx.Module):
         *,
         rivals: bool = False,
         most: int | None = None,
+        scanned: Problem | None = None,
     ) -> tuple[Optimum, Observation]:
         """Optima of any number of fits, each with its own weights, and their observations.
 
@@ -339,6 +340,7 @@ class Observer(eqx.Module):
             active: set of effects of each member, see `ActiveSet`; None keeps the problem's.
             rivals: True if all search the same optimum, so that some may be stopped early.
             most: largest number of steps of each; None: the policy's.
+            scanned: problem of the base only, whose coordinates are scanned and come first; None: the problem itself.
         """
 
     def observed(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> Observation:

@@ -105,8 +105,8 @@ DELAYS, SCANNED = (256, 2048), 32
 #: Time up to which a first sample has to show a robot at rest [s]; largest allowed reading there, as a share of the
 #: largest speed and in sds.
 EARLY, RESTING, RESTING_SD = 0.005, 0.2, 5.0
-#: Members of a search that one call of its program evaluates.
-TOGETHER = 2
+#: Members of a search that one call of its program evaluates; calls for others run in parallel.
+TOGETHER = 1
 #: Differences between neighbouring residuals, over their median, above which they are jumps rather than noise [-].
 JUMP = 7.0
 #: Fields of `Conditions` that may change within a run.
@@ -696,6 +696,7 @@ class Histories(Observer):
         *,
         rivals: bool = False,
         most: int | None = None,
+        scanned: Problem | None = None,
     ) -> tuple[Optimum, Observation]:
         """Searches as in the protocol; the runs are compiled once for all steps."""
         data, steps = problem.data, self.policy.steps if most is None else most
@@ -708,19 +709,23 @@ class Histories(Observer):
         near = np.asarray(optima[0].cost) < np.nanmin(optima[0].cost) + NEAR
         if most is None and np.any(near & ~np.asarray(optima[0].converged)):  # a proposal has to be an optimum
             optima = searched(np.asarray(optima[0].z))
-        if not rivals or not scans.scanned_coordinates(problem):
+        bare = problem if scanned is None else scanned
+        if not rivals or not scans.scanned_coordinates(bare):
             return optima
-        k = int(np.nanargmin(optima[0].cost))
-        one = lambda x: jax.tree.map(lambda leaf: leaf[k], x)  # noqa: E731
-        data = dataclasses.replace(problem.data, weight=weights[k])
-        best = scans.search_lower_basins(
-            problem,
-            one(optima),
-            data,
-            lambda z: one(searched(np.tile(z, (len(starts), 1)))),
-            lambda _: None,
-        )
-        return jax.tree.map(lambda every, mine: jnp.asarray(every).at[k].set(mine), optima, best)
+        k, size = int(np.nanargmin(optima[0].cost)), len(bare.coordinates)
+
+        def one(every: tuple[Optimum, Observation]) -> tuple[Optimum, Observation]:
+            best, seen = jax.tree.map(lambda leaf: leaf[k], every)
+            return dataclasses.replace(best, z=best.z[:size], sd=best.sd[:size]), seen
+
+        def again(z: np.ndarray) -> tuple[Optimum, Observation]:
+            return one(searched(np.tile(np.pad(z, (0, np.shape(starts)[1] - size)), (len(starts), 1))))
+
+        data = dataclasses.replace(bare.data, weight=weights[k])
+        best, seen = scans.search_lower_basins(bare, one(optima), data, again, lambda _: None)
+        whole = jax.tree.map(lambda leaf: jnp.asarray(leaf[k]), optima[0])
+        best = dataclasses.replace(best, z=whole.z.at[:size].set(best.z), sd=whole.sd.at[:size].set(best.sd))
+        return jax.tree.map(lambda every, mine: jnp.asarray(every).at[k].set(mine), optima, (best, seen))
 
     def observed(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> Observation:
         return self.at(problem, z, active)[2]
