@@ -162,7 +162,7 @@ def test_large_grid_of_options_leaves_a_store_with_the_numbers_of_the_table(mmrj
     assert "--export csv" in said
     left = {f.name for f in (tmp_path / "large").iterdir()}
     assert left == {
-        "config.resolved.toml", "zarr_store.json", "journal", "manifest.json", "result.json", "results.zarr", "robot.toml",
+        "config.resolved.toml", "identity.json", "journal", "manifest.json", "result.json", "results.zarr", "robot.toml",
     }  # fmt: skip
     results = [json.loads((tmp_path / name / "result.json").read_text()) for name in ("small", "large")]
     assert results[0]["statuses"] == results[1]["statuses"] and results[0]["runs"] == results[1]["points"] == 12
@@ -592,7 +592,7 @@ def test_store_is_not_abandoned_while_a_share_is_at_work(opened, tmp_path):
     share.begin((2, 3))
     rest.begin()
     rest.abandon()
-    assert (tmp_path / "s.partial" / "zarr_store.json").is_file()
+    assert (tmp_path / "s.partial" / "identity.json").is_file()
     share.close()
     rest.abandon()
     assert not list(tmp_path.iterdir())
@@ -634,7 +634,7 @@ def test_replacement_killed_between_any_two_steps_is_taken_up(opened, monkeypatc
     def finish(store):
         with store.last() as last:
             assert last
-            names = ["zarr_store.json", "journal", "manifest.json", zarr_store.STORE]
+            names = ["identity.json", "journal", "manifest.json", zarr_store.STORE]
             store.write_json("manifest.json", {"schema": MANIFEST, "contents": names})
             store.move_into_place()
 
@@ -688,7 +688,7 @@ def flip(file):
 
 HARMS = {"cut": cut, "flip": flip, "empty": lambda file: file.write_bytes(b""), "remove": Path.unlink}
 DAMAGED = (
-    "zarr_store.json",
+    "identity.json",
     "journal/1-of-1.jsonl",
     "zarr.json",
     "speed/zarr.json",
@@ -706,7 +706,7 @@ def victim(folder, name):
 def finished(store):
     with store.last() as last:
         assert last
-        names = ["zarr_store.json", "journal", "manifest.json", zarr_store.STORE]
+        names = ["identity.json", "journal", "manifest.json", zarr_store.STORE]
         store.write_json("manifest.json", {"schema": MANIFEST, "contents": names})
         store.move_into_place()
 
@@ -720,7 +720,7 @@ def test_what_is_damaged_of_an_interrupted_sweep_is_computed_again(opened, tmp_p
         written(store, k, speed=speed)
     store.close()
     HARMS[harm](victim(store.partial, name))
-    if name == "zarr_store.json" and harm != "remove":  # without one the store had not begun
+    if name == "identity.json" and harm != "remove":  # without one the store had not begun
         with pytest.raises(
             BadData, match=r"identity\.json is damaged; choose another path, or --force to begin anew"
         ):
@@ -751,7 +751,7 @@ def test_what_is_damaged_of_a_finished_sweep_is_said(opened, tmp_path, name, har
     HARMS[harm](file)
     with pytest.raises((BadData, BadConfiguration), match=r"is damaged; choose another path|s exists already"):
         opened()
-    if name not in ("manifest.json", "zarr_store.json") or harm == "flip":
+    if name not in ("manifest.json", "identity.json") or harm == "flip":
         return
     before = sorted(tmp_path.rglob("*"))
     with contextlib.suppress(BadConfiguration):
