@@ -237,7 +237,7 @@ def test_what_is_held_by_its_prior_is_said_everywhere(shown, capsys, tmp_path, n
     assert {n for n, answer in said.items() if answer == "no"} == held - pairs
     assert {n for n, answer in said.items() if answer.startswith("only with ")} == pairs & set(said)
     made.save(tmp_path)
-    assert note in (tmp_path / "robot.toml").read_text("utf-8")
+    assert f"prior's): {', '.join(made.held_by_prior)}" in (tmp_path / "robot.toml").read_text("utf-8")
 
 
 def resolved(found, p, outside=(), settled=True):
