@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import numbers
+from collections.abc import Sequence
 from typing import Any
 
 from mmrjax.errors import allowed_words as allowed_words
@@ -44,6 +45,15 @@ def parse_number(text: str) -> float:
     if "_" in text or not text.isascii():
         raise ValueError(f"could not convert {text!r} to a number")
     return float(text)
+
+
+def rows_text(rows: Sequence[int], most: int, rest: str = ", ...") -> str:
+    """`row 4`, or `rows 4, 5` and so on, from indices that begin at 0.
+
+    `rest` stands for rows after the first `most`; `{}` in it is their number.
+    """
+    shown = ", ".join(str(k + 1) for k in rows[:most]) + rest.format(len(rows) - most) * (len(rows) > most)
+    return f"row{'s' * (len(rows) > 1)} {shown}"
 
 
 def bound_text(value: float) -> str:

@@ -27,7 +27,7 @@ from mmrjax.model import channels
 from mmrjax.model.channels import Channel
 from mmrjax.model.quantities import VOLTAGE
 from mmrjax.model.rig import Instrument
-from mmrjax.model.robot import Robot
+from mmrjax.model.robot import Load, Robot
 
 #: Least rows between two readings of a slow sensor, and least number of its readings.
 APART, FEWEST = 2, 12
@@ -281,18 +281,22 @@ def _unexplained(readings: np.ndarray, settings: Sequence[np.ndarray]) -> float:
     return float(np.sum((readings - a @ np.linalg.lstsq(a, readings, rcond=None)[0]) ** 2))
 
 
+def inertia_at_motor(robot: Robot, load: Load) -> float:
+    """Inertia of a motor and of its share of a load that rolls without slip [kg·m²]."""
+    moved = float(load.mass) * float(load.radius) ** 2 / float(robot.sides)
+    return float(robot.motor.inertia) + (float(load.inertia) + moved) / float(robot.gearbox.ratio) ** 2
+
+
 def time_constant(robot: Robot) -> float:
     """Time constant J R/k² of the motors' speed with the slowest load [s]; infinite if it is unknown."""
-    motor, sides, found = robot.motor, float(robot.sides), 0.0
+    motor, slowest = robot.motor, 0.0
     if not robot.knows(VOLTAGE):
         return math.inf
     for load in robot.configurations.members:
         if not robot.has_ground and float(load.torque_gravity) > 0:
             return math.inf
-        moved = float(load.mass) * float(load.radius) ** 2 / sides if robot.has_ground else 0.0
-        carried = (float(load.inertia) + moved) / float(robot.gearbox.ratio) ** 2
-        found = max(found, float(motor.inertia) + carried)
-    return found * float(motor.resistance) / float(motor.torque_constant) ** 2
+        slowest = max(slowest, inertia_at_motor(robot, load))
+    return slowest * float(motor.resistance) / float(motor.torque_constant) ** 2
 
 
 def driven_rows(name: str, columns: Columns, layout: Layout) -> tuple[Columns, np.ndarray, Names]:

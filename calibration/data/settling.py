@@ -17,6 +17,7 @@ from calibration.data.contradictions import GAP
 from calibration.data.courses import applied_drive, differs_from_row_before
 from calibration.data.input_errors import BadData, bound_text
 from calibration.data.instruments import step_of
+from calibration.data.row_checks import inertia_at_motor
 from calibration.data.runs import Runs
 from mmrjax.errors import count_noun
 from mmrjax.model import balances, channels
@@ -938,8 +939,7 @@ def acceleration_currents(robot: Robot) -> dict[str, Inertia]:
     constant, ratio = float(robot.motor.torque_constant), float(robot.gearbox.ratio)
     found = {}
     for k, (name, load) in enumerate(robot.configurations.items()):
-        moved = float(load.mass) * float(load.radius) ** 2 / float(robot.sides)
-        at_motor = float(robot.motor.inertia) + (float(load.inertia) + moved) / ratio**2
+        at_motor = inertia_at_motor(robot, load)
         none, one = jnp.zeros(()), jnp.ones(())
         rolling = float(load.radius) / ratio
         states = State(one, none, none, none), State(none, one, jnp.asarray(rolling), none)  # of 1 A, and of 1 rad/s

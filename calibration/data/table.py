@@ -22,7 +22,7 @@ from calibration.data.columns import (
     WHEN,
     Layout,
 )
-from calibration.data.input_errors import BadData, allowed_words
+from calibration.data.input_errors import BadData, allowed_words, rows_text
 from mmrjax.model import channels, quantities
 from mmrjax.model.channels import Channel
 from mmrjax.model.conditions import Conditions
@@ -205,8 +205,7 @@ class Runs:
             if not self.has(channel.column) or lost.size == len(self):
                 said.append(f"{channel.column}: no readings; parameters that only they show are not fitted")
             elif lost.size:
-                rows = ", ".join(str(r + 1) for r in lost[:8]) + (", ..." if lost.size > 8 else "")
-                rows = f"row{'s' * (lost.size > 1)} {rows}"
+                rows = rows_text(lost.tolist(), 8)
                 said.append(f"{channel.column}: {lost.size} of {len(self)} readings are missing ({rows})")
         return said
 

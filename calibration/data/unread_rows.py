@@ -1,4 +1,4 @@
-"""Readings of settled rows that are none: a speed that was not read, and rows beyond a limit of supply or driver."""
+"""Settled rows without sound readings: speeds that were not read, and rows beyond a limit of supply or driver."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 
 from calibration.data.columns import LOAD, SUPPLY
+from calibration.data.input_errors import rows_text
 from calibration.data.table import Runs
 from mmrjax.model.robot import Robot
 
@@ -16,10 +17,12 @@ TURNS, DRIVES = 0.3, 2.0
 ALIKE, RISE = 0.02, 1.05
 #: Fall of the supply's voltage over such rows, beyond which two of them are enough; else three.
 FALLS = 0.05
+#: Rows that a note lists, and its words for more of them.
+SHOWN = 12, " and {} more"
 
 
 def without_unread(runs: Runs, robot: Robot) -> Runs:
-    """The table of settled runs with missing readings in place of those that are none, and notes on them."""
+    """The table of settled runs with unsound readings marked as missing, and a note on each kind."""
     if runs.sampled or runs.turns or runs.layout.imposed_column != SUPPLY or runs.has("held"):
         return runs
     columns, notes = dict(runs.columns), list(runs.notes)
@@ -27,16 +30,18 @@ def without_unread(runs: Runs, robot: Robot) -> Runs:
     beyond = _beyond_limit(runs, np.abs(drive))
     unread = _turning(runs, robot, drive) & ~beyond
     for channel in (c for c in runs.channels if runs.has(c.column)):
-        lost = beyond | (unread & (runs[channel.column] == 0) & channel.zero_at_rest)
-        columns[channel.column] = np.where(lost, np.nan, runs[channel.column])
-        if (lost & ~beyond).any():
+        not_read = unread & (runs[channel.column] == 0) & channel.zero_at_rest
+        columns[channel.column] = np.where(beyond | not_read, np.nan, runs[channel.column])
+        if not_read.any():
+            rows = rows_text(np.flatnonzero(not_read).tolist(), *SHOWN)
             notes.append(
-                f"{runs.source}, {channel.column}: 0 in {_rows(lost & ~beyond)} at the current of a motor that turns;"
+                f"{runs.source}, {channel.column}: 0 in {rows} at the current of a motor that turns;"
                 " it was not read and is taken for missing"
             )
     if beyond.any():
+        rows = rows_text(np.flatnonzero(beyond).tolist(), *SHOWN)
         notes.append(
-            f"{runs.source}, {_rows(beyond)}: the readings no longer change while the drive rises, so supply or "
+            f"{runs.source}, {rows}: the readings no longer change while the drive rises, so supply or "
             "driver are at a limit; set aside"
         )
     return dataclasses.replace(runs, columns=columns, notes=tuple(notes))
@@ -82,10 +87,3 @@ def _beyond_limit(runs: Runs, drive: np.ndarray) -> np.ndarray:
         elif len(levels) > 2 and drive[top].max() > RISE * drive[top].min():
             found[top[command[top] > levels[0]]] = True
     return found
-
-
-def _rows(which: np.ndarray) -> str:
-    """`row 3` or `rows 3, 4, 5`."""
-    numbers = [str(k + 1) for k in np.flatnonzero(which)]
-    shown = ", ".join(numbers[:12]) + f" and {len(numbers) - 12} more" * (len(numbers) > 12)
-    return f"row{'s' * (len(numbers) > 1)} {shown}"

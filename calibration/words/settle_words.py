@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from calibration.data.input_errors import rows_text
 from calibration.data.settling import RATES, Settled, Stretch
 from mmrjax.errors import count_noun
 
@@ -104,8 +105,7 @@ def settle_remarks(found: Settled) -> list[str]:
     """Sentences on what should be looked at."""
     said = []
     if found.gaps:
-        rows = ", ".join(str(k + 1) for k in found.gaps[:5]) + (", ..." if len(found.gaps) > 5 else "")
-        said.append(f"samples are missing after row{'s' * (len(found.gaps) > 1)} {rows}; no stretch goes across")
+        said.append(f"samples are missing after {rows_text(found.gaps, 5)}; no stretch goes across")
     said += glitch_sentences(found)
     angles = {rate: angle for angle, rate, _ in RATES}
     for channel in (s.channel for s in found.signals):
