@@ -102,7 +102,6 @@ LIKELY = 4.0
 #: Distance from the prior above which a note reports a base parameter [prior sd].
 FAR = 3.0
 #: Callback for progress notes.
-#: Is told what the loop does next.
 Tell = Callable[[Remark | str], None]
 
 
@@ -270,8 +269,11 @@ def prepare_loop(
     own = {name: e for name, e in effects.OF_CHANNELS.items() if e.channel in ready.robot.rig.channels}
     library = {**library, **kind.library, **own}
     library = scales.library_of_size(ready.robot, distinct.conditions(ready.robot), library, turned)
-    settings = dataclasses.replace(settings_for(kind, replicates, seed, prefer), forbidden=tuple(forbidden))
-    settings = dataclasses.replace(settings, silent=tuple(c.name for c in ready.noise.silent))
+    settings = dataclasses.replace(
+        settings_for(kind, replicates, seed, prefer),
+        forbidden=tuple(forbidden),
+        silent=tuple(c.name for c in ready.noise.silent),
+    )
     return LoopInput(distinct, numbers, ready.robot, ready.noise, ready.stated, settings, library, said, at_first)
 
 

@@ -284,7 +284,7 @@ class Headline:
 
     Attributes:
         level: of the claims, a verdict; `open` if the noise decides whether an effect is missing.
-        claims: laws, mechanisms or places, each with those that the data cannot separate from it.
+        claims: laws, mechanisms or places, each with its indistinguishable alternatives.
         factors: on the noise.
         shared: number of the first members of each mechanism or place that hold at every noise; at some noises the
             others cannot be separated from these.

@@ -92,9 +92,10 @@ def _lost(moved: np.ndarray, reversed_: np.ndarray, others: np.ndarray) -> tuple
         The sum of squares that is left, the angle, its sd, and the share of the sum of squares that it explains.
     """
     terms = np.column_stack([others / np.maximum(np.linalg.norm(others, axis=0), 1e-300), -reversed_])
-    with_it, without = (moved - x @ np.linalg.lstsq(x, moved)[0] for x in (terms, terms[:, :-1]))
-    variance = float(with_it @ with_it) / max(len(moved) - terms.shape[1], 1)
-    width = float(np.linalg.lstsq(terms, moved)[0][-1])
-    sd = np.sqrt(variance * np.linalg.pinv(terms.T @ terms)[-1, -1])
+    causes = terms[:, :-1]
+    fitted = np.linalg.lstsq(terms, moved)[0]
+    with_it, without = moved - terms @ fitted, moved - causes @ np.linalg.lstsq(causes, moved)[0]
     left, before = float(with_it @ with_it), float(without @ without)
-    return left, width, float(sd), 1 - left / max(before, 1e-300)
+    variance = left / max(len(moved) - terms.shape[1], 1)
+    sd = np.sqrt(variance * np.linalg.pinv(terms.T @ terms)[-1, -1])
+    return left, float(fitted[-1]), float(sd), 1 - left / max(before, 1e-300)

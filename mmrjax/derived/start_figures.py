@@ -176,7 +176,7 @@ def curve_peak(times: Float[Array, " times"], x: Float[Array, " times"], kink: S
 
     Args:
         times: not decreasing [s]; x: samples, NaN if the curve has no value.
-        kink: value at which the curve bends, as a current does at its limit; no parabola reaches beyond it.
+        kink: largest value of the parabola. At a limit of the current the curve has a corner.
     """
     known = jnp.where(jnp.isfinite(x), x, -jnp.inf)
     k = jnp.clip(jnp.argmax(known), 1, x.shape[0] - 2)

@@ -14,7 +14,7 @@ from calibration.described import describe
 from calibration.discovery.result import DiscoveryResult
 from calibration.discovery.settings import WITHOUT_NAME
 from calibration.inference import blocks
-from calibration.inference.details import EquationDefects, TimeStatistics
+from calibration.inference.details import TimeStatistics
 from calibration.inference.fit_notes import Determination, with_codes
 from calibration.inference.simulation_errors import OF_SIZE
 from calibration.words import loop_words
@@ -246,7 +246,7 @@ def _resolved(found: DiscoveryResult) -> Section:
 
 
 def _certain(found: DiscoveryResult, missing: bool) -> Iterable[Section]:
-    """How sure the answer is, and what to know before it is used."""
+    """Sections on the certainty of the answer and its limits."""
     reasons = {"standing": loop_words.support_sentence(found), "ruled_out": loop_words.ruled_out(found)}
     also = [loop_words.hidden_effects_sentence(found)] if found.hidden else []
     also += [loop_words.proposed_formula(found.unnamed)] if found.unnamed is not None else []
@@ -297,15 +297,14 @@ def _sections(found: DiscoveryResult, changes: Mapping[str, Change], missing: bo
 
 
 def _run_by_run(found: DiscoveryResult, table: Columns) -> Iterable[Block]:
-    verdict = "none" if found.refit_alone else found.verdict
-    if isinstance(found.detail, EquationDefects):
+    verdict, detail = "none" if found.refit_alone else found.verdict, found.detail
+    if not isinstance(detail, TimeStatistics):
         yield catalogue.figure("loop.before_after", table, found.channels, verdict, words=("",))
         return
     lines = {"after_": "with what was found", "before_": "before"}
     lines = {"after_": "simulated"} if verdict == "none" else lines
     yield catalogue.figure("fit.overlay", table, found.channels, lines, finding=found.statement)
-    runs = found.to_json()["series"]["runs"]
-    some = f", of the first 8 of {runs} runs" if runs > 8 else ""
+    some = f", of the first 8 of {detail.runs} runs" if detail.runs > 8 else ""
     yield catalogue.figure("loop.over_time", found.runs, table, found.channels, verdict, words=(some,))
 
 
@@ -313,13 +312,12 @@ def _where_missing(found: DiscoveryResult, table: Columns, changes: Mapping[str,
     verdict, sized = "none" if found.refit_alone else found.verdict, Layout.of(found.robot).crosses_zero
     if changes:
         yield catalogue.figure("loop.laws", found, table, changes)
-    if isinstance(found.detail, TimeStatistics):
-        d = found.to_json()["series"]
-        memory = d["before"]["memory"]
-        numbers = (memory["deviate"], d["after"]["memory"]["deviate"], memory["threshold"], (2 * d["runs"]) ** 0.5)
-        names = ", ".join(map(str, d["orders_unresolved"]))
+    if isinstance(detail := found.detail, TimeStatistics):
+        memory = detail.before.memory
+        numbers = memory.deviate, detail.after.memory.deviate, memory.threshold, (2 * detail.runs) ** 0.5
+        names = ", ".join(detail.orders_unresolved)
         more = catalogue.text("loop.unresolved", names) if names else ""
-        yield catalogue.figure("loop.series", found.detail, found.channels, verdict, words=numbers, more=more)
+        yield catalogue.figure("loop.series", detail, found.channels, verdict, words=numbers, more=more)
     else:
         drawn = table, verdict, sized
         yield catalogue.figure(
