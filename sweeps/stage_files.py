@@ -20,7 +20,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from calibration.data import Columns, Json
+from calibration.data import Columns
 from calibration.data.effect_file import OWN_MODULE
 from mmrjax.effects.scaled import scaled_effect
 from mmrjax.model import channels
@@ -204,7 +204,7 @@ class _Reader:
             raise Unreadable(f"array of {dtype}")
         return np.frombuffer(self._data, kind, math.prod(shape), at).reshape(shape, order=order).copy("K")
 
-    def _instance(self, module: str, name: str, factors: list[float] | None, fields: Json) -> Any:
+    def _instance(self, module: str, name: str, factors: list[float] | None, fields: dict[str, Any]) -> Any:
         kind = _class(module, name, factors)
         if not dataclasses.is_dataclass(kind) or not all(_holds(kind, name) for name in fields):
             raise Unreadable(f"{module}.{name} has other fields")
@@ -217,7 +217,7 @@ class _Reader:
 def _holds(kind: type, name: str) -> bool:
     """True if instances of a dataclass hold a value by that name: a field, or what they compute once and keep."""
     kept = inspect.getattr_static(kind, name, None)
-    fields: Json = getattr(kind, "__dataclass_fields__", {})
+    fields: dict[str, Any] = getattr(kind, "__dataclass_fields__", {})
     return name in fields or isinstance(kept, functools.cached_property)
 
 

@@ -7,14 +7,14 @@ import dataclasses
 import math
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
 import mmrjax as mm
-from calibration.data import Columns, Json, effect_file, robot_file
+from calibration.data import Columns, effect_file, robot_file
 from calibration.described import in_words
 from calibration.discovery import findings
 from calibration.discovery.discover import discover
@@ -62,7 +62,7 @@ def _loop(config: configuration.Loop, beside: configuration.LoopBeside) -> int:
         check_resolvable(runs, beside.members)
     replicates = max(config.replicates, fewest_replicates(observers.observer_kind(runs)))
 
-    stages: Json = {}
+    stages: dict[str, Any] = {}
 
     def left() -> float | None:
         return None if within is None else max(within - (time.monotonic() - began), 0.0)
@@ -170,7 +170,7 @@ def _show_ranking(found: Ranking, folder: RunFolder, timed: Callable[[str], None
     folder.write_json(SCREENING_FILE, content)
 
 
-def _say_kept(stages: Json, folder: RunFolder, robot_name: str) -> None:
+def _say_kept(stages: Mapping[str, Any], folder: RunFolder, robot_name: str) -> None:
     """Say which stages are kept, and leave the robot of the base fit where there is one but no verdict."""
     if not stages:
         return

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data import Json, Names
+from calibration.data import Names
 from calibration.data.input_errors import BadConfiguration, allowed_words
 from calibration.data.robot_file import RobotFile
 from mmrjax.effects import Effect
@@ -220,11 +220,11 @@ class _Tracer:
 
         return trace_function(slope if by else value, self.names, what)
 
-    def _given(self, known: Json) -> tuple[Robot, Signals]:
+    def _given(self, known: dict[str, Any]) -> tuple[Robot, Signals]:
         robot = params.replace(self.joint.robot, {n: known[n] for n in self.parameters})
         (load,) = robot.configurations.members
         robot = robot.within(0)
-        around: Json = {n: _STILL.get(n, known[f"surroundings.{n}"]) for n in self.around}
+        around: dict[str, Any] = {n: _STILL.get(n, known[f"surroundings.{n}"]) for n in self.around}
         around |= {field: known[name] for name, field in VARIABLES.items()}
         around.update(
             on_tracks=load.on_tracks,

@@ -249,7 +249,7 @@ def _quiet() -> Iterator[None]:
 # --- on the workers -------------------------------------------------------------------------------------------------
 
 _lock = threading.Lock()
-_compiled: Json = {}
+_compiled: dict[str, Any] = {}
 
 
 def program_identity() -> dict[str, dict[str, str]]:

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from calibration.data import Json
 from mmrjax.fidelities import outputs
 from mmrjax.fidelities.variation import STATUS
 from mmrjax.model import channels, quantities
@@ -52,7 +51,7 @@ def chunk_tables(store: Path, layout: Layout) -> Iterator[Any]:
     for chunk in range(len(blocks)):
         box = blocks.box(chunk)
         shape = tuple(b.stop - b.start for b in box)
-        found: Json = {}
+        found: dict[str, Any] = {}
         for k, (name, values) in enumerate(design.axes.items()):
             along = values[box[k]][(slice(None),) + (None,) * (len(shape) - k - 1)]
             flat = np.broadcast_to(along, shape).ravel()
