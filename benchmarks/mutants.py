@@ -35,7 +35,8 @@ LIST = ROOT / "tests" / "mutants.toml"
 #: Slow imports of the tests, done once before processes are forked; no module of this project.
 PRELOADED = ("numpy", "scipy.stats", "jax", "jax.numpy", "equinox", "optimistix", "optax", "mujoco")
 #: A module that is imported before pytest sees it causes a warning, but has no asserts to rewrite here.
-OPTIONS = ("-x", "-q", "-p", "no:cacheprovider", "-W", "ignore::pytest.PytestAssertRewriteWarning")
+BASE = ("-q", "-p", "no:cacheprovider", "-W", "ignore::pytest.PytestAssertRewriteWarning")
+OPTIONS = ("-x", *BASE)
 #: Time limit of a mutant's tests [s]: a mutant may loop for ever.
 PATIENCE = 900.0
 LEFT_OUT = shutil.ignore_patterns(".git", ".venv", "runs", "__pycache__", ".*_cache", "*.egg-info", ".hypothesis")
@@ -95,7 +96,7 @@ class _Passed:
             self.names.append(report.nodeid)
 
 
-def _run(tree: str, tests: list[str], marks: str, log: str, answer: str) -> None:
+def _run(tree: str, tests: list[str], marks: str, log: str, answer: str, options: tuple[str, ...]) -> None:
     """Runs tests of a tree in this process; writes pytest's exit code and the passed tests to a file."""
     os.chdir(tree)
     os.environ["PYTHONPATH"] = tree  # for processes that tests start
@@ -106,7 +107,7 @@ def _run(tree: str, tests: list[str], marks: str, log: str, answer: str) -> None
     import pytest
 
     passed = _Passed()
-    code = int(pytest.main([*OPTIONS, "-m", marks, *tests], plugins=[passed]))
+    code = int(pytest.main([*options, "-m", marks, *tests], plugins=[passed]))
     for name in ("mmrjax", "calibration", "sweeps"):
         module = sys.modules.get(name)
         if module is not None and not str(module.__file__).startswith(tree):
@@ -114,12 +115,14 @@ def _run(tree: str, tests: list[str], marks: str, log: str, answer: str) -> None
     Path(answer).write_text(json.dumps([code, passed.names]), encoding="utf-8")
 
 
-def run(tree: Path, tests: list[str], marks: str, log: Path) -> tuple[int | None, list[str]]:
+def run(
+    tree: Path, tests: list[str], marks: str, log: Path, options: tuple[str, ...] = OPTIONS
+) -> tuple[int | None, list[str]]:
     """Exit code of pytest over tests in a separate process, None if it hangs or dies, and the passed tests."""
     context = multiprocessing.get_context("forkserver")
     answer = tree / "mutant.json"
     answer.unlink(missing_ok=True)
-    process = context.Process(target=_run, args=(str(tree), tests, marks, str(log), str(answer)))
+    process = context.Process(target=_run, args=(str(tree), tests, marks, str(log), str(answer), options))
     process.start()
     process.join(PATIENCE)
     if process.is_alive():
@@ -151,24 +154,23 @@ def tested(mutant: Mutant, tree: Path, stamp: int) -> tuple[str, float, str]:
     return outcome, time.perf_counter() - begin, failed[0] if failed and outcome == "killed" else said[-1500:]
 
 
-def unmutated(chosen: list[Mutant], trees: list[Path]) -> str | None:
-    """Reason why the killing tests are not usable; None if all pass without a mutant under the stated marks."""
+def passing(chosen: list[Mutant], trees: list[Path]) -> list[str]:
+    """Node ids of the killing tests that pass without a mutant, under the stated marks."""
+    names: list[str] = []
     for marks in dict.fromkeys(mutant.marks for mutant in chosen):
         tests = list(dict.fromkeys(test for mutant in chosen if mutant.marks == marks for test in mutant.killed_by))
         files = list(dict.fromkeys(test.split("::")[0] for test in tests))
         shares = [[t for t in tests if files.index(t.split("::")[0]) % len(trees) == k] for k in range(len(trees))]
         parts = [(tree, share) for tree, share in zip(trees, shares, strict=True) if share]
         with ThreadPoolExecutor(len(parts)) as pool:
-            ends = list(pool.map(lambda part: run(part[0], part[1], marks, part[0] / "mutant.log"), parts))  # noqa: B023
-        for (tree, _), (code, _) in zip(parts, ends, strict=True):
-            if code != 0:
-                said = (tree / "mutant.log").read_text(errors="replace")
-                return f"the tests don't pass without a mutant:\n{said[-3000:]}"
-        passed = [name for _, names in ends for name in names]
-        none = [t for t in tests if not any(p == t or p.startswith((f"{t}[", f"{t}::")) for p in passed)]
-        if none:
-            return f"not run with -m '{marks}': {', '.join(none)}"
-    return None
+            ends = pool.map(lambda part: run(part[0], part[1], marks, part[0] / "mutant.log", BASE), parts)  # noqa: B023
+            names += [name for _, passed in ends for name in passed]
+    return names
+
+
+def fit(mutant: Mutant, names: list[str]) -> bool:
+    """True where each of a mutant's tests passes without it."""
+    return all(any(n == t or n.startswith((f"{t}[", f"{t}::")) for n in names) for t in mutant.killed_by)
 
 
 def main() -> int:
@@ -190,19 +192,20 @@ def main() -> int:
         copies = [Path(folder).resolve() / str(k) for k in range(options.jobs)]
         for copy in copies:
             shutil.copytree(ROOT, copy, ignore=LEFT_OUT)
-        if wrong := unmutated(chosen, copies):
-            print(wrong)
-            return 1
+        names = passing(chosen, copies)
+        unfit = [m.name for m in chosen if not fit(m, names)]
         trees: queue.SimpleQueue[Path] = queue.SimpleQueue()
         for copy in copies:
             trees.put(copy)
-        print(f"{len(chosen)} mutants; their tests pass without them", flush=True)
+        print(f"{len(chosen)} mutants; the tests of {len(chosen) - len(unfit)} pass without them", flush=True)
 
         def one(k: int) -> tuple[str, float]:
-            tree = trees.get()
-            outcome, seconds, said = tested(chosen[k], tree, k + 1)
-            trees.put(tree)
             mutant = chosen[k]
+            outcome, seconds, said = "error", 0.0, "its tests do not pass without it"
+            if mutant.name not in unfit:
+                tree = trees.get()
+                outcome, seconds, said = tested(mutant, tree, k + 1)
+                trees.put(tree)
             print(f"{outcome:9} {seconds:6.1f} s  {mutant.kind:12} {mutant.name:40} {mutant.file}", flush=True)
             print(f"          {said.strip()}" if outcome != "killed" else f"          {said[:150]}", flush=True)
             return outcome, seconds
