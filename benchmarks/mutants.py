@@ -35,7 +35,14 @@ LIST = ROOT / "tests" / "mutants.toml"
 #: Slow imports of the tests, done once before processes are forked; no module of this project.
 PRELOADED = ("numpy", "scipy.stats", "jax", "jax.numpy", "equinox", "optimistix", "optax", "mujoco")
 #: A module that is imported before pytest sees it causes a warning, but has no asserts to rewrite here.
-BASE = ("-q", "--continue-on-collection-errors", "-p", "no:cacheprovider", "-W", "ignore::pytest.PytestAssertRewriteWarning")
+BASE = (
+    "-q",
+    "--continue-on-collection-errors",
+    "-p",
+    "no:cacheprovider",
+    "-W",
+    "ignore::pytest.PytestAssertRewriteWarning",
+)
 OPTIONS = ("-x", *BASE)
 #: Time limit of a mutant's tests [s]: a mutant may loop for ever.
 PATIENCE = 900.0
