@@ -14,7 +14,6 @@ from calibration.inference.fit_notes import Remark
 from calibration.inference.noise import Noise
 from calibration.inference.operating import operating_readings
 from calibration.inference.unused import unused_columns
-from mmrjax.model.channels import Channel
 from mmrjax.model.robot import Robot
 
 #: Fewest rows and distinct readings for a line through all of them to be significant.
@@ -60,6 +59,7 @@ def copied_channels(runs: Runs, robot: Robot) -> list[Remark]:
         both = np.isfinite(x) & np.isfinite(y)
         if (line := _line(x[both], y[both])) is not None:
             copies.add(other.name)
+            same = one.unit_si == other.unit_si
             copied.append(
                 Remark(
                     "copied",
@@ -68,7 +68,7 @@ def copied_channels(runs: Runs, robot: Robot) -> list[Remark]:
                     other=one.column,
                     intercept=line[0],
                     slope=line[1],
-                    tied=_tied(one, other, robot),
+                    tied=same or (not robot.has_ground and one.zero_at_rest and other.zero_at_rest),
                 )
             )
     return copied
@@ -89,12 +89,6 @@ def computed_load(runs: Runs) -> Remark | None:
                 "copied", source=runs.source, column=LOAD, other=column, intercept=line[0], slope=line[1], tied=False
             )
     return None
-
-
-def _tied(one: Channel, other: Channel, robot: Robot) -> bool:
-    """True if the rig ties two channels to each other: readings of one unit, or speeds without slip."""
-    same = one.unit_si == other.unit_si
-    return same or (not robot.has_ground and one.zero_at_rest and other.zero_at_rest)
 
 
 def _line(x: np.ndarray, y: np.ndarray) -> tuple[float, float] | None:
