@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import jax.numpy as jnp
 import numpy as np
 
 from calibration.data.columns import LOAD
@@ -73,7 +74,9 @@ def _load_at(runs: Runs, robot: Robot, channel: str, current: np.ndarray) -> np.
     many = float(robot.sides) if channel == "total_current" else 1.0
     rise = float(robot.gearbox.ratio * robot.gearbox.efficiency_load * robot.motor.torque_constant) / many
     for _ in range(SEARCH):
-        drawn = np.asarray(simulate(robot, dataclasses.replace(conditions, load_torque=load)).reading[channel])
+        drawn = np.asarray(
+            simulate(robot, dataclasses.replace(conditions, load_torque=jnp.asarray(load))).reading[channel]
+        )
         wrong = np.where(np.isfinite(current), current - drawn, 0.0)
         load = load + rise * np.nan_to_num(wrong)
     far = np.flatnonzero(~(np.abs(wrong) <= ERROR * np.nanmax(np.abs(current))))
