@@ -88,8 +88,10 @@ def test_time_of_a_single_ramp_is_no_driver():
     columns = {"configuration": np.full(40, "bench"), "time_s": time, "total_current_A": RNG.uniform(1, 5, 40)}
     scope = bases.Scope(("electrical",), ("supply_voltage_V",))
     for voltage, expected in ((time / 4, False), (np.full(40, 9.0), True), (np.abs(time - 19.5), True)):
-        families = curve_families(columns | {"supply_voltage_V": voltage}, np.ones(40), scope=scope)
-        assert ("time" in variables(families)) == expected
+        logged = columns | {"supply_voltage_V": voltage}, np.ones(40)
+        assert ("time" in variables(curve_families(*logged, scope=scope))) == expected
+        windows = [v for v in variables(window_families(*logged, scope=scope)) if v.startswith("time")]
+        assert bool(windows) == expected
 
 
 def test_collinearity_is_not_made_by_the_number_of_terms():
@@ -168,7 +170,8 @@ def test_order_is_told_by_combinations_of_conditions():
 
 def test_windows_of_histories_are_in_time_at_the_same_instants_of_all_runs():
     time = np.tile(np.linspace(0, 1.5, 30), 2)
-    for basis in window_families(table(time_s=time), COUNTS):
+    columns = table(time_s=time, supply_voltage_V=np.full(ROWS, 24.0), slope_deg=np.zeros(ROWS))
+    for basis in window_families(columns, COUNTS):
         over_time = [k for k, (_, v) in enumerate(basis.names) if window_from_name(v).axis == "time"]
         assert over_time
         for shape in np.asarray(basis.columns)[over_time, :, 0]:

@@ -110,6 +110,12 @@ def test_another_function_class_or_curve_has_another_program():
     assert len(names) == len(some)
 
 
+def test_the_source_is_hashed_at_the_folder_of_the_packages():
+    """A module that moved a folder down hashed no file, and old programs were run after an edit."""
+    (root,) = programs.source_hash.__wrapped__.__defaults__
+    assert all((root / package / "__init__.py").is_file() for package in programs.OWN)
+
+
 def test_settings_and_source_are_part_of_a_name(monkeypatch, tmp_path):
     before = named(sine, MATRIX)
     with monkeypatch.context() as patch:

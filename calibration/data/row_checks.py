@@ -197,7 +197,10 @@ def _check_held(name: str, columns: Columns) -> None:
     """Refuses a clamp in a log, and a load torque beside it: what the clamp carries is a reading."""
     held = columns.get("held", np.zeros(1)) > 0.5
     if held.any() and set(TIME) <= set(columns):
-        raise BadData(f"{name}: column held is for settled rows; expected no time_s, or rows without a clamp")
+        raise BadData(
+            f"{name}: column held is for settled rows; expected no time_s, held = 1 in every row of a log, or a file "
+            "of its own for rows of a clamp"
+        )
     for at in np.flatnonzero(held & (columns.get(LOAD, 0.0) != 0))[:1]:
         raise BadData(
             f"{name} row {at + 1}, {LOAD}: got {bound_text(columns[LOAD][at])} where held is 1; expected 0, as the "
@@ -232,38 +235,53 @@ def _check_deviations(name: str, columns: Columns, shown: tuple[Channel, ...]) -
 def settled_points(name: str, columns: Columns, layout: Layout, robot: Robot) -> tuple[Columns, Names]:
     """Returns columns without the time if each row is a settled run, and a note that says so.
 
-    Rows are `SECONDS_APART` and `CONSTANTS_APART` time constants of the motors after one another, and half of them
-    have another setting than the row before. Readings follow the setting of their own row as well as that of the
-    row before. They do not if a setting begins at its row.
+    Rows are `CONSTANTS_APART` time constants after one another: of the windings where a clamp holds the output in
+    every row, else of the motors, and then they are points as of `_are_points`.
     """
     kept, time = dict(columns), columns.get("time_s")
-    if time is None or len(time) < 3 or layout.imposed != "voltage" or SUPPLY not in columns:
+    if time is None or len(time) < 3 or {"mode", *layout.sides} & set(columns):
         return kept, ()
-    if {"held", "mode", *layout.sides} & set(columns):
+    step = np.diff(time)
+    apart, clamped = float(step[step > 0].min(initial=math.inf)), _is_clamped(columns, layout)
+    windings = float(robot.motor.inductance / robot.motor.resistance) if robot.knows(VOLTAGE) else 0.0
+    constant = windings if clamped else time_constant(robot)
+    if not math.inf > apart >= CONSTANTS_APART * constant or not (clamped or _are_points(columns, layout, apart)):
         return kept, ()
-    shown = [c for c in layout.channels if c.column in columns]
-    constant, step = time_constant(robot), np.diff(time)
-    apart = float(step[step > 0].min(initial=math.inf))
-    if not all(c.settled for c in shown) or not math.inf > apart >= max(SECONDS_APART, CONSTANTS_APART * constant):
-        return kept, ()
-    settings = [c for c in (SUPPLY, "duty", LOAD, "slope_deg", "payload_kg") if c in columns]
-    changed = np.any([np.diff(columns[c]) != 0 for c in settings], 0) if settings else np.zeros(1, bool)
-    if changed.mean() < 0.5:
-        return kept, ()
-    drive = columns[SUPPLY] * columns.get("duty", 1.0)
-    others = [columns[c] for c in settings if c not in (SUPPLY, "duty")]
-    for channel in shown:
-        own, before = (
-            _unexplained(columns[channel.column][1:], [x[k : len(x) - 1 + k] for x in (drive, *others)])
-            for k in (1, 0)
-        )
-        if own > 2 * before:
-            return kept, ()
     for column in (*TIME, "run_id"):
         kept.pop(column, None)
     said = f"rows are {three_digits(apart)} s apart or more, most at another setting"
     settle = f", and the motors settle in about {three_digits(CONSTANTS_APART * constant)} s" if constant > 0 else ""
-    return kept, (f"{name}: {said}{settle}: each row is read as a settled run, without its time",)
+    why = "the output is held in every row" if clamped else f"{said}{settle}"
+    return kept, (f"{name}: {why}: each row is read as a settled run, without its time",)
+
+
+def _is_clamped(columns: Columns, layout: Layout) -> bool:
+    """True if a clamp holds the output in every row, or an imposed speed of 0 holds it against a torque."""
+    if "held" in columns:
+        return bool((columns["held"] > 0.5).all())
+    speed = columns.get(layout.imposed_column, np.ones(1))
+    return layout.imposed == "motor_speed" and LOAD in columns and not speed.any()
+
+
+def _are_points(columns: Columns, layout: Layout, apart: float) -> bool:
+    """True for rows `SECONDS_APART` or more after one another, half of them at another setting than the row before.
+
+    Readings follow the setting of their own row as well as that of the row before. They do not if a setting begins at
+    its row.
+    """
+    shown = [c for c in layout.channels if c.column in columns]
+    if layout.imposed != "voltage" or SUPPLY not in columns or "held" in columns or apart < SECONDS_APART:
+        return False
+    settings = [c for c in (SUPPLY, "duty", LOAD, "slope_deg", "payload_kg") if c in columns]
+    if not all(c.settled for c in shown) or np.any([np.diff(columns[c]) != 0 for c in settings], 0).mean() < 0.5:
+        return False
+    drive = columns[SUPPLY] * columns.get("duty", 1.0)
+    others = [columns[c] for c in settings if c not in (SUPPLY, "duty")]
+
+    def left(readings: np.ndarray, k: int) -> float:
+        return _unexplained(readings[1:], [x[k : len(x) - 1 + k] for x in (drive, *others)])
+
+    return all(left(columns[c.column], 1) <= 2 * left(columns[c.column], 0) for c in shown)
 
 
 def _unexplained(readings: np.ndarray, settings: Sequence[np.ndarray]) -> float:

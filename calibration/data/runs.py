@@ -29,6 +29,7 @@ from calibration.data import (
     sides,
 )
 from calibration.data.columns import CONDITIONS, DUTY, SUPPLY, TIME, WHEN, Column, Layout
+from calibration.data.computed_columns import without_computed_torques
 from calibration.data.input_errors import BadConfiguration, BadData, bound_text
 from calibration.data.named_arrays import NamedArrays, Raw, column_numbers, column_texts, missing_readings
 from calibration.data.sources import opening, reading
@@ -178,7 +179,7 @@ def of_arrays(
     runs = Runs(name, columns, tuple(extras), arrays.digest, extras, layout, notes, headings)
     if robot is not None:
         contradictions.check_contradictions(runs, robot)
-        runs = without_unread(runs, robot)
+        runs = without_computed_torques(without_unread(runs, robot), robot)
     return runs
 
 

@@ -263,8 +263,8 @@ def prepare_loop(
     for note in with_codes(ready.checked, "nothing_varies", "copied"):
         if note.code == "nothing_varies" or not note.tied:
             raise BadData(describe(note))
-    at_first = (*ready.foreign, *ready.doubted)
-    said: Notes = (*notes, *ready.checked, *ready.begins, *ready.weighed, *at_first)
+    at_first = (*ready.foreign, *ready.doubted, *with_codes(ready.checked, "lost_motion"))
+    said: Notes = (*notes, *ready.checked, *ready.begins, *ready.weighed, *ready.foreign, *ready.doubted)
     turned = scales.output_rotation(distinct, ready.robot)
     own = {name: e for name, e in effects.OF_CHANNELS.items() if e.channel in ready.robot.rig.channels}
     library = {**library, **kind.library, **own}

@@ -24,7 +24,7 @@ from calibration.discovery.loop_notes import Asked, Headline, Mechanism, NameSup
 from calibration.discovery.prediction import Gain
 from calibration.discovery.settings import Settings
 from calibration.inference.details import Detail
-from calibration.inference.fit_notes import Notes, Pair, Remark
+from calibration.inference.fit_notes import Notes, Pair, Remark, with_codes
 from calibration.inference.fit_posterior import determined_together
 from calibration.inference.residual_clusters import ResidualCluster
 from calibration.inference.simulation_errors import OF_SIZE
@@ -540,8 +540,9 @@ class DiscoveryResult:
 
     @property
     def statement(self) -> str:
-        """The answer in a sentence or two."""
-        return describe(self.headline)
+        """The answer in a sentence or two, after lost motion, which no effect of the library explains."""
+        lost = (f"{note}." for note in sentences(with_codes(self.remarks, "lost_motion")))
+        return " ".join((*lost, describe(self.headline)))
 
     @property
     def verdict_statement(self) -> str:

@@ -296,8 +296,7 @@ def window_families(
 ) -> Bases:
     """Windows of time or of the order of runs, and levels of conditions, in each balance and channel.
 
-    Windows of time are at the same instants in all runs. Windows of the order are omitted if the conditions
-    explain the order.
+    Windows of time are at the same instants in all runs. Windows are omitted if the conditions explain time or order.
 
     Args:
         columns: of the table; weight: 0 for excluded rows, shape (rows,).
@@ -313,7 +312,7 @@ def window_families(
         x = np.asarray(columns[VARIABLES[axis]], float)
         low, high = x[counts].min(), x[counts].max()
         # Consecutive runs then have similar conditions, and conditions have windows of their own.
-        sorted_runs = axis == "order" and order_collinearity(columns, weight, scope.axes) > COLLINEAR
+        sorted_runs = order_collinearity(columns, weight, scope.axes, VARIABLES[axis]) > COLLINEAR
         for share in WINDOWS:
             size = share * (high - low)
             for k in range(round(2 / share) - 1):

@@ -10,14 +10,13 @@ from calibration.data.columns import SUPPLY
 from calibration.data.courses import applied_drive
 from calibration.data.input_errors import BadConfiguration, BadData, bound_text
 from calibration.data.runs import Runs
-from calibration.described import describe
 from calibration.inference import observers
 from calibration.inference.conduct import conduct_notes
 from calibration.inference.fit_notes import Remark
 from calibration.inference.lost_motion import lost_motion_notes
 from calibration.inference.noise import Noise
 from calibration.inference.ranges import check_ranges
-from calibration.inference.uninformative import computed_load, copied_channels, nothing_varies
+from calibration.inference.uninformative import copied_channels, nothing_varies
 from calibration.inference.unused import unexplained_torque_notes, unused_notes
 from mmrjax.errors import count_noun
 from mmrjax.model.robot import Robot
@@ -84,11 +83,9 @@ def _check_motion(runs: Runs, noise: Noise) -> None:
 
 
 def _uninformative(runs: Runs, robot: Robot, noise: Noise) -> list[Remark]:
-    """Notes on settled runs of one condition, and on channels computed from others; a computed load is refused."""
+    """Notes on settled runs of one condition, and on channels computed from others."""
     if runs.sampled or runs.turns:
         return []
-    if (computed := computed_load(runs)) is not None:
-        raise BadData(describe(computed))
     same = nothing_varies(runs, robot, noise)
     return [same] if same is not None else [*copied_channels(runs, robot)]
 

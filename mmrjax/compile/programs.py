@@ -287,7 +287,7 @@ def _settings() -> tuple[tuple[str, str], ...]:
 
 
 @functools.cache
-def source_hash(root: Path = Path(__file__).resolve().parents[1]) -> str:  # noqa: B008 (a constant)
+def source_hash(root: Path = Path(__file__).resolve().parents[2]) -> str:  # noqa: B008 (a constant)
     """A hash of the source of our packages in a folder, of the versions of the libraries and of Python."""
     digest = hashlib.sha256(sys.version.encode())
     for library in LIBRARIES:
