@@ -30,7 +30,6 @@ from mmrjax.effects.periodic import Periodic
 from mmrjax.effects.scaled import scaled_effect
 from mmrjax.fidelities.drive import drive, drive_rates, drive_start, state_of_unknowns
 from mmrjax.fidelities.steady import steady, steady_batch
-from mmrjax.fidelities.track import track
 from mmrjax.model import balances, channels, paper_robots, params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar, parameter
@@ -848,13 +847,6 @@ def test_stribeck_exponent_has_finite_derivatives_through_rest(exponent):
     assert_allclose(found[0, 5], (at[1] - at[0]) / (2 * step), rtol=1e-6)
 
 
-@pytest.mark.slow
-def test_backdriving_loss_changes_nothing_where_no_load_drives():
-    _, plain = _travel([15.0, 33.0], [0.0, 5.0])
-    _, found = _travel([15.0, 33.0], [0.0, 5.0], backdriving_loss=0.5)
-    _same(found, plain)
-
-
 def _on_shaft(torque_constant, *present):
     """A winch or a bench of one drive with losses, the motor's speed imposed forward and backward."""
     load = Shaft(inertia=1e-3, loss_coulomb=0.05, loss_viscous=1e-3, torque_constant=torque_constant)
@@ -1097,19 +1089,4 @@ def test_instant_of_half_robot_with_all_effects_has_finite_derivatives_by_every_
         return jnp.concatenate([x.ravel() for x in leaves if x.dtype == THETA.dtype])
 
     slopes = _slopes(outputs)
-    assert np.isfinite(slopes).all() and np.abs(slopes[0]).max() > 0
-
-
-@pytest.mark.slow
-def test_drive_with_all_effects_has_finite_derivatives_by_every_parameter():
-    times = jnp.asarray([0.0, 1e-3, 5e-3])
-    slopes = _slopes(lambda robot, run: readings(robot, drive(robot, run, times).signals))
-    assert np.isfinite(slopes).all() and np.abs(slopes[0, 1:]).max() > 0
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-@pytest.mark.parametrize("rolling", [False, True], ids=["standstill", "rolling"])
-def test_track_with_all_effects_has_finite_derivatives_by_every_parameter(rolling):
-    slopes = _slopes(lambda robot, run: readings(robot, track(robot, run, duration=2e-3, rolling=rolling).signals))
     assert np.isfinite(slopes).all() and np.abs(slopes[0]).max() > 0
