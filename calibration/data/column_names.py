@@ -40,7 +40,11 @@ def convert_column(meaning: Column, raw: Raw, layout: Layout) -> tuple[np.ndarra
     beyond = ROUNDED_FACTOR if meaning.factor != 1.0 else ROUNDED
     above = found > low if meaning.column in layout.deviation_columns else found >= low - beyond * abs(low)
     refused = ~(above & (found <= high + beyond * abs(high)))
-    if _may_be_empty(meaning.column, layout):
+    if meaning.column != layout.imposed_column and meaning.column in (
+        *layout.measured_columns,
+        *layout.deviation_columns,
+        *DUTY,
+    ):
         refused[refused] = ~missing_readings(raw, np.flatnonzero(refused))
     np.clip(found, low, high, out=found)
     return found if meaning.as_named else _in_its_unit(meaning, found), refused
@@ -51,13 +55,6 @@ def _in_its_unit(meaning: Column, written: np.ndarray) -> np.ndarray:
     if meaning.quantity.percent and meaning.unit == quantities.PERCENT:  # not proportional
         return np.array([meaning.value(x) for x in written.tolist()])
     return written * meaning.factor * meaning.quantity.units[meaning.unit]
-
-
-def _may_be_empty(column: str, layout: Layout) -> bool:
-    """True for a column whose cells may have no reading."""
-    return column != layout.imposed_column and column in (
-        *layout.measured_columns, *layout.deviation_columns, *DUTY,
-    )  # fmt: skip
 
 
 def _allowed_words(column: str, word: str, layout: Layout) -> str:

@@ -228,7 +228,9 @@ class Layout:
             if column in theirs:
                 mine, factor = theirs[column]
                 meant = by_name.get(mine)
-                if meant is None and mine in _of_every_channel():  # a channel that is not read
+                if meant is None and mine in {
+                    name for channel in channels.EVERY for q in _of_channel(channel) for name in q.columns()
+                }:  # a channel that is not read
                     found.append(None)
                     continue
                 if meant is None:
@@ -278,11 +280,6 @@ class Layout:
         """Returns the column, with its source column if the robot's file states one."""
         theirs = next((their for mine, their, _ in self.mapped if _standard(self._by_name(), mine) == column), None)
         return column if theirs is None else f"{column} (in the robot's file: {theirs})"
-
-
-def _of_every_channel() -> set[str]:
-    """Names of columns of every channel, in any unit."""
-    return {name for channel in channels.EVERY for q in _of_channel(channel) for name in q.columns()}
 
 
 def _standard(by_name: Mapping[str, Column], name: str) -> str:

@@ -427,21 +427,16 @@ def _driven(cells: _Cells) -> tuple[Names, Columns]:
                 found[name][row] = full[name] if mode == MODES[VOLTAGE] else found[name][row - 1]
         for field in (*(f for f in ends if f not in own), *own):
             found["demand" if field in CONTROLLED else field][row] = cells.value(field, row)
-        if _demands_yaw(cells, row, before, mode):
+        speed, stated = MODES[SPEED], bool(cells.text(YAW_RATE, row))
+        if stated and mode != speed and not (cells.linear and before == speed):
+            cells.refuse(
+                YAW_RATE, row, f"an empty cell: a yaw rate goes with a demanded speed, and this row has mode {mode}"
+            )
+        if cells.has(YAW_RATE) and not stated and mode == speed and (cells.linear or row < len(cells) - 1):
+            cells.refuse(YAW_RATE, row, "the demanded yaw rate, 0 for straight travel")
+        if stated:
             found[YAW_RATE][row] = cells.value(YAW_RATE, row)
     return tuple(modes), found
-
-
-def _demands_yaw(cells: _Cells, row: int, before: str, mode: str) -> bool:
-    """True if a row states a yaw rate, which only a row with a demanded speed may."""
-    speed, stated = MODES[SPEED], bool(cells.text(YAW_RATE, row))
-    if stated and mode != speed and not (cells.linear and before == speed):
-        cells.refuse(
-            YAW_RATE, row, f"an empty cell: a yaw rate goes with a demanded speed, and this row has mode {mode}"
-        )
-    if cells.has(YAW_RATE) and not stated and mode == speed and (cells.linear or row < len(cells) - 1):
-        cells.refuse(YAW_RATE, row, "the demanded yaw rate, 0 for straight travel")
-    return stated
 
 
 def _mode(cells: _Cells, row: int, before: str, filled: list[str]) -> str:

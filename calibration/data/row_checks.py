@@ -151,22 +151,17 @@ def _fill(name: str, columns: Columns, rows: int, layout: Layout) -> None:
     if layout.complete:
         return
     if "configuration" not in columns and layout.configurations:
-        columns["configuration"] = np.full(rows, _only(name, columns, layout))
+        labels = np.unique(columns.get("surface", np.zeros(0, str)))
+        found = surfaces.common_configuration(layout.configurations, labels)
+        if found is None:
+            raise BadData(
+                f"{name}: column configuration is missing, and the robot has {', '.join(layout.configurations)}"
+            )
+        columns["configuration"] = np.full(rows, found)
     if layout.imposed_column == SPEED and set(SPEEDS) <= set(columns):
         columns[SPEED] = np.mean([columns[c] for c in SPEEDS], 0)
     for column, value in DEFAULTS.items():
         columns.setdefault(column, np.full(rows, value))
-
-
-def _only(name: str, columns: Columns, layout: Layout) -> str:
-    """Returns the configuration of a table without that column: the only one, or the only one with its surfaces."""
-    labels = np.unique(columns.get("surface", np.zeros(0, str)))
-    found = surfaces.common_configuration(layout.configurations, labels)
-    if found is None:
-        raise BadData(
-            f"{name}: column configuration is missing, and the robot has {', '.join(layout.configurations)}"
-        )
-    return found
 
 
 def _check_driving(name: str, columns: Columns) -> None:
@@ -329,7 +324,17 @@ def driven_rows(name: str, columns: Columns, layout: Layout) -> tuple[Columns, n
     if note:
         columns = {column: values[driven] for column, values in columns.items()}
     if {*layout.sides, *HEADING} & set(columns):
-        _check_level(name, columns)
+        slope = columns["slope_deg"]
+        if slope.any():
+            row = int(np.flatnonzero(slope)[0])
+            more = (
+                f", and so in {np.count_nonzero(slope)} of {len(slope)} rows" if np.count_nonzero(slope) > 1 else ""
+            )
+            raise BadData(
+                f"{name} row {row + 1}, slope_deg: got {bound_text(slope[row])} in a table of settled turns{more}; "
+                "on a slope the heading changes all the time, so that no turn is settled there: expected 0; remove "
+                "such rows (simulate --left, --right and --slope with --model drive follows one over time)"
+            )
     if not set(layout.sides) & set(columns):
         _check_signs(name, columns, layout)
     return columns, driven, (note,) if note else ()
@@ -371,19 +376,6 @@ def _driven(name: str, columns: Columns, layout: Layout) -> tuple[np.ndarray, st
     return size != 0, (
         f"{name}: {which} left out, as nothing drives the motors ({zero or column} 0); rows are counted without them"
     )
-
-
-def _check_level(name: str, columns: Columns) -> None:
-    """Refuses readings of turns on a slope, since no turn is settled there."""
-    slope = columns["slope_deg"]
-    if slope.any():
-        row = int(np.flatnonzero(slope)[0])
-        more = f", and so in {np.count_nonzero(slope)} of {len(slope)} rows" if np.count_nonzero(slope) > 1 else ""
-        raise BadData(
-            f"{name} row {row + 1}, slope_deg: got {bound_text(slope[row])} in a table of settled turns{more}; on a "
-            "slope the heading changes all the time, so that no turn is settled there: expected 0; remove such rows "
-            "(simulate --left, --right and --slope with --model drive follows one over time)"
-        )
 
 
 def _check_signs(name: str, columns: Columns, layout: Layout) -> None:

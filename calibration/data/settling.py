@@ -238,7 +238,13 @@ def settle_log(
         raise BadData(_nothing(result, loop))
     _check_signs(result)  # by sds of their own: repeats whose signs differ widen them
     _check_units(result, rolling or {})
-    return dataclasses.replace(result, stretches=tuple(_wider(s, result.scatter) for s in result.stretches))
+    return dataclasses.replace(
+        result,
+        stretches=tuple(
+            dataclasses.replace(s, sd={name: math.hypot(sd, result.scatter[name]) for name, sd in s.sd.items()})
+            for s in result.stretches
+        ),
+    )
 
 
 def doubtful_sign(runs: Runs) -> str:
@@ -546,7 +552,11 @@ def _settled(
     seen = {name: x for name, x in found.seen.items() if math.isfinite(x[0])}
     if not seen:
         return out("unread")
-    if _rests(signals, seen):
+    moving = [
+        s for s in signals if s.channel.zero_at_rest and s.channel.name in seen and s.channel.name not in OF_YAW
+    ]
+    ends = [(s, *seen[s.channel.name][:2]) for s in moving]
+    if bool(ends) and all(abs(mean) < max(STILL * s.largest, SDS * sd) for s, mean, sd in ends):
         return out("rest")
     acting = inertia.get(str(runs["configuration"][rows[0]]))
     lasts = float(time[found.rows[-1]] - time[found.rows[0]])
@@ -607,15 +617,6 @@ def _unsettled(signals: tuple[Signal, ...], rows: np.ndarray, end: _End, drift: 
             return ("settling", name, to_come), left_over
         left_over = max(left_over, to_come)
     return None, left_over
-
-
-def _rests(signals: tuple[Signal, ...], seen: Mapping[str, tuple[float, float, float]]) -> bool:
-    """True if channels that are zero at rest were read and none of them moves."""
-    moving = [
-        s for s in signals if s.channel.zero_at_rest and s.channel.name in seen and s.channel.name not in OF_YAW
-    ]
-    ends = [(s, *seen[s.channel.name][:2]) for s in moving]
-    return bool(ends) and all(abs(mean) < max(STILL * s.largest, SDS * sd) for s, mean, sd in ends)
 
 
 def _accelerates(
@@ -796,10 +797,6 @@ def _held(runs: Runs, stretch: Stretch) -> tuple[int, ...]:
     return tuple(
         round(float(np.mean(x[stretch.rows])) / (DRIFT * float(np.max(np.abs(x))))) if x.any() else 0 for x in signals
     )
-
-
-def _wider(stretch: Stretch, scatter: Mapping[str, float]) -> Stretch:
-    return dataclasses.replace(stretch, sd={name: math.hypot(sd, scatter[name]) for name, sd in stretch.sd.items()})
 
 
 #: Sds beyond zero from which on a mean has a sign.

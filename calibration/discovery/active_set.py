@@ -136,13 +136,6 @@ class ScoredLibrary:
         return int(mine[np.argmax(np.abs(np.asarray(single)[mine]))])
 
 
-def scored_library(effects: Sequence[Effect]) -> ScoredLibrary:
-    """Library of the effects, each at every point of its shape's grid."""
-    grids = tuple(with_shape_grid(e) for e in effects)
-    effect = np.repeat(np.arange(len(grids)), [len(s.at) for s in grids])
-    return ScoredLibrary(tuple(effects), grids, effect, np.concatenate([s.at for s in grids]))
-
-
 @dataclasses.dataclass(frozen=True)
 class CandidateSpace:
     """Problems of a search: the base, and the base with any effects of a library in a few slots.
@@ -264,4 +257,10 @@ def candidate_space(
     more = tuple(library[e.name]() for e in effects if e.name not in have)
     robot = params.without_weak_types(dataclasses.replace(bare.base, effects=(*bare.base.effects, *more)))
     data = dataclasses.replace(bare.data, centre=jnp.zeros(len(coordinates)))
-    return CandidateSpace(bare, Problem(robot, coordinates, bare.observe, data), scored_library(effects))
+    grids = tuple(with_shape_grid(e) for e in effects)
+    effect = np.repeat(np.arange(len(grids)), [len(s.at) for s in grids])
+    return CandidateSpace(
+        bare,
+        Problem(robot, coordinates, bare.observe, data),
+        ScoredLibrary(tuple(effects), grids, effect, np.concatenate([s.at for s in grids])),
+    )

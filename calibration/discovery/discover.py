@@ -1034,6 +1034,7 @@ def _result(
     listed = findings.effect_scores(space, left.scores, settings)
     shown = space.library.indices([s.name for s in listed])
     said = verdict_summary(traced, numbers)
+    kind = type(observe)
     return DiscoveryResult(
         verdict=traced.verdict,
         summary=said,
@@ -1053,8 +1054,10 @@ def _result(
         remains=remains,
         next_experiment=findings.next_experiment(_proposal(space, traced, settings)),
         cannot_see=findings.invisible_effects(space, left.scores, settings),
-        needs_histories=_needs_histories(library, type(observe)),
-        needs_reverse=_needs_reverse(library, runs),
+        needs_histories=tuple(sorted(name for name, e in library.items() if e.transient and not kind.shows(e))),
+        needs_reverse=tuple(
+            sorted(name for name, e in library.items() if e.needs_reverse and not goes_both_ways(runs))
+        ),
         alternatives=near,
         implausible=too_large,
         hidden=concealed,
@@ -1176,16 +1179,6 @@ def _proposal(space: CandidateSpace, traced: LoopStages, settings: Settings) -> 
     if traced.verdict in WITHOUT_NAME and traced.where is not None:
         return propose_denser_runs(space, traced.where, settings)
     return None if traced.alike is None else propose_separating(space, traced.best, traced.alike, settings)
-
-
-def _needs_histories(library: Library, kind: type[observers.Observer]) -> tuple[str, ...]:
-    """Effects of the library that data of this kind cannot show, but histories could."""
-    return tuple(sorted(name for name, e in library.items() if e.transient and not kind.shows(e)))
-
-
-def _needs_reverse(library: Library, runs: Runs) -> tuple[str, ...]:
-    """Effects of the library that these runs cannot show because they all go in one direction."""
-    return tuple(sorted(name for name, e in library.items() if e.needs_reverse and not goes_both_ways(runs)))
 
 
 def _noise(runs: Runs, noise: Noise, kind: type[observers.Observer]) -> dict[str, dict[str, object]]:

@@ -218,10 +218,6 @@ def _predicted(
     return jax.vmap(one)(which, z, informed)
 
 
-def _informed(problem: Problem, at: Candidate, active: tuple[int, ...]) -> Array:
-    return problem.observe.at(problem, at.z, active)[1][informative_residuals(problem.data)]
-
-
 def predict_menu(space: CandidateSpace, candidates: Mapping[str, Candidate], settings: Settings) -> PredictedReadings:
     """Predictions of the menu by these alternatives, with instruments as good as those of the table.
 
@@ -237,7 +233,12 @@ def predict_menu(space: CandidateSpace, candidates: Mapping[str, Candidate], set
     equipped, indices = space.fitted_by(c.active for c in those)
     active = jnp.asarray(indices)
     z = jnp.asarray(np.stack([c.z for c in those]))
-    informed = jnp.stack([_informed(equipped, c, mine) for c, mine in zip(those, indices, strict=True)])
+    informed = jnp.stack(
+        [
+            equipped.observe.at(equipped, c.z, mine)[1][informative_residuals(equipped.data)]
+            for c, mine in zip(those, indices, strict=True)
+        ]
+    )
     within = reach_of_space(space, space.bare.robot(jnp.asarray(those[0].z[: space.free])))
     everything, shown = menu.experiment_menu(within), channels.channel_names(space.bare.channels)
     found, half = jax.device_get(

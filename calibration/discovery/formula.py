@@ -170,7 +170,10 @@ def propose_formula(
     if curve.wave:
         return _wave_formula(balance, curve)
     if curve.happening:
-        return _temporary_formula(balance, curve)
+        level = float(np.mean((curve.scale * curve.root @ curve.start)[1:-1]))
+        formula = f"{SYMBOL[balance]} = {level:.2g} {PLACES[balance][0]} while {curve.variable}"
+        axis = curve.variable.split()[0]
+        return Proposal(formula, (), (level,), (float("nan"),), (axis,), curve.explained, 0.0, 1)
     if curve.variable in FADING:
         return _decay_formula(linear, balance, counts, curve)
     counts = linear.at_points(counts)
@@ -221,14 +224,6 @@ def _wave_formula(balance: str, curve: Smooth) -> Proposal:
         f"{SYMBOL[balance]} = {size:.2g} {unit} sin({order:.3g} θ_k {'-' if phase < 0 else '+'} {abs(phase):.2g})"
     )
     return Proposal(formula, (), (size,), (float("nan"),), ("angle of the driving shaft",), curve.explained, 0.0, 1)
-
-
-def _temporary_formula(balance: str, curve: Smooth) -> Proposal:
-    """Formula of a temporary change: its mean."""
-    level = float(np.mean((curve.scale * curve.root @ curve.start)[1:-1]))
-    formula = f"{SYMBOL[balance]} = {level:.2g} {PLACES[balance][0]} while {curve.variable}"
-    axis = curve.variable.split()[0]
-    return Proposal(formula, (), (level,), (float("nan"),), (axis,), curve.explained, 0.0, 1)
 
 
 def _decay_formula(linear: Linearization, balance: str, counts: np.ndarray, curve: Smooth) -> Proposal:

@@ -68,7 +68,10 @@ def search_effects(
         base: the fit without effects.
         left: its diagnosis.
     """
-    rounds = [_singles(space, base, left, settings)]
+    names = _ranked(space, left.scores)
+    if not space.bare.observe.long:
+        names = names[: _batch(space)]
+    rounds = [_fit_sets(space, [(fill_slots([name], settings), base, left) for name in names], settings)]
     space = space.with_room(rounds[0].room)
     ladder = list(rounds[0].candidates)
     null = np.asarray(left.test.null.single)
@@ -78,7 +81,9 @@ def search_effects(
     while best is not None:
         seen = best
         diagnosis = diagnose_candidate(space, best, bases, left.test.null, settings)
-        if not diagnosis.test.rejected_with_margin or len(best.effects) == _largest_set_size(space, settings):
+        if not diagnosis.test.rejected_with_margin or len(best.effects) == int(
+            min(settings.slots, max(1, space.included.sum() // settings.rows_per_effect))
+        ):
             break
         progress(next_step("more effects", best.effects))
         rounds.append(_extend(space, best, diagnosis, base, left, settings))
@@ -131,24 +136,11 @@ def without_each(
     return [simulated[w] for w in fewer]
 
 
-def _largest_set_size(space: CandidateSpace, settings: Settings) -> int:
-    """Largest number of effects that the data allow, at most the number of slots."""
-    return int(min(settings.slots, max(1, space.included.sum() // settings.rows_per_effect)))
-
-
 def _ranked(space: CandidateSpace, scores: ScoreTable, without: Sequence[str] = ()) -> list[str]:
     """Effects by their best |score|, the strongest first. Those in `without` come last."""
     strength = space.library.largest(np.abs(np.asarray(scores.single)))
     strength[list(space.library.indices(without))] = 0.0
     return [space.library.names[k] for k in np.argsort(-strength)]
-
-
-def _singles(space: CandidateSpace, base: Candidate, left: Diagnosis, settings: Settings) -> Confirmed:
-    """Single effects: those with the highest scores, or for long runs all of them by regression."""
-    names = _ranked(space, left.scores)
-    if not space.bare.observe.long:
-        names = names[: _batch(space)]
-    return _fit_sets(space, [(fill_slots([name], settings), base, left) for name in names], settings)
 
 
 def _fit_sets(

@@ -31,7 +31,14 @@ def check_data(runs: Runs, robot: Robot, names: Sequence[str], noise: Noise) -> 
             different conditions, a configuration that `robot` does not have, readings in other units.
         BadConfiguration: a free parameter of a configuration that has no rows.
     """
-    _check_configurations(runs, robot, names)
+    present = {robot.configurations.names[k] for k in np.unique(runs.configurations(robot))}
+    for name in names:
+        word = name.split(".")[0]
+        if word in robot.configurations and word not in present:
+            raise BadConfiguration(
+                f"--free {name}: {runs.source} has no {word} rows, so nothing measures it; "
+                f"add {word} runs or leave it fixed"
+            )
     _check_enough_readings(runs, names, noise)
     _check_motion(runs, noise)
     said = [
@@ -81,17 +88,6 @@ def _uninformative(runs: Runs, robot: Robot, noise: Noise) -> list[Remark]:
         return []
     same = nothing_varies(runs, robot, noise)
     return [same] if same is not None else [*copied_channels(runs, robot)]
-
-
-def _check_configurations(runs: Runs, robot: Robot, names: Sequence[str]) -> None:
-    present = {robot.configurations.names[k] for k in np.unique(runs.configurations(robot))}
-    for name in names:
-        word = name.split(".")[0]
-        if word in robot.configurations and word not in present:
-            raise BadConfiguration(
-                f"--free {name}: {runs.source} has no {word} rows, so nothing measures it; "
-                f"add {word} runs or leave it fixed"
-            )
 
 
 def _check_enough_readings(runs: Runs, names: Sequence[str], noise: Noise) -> None:

@@ -147,11 +147,15 @@ def _optimum(jacobian: Array, r: Array, z: Array, data: Data, pin: Pin, steps: A
     decrement = half_squares(r, held_rows) - half_squares(ahead, held_rows)
     held = jnp.where(pin.held, pin.at - data.centre, 0.0)
     cost = half_squares(r, held_rows) + 0.5 * jnp.sum(held**2)
-    return Optimum(pin.apply(z), sd, half.T @ half, cost, decrement, _is_converged(decrement, cost), steps)
-
-
-def _is_converged(decrement: Any, cost: Array) -> Array:
-    return jnp.asarray(decrement < DECREMENT + DECREMENT_SHARE * cost)
+    return Optimum(
+        pin.apply(z),
+        sd,
+        half.T @ half,
+        cost,
+        decrement,
+        jnp.asarray(decrement < DECREMENT + DECREMENT_SHARE * cost),
+        steps,
+    )
 
 
 def optimum_at_point(jacobian: np.ndarray, residual: np.ndarray, z: np.ndarray, data: Data) -> Optimum:
@@ -176,12 +180,6 @@ def _unevaluated(z: Z, args: Any) -> tuple[Array, Any]:
     raise NotImplementedError
 
 
-def _of_every_row(data: Data) -> Observation:
-    """Shapes and dtypes of an observation of the rows of data."""
-    codes = jnp.zeros(data.measured.shape[0], int)
-    return jax.eval_shape(lambda: Observation(data.measured, data.measured[:, 0], codes, codes))
-
-
 def _step(solver: OneSidedLevenbergMarquardt, function: Function, at: Progress) -> Progress:
     """The next step of a search."""
     y, state, _ = solver.step(function, at[0], None, {}, at[1], frozenset())
@@ -191,7 +189,13 @@ def _step(solver: OneSidedLevenbergMarquardt, function: Function, at: Progress) 
 def _begun(problem: Problem, start: Z, data: Data) -> Progress:
     """State of a problem's search before its first evaluation."""
     size = penalty_slice(data).stop + start.shape[0]
-    return _begin(_solver(data, problem.observe.long), start, size, _of_every_row(data))
+    codes = jnp.zeros(data.measured.shape[0], int)
+    return _begin(
+        _solver(data, problem.observe.long),
+        start,
+        size,
+        jax.eval_shape(lambda: Observation(data.measured, data.measured[:, 0], codes, codes)),
+    )
 
 
 def _advance(problem: Problem, at: Progress, data: Data, max_steps: int | Numbers) -> Progress:

@@ -83,13 +83,16 @@ def check_ranges(runs: Runs, robot: Robot) -> list[Remark]:
         ):  # a sliding vehicle may have other speeds
             continue
         typical = _factor(measured[:, k], possible[1:2, :, k])
+        mine = factors[channel]
         found = Remark(
             "off_by",
             column=channel.column,
             unit=channel.unit,
             factor=typical if units else factor,
             units=tuple(units),
-            others=tuple(_columns_with_same_factor(channel, factors)),
+            others=tuple(
+                c.column for c, f in factors.items() if c is not channel and abs(math.log(f / mine)) < math.log(ALIKE)
+            ),
             imposed=runs.layout.imposed_column,
         )
         if off > REFUSED:
@@ -178,12 +181,6 @@ def _units(channel: Channel, measured: np.ndarray, possible: np.ndarray, robot: 
         known["rpm of the driving wheel"] = 1 / float(robot.gearbox.ratio)
     left = {unit: abs(math.log(_factor(measured / f, possible))) for unit, f in known.items()}
     return sorted((u for u, x in left.items() if x < math.log(ALIKE)), key=left.__getitem__)
-
-
-def _columns_with_same_factor(channel: Channel, factors: dict[Channel, float]) -> list[str]:
-    """Columns of the other channels with the same factor."""
-    mine = factors[channel]
-    return [c.column for c, f in factors.items() if c is not channel and abs(math.log(f / mine)) < math.log(ALIKE)]
 
 
 def _slips(robot: Robot, channel: Channel, factor: float) -> bool:

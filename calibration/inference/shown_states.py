@@ -272,7 +272,8 @@ def correlation_time(time: np.ndarray, speed: np.ndarray, noise: float) -> float
 def slopes_of(time: np.ndarray, values: np.ndarray, piece: np.ndarray, count: int) -> np.ndarray:
     """Slope at each point of a cubic over the `count` points around it, within its piece."""
     out = np.zeros(len(time))
-    for begin, end in _stretches(piece):
+    starts = np.flatnonzero(np.r_[len(piece) > 0, np.diff(piece) != 0])
+    for begin, end in zip(starts.tolist(), [*starts[1:].tolist(), len(piece)], strict=True):
         wide = min(count, end - begin)
         if wide < FEWEST // 2:
             out[begin:end] = np.gradient(values[begin:end], time[begin:end]) if wide > 1 else 0.0
@@ -287,12 +288,6 @@ def slopes_of(time: np.ndarray, values: np.ndarray, piece: np.ndarray, count: in
             rise = np.einsum("nwi,nw->ni", powers, values[near] - values[here])
             out[begin + part] = np.linalg.solve(normal, rise[..., None])[:, 1, 0] / scale
     return out
-
-
-def _stretches(piece: np.ndarray) -> zip[tuple[int, int]]:
-    """Beginning and end of each stretch of equal values."""
-    starts = np.flatnonzero(np.r_[len(piece) > 0, np.diff(piece) != 0])
-    return zip(starts.tolist(), [*starts[1:].tolist(), len(piece)], strict=True)
 
 
 def slope_rows(time: np.ndarray, angle: np.ndarray, sd: float) -> tuple[int, float]:
@@ -511,16 +506,13 @@ def _ways(
     if plan.imposed == "motor_speed":
         speed, off = conditions.motor_speed / float(problem.base.gearbox.ratio), np.zeros(len(shown))
     else:
-        per = _wheel_per_unit(problem, plan)
+        robot, none = problem.base, jnp.zeros(())
+        chassis = robot.configurations.members[0]
+        rolling = State(none, robot.gearbox.ratio, chassis.radius, none, distance=chassis.radius)
+        per = 1 / float(
+            problem.channels[plan.motion].read(robot, balances.begin_signals(robot, Conditions(0), rolling))
+        )
         speed = per * (rate if plan.angle else shown[:, plan.motion])
         off = abs(per) * (np.full(len(shown), noise) if plan.angle else sd[:, plan.motion])
     limit = np.maximum(REST * np.abs(speed).max(initial=0.0), REST_SD * off)
     return np.where(np.abs(speed) > limit, np.sign(speed), 0.0), speed
-
-
-def _wheel_per_unit(problem: Problem, plan: Plan) -> float:
-    """Speed or angle of the output for one unit of the channel of the motion [rad/unit]."""
-    robot, none = problem.base, jnp.zeros(())
-    chassis = robot.configurations.members[0]
-    rolling = State(none, robot.gearbox.ratio, chassis.radius, none, distance=chassis.radius)
-    return 1 / float(problem.channels[plan.motion].read(robot, balances.begin_signals(robot, Conditions(0), rolling)))

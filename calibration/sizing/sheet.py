@@ -275,13 +275,6 @@ def _computed_name(requirement: Requirement) -> str:
     return "speed_m_s" if requirement.name == "speed_end_of_charge_m_s" else requirement.name
 
 
-def changeable_parameters(robot: Robot, configuration: str) -> dict[str, params.Parameter]:
-    """Parameters of a robot that a designer can change, by name, without cells."""
-    by_name = {p.name: p for p in params.walk_parameters(robot)}
-    names = (*CHANGEABLE, *(f"{configuration}.{n}" for n in OF_CONFIGURATION))
-    return {name: by_name[name] for name in names if name in by_name}
-
-
 def check_requirements(
     robot: Robot,
     asked: Requirements,
@@ -304,7 +297,13 @@ def check_requirements(
     for r in asked.each:
         configuration = _configuration(robot, r.envelope)
         of_levers = OF_LEVERS if r.quantity.group == "posture" else ()
-        held.append(_QuantityOfRobot(robot, r, (*changeable_parameters(robot, configuration), *of_levers, CELLS)))
+        by_name = {p.name: p for p in params.walk_parameters(robot)}
+        names = (*CHANGEABLE, *(f"{configuration}.{n}" for n in OF_CONFIGURATION))
+        held.append(
+            _QuantityOfRobot(
+                robot, r, (*{name: by_name[name] for name in names if name in by_name}, *of_levers, CELLS)
+            )
+        )
     found = []
     for k, h in enumerate(held, 1):
         tell(next_step("requirement", k, len(held), h.requirement.quantity.label))

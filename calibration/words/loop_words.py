@@ -32,7 +32,6 @@ if TYPE_CHECKING:
         Ranking,
         Resolved,
         Sensitivity,
-        StatedValue,
         UnnamedDiscrepancy,
         Worse,
     )
@@ -577,13 +576,6 @@ def hidden_effects_sentence(found: DiscoveryResult) -> str:
     return f"Could be hidden behind what was found: {', '.join(each)}."
 
 
-def stated_value(name: str, s: StatedValue) -> str:
-    """`motor.resistance is 1.94 ohm (stated 0.611, +9.6 sds)`."""
-    return (
-        f"{freed_value(loop_notes.FreedValue(name, s.value, s.unit))} (stated {s.stated:.3g}, {s.prior_sds:+.1f} sds)"
-    )
-
-
 def moved_parameter(name: str, value: float, stated: float, unit: str, shift: float) -> str:
     """`motor.friction_viscous is 1.2e-05 N·m·s, 3 times the stated 4e-06 (+2.3 prior sds)`."""
     ratio = f"{value / stated:.2g} times the " if stated and value / stated > 0 else ""
@@ -610,7 +602,10 @@ def indistinguishable_effects(found: DiscoveryResult, e: FoundEffect) -> str:
         ]
         + [f"{name} (time histories alone tell that)" for name in settled if name not in e.members]
     )
-    values = " or ".join(stated_value(name, s) for name, s in e.stated.items())
+    values = " or ".join(
+        f"{freed_value(loop_notes.FreedValue(name, s.value, s.unit))} (stated {s.stated:.3g}, {s.prior_sds:+.1f} sds)"
+        for name, s in e.stated.items()
+    )
     return ", or ".join(words for words in (others, values) if words)
 
 

@@ -166,12 +166,6 @@ INRUSH, EARLIEST, LATEST, REST = 250, 2e-5, 0.02, 800
 TOLERANCE = 1e-7
 
 
-def start_times() -> np.ndarray:
-    """Times of a start [s]: spaced by 3 % while the current rises to its peak, then by 5 ms."""
-    early = np.geomspace(EARLIEST, LATEST, INRUSH, endpoint=False)
-    return np.concatenate([[0.0], early, np.linspace(LATEST, TIME_SETTLED, REST)])
-
-
 def curve_peak(times: Float[Array, " times"], x: Float[Array, " times"], kink: Scalar = np.inf) -> Float[Array, ""]:
     """Largest value of a sampled curve: the vertex of the parabola through its largest sample and both neighbours.
 
@@ -226,7 +220,8 @@ def compute(robot: Robot, conditions: Conditions) -> dict[str, Array]:
         ∫ U_e I_s dt until then [J]. `status` of the run. Numbers are NaN unless it is `converged`: a run that slides,
         stalls or has not settled has no final speed. Derivatives are forward.
     """
-    times = jnp.asarray(start_times())
+    early = np.geomspace(EARLIEST, LATEST, INRUSH, endpoint=False)
+    times = jnp.asarray(np.concatenate([[0.0], early, np.linspace(LATEST, TIME_SETTLED, REST)]))
     run = drive(robot, conditions, times, TOLERANCE)
     signals = run.signals
     speed, rate, current = (jnp.asarray(x) for x in (signals.speed, signals.acceleration, signals.total_current))

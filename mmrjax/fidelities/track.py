@@ -246,7 +246,16 @@ def track_batch(
     """
     check_track_runs(robot, conditions, duration=duration, step=step, sample=sample)
     if progress is not None:
-        return _in_parts(robot, conditions, duration, step, sample, rolling, progress)
+        # All parts have one length, to share a compilation; the excess of the last one is cut off.
+        samples = round(duration / sample)
+        length = math.ceil(samples / PARTS)
+        start = motion = _begin(robot, conditions, step, rolling)
+        records = []
+        for done in range(0, samples, length):
+            motion, record = jax.block_until_ready(_part(robot, conditions, motion, step, sample, length))
+            records.append(record)
+            progress(min((done + length) / samples, 1.0))
+        return _end(robot, conditions, start, records, step, sample, samples)
     return _batch(robot, conditions, duration, step, sample, rolling)
 
 
@@ -263,27 +272,6 @@ def _batch(
         return track(robot, conditions, duration=duration, step=step, sample=sample, rolling=rolling)
 
     return jax.vmap(one)(conditions)
-
-
-def _in_parts(
-    robot: Robot,
-    conditions: Conditions,
-    duration: float,
-    step: float,
-    sample: float,
-    rolling: bool,
-    progress: Progress,
-) -> Trajectory:
-    # All parts have one length, to share a compilation; the excess of the last one is cut off.
-    samples = round(duration / sample)
-    length = math.ceil(samples / PARTS)
-    start = motion = _begin(robot, conditions, step, rolling)
-    records = []
-    for done in range(0, samples, length):
-        motion, record = jax.block_until_ready(_part(robot, conditions, motion, step, sample, length))
-        records.append(record)
-        progress(min((done + length) / samples, 1.0))
-    return _end(robot, conditions, start, records, step, sample, samples)
 
 
 @compiled

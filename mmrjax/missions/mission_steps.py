@@ -442,9 +442,14 @@ class _Leg(NamedTuple):
         tops = _top(c.y, y, h * c.slope, h * dy)
         within = law.peaks_within(robot, y, tops)
         highest = jnp.stack([jnp.where(taken, within.get(name, -jnp.inf), -jnp.inf) for name in law.PEAKS])
-        peaks = jnp.maximum(jnp.maximum(c.peaks, _peaks_of(law, robot, found)), highest)
+        each = law.peaks(robot, found)
+        peaks = jnp.maximum(
+            jnp.maximum(c.peaks, jnp.stack([jnp.asarray(each[name]) * jnp.ones(()) for name in law.PEAKS])), highest
+        )
         hot = taken & (within["temperature"] > robot.motor.temperature_limit)
-        flags = _flags(law, robot, found, cut_off) | flag_mask({"too_hot": hot})
+        over = law.exceeded(robot, found)
+        over.pop("slips")  # every start slips for an instant; for a segment, slip counts at its end
+        flags = flag_mask({**over, "cut_off": cut_off}) | flag_mask({"too_hot": hot})
         failed = c.failed | (~good & (h <= SHORTEST))
         ended = c.ended | cut_off | (landed.which == EMPTY) | failed
         now = (robot, otherwise, segment, y, stands, below)
@@ -467,18 +472,3 @@ def _stayed_below(robot: Robot, below: Array, low: Array) -> Array:
     """True if the cells have been below their cut-off longer than permitted."""
     rounding = 8 * jnp.finfo(low.dtype).eps
     return below & (low >= robot.battery.delay_cutoff * (1 - rounding))
-
-
-def _peaks_of(law: MotionLaw, robot: Robot, found: Any) -> Array:
-    each = law.peaks(robot, found)
-    return jnp.stack([jnp.asarray(each[name]) * jnp.ones(()) for name in law.PEAKS])
-
-
-def _flags(law: MotionLaw, robot: Robot, found: Any, cut_off: Array) -> Array:
-    """Limits exceeded at an instant.
-
-    A start exceeds the limits of the cells for an instant. Only longer loads count.
-    """
-    over = law.exceeded(robot, found)
-    over.pop("slips")  # every start slips for an instant; for a segment, slip counts at its end
-    return flag_mask({**over, "cut_off": cut_off})

@@ -24,7 +24,7 @@ from mmrjax.model.masses import lever_angles
 from mmrjax.model.params import Scalar
 from mmrjax.model.signals import GRAVITY, Signals
 from mmrjax.numerics.trigonometry import cosine, sine
-from mmrjax.undercarriage.belt import Path, Runs, Tips, belt_runs, tension_along, tips_on_path
+from mmrjax.undercarriage.belt import Path, Runs, belt_runs, tension_along, tips_on_path
 from mmrjax.undercarriage.running_gear import GROUSERS, TEETH_BELT, WHEELS, RunningGear
 
 CONTACTS = GROUSERS + WHEELS  # with the ground, of one side; those of the other configuration carry no load
@@ -77,23 +77,6 @@ def join_contacts(
     return jnp.where(WHEEL, wheels, jnp.pad(grousers, (0, WHEELS)))
 
 
-def _geometry(
-    path: Path, where: Tips, weight: Array, pitch: Scalar, radius_wheel: Scalar
-) -> tuple[Array, Array, Array, Array, Array]:
-    cos, sin = cosine(pitch), sine(pitch)
-    forward, up = join_contacts(where.forward, path.gear.wheelbase / 2 * _END), join_contacts(where.up)
-    ahead, rise = join_contacts(where.rate_forward), join_contacts(where.rate_up)
-    # The lowest point of a wheel is below its axle at any pitch of the robot.
-    below = jnp.where(WHEEL, radius_wheel, 0.0)
-    return (
-        forward * cos + up * sin,
-        up * cos - forward * sin - below,
-        ahead * cos + rise * sin - below / path.radius,
-        rise * cos - ahead * sin,
-        join_contacts(weight, jnp.where(_END < 0, 1.0, 0.0)),
-    )
-
-
 def bearing_contacts(chassis: Chassis) -> Float[Array, " contacts"]:
     """1 for contacts that carry load in this configuration, else 0 [-]."""
     return jnp.where(WHEEL, 1 - chassis.on_tracks, chassis.on_tracks)
@@ -119,7 +102,19 @@ def contact_state(path: Path, chassis: Chassis, q: Sequence[Scalar] | Array, v: 
     belt = belt_runs(path, (q[3], q[4]), (v[3], v[4]))
     place, weight = path.place(q[3], q[4])
     where = tips_on_path(path, place)
-    x, z, rate_x, rate_z, weight = _geometry(path, where, weight, q[2], chassis.radius)
+    pitch = q[2]
+    cos, sin = cosine(pitch), sine(pitch)
+    forward, up = join_contacts(where.forward, path.gear.wheelbase / 2 * _END), join_contacts(where.up)
+    ahead, rise = join_contacts(where.rate_forward), join_contacts(where.rate_up)
+    # The lowest point of a wheel is below its axle at any pitch of the robot.
+    below = jnp.where(WHEEL, chassis.radius, 0.0)
+    x, z, rate_x, rate_z, weight = (
+        forward * cos + up * sin,
+        up * cos - forward * sin - below,
+        ahead * cos + rise * sin - below / path.radius,
+        rise * cos - ahead * sin,
+        join_contacts(weight, jnp.where(_END < 0, 1.0, 0.0)),
+    )
     speed = path.radius * ((1 - weight) * v[3] + weight * v[4])
     gap = q[1] + z
     gap_rate = v[1] - v[2] * x + rate_z * speed

@@ -66,7 +66,16 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
     source = profiles.read_profile(config.profile)
     for note in source.notes:
         print_message(note)
-    _check_acting(robot, source)
+    ground, shaft = (
+        [f"{source.source}, {column}" for column in columns if column in source.stated]
+        for columns in (("slope_deg", "payload_kg", "surface"), ON_SHAFT)
+    )
+    imposed.check_acting(robot, ground, shaft)
+    if "speed" in source.modes and not robot.shows_travel:
+        raise BadConfiguration(
+            f"{source.source}, speed_mm_s: the robot's load is a shaft, so no channel shows a distance; state "
+            "motor_speed_rpm or duty"
+        )
     source.check_source(config.battery)
     for column in source.stated:
         if column in beside.stated:
@@ -91,20 +100,6 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
         result = run.SimulationResult("simulate", config.model, robot, runs, found.table, found.to_json())
         return run.write_run_folder(
             folder, config, result, print_report(mission_report.missions_document(file, found), file)
-        )
-
-
-def _check_acting(robot: Robot, source: ProfileTable) -> None:
-    """Refuse a profile that states what does not act on the robot's load."""
-    ground, shaft = (
-        [f"{source.source}, {column}" for column in columns if column in source.stated]
-        for columns in (("slope_deg", "payload_kg", "surface"), ON_SHAFT)
-    )
-    imposed.check_acting(robot, ground, shaft)
-    if "speed" in source.modes and not robot.shows_travel:
-        raise BadConfiguration(
-            f"{source.source}, speed_mm_s: the robot's load is a shaft, so no channel shows a distance; state "
-            "motor_speed_rpm or duty"
         )
 
 

@@ -62,7 +62,10 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
         if settled:
             with report_stage(stages - 1, stages, "settled turns over the duties of the inner side"):
                 batch, swept = _with_others(robot, asked)
-            turns = {**_duties(swept), **_columns(robot, shown, swept, batch)}
+            turns = {
+                **{name: np.asarray(getattr(swept, name)) for name in SIDES},
+                **_columns(robot, shown, swept, batch),
+            }
             folder.write_table("turns.csv", capabilities.without_idle(robot, turns))
             first, history = jax.tree.map(lambda x: x[:1], batch), None
         else:
@@ -214,10 +217,6 @@ def _with_others(robot: Robot, asked: Conditions) -> tuple[Run, Conditions]:
     rows = dataclasses.replace(rows, duty_left=jax.numpy.asarray(duty_left), duty_right=jax.numpy.asarray(duty_right))
     rows = jax.tree.map(jax.numpy.asarray, rows)
     return jax.device_get(fidelities.get_fidelity(fidelities.NAMES[0]).run(robot, rows, {})), rows
-
-
-def _duties(conditions: Conditions) -> Columns:
-    return {name: np.asarray(getattr(conditions, name)) for name in SIDES}
 
 
 def _columns(robot: Robot, shown: tuple[Channel, ...], conditions: Conditions, batch: Run) -> Columns:

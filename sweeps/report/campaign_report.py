@@ -51,7 +51,21 @@ def _sections(store: Path, layout: Layout, extremes: Json) -> Iterable[Section]:
     values, found = sample_points(store, layout)
     yield Section("What varies", (_varied(layout, values),), "varied")
     if VERDICT in found:
-        yield Section("How the climbs ended", _verdicts(values, found, layout), "verdicts")
+        codes, design = found[VERDICT].astype(int), layout.design
+        meanings = next(v.attributes for v in layout.variables if v.name == VERDICT)["flag_meanings"].split()
+        rows = [(f"`{meanings[k]}`", int((codes == k).sum()), *VERDICTS[meanings[k]]) for k in np.unique(codes)]
+        others = [n for n in design.axes if n != SIZE and len(design.axes[n]) > 1][:1]
+        figure = catalogue.figure("campaign.endings", codes, meanings, values, layout, *others)  # fmt: skip
+        drawn = (figure,) * bool(others and SIZE in design.axes)
+        yield Section(
+            "How the climbs ended",
+            (
+                Note(_largest(values, found, layout), "answer", "largest"),
+                catalogue.table("campaign.endings", rows),
+                *drawn,
+            ),
+            "verdicts",
+        )
     yield Section("What came out", tuple(_outputs(values, found, layout, extremes)), "outputs")
 
 
@@ -76,21 +90,6 @@ def _outputs(values: np.ndarray, found: Columns, layout: Layout, extremes: Json)
     yield catalogue.note("campaign.thinned", len(values), drawn)
     yield catalogue.table("campaign.ranges", rows)
     yield from figures
-
-
-def _verdicts(values: np.ndarray, found: Columns, layout: Layout) -> tuple[Block, ...]:
-    """The largest obstacle, the number of climbs by outcome, and these over size and the first other axis."""
-    codes, design = found[VERDICT].astype(int), layout.design
-    meanings = next(v.attributes for v in layout.variables if v.name == VERDICT)["flag_meanings"].split()
-    rows = [(f"`{meanings[k]}`", int((codes == k).sum()), *VERDICTS[meanings[k]]) for k in np.unique(codes)]
-    others = [n for n in design.axes if n != SIZE and len(design.axes[n]) > 1][:1]
-    figure = catalogue.figure("campaign.endings", codes, meanings, values, layout, *others)  # fmt: skip
-    drawn = (figure,) * bool(others and SIZE in design.axes)
-    return (
-        Note(_largest(values, found, layout), "answer", "largest"),
-        catalogue.table("campaign.endings", rows),
-        *drawn,
-    )
 
 
 def _largest(values: np.ndarray, found: Columns, layout: Layout) -> str:

@@ -136,12 +136,22 @@ def comparison_document(found: Comparison) -> Document:
         ),
     )
     errors = catalogue.figure("comparison.errors", *known, True, found.over, finding=_trend(found))
+    status = found.table["status"]
     return Document(
         f"{found.robot_name} against {found.source}",
         comparison_answer(found),
         (
             Note(lead, "lead"),
-            *(Note(text, "warn", terminal=True) for text in _unsolved(found)),
+            *(
+                Note(
+                    f"{words.short_status(name).capitalize()}: {count} of {len(status)} rows; "
+                    f"{words.status_meaning(name)}.",
+                    "warn",
+                    terminal=True,
+                )
+                for name, count in Counter(map(str, status)).items()
+                if name not in words.SETTLED
+            ),
             _errors_table(found),
             *([_both_robots(found)] if found.against else []),
             catalogue.note("comparison.errors-note"),
@@ -206,16 +216,6 @@ def _seconds(found: Comparison) -> float:
     time = found.table["time_s"]
     runs = found.table.get("run_id", np.zeros(len(time)))
     return float(sum(np.ptp(time[runs == name]) for name in np.unique(runs)))
-
-
-def _unsolved(found: Comparison) -> list[str]:
-    """A sentence for each status that gives no operating point."""
-    status = found.table["status"]
-    return [
-        f"{words.short_status(name).capitalize()}: {count} of {len(status)} rows; {words.status_meaning(name)}."
-        for name, count in Counter(map(str, status)).items()
-        if name not in words.SETTLED
-    ]
 
 
 def _errors_table(found: Comparison) -> Table:

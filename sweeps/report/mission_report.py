@@ -22,7 +22,7 @@ from mmrjax.model.signals import FLAGS
 from sweeps import capabilities
 from sweeps.pages import words
 from sweeps.report import catalogue, run_tables
-from sweeps.report.document import Block, Column, Document, Note, Section, Table, columns, remarks
+from sweeps.report.document import Column, Document, Note, Section, Table, columns, remarks
 from sweeps.report.run_tables import quantity_column
 from sweeps.report.runs_report import run_headings
 
@@ -131,7 +131,18 @@ def _sections(robot: Robot, found: Missions, first: Json, answer: str) -> Iterab
     limits = run_tables.limits_table(mission_limits(robot, first), "this mission")
     yield Section("Over time", (course, limits, catalogue.note("run.warming")), "course-section")
     if source.turns:
-        yield Section("From above", _from_above(robot, first, rows), "path-section")
+        place = rows["x_mm"] / 1e3, rows["y_mm"] / 1e3, np.radians(rows["yaw_deg"])
+        sides = [[first[f"{name}_{side}_{unit}"] for side in channels.SIDES]
+                 for name, unit in (("rms_current", "A"), ("winding_peak", "C"))]  # fmt: skip
+        heat = catalogue.text("mission.heat", *sides[1]) if robot.knows(WARMING) else ""
+        yield Section(
+            "From above",
+            (
+                catalogue.figure("mission.path", robot, first, *place, words=(first["turned_deg"],)),
+                catalogue.figure("mission.sides", rows, words=sides[0], more=heat),
+            ),
+            "path-section",
+        )
     back, on_battery = float(first["energy_returned_Wh"]), bool(np.isfinite(first["state_of_charge"]))
     returned = f"{back:.3g} Wh came back to the source." if back > 1e-6 * first["energy_drawn_Wh"] else (
         f"{_NO_RETURN}; what driven motors give feeds the other consumers first." if on_battery else f"{_NO_RETURN}."
@@ -145,17 +156,6 @@ def _sections(robot: Robot, found: Missions, first: Json, answer: str) -> Iterab
         "Segments", (_segments(found, name, capabilities.idle_columns(robot)), catalogue.note("mission.settles")),
         "segments-section",
     )  # fmt: skip
-
-
-def _from_above(robot: Robot, first: Json, rows: Columns) -> tuple[Block, ...]:
-    place = rows["x_mm"] / 1e3, rows["y_mm"] / 1e3, np.radians(rows["yaw_deg"])
-    sides = [[first[f"{name}_{side}_{unit}"] for side in channels.SIDES]
-             for name, unit in (("rms_current", "A"), ("winding_peak", "C"))]  # fmt: skip
-    heat = catalogue.text("mission.heat", *sides[1]) if robot.knows(WARMING) else ""
-    return (
-        catalogue.figure("mission.path", robot, first, *place, words=(first["turned_deg"],)),
-        catalogue.figure("mission.sides", rows, words=sides[0], more=heat),
-    )
 
 
 def _names(runs: Columns) -> list[str]:

@@ -33,12 +33,11 @@ def of_mdf(path: Path, name: str) -> tuple[Signal, ...]:
     clocks = {id(s.clock) for s in found}
     if len(clocks) == 1 and found and found[0].clock is not None:  # a table
         time = found[0].clock
-        found = [Signal("time_s", found[0].length, time.load, "s"), *(_in_table(s) for s in found)]
+        found = [
+            Signal("time_s", found[0].length, time.load, "s"),
+            *(Signal(s.path, s.length, s.load, s.unit) for s in found),
+        ]
     return tuple(found)
-
-
-def _in_table(signal: Signal) -> Signal:
-    return Signal(signal.path, signal.length, signal.load, signal.unit)
 
 
 @contextlib.contextmanager

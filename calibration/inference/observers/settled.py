@@ -66,18 +66,6 @@ LOST = 0.1
 EQUATIONS = {"electrical": "voltage", "track": "torque_output", "slip": "speed_theoretical"}
 
 
-def _unused(runs: Runs, first: int, second: int, but: str) -> tuple[str, ...]:
-    """Columns that differ between two rows and are no condition: those without a role, and a load's torque.
-
-    Args:
-        but: an omitted column.
-    """
-    without = [c for c, cells in runs.extras.items() if cells.dtype.kind == "f"]
-    torque = [c for c in (LOAD,) if c != but and runs.has(c)]
-    cells = {**runs.extras, **runs.columns}
-    return tuple(c for c in (*without, *torque) if cells[c][first] != cells[c][second])
-
-
 class SettledLinearization(Linearization):
     """Linearization of settled rows.
 
@@ -183,7 +171,10 @@ class SettledRuns(Observer):
                 in_sds = not (noise.estimated[k] or shared[k])
                 known = f"{apart[at] / sd[at]:.0f} sd" if in_sds else f"{apart[at] / mean[at]:.0%}"
                 values = float(runs[column][first]), float(runs[column][second])
-                others = _unused(runs, first, second, column)
+                without = [c for c, cells in runs.extras.items() if cells.dtype.kind == "f"]
+                torque = [c for c in (LOAD,) if c != column and runs.has(c)]
+                cells = {**runs.extras, **runs.columns}
+                others = tuple(c for c in (*without, *torque) if cells[c][first] != cells[c][second])
                 near = runs.layout.nearest(others[0], runs.columns) if others else ""
                 found.append(
                     Remark(

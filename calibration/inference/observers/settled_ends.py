@@ -131,7 +131,10 @@ def starts_from_settled_ends(
     points = np.concatenate(
         [ends, np.where(friction, _spread_over_surfaces(problem, draws), ends[0]), 0 * ends[:1], draws]
     )
-    blunt = _with_blunt_instruments(problem)
+    data = problem.data
+    count = np.maximum(np.sum(np.asarray(data.weight) > 0, 0), 1)
+    rms = np.sqrt(np.sum(np.asarray(data.weight > 0) * np.asarray(data.measured) ** 2, 0) / count)
+    blunt = dataclasses.replace(problem, data=dataclasses.replace(data, sd=jnp.hypot(data.sd, BLUNT * rms)))
     optima = search(blunt, _recombined(blunt, points)[:SEARCHES], STEPS_BLUNT)
     ended = np.asarray(optima.z)[np.argsort(np.asarray(optima.cost))]
     best = _recombined(blunt, ended)[:1]
@@ -205,14 +208,6 @@ def _coordinate(problem: Problem, k: int, value: float) -> float:
     c = problem.coordinates
     location, spread, scale = (np.asarray(x)[k] for x in (c.location, c.spread, c.scale))
     return float(((np.log(value) if scale else value) - location) / spread)
-
-
-def _with_blunt_instruments(problem: Problem) -> Problem:
-    """Problem with the enlarged sds of blunt instruments."""
-    data = problem.data
-    count = np.maximum(np.sum(np.asarray(data.weight) > 0, 0), 1)
-    rms = np.sqrt(np.sum(np.asarray(data.weight > 0) * np.asarray(data.measured) ** 2, 0) / count)
-    return dataclasses.replace(problem, data=dataclasses.replace(data, sd=jnp.hypot(data.sd, BLUNT * rms)))
 
 
 def _fit_settled_ends(problem: Problem) -> Float[np.ndarray, "starts parameters"]:

@@ -88,7 +88,6 @@ from mmrjax.fidelities.histories import (
     time_grid,
 )
 from mmrjax.model import balances, channels
-from mmrjax.model.channels import Channel
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar
 from mmrjax.model.rig import Begin, Begins, Rig
@@ -772,12 +771,15 @@ class Histories(Observer):
         def side(diagnosis: Diagnosis) -> TimeSide:
             lags = min(LAGS, self.rows_of.shape[1] // 4)
             test = diagnosis.test
+            x = np.asarray(diagnosis.linear.series())
+            power = np.maximum(np.sum(x**2, (0, 1)), 1e-12)
+            by_lag = [np.sum(x[:, k:] * x[:, :-k], (0, 1)) / power for k in range(1, lags + 1)]
             memory = Memory(
                 float(test.found.white),
                 test.threshold("white"),
                 test.p("white"),
                 lags,
-                _autocorrelation(diagnosis.linear, lags),
+                {name: [float(lag[k]) for lag in by_lag] for k, name in enumerate(diagnosis.linear.channels)},
             )
             waves = {(w, bases_room.ORDERS[w][0]): wave for w in orders if (wave := strongest(diagnosis, w))}
             return TimeSide(memory, waves, strongest(diagnosis, "time"))
@@ -785,14 +787,6 @@ class Histories(Observer):
         samples = int((np.asarray(self.rows_of) >= 0).sum())
         unresolved = tuple(w for w in bases_room.ORDERS if w not in orders)
         return TimeStatistics(self.rows_of.shape[0], samples, unresolved, side(before), side(after))
-
-
-def _autocorrelation(linear: Linearization, lags: int) -> dict[str, list[float]]:
-    """Autocorrelation of each channel's residuals over all runs, at lags 1 to `lags` samples."""
-    x = np.asarray(linear.series())
-    power = np.maximum(np.sum(x**2, (0, 1)), 1e-12)
-    by_lag = [np.sum(x[:, k:] * x[:, :-k], (0, 1)) / power for k in range(1, lags + 1)]
-    return {name: [float(lag[k]) for lag in by_lag] for k, name in enumerate(linear.channels)}
 
 
 def _drive_jumps(runs: Runs, each: list[np.ndarray], rig: Rig) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -891,7 +885,13 @@ def measure_initial_states(robot: Robot, runs: Runs, noise: Noise) -> Robot:
             field = "motor_speed" if channel.settled else "angle"
             finite = mine[np.isfinite(measured[mine, k])][:FIRST_SAMPLES]
             if channel.zero_at_rest and field not in state and len(finite):
-                factor = 1 / _shown_of_unit(robot, int(rows[mine[0]]), channel)
+                configuration = int(rows[mine[0]])
+                radius = float(robot.configurations.members[configuration].radius)
+                none, one = jnp.zeros(()), jnp.ones(())
+                rolling = State(none, one, radius / robot.gearbox.ratio, none, distance=radius)
+                factor = 1 / float(
+                    channel.read(robot, balances.begin_signals(robot, Conditions(configuration), rolling))
+                )
                 value, sd = _extrapolated(runs["time_s"][finite] - runs["time_s"][mine[0]], measured[finite, k])
                 least = float(np.median(noise.sd[finite, k]))
                 state[field] = factor * value, abs(factor) * max(sd, least)
@@ -899,15 +899,6 @@ def measure_initial_states(robot: Robot, runs: Runs, noise: Noise) -> Robot:
         stated += [(f"rig.{key}.{field}", value, sd) for field, (value, sd) in state.items()]
     priors = (*robot.rig.priors, *stated) if robot.rig.start == "free" else robot.rig.priors
     return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, begins=Begins(begins), priors=priors))
-
-
-def _shown_of_unit(robot: Robot, configuration: int, channel: Channel) -> float:
-    """Reading of a channel [SI] if the motor shafts turn at 1 rad/s, the load rolls with them and the output's angle
-    is 1 rad."""
-    radius = float(robot.configurations.members[configuration].radius)
-    none, one = jnp.zeros(()), jnp.ones(())
-    rolling = State(none, one, radius / robot.gearbox.ratio, none, distance=radius)
-    return float(channel.read(robot, balances.begin_signals(robot, Conditions(configuration), rolling)))
 
 
 def _extrapolated(time: np.ndarray, shown: np.ndarray) -> tuple[float, float]:

@@ -104,17 +104,17 @@ def posture_of_runs(robot: Robot, runs: Runs, conditions: Conditions) -> Posture
     }
     first, side, step = jax.tree.map(lambda x: x[0], (conditions, lies, steps))
     level = Drawn(side, float(rests.height[0]), 0.0, float(first.slope))
-    return Postures(table, level, _on_step(step), step_map(robot, first))
-
-
-def step_map(robot: Robot, conditions: Conditions) -> StepMap:
-    """Highest steps and margins of tipping of one run over the angles of its levers."""
-    found, margin = jax.device_get(static_limits.steps_over_lever_angles(robot, conditions, ANGLES, ANGLES))
+    found, margin = jax.device_get(static_limits.steps_over_lever_angles(robot, first, ANGLES, ANGLES))
     front, rear = np.unravel_index(np.argmax(found.height), found.height.shape)
     best = _on_step(jax.tree.map(lambda x: x[front, rear], found))
-    own = tuple(float(np.degrees(x)) for x in lever_angles(robot.running_gear, conditions))
-    return StepMap(
-        ANGLES, found.height / MM, margin / MM, best, float(ANGLES[front]), float(ANGLES[rear]), (own[0], own[1])
+    own = tuple(float(np.degrees(x)) for x in lever_angles(robot.running_gear, first))
+    return Postures(
+        table,
+        level,
+        _on_step(step),
+        StepMap(
+            ANGLES, found.height / MM, margin / MM, best, float(ANGLES[front]), float(ANGLES[rear]), (own[0], own[1])
+        ),
     )
 
 
