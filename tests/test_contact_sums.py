@@ -46,7 +46,7 @@ def eventful(recessed):
 
 
 def motion_of(robot, run, k):
-    """In mid-run, no two parts alike; which of the contacts slip beyond V_s differs with `k`."""
+    """In mid-run, no two parts alike. Which of the contacts slip beyond V_s differs with `k`."""
     draw = np.random.default_rng(k)
     setup = half_robot_system(robot, run, STEP)
     low = float(half_robot.axle_height(setup))

@@ -150,7 +150,7 @@ def test_nothing_is_chosen_where_nothing_can_be_held_out(runs):
     ],
 )
 def test_a_block_with_parameters_of_its_own_is_not_predicted(names, tied, dropped):
-    """Of two configurations at two voltages each; runs of one at another voltage determine what is its own."""
+    """Of two configurations at two voltages each. Runs of one at another voltage determine what is its own."""
     columns = {
         "configuration": np.repeat(["a", "b"], 4), "supply_voltage_V": np.tile([10.0, 10.0, 20.0, 20.0], 2),
         "order": np.arange(8.0),

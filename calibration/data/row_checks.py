@@ -40,13 +40,13 @@ STEPS = 0.5
 
 
 def reading_period(values: np.ndarray) -> float:
-    """Rows of a log between two readings of a slow sensor; 0 for a channel that is read in every row.
+    """Rows of a log between two readings of a slow sensor, 0 for a channel that is read in every row.
 
     A slow sensor changes at even distances of two rows or more, and rarely sooner. An instrument of coarse steps
     repeats numbers too, but changes by its smallest step, or at any distance.
 
     Args:
-        values: readings of a channel in one recording, in the order of time; NaN if missing.
+        values: readings of a channel in one recording, in the order of time, NaN if missing.
     """
     values = values[np.isfinite(values)]
     changed = np.flatnonzero(np.diff(values) != 0)
@@ -68,11 +68,12 @@ def reading_period(values: np.ndarray) -> float:
 
 def used_once(values: np.ndarray, time: np.ndarray, run: np.ndarray | None = None) -> tuple[np.ndarray, float]:
     """Returns a channel's values with one row for each reading of a slow sensor, NaN in the rows that repeat it, and
-    the rows between readings; the unchanged values and 0 if no reading is repeated.
+    the rows between readings. The unchanged values and 0 if no reading is repeated.
 
     Args:
-        values: NaN for a missing reading, shape (rows,); time: of the rows; run: name of the recording of each row;
-            None: all are of one.
+        values: NaN for a missing reading, shape (rows,).
+        time: of the rows.
+        run: name of the recording of each row. None: all are of one.
     """
     if (np.diff(values) == 0).sum() < LEAST * len(values):
         return values, 0.0
@@ -301,7 +302,7 @@ def inertia_at_motor(robot: Robot, load: Load) -> float:
 
 
 def time_constant(robot: Robot) -> float:
-    """Time constant J R/k² of the motors' speed with the slowest load [s]; infinite if it is unknown."""
+    """Time constant J R/k² of the motors' speed with the slowest load [s]. Infinite if it is unknown."""
     motor, slowest = robot.motor, 0.0
     if not robot.knows(VOLTAGE):
         return math.inf
@@ -340,7 +341,7 @@ def driven_rows(name: str, columns: Columns, layout: Layout) -> tuple[Columns, n
 
 
 def _driven(name: str, columns: Columns, layout: Layout) -> tuple[np.ndarray, str]:
-    """True for rows of settled runs in which something drives the motors; a sentence on the other rows.
+    """True for rows of settled runs in which something drives the motors. A sentence on the other rows.
 
     Raises:
         BadData: no row is driven, or a speed is read where nothing drives the motors.

@@ -29,9 +29,11 @@ class Search:
 
     Attributes:
         ladder: every candidate that was fitted.
-        best: the proposed one, None without a plausible one; diagnosis: of its residuals.
-        asked, otherwise: number of simulated sets that were screened by regression, and of unconfirmed ones among
-            them, see `screening.Confirmed`; room: effects in the program of these fits.
+        best: the proposed one, None without a plausible one.
+        diagnosis: of its residuals.
+        asked, otherwise: number of simulated sets that were screened by regression, and of unconfirmed ones
+            among them, see `screening.Confirmed`.
+        room: effects in the program of these fits.
     """
 
     ladder: tuple[Candidate, ...]
@@ -63,7 +65,8 @@ def search_effects(
     """Smallest set of effects that explains the discrepancy of the base to within the test's margin.
 
     Args:
-        base: the fit without effects; left: its diagnosis.
+        base: the fit without effects.
+        left: its diagnosis.
     """
     names = _ranked(space, left.scores)
     if not space.bare.observe.long:
@@ -134,7 +137,7 @@ def without_each(
 
 
 def _ranked(space: CandidateSpace, scores: ScoreTable, without: Sequence[str] = ()) -> list[str]:
-    """Effects by their best |score|, the strongest first; those in `without` come last."""
+    """Effects by their best |score|, the strongest first. Those in `without` come last."""
     strength = space.library.largest(np.abs(np.asarray(scores.single)))
     strength[list(space.library.indices(without))] = 0.0
     return [space.library.names[k] for k in np.argsort(-strength)]
@@ -143,7 +146,7 @@ def _ranked(space: CandidateSpace, scores: ScoreTable, without: Sequence[str] = 
 def _fit_sets(
     space: CandidateSpace, wanted: Sequence[tuple[Names, Candidate, Diagnosis]], settings: Settings
 ) -> Confirmed:
-    """Sets of effects, each in addition to another fit and its diagnosis; for long runs first screened by
+    """Sets of effects, each in addition to another fit and its diagnosis. For long runs first screened by
     regression."""
     if not space.bare.observe.long:
         return Confirmed(tuple(fit_in_addition(space, [(w, at, by.scores) for w, at, by in wanted], settings)))

@@ -24,7 +24,7 @@ from mmrjax.model.signals import SLIDES, STATUSES
 
 
 def check_data(runs: Runs, robot: Robot, names: Sequence[str], noise: Noise) -> list[Remark | str]:
-    """Refuse data that cannot be fitted; return notes on data that can.
+    """Refuse data that cannot be fitted. Return notes on data that can.
 
     Raises:
         BadData: too few readings, a stuck channel, contradictory replicates, samples of one run under
@@ -108,7 +108,7 @@ def _check_enough_readings(runs: Runs, names: Sequence[str], noise: Noise) -> No
 
 
 def _check_stuck_channels(runs: Runs) -> list[Remark]:
-    """Refuses a channel with one value under several conditions; returns notes for a motor voltage with one value."""
+    """Refuses a channel with one value under several conditions. Returns notes for a motor voltage with one value."""
     labels = () if runs.layout.complete else ("configuration", "surface")
     columns = [c for c in (*observers.observer_kind(runs).axes_of(runs), *labels) if runs.has(c)]
     varied = [np.unique(runs[c], return_inverse=True)[1] for c in columns]
@@ -157,8 +157,10 @@ def infeasible_error(
     """Error for rows that the model does not reach at the best point of all searches.
 
     Args:
-        robot: of that point; status: of each row there, shape (rows,).
-        lost: True for rows not reached, shape (rows,); names: of the free parameters.
+        robot: of that point.
+        status: of each row there, shape (rows,).
+        lost: True for rows not reached, shape (rows,).
+        names: of the free parameters.
     """
 
     def rows(which: np.ndarray) -> str:

@@ -35,9 +35,9 @@ def analyse_sensitivity(
 
     Args:
         method: one of `METHODS`.
-        evaluations: least number of model evaluations in all; None takes the default.
+        evaluations: least number of model evaluations in all. None takes the default.
         seed: random seed.
-        candidates: possible next runs; None proposes none.
+        candidates: possible next runs. None proposes none.
 
     Raises:
         BadConfiguration: an unknown method, a method that needs independent inputs, too few evaluations, inputs

@@ -5,7 +5,7 @@ wheelbase (axle line) over the ground, pitch θ [rad] nose down, angles φ_1, φ
 driven pulley, relative to the chassis. Velocities v are their rates. A wheel of 4W2T sits on its pulley's shaft.
 
 Contact pairs of one side: 24 grousers with the ground, 168 teeth with each of two guides (720 in all for
-6T2A); 2 wheels with the ground for 4W2T.
+6T2A), 2 wheels with the ground for 4W2T.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _END = np.where(WHEEL, np.where(np.arange(CONTACTS) == GROUSERS, 1.0, -1.0), 0.0
 
 
 class Touch(eqx.Module):
-    """Position, motion and load of the contacts at an instant; grousers first.
+    """Position, motion and load of the contacts at an instant, grousers first.
     Attributes:
         lever_x, lever_z: contact point from the middle of the wheelbase [m].
         rate_x, rate_z: its velocity per belt speed [-].
@@ -43,7 +43,8 @@ class Touch(eqx.Module):
         speed_x: its velocity over the ground, uphill [m/s].
         gap, gap_rate: height over the ground [m] and its rate [m/s].
         compliance: of the belt under it at its tension [m/N].
-        force: normal force R_z [N]; damped: its decrease with the gap's rate [N·s/m].
+        force: normal force R_z [N].
+        damped: its decrease with the gap's rate [N·s/m].
         guided: share of the force that passes to the lower guide [-].
         belt: tensions of the runs.
     """
@@ -149,8 +150,8 @@ class Pull(eqx.Module):
         guide: friction of the teeth on the lower guide F'_t, against forward running [N], eq. (26).
         guided: load on the lower guide [N].
         load: of the belt, the ground and the guides on the driving shaft [N·m].
-        generalized: forces on (x, z, θ, φ_2) [N, N, N·m, N·m]; the shaft's own torque is the gearbox's.
-        aside: lateral force of each contact, to the left on a robot free to turn [N]; None: straight travel.
+        generalized: forces on (x, z, θ, φ_2) [N, N, N·m, N·m]. The shaft's own torque is the gearbox's.
+        aside: lateral force of each contact, to the left on a robot free to turn [N]. None: straight travel.
     """
 
     force: Float[Array, " contacts"]
@@ -167,7 +168,7 @@ class Pull(eqx.Module):
 
 
 def sliding_speeds(signals: Signals, at: Touch) -> Float[Array, " contacts"]:
-    """Backward sliding speed of each contact over the ground [m/s]; `speed_slip_terms` shifts it."""
+    """Backward sliding speed of each contact over the ground [m/s], `speed_slip_terms` shifts it."""
     return -at.speed_x - signals.speed_slip_terms
 
 
@@ -187,10 +188,10 @@ def contact_forces(
     Args:
         path: the belt's path.
         chassis: friction and guide coefficients.
-        signals: those up to `balances.slip`; `speed_slip_terms` shifts the sliding of every contact.
+        signals: those up to `balances.slip`. `speed_slip_terms` shifts the sliding of every contact.
         at: the contacts.
         height: of the axle line over the ground [m].
-        force: traction of each contact if contacts slide laterally too [N]; None: by Fig. 7.
+        force: traction of each contact if contacts slide laterally too [N]. None: by Fig. 7.
     """
     if force is None:
         force = jnp.asarray(chassis.ground.traction(sliding_speeds(signals, at), at.force, signals.adhesion))
@@ -231,7 +232,7 @@ class Reactions(eqx.Module):
     def teeth(self, path: Path) -> tuple[Float[Array, "... 168"], Float[Array, "... 168"]]:
         """Load R_g of the lower and of the upper guide on each tooth [N].
 
-        A grouser's load on the lower guide spreads evenly over the teeth of its pitch; the upper guide
+        A grouser's load on the lower guide spreads evenly over the teeth of its pitch. The upper guide
         carries the weight of the belt on it.
         """
         lower = jnp.repeat(self.guided / TEETH_GROUSER, TEETH_GROUSER, axis=-1)

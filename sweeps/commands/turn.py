@@ -38,7 +38,7 @@ SHOWN = tuple(c.name for c in channels.OF_TURNS)
 
 
 def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> int:
-    """Simulate one run of options whose sides are driven apart; leave a run folder; returns the exit code.
+    """Simulate one run of options whose sides are driven apart. Leave a run folder. Returns the exit code.
 
     Raises:
         BadConfiguration: runs of a file, a robot that cannot turn, a turn without a steady state.
@@ -114,7 +114,7 @@ def _demanded(robot: Robot, asked: Conditions, runs: Runs, config: configuration
     wanted = np.array([config.speed_m_s, 0.5 * width * config.yaw_rate_rad_s])  # of the turn [m/s]
 
     def driven(volts: np.ndarray) -> Conditions:
-        """Of an external supply that has as much; a battery has what it has."""
+        """Voltage of an external supply. A battery sets its own."""
         most = max(supply, float(np.abs(volts).max()))
         left, right, source = (jax.numpy.full(asked.shape, x) for x in (*volts / most, most))
         voltage = asked.voltage if config.battery else source

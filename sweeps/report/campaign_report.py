@@ -30,7 +30,8 @@ def campaign_document(file: RobotFile, layout: Layout, result: Json, store: Path
     """The report of a store whose every chunk is done.
 
     Args:
-        result: `result.json`; store: folder of the arrays.
+        result: `result.json`.
+        store: folder of the arrays.
     """
     counts, model, total = result["statuses"], result["model"], result["points"]
     reached = sum(counts.get(s, 0) for s in words.SETTLED)
@@ -69,7 +70,7 @@ def _sections(store: Path, layout: Layout, extremes: Json) -> Iterable[Section]:
 
 
 def _outputs(values: np.ndarray, found: Columns, layout: Layout, extremes: Json) -> Iterable[Block]:
-    """Outputs with their extremes and quantiles; the first of them are drawn."""
+    """Outputs with their extremes and quantiles. The first of them are drawn."""
     settled = np.isin(found[STATUS], signals.DONE)
     rows, figures = list[tuple[Any, ...]](), list[Figure]()
     for variable in (v for v in layout.variables if "units" in v.attributes):

@@ -31,11 +31,14 @@ class Comparison:
     Attributes:
         table: conditions, `<column>` measured, `simulated_<column>`, `error_<channel>_percent`, `status`.
         summary: errors of all rows and of each configuration.
-        channels: of the readings; source: name of the table; model: fidelity; robot_name: of the simulated robot.
+        channels: of the readings.
+        source: name of the table.
+        model: fidelity.
+        robot_name: of the simulated robot.
         fit: `these` if the robot was fitted to these rows, `others` if to other rows, "" if no fit is recorded.
         over: further columns of histories for the axes of the errors, with their headings.
         notes: sentences on the table.
-        against: name of a second robot, "" for none; its readings are the columns `against_<column>` of the table.
+        against: name of a second robot, "" for none. Its readings are the columns `against_<column>` of the table.
     """
 
     table: Columns
@@ -164,7 +167,7 @@ def comparison_document(found: Comparison) -> Document:
 
 
 def _over_time(found: Comparison) -> tuple[Section, ...]:
-    """The section with readings over time of a log; none for a table of settled runs."""
+    """The section with readings over time of a log. None for a table of settled runs."""
     if found.over is None:
         return ()
     lines = {"simulated_": found.robot_name, "against_": found.against}

@@ -38,7 +38,8 @@ def loop_document(found: DiscoveryResult, robot_name: str, changes: Mapping[str,
     """The report of a pass of the loop.
 
     Args:
-        robot_name: name or file of the robot that it began with; changes: of settled runs by each effect.
+        robot_name: name or file of the robot that it began with.
+        changes: of settled runs by each effect.
     """
     missing = found.verdict not in ("none", "undescribed")
     moved = list(moved_parameters(found))

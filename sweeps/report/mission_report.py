@@ -32,8 +32,9 @@ class Missions:
     """Runs over one profile, as tables.
 
     Attributes:
-        table: a row a run, `runs.csv`; segments: a row a segment, `segments.csv`; course: a row an accepted step that
-            is kept, `history.csv`.
+        table: a row a run, `runs.csv`.
+        segments: a row a segment, `segments.csv`.
+        course: a row an accepted step that is kept, `history.csv`.
         source: the profile that they follow.
         whole: whether the course of every run reaches its end.
     """
@@ -84,7 +85,7 @@ _NO_RETURN = "Nothing came back to the source"
 
 
 def missions_document(file: RobotFile, found: Missions) -> Document:
-    """The report of finished missions; in detail the first run."""
+    """The report of finished missions. In detail the first run."""
     table, source = found.table, found.source
     shown = capabilities.without_idle(file.robot, table)
     first, names = {key: value[0] for key, value in table.items()}, _names(table)
@@ -158,7 +159,7 @@ def _sections(robot: Robot, found: Missions, first: Json, answer: str) -> Iterab
 
 
 def _names(runs: Columns) -> list[str]:
-    """Headings of runs; what the profile states in the place of a run's condition is left out."""
+    """Headings of runs. What the profile states in the place of a run's condition is left out."""
     parts = (label.split(", ") for label in run_headings(runs))
     return [", ".join([head, *(p for p in rest if not p.startswith("nan"))]) for head, *rest in parts]
 

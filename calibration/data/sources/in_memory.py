@@ -102,7 +102,7 @@ def _words(series: Any) -> Callable[[], np.ndarray]:
 
 
 def _of_xarray(dataset: Any) -> tuple[Signal, ...]:
-    """Signals of a Dataset; if its variables have several dimensions of time, each variable has its own clock."""
+    """Signals of a Dataset. If its variables have several dimensions of time, each variable has its own clock."""
     dimensions = {d for v in dataset.data_vars.values() for d in v.dims}
     several = len({dataset.sizes[d] for d in dimensions if dataset.sizes[d] > 1}) > 1 and len(dimensions) > 1
     found: list[Signal] = []

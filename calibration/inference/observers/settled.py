@@ -79,7 +79,7 @@ class SettledLinearization(Linearization):
         return moved.sum(0).reshape(-1, shapes.shape[1])
 
     def of_sides(self, balance: Scalar | int) -> Float[Array, "sides rows channels"]:
-        """Change of the readings by a defect of a balance on each side; identical sides are one."""
+        """Change of the readings by a defect of a balance on each side. Identical sides are one."""
         return self.defects[balance].reshape(-1, *self.scale.shape)
 
     def along_of_sides(self, balance: str) -> np.ndarray:
@@ -152,7 +152,7 @@ class SettledRuns(Observer):
 
     @classmethod
     def check(cls, runs: Runs, noise: Noise) -> list[Remark | str]:
-        """Refuses a table of one condition with readings that differ; notes the repeats that differ most."""
+        """Refuses a table of one condition with readings that differ. Notes the repeats that differ most."""
         measured, alike = runs.measured(), rows_of_same_conditions(runs)
         least, found = cls.least(runs), list[Remark]()
         shared = np.array([source == "series" for source in noise.source])
@@ -381,7 +381,7 @@ class SettledRuns(Observer):
     def detail(self, bases: Bases, included: np.ndarray, before: Diagnosis, after: Diagnosis) -> EquationDefects:
         """Defects of `electrical`, `track` and `slip` that together make each row's residual.
 
-        Residuals are simulated less measured; sides have defects of their own if they are driven independently.
+        Residuals are simulated less measured. Sides have defects of their own if they are driven independently.
         """
         return EquationDefects(_defects(before.linear, included), _defects(after.linear, included))
 

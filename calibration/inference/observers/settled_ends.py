@@ -144,7 +144,7 @@ def starts_from_settled_ends(
 def _with_peaked_friction(problem: Problem, z: np.ndarray) -> np.ndarray:
     """Copies of z with a friction that falls from a peak, with the same creep and sliding friction.
 
-    Their μ_s, V_s and V_d have the nominal ratios to μ_d and to each other, in one configuration or in all;
+    Their μ_s, V_s and V_d have the nominal ratios to μ_d and to each other, in one configuration or in all,
     shape (points, parameters).
     """
     c, out, every = problem.coordinates, [], z.copy()
@@ -229,7 +229,7 @@ def _fit_settled_ends(problem: Problem) -> Float[np.ndarray, "starts parameters"
 
 
 def _slides_at_end(problem: Problem, ends: Ends) -> np.ndarray:
-    """True if a run's movers spin at its end, also while it still gains speed, forwards or back; shape (runs,)."""
+    """True if a run's movers spin at its end, also while it still gains speed, forwards or back, shape (runs,)."""
     if not {"motor_speed", "speed"} <= set(problem.base.rig.channels):
         return np.zeros(len(ends.mean), bool)
     turning, travelling = (
@@ -279,7 +279,7 @@ def _fit_pinned(problem: Problem, starts: Array, held: Array) -> Optimum:
 
 
 def _misfit_of_runs(problem: Problem, points: np.ndarray) -> np.ndarray:
-    """Sum of squares of each run's residuals at each point [σ²], infinite if a run fails; shape (points, runs)."""
+    """Sum of squares of each run's residuals at each point [σ²], infinite if a run fails, shape (points, runs)."""
     observe: Histories = problem.observe  # type: ignore[assignment]
     filled = np.resize(points, (-(-len(points) // TOGETHER) * TOGETHER, points.shape[1]))
     parts = filled.reshape(-1, TOGETHER, points.shape[1])

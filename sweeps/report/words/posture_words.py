@@ -29,7 +29,10 @@ class Drawn:
     """A robot from the side on the ground: lower, and from its centre of mass on higher by a step.
 
     Attributes:
-        side: in a frame along the ground; base: height of its middle of the wheelbase [m]; step: [m]; slope: [rad].
+        side: in a frame along the ground.
+        base: height of its middle of the wheelbase [m].
+        step: [m].
+        slope: [rad].
     """
 
     side: Outline
@@ -43,8 +46,9 @@ class StepMap:
     """Highest steps and margins of tipping over angles of the levers.
 
     Attributes:
-        angles_deg: of front and rear; step_mm, margin_mm (at rest on the run's slope): shape (front, rear).
-        best: the highest, drawn; front_deg, rear_deg: there.
+        angles_deg: of front and rear. step_mm, margin_mm (at rest on the run's slope): shape (front, rear).
+        best: the highest, drawn.
+        front_deg, rear_deg: there.
         own_deg: the run's own angles, front and rear.
     """
 
@@ -62,7 +66,9 @@ class Postures:
     """Of the runs of a table.
 
     Attributes:
-        table: by column; rest, step: the first run's, drawn, at rest and on its highest step; over: of the first run.
+        table: by column.
+        rest, step: the first run's, drawn, at rest and on its highest step.
+        over: of the first run.
     """
 
     table: Columns
@@ -72,7 +78,7 @@ class Postures:
 
 
 def posture_of_runs(robot: Robot, runs: Runs, conditions: Conditions) -> Postures | None:
-    """Postures of the runs of a table; None if it states no levers."""
+    """Postures of the runs of a table, None if it states no levers."""
     if not conditions.states_levers:
         return None
     rests, limits, lies, steps = jax.device_get(static_limits.postures_of_runs(robot, conditions))
