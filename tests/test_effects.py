@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import dataclasses
 import functools
 import importlib
@@ -590,23 +589,6 @@ def test_every_file_of_effects_can_be_imported_first():
     first = ["mmrjax.model.robot", "mmrjax.model.balances", "mmrjax.effects", *MODULES]
     done = subprocess.run([sys.executable, "-c", FIRST, str(len(ALL)), *first], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-
-
-def imported(source: str, modules: set[str]) -> set[str]:
-    """Those of `modules` that a module imports when it is loaded: not for types alone, not within functions."""
-    found, rest = set(), list(ast.parse(source).body)
-    while rest:
-        node = rest.pop()
-        if isinstance(node, ast.ImportFrom):
-            below = {f"{node.module}.{a.name}" for a in node.names}
-            found |= below & modules or {str(node.module)} & modules
-        elif isinstance(node, ast.Import):
-            found |= {a.name for a in node.names} & modules
-        elif isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
-            rest += node.orelse
-        elif not isinstance(node, ast.FunctionDef | ast.Lambda):
-            rest += [n for n in ast.iter_child_nodes(node) if isinstance(n, ast.stmt)]
-    return found
 
 
 def test_units_of_signals_are_all_known():
