@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import itertools
 import pickle
@@ -246,39 +245,6 @@ def measured_with(robot, folder, changed, sd=0.01):
         x = np.asarray(shown[c.name]) / c.factor
         table |= {c.column: x * (1 + sd * drawn.standard_normal(12)), c.sd_column: sd * np.abs(x)}
     return written(folder / "t.csv", table)
-
-
-OPTIONS = {"starts": 2, "profiles": False, "blocks": False}
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-def test_two_rigs_are_calibrated_side_by_side_as_alone(tmp_path):
-    cases = []
-    for name, shown in (("a", TORQUE), ("b", VOLTS)):
-        (tmp_path / name).mkdir()
-        robot = rig(tmp_path / name, shown)
-        path = measured_with(robot, tmp_path / name, {"brake.loss_coulomb": 0.4})
-        cases.append((robot, calibration.read_runs(path, robot=robot)))
-    alone = [calibration.calibrate(runs, robot, **OPTIONS) for robot, runs in cases]
-    for found, (robot, runs) in zip(alone, cases, strict=True):
-        found.save(tmp_path / "found")
-        with (tmp_path / "found" / "rows.csv").open() as file:
-            rows = list(csv.DictReader(file))
-        for c in robot.channels:
-            assert_allclose(
-                [float(r[c.column]) for r in rows], runs[c.column], rtol=1e-8
-            )  # as many digits as a file has
-            assert np.abs(found.readings[c.name].sigma).max() < 4
-        loss = found.parameters["brake.loss_coulomb"]
-        assert abs(loss.value - 0.4) < 4 * loss.sd
-        assert found.to_json()["errors"]["after"]["fitted"].keys() == set(robot.rig.channels)
-    # Torque tells the loss better than the speeds and voltage of the same runs do.
-    assert alone[0].parameters["brake.loss_coulomb"].sd < 0.5 * alone[1].parameters["brake.loss_coulomb"].sd
-    with ThreadPoolExecutor(2) as pool:
-        again = list(pool.map(lambda case: calibration.calibrate(case[1], case[0], **OPTIONS), cases * 2))
-    for one, other in zip(again, alone * 2, strict=True):
-        assert one.to_json() == other.to_json()
 
 
 @pytest.mark.slow

@@ -9,8 +9,6 @@ import pytest
 import mmrjax as mm
 from calibration.data import runs as records
 from calibration.data import surfaces
-from calibration.discovery import discover
-from calibration.discovery.candidates import fit_base
 from calibration.inference import blocks, observers, priors
 from calibration.inference.calibration import calibrate
 from calibration.inference.observers import SettledTurns
@@ -41,10 +39,6 @@ def test_runs_are_what_is_held_out_first(runs):
     assert next(iter(held)) == "run" and len(held["run"]) == len(set(runs["run_id"])) > 10
 
 
-#: At which rows of equal speeds do not contradict each other.
-NOISE = "motor_current_left=1A,motor_current_right=1A,yaw_rate=0.03rad/s"
-
-
 def test_loop_frees_the_friction_that_turns_show(robot, runs):
     """Of each surface. In straight travel nothing but a speed shows it."""
     ours = surfaces.with_surface_configurations(robot, runs)
@@ -54,18 +48,6 @@ def test_loop_frees_the_friction_that_turns_show(robot, runs):
     assert len(of_ground) == 6 and of_ground < set(freed)
     straight = dataclasses.replace(ours, rig=dataclasses.replace(ours.rig, channels=("motor_current",)))
     assert not of_ground & set(priors.free_names(straight, present))
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-def test_base_of_the_loop_fits_currents_as_calibrate_does(robot, runs):
-    """18.8 % held out. The currents' own friction held at the file's numbers left 37 and 26 %."""
-    ready = discover.prepare_loop(runs, dataclasses.replace(robot, effects=()), noise=NOISE)
-    space = discover.pose_candidates(ready.runs, ready.robot, ready.noise.sd, ready.settings)
-    base = fit_base(space, ready.settings, "husky.csv")
-    measured = np.asarray(space.bare.data.measured)
-    rms = np.sqrt(np.mean((base.reading - measured)[: len(runs)] ** 2, 0) / np.mean(measured[: len(runs)] ** 2, 0))
-    assert base.candidate.converged and np.all(rms[:2] < 0.20)
 
 
 @pytest.mark.nightly

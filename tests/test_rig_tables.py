@@ -562,28 +562,6 @@ def test_three_motors_forward_and_reverse_are_calibrated(tmp_path):
     assert set(found.status) == {"converged", "reverses"}
 
 
-@pytest.mark.slow
-def test_a_vehicle_on_two_surfaces_is_calibrated(tmp_path):
-    robot = vehicle(sides=2.0)
-    speed = np.tile([1000.0, 2000, 3000, -1000, -2000, -3000], 4)
-    labels = np.repeat(["felt", "tiles"], 12)
-    two = dataclasses.replace(robot, configurations=Configurations({n: robot.configurations["rig"] for n in "ab"}))
-    true = {"a.ground.rolling_resistance": 0.15, "b.ground.rolling_resistance": 0.03}
-    found = steady_batch(params.replace(two, true), Conditions(np.repeat([0, 1], 12), motor_speed=speed * np.pi / 30))
-    rng = np.random.default_rng(1)
-    rows = [
-        f"{n},{s},{i * (1 + 0.01 * e):.6g},{v * 1e3 * (1 + 0.005 * f):.6g}"
-        for n, s, i, v, e, f in zip(
-            speed, labels, np.asarray(found.reading["total_current"]), np.asarray(found.reading["speed"]),
-            *rng.standard_normal((2, 24)), strict=True,
-        )
-    ]  # fmt: skip
-    runs = read(tmp_path, "\n".join(["motor_speed_rpm,surface,total_current_A,speed_mm_s", *rows]) + "\n", robot)
-    found = calibrate(runs, robot, noise="current=1%,speed=0.5%", free=["rig.ground.rolling_resistance"], **QUICK)
-    named = {"rig-felt.ground.rolling_resistance": 0.15, "rig-tiles.ground.rolling_resistance": 0.03}
-    assert set(found.parameters) == set(named) and max(inside(found, named).values()) < 3
-
-
 # --- instruments of which the table tells --------------------------------------------------------------
 
 

@@ -21,7 +21,6 @@ from mmrjax.effects.scaled import amplitude_of, scaled_effect, shape_of
 from mmrjax.model import params
 from mmrjax.model.quantities import RPM
 from sweeps.commands import rig_new
-from tests.commands import ends
 
 #: Of rigs: kind and what is imposed; the largest and the smallest that a few draws give.
 RIGS = [("bench", "voltage"), ("linear", "motor_speed"), ("wheeled", "voltage")]
@@ -113,20 +112,6 @@ def test_effects_of_turns_of_a_rigs_size_are_read_again_as_they_were_written(tmp
     whole = with_all(robot, library, 0.5)
     robot_file.write_robot(whole, tmp_path / "robot.toml")
     assert library and eqx.tree_equal(whole.effects, robot_file.read_robot(tmp_path / "robot.toml").effects)
-
-
-@pytest.mark.slow
-def test_a_robot_with_effects_of_its_size_is_compared_and_swept(tmp_path, mmrjax):
-    robot, _, library = rig("bench", "voltage", tmp_path)
-    some = {name: library[name] for name in list(library)[:4]}
-    robot_file.write_robot(with_all(robot, some, 0.01), tmp_path / "robot.toml")
-    options = ("--robot", tmp_path / "robot.toml", "--no-report")
-    for command in (("compare", tmp_path / "table.csv"), ("sweep", "--voltages", 12)):
-        ends(mmrjax(*command, *options, "--out", tmp_path / command[0]), code=0)
-    assert eqx.tree_equal(
-        robot_file.read_robot(tmp_path / "compare" / "robot.toml").effects,
-        robot_file.read_robot(tmp_path / "robot.toml").effects,
-    )
 
 
 @pytest.mark.quick(1)

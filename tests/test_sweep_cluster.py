@@ -80,16 +80,6 @@ def command(folder, *options, timeout=300):
 
 
 @pytest.mark.slow
-def test_sweep_on_two_workers_leaves_the_same_store(tmp_path, two_workers):
-    (tmp_path / "plan.toml").write_text(CONFIG.replace("chunk = 40", "chunk = 5"))
-    there = command(tmp_path, "--scheduler", two_workers.address, "--out", "there")
-    assert there.returncode == 0, there.stderr
-    here = command(tmp_path, "--out", "here")
-    assert here.returncode == 0, here.stderr
-    assert arrays(tmp_path / "there") == arrays(tmp_path / "here")
-
-
-@pytest.mark.slow
 def test_worker_killed_in_the_middle_changes_nothing(tmp_path, two_workers):
     """Of two workers one is killed when a third of the chunks is there. The other does the rest."""
     config = CONFIG.replace("chunk = 40", "chunk = 10").replace("number = 50", "number = 500")

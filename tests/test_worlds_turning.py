@@ -139,24 +139,6 @@ def test_run_of_equal_voltages_is_the_half_robots():
     assert_allclose(history["omega"], 0.0, atol=1e-12)
 
 
-@pytest.mark.parametrize("wheeled", [False, True])
-def test_sides_swapped_mirror_and_voltages_reversed_reverse(wheeled):
-    robot = paper_robot(wheeled, "concrete", rule=1.3)
-    turn = circling(robot, Inputs(33.0, 15.0))
-    mirror = circling(robot, Inputs(15.0, 33.0))
-    back = circling(robot, Inputs(-33.0, -15.0))
-    for other, along, across, yaw in (
-        (mirror, 1, -1, -1),
-        (back, -1, 1, -1),
-    ):  # v_y does not reverse: m ω v_x does not
-        assert other.v_x == pytest.approx(along * turn.v_x, rel=1e-9)
-        assert other.v_y == pytest.approx(across * turn.v_y, rel=1e-9)
-        assert other.omega == pytest.approx(yaw * turn.omega, rel=1e-9)
-    assert_allclose(mirror.I[::-1], turn.I, rtol=1e-9)
-    assert_allclose(-back.I, turn.I, rtol=1e-9)
-    assert turn.omega < 0 and turn.instant.ground.N[0] > turn.instant.ground.N[1]  # to the right: the left bears more
-
-
 @pytest.mark.slow
 def test_circling_is_what_a_run_settles_on():
     robot, inputs = paper_robot(True), Inputs(15.0, 12.0)
@@ -164,28 +146,6 @@ def test_circling_is_what_a_run_settles_on():
     found = circling(robot, inputs)
     for name, expected in (("v_x", found.v_x), ("v_y", found.v_y), ("omega", found.omega), ("I_left", found.I[0])):
         assert end[name][-1] == pytest.approx(float(expected), rel=1e-5)
-
-
-@pytest.mark.quick(1)
-@pytest.mark.parametrize(
-    ("wheeled", "inputs", "battery"),
-    [
-        (False, Inputs(33.0, 12.0, slope=0.12), False),
-        (True, Inputs(1.0, -0.4, "duty"), True),
-        (True, Inputs(20.0, 0.0, ("voltage", "open"), slope=-0.05), False),
-    ],
-)
-def test_energy_in_is_what_sinks_take_and_what_is_stored(wheeled, inputs, battery):
-    robot = paper_robot(wheeled, battery=battery, rule=1.5)
-    start = np.zeros(len(STATES))
-    start[2] = 0.7
-    history = simulate(robot, inputs, np.linspace(0.0, 0.25, 6), start, rtol=1e-7, atol=1e-9)
-    begin = turning.stored(robot, inputs, start)
-    for k in range(6):
-        out = sum(taken[k] for taken in history.sinks.values())
-        kept = turning.stored(robot, inputs, history.states[k]) - begin
-        assert history.drawn[k] == pytest.approx(out + kept, abs=1e-6 * max(1.0, history.drawn[-1]))
-    assert all(np.all(np.diff(taken) >= -1e-9) for taken in history.sinks.values())
 
 
 @pytest.mark.parametrize("rule", [1.0, 1.5, 2.0])
