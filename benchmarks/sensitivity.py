@@ -2,7 +2,6 @@
 
     python benchmarks/sensitivity.py coverage       # 200 seeds: Ishigami, and the steady model against SciPy
     python benchmarks/sensitivity.py speed          # model evaluations of a study: SciPy loop, NumPy, ours
-    python benchmarks/sensitivity.py table8         # derivative-based indices of the whole of Table 8
 
 The SciPy implementation is `tests/worlds/paper.py`, a loop of `scipy.optimize.root` over points. The NumPy one is the
 closed form of the same balances without effects, vectorised. `--json FILE` writes every number.
@@ -30,14 +29,10 @@ from worlds import paper  # noqa: E402
 
 from calibration.sensitivity import sobol  # noqa: E402
 from calibration.sensitivity import uncertain_inputs as room  # noqa: E402
-from calibration.sensitivity.methods import derivative_bounds  # noqa: E402
 from calibration.sensitivity.model import Model, chosen_outputs  # noqa: E402
-from calibration.sensitivity.result import Points  # noqa: E402
-from calibration.sensitivity.study import Study  # noqa: E402
 from mmrjax import nominal  # noqa: E402
 from mmrjax.fidelities.variation import Variation, evaluate_points  # noqa: E402
 from mmrjax.model.conditions import Conditions  # noqa: E402
-from mmrjax.model.paper_tables import PAYLOADS_KG, SLOPES_DEG, VOLTAGES_V  # noqa: E402
 
 NAMES = (
     "motor.torque_constant",
@@ -210,31 +205,10 @@ def speed(points: int, repeats: int) -> dict[str, Any]:
     return record
 
 
-def table8(repeats: int) -> dict[str, Any]:
-    """Time for the derivative-based indices of the whole of Table 8 [s], every configuration, all parameters."""
-    robot = nominal()
-    inputs = room.inputs_from_priors(robot, room.default_input_names(robot, robot.configurations.names, False), {})
-    axes = np.meshgrid(range(2), VOLTAGES_V, PAYLOADS_KG, SLOPES_DEG, indexing="ij")
-    which, voltage, payload, slope = (x.ravel() for x in axes)
-    points = Points(np.array(robot.configurations.names)[which], voltage, payload, slope)
-    moving = np.ones(len(inputs), bool)
-    times = []
-    for _ in range(repeats + 1):
-        study = Study(robot, inputs, points, chosen_outputs((), robot))
-        began = time.perf_counter()
-        derivative_bounds(study, moving, 0)
-        times.append(time.perf_counter() - began)
-    record = {"points": len(points), "inputs": len(inputs), "gradients": study.evaluations}
-    record |= {"first_s": times[0], "best_s": min(times[1:]), "median_s": float(np.median(times[1:]))}
-    for key, value in record.items():
-        print(f"{key}: {value:.4g}")
-    return record
-
-
 def main() -> None:
     """Runs one part."""
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    options.add_argument("part", choices=("coverage", "speed", "table8"))
+    options.add_argument("part", choices=("coverage", "speed"))
     options.add_argument("--seeds", type=int, default=200, help="number of seeds for the coverage")
     options.add_argument("--size", type=int, default=32, help="base points of a replicate, a power of 2")
     options.add_argument("--reference-size", type=int, default=512, help="base points of the reference by SciPy")
@@ -245,10 +219,8 @@ def main() -> None:
     record: dict[str, Any] = machine()
     if a.part == "coverage":
         record |= coverage(a.seeds, a.size, a.reference_size)
-    elif a.part == "speed":
-        record |= speed(a.points, a.repeats)
     else:
-        record |= table8(a.repeats)
+        record |= speed(a.points, a.repeats)
     if a.json:
         a.json.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
 

@@ -765,7 +765,7 @@ class Sensitivity(RobotPart, DataPart, FidelityPart, SupplyPart, AxesPart, Outpu
 
     method: str = option_field(
         "sobol",
-        "local, sobol, morris or derivative",
+        "local, sobol or morris",
         usual="sobol; with --posterior local",
     )
     parameters: Names = option_field(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from calibration.sensitivity import derivative, information, morris, sobol
+from calibration.sensitivity import information, morris, sobol
 from calibration.sensitivity.replicates import REPLICATES, ratio_estimate
 
 A, B = 7.0, 0.1
@@ -17,16 +17,6 @@ A, B = 7.0, 0.1
 def ishigami(u):
     x = np.pi * (2 * u - 1)
     return np.sin(x[:, 0]) + A * np.sin(x[:, 1]) ** 2 + B * x[:, 2] ** 4 * np.sin(x[:, 0])
-
-
-def ishigami_gradient(u):
-    x = np.pi * (2 * u - 1)
-    by = [
-        np.cos(x[:, 0]) * (1 + B * x[:, 2] ** 4),
-        2 * A * np.sin(x[:, 1]) * np.cos(x[:, 1]),
-        4 * B * x[:, 2] ** 3 * np.sin(x[:, 0]),
-    ]
-    return 2 * np.pi * np.stack(by, 1)
 
 
 ONE, TWO = (1 + B * np.pi**4 / 5) ** 2 / 2, A**2 / 8
@@ -138,37 +128,6 @@ def test_sobol_intervals_cover_those_of_the_steady_model_in_scipy():
 
 
 # --- derivatives ------------------------------------------------------------------------------------------------
-
-
-def test_bounds_meet_at_the_indices_of_a_linear_model():
-    slopes, normal = np.array([1.0, 2.0, 3.0]), np.array([True, True, False])
-    rng_points = derivative.derivative_design(3, 64, 0)
-    scores = rng_points.copy()
-    from scipy.special import ndtri
-
-    scores[:, :2] = ndtri(rng_points[:, :2])
-    terms = derivative.derivative_terms(scores, scores @ slopes, np.tile(slopes, (len(scores), 1)), normal)
-    found = derivative.index_bounds(terms)
-    parts = slopes**2 * np.array([1, 1, 1 / 12])
-    assert within(found.lower, parts / parts.sum(), 2)
-    # a uniform score's Poincaré bound is 12/π² above what a straight line has
-    assert within(found.upper, parts / parts.sum() * np.array([1, 1, 12 / np.pi**2]), 2)
-
-
-def test_bounds_bracket_the_indices_of_ishigami():
-    u = derivative.derivative_design(3, 64, 0)
-    found = derivative.index_bounds(
-        derivative.derivative_terms(u, ishigami(u), ishigami_gradient(u), np.zeros(3, bool))
-    )
-    assert np.all(found.upper.value >= TOTAL) and np.all(found.lower.value <= FIRST + 0.02)
-
-
-def test_bounds_leave_out_points_without_numbers():
-    u = derivative.derivative_design(2, 64, 0)
-    y = np.where(u[:, 0] < 0.1, np.nan, u.sum(1))
-    terms = derivative.derivative_terms(u, y, np.ones_like(u), np.zeros(2, bool))
-    assert terms.lost == np.isnan(y).sum() and np.isfinite(derivative.index_bounds(terms).upper.value).all()
-    assert derivative.derivative_terms(u, np.full(len(u), np.nan), np.ones_like(u), np.zeros(2, bool)) is None
 
 
 # --- Morris -------------------------------------------------------------------------------------------------------

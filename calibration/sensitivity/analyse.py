@@ -4,17 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from calibration.data import Json
 from calibration.data.input_errors import BadConfiguration
 from calibration.inference.fit_notes import Remark, next_step
 from calibration.inference.identifiability import Z95
 from calibration.sensitivity.local import Local, correlated_directions, inert_inputs, local_derivatives
-from calibration.sensitivity.methods import (
-    Part,
-    derivative_bounds,
-    morris_screening,
-    sobol_indices,
-)
+from calibration.sensitivity.methods import Part, morris_screening, sobol_indices
 from calibration.sensitivity.next_runs import Candidates, next_runs
 from calibration.sensitivity.result import METHODS, Input, OutputStudy, SensitivityResult
 from calibration.sensitivity.study import Study
@@ -65,12 +59,6 @@ def analyse_sensitivity(
             "--parameters: the derivative of every output by every input is zero; choose others, or change --outputs"
         )
     parts = _by_method(study, method, ~idle, evaluations, seed)
-    comparison: dict[str, Json] = {}
-    if method == "derivative":
-        spent = study.evaluations, study.seconds, dict(study.sampled)
-        study.tell(next_step("sobol"))
-        comparison = _compared(study, parts, sobol_indices(study, ~idle, evaluations, seed, second=False))
-        study.evaluations, study.seconds, study.sampled = spent
     outputs = {o.name: _study_of(o, study, studies, parts.get(o.name)) for o in model.outputs}
     if method != "local" and not any(s.studied.any() for s in outputs.values()):
         raise BadConfiguration(_none_converges(study, study.statuses()))
@@ -88,7 +76,6 @@ def analyse_sensitivity(
         next_runs=proposed,
         evaluations=study.evaluations,
         seconds=round(study.seconds, 3),
-        comparison=comparison,
         remarks=_remarks(study, method, outputs, idle),
     )
 
@@ -99,9 +86,7 @@ def _by_method(study: Study, method: str, moving: np.ndarray, evaluations: int, 
     study.tell(Remark("sampling", method=method, points=len(study.points)))
     if method == "sobol":
         return sobol_indices(study, moving, evaluations, seed)
-    if method == "morris":
-        return morris_screening(study, moving, evaluations, seed)
-    return derivative_bounds(study, moving, seed)
+    return morris_screening(study, moving, evaluations, seed)
 
 
 def _described(inputs: Inputs, idle: np.ndarray) -> dict[str, Input]:
@@ -164,32 +149,6 @@ def _study_of(row: Quantity, study: Study, found: Local, part: Part | None) -> O
         part.lost,
         part.studied,
     )
-
-
-def _compared(study: Study, bounds: dict[str, Part], sampled: dict[str, Part]) -> dict[str, Json]:
-    """Comparison of derivative bounds with Sobol indices of the same points, by output."""
-    compared: dict[str, Json] = {}
-    for name, bound in bounds.items():
-        beside = sampled[name]
-        if not bound.overall or not beside.overall:
-            continue
-        total, first = beside.overall["total"], beside.overall["first"]
-        upper, lower = bound.overall["upper"], bound.overall["lower"]
-        compared[name] = {
-            "inputs": {
-                n: {
-                    "lower": float(lower.value[k]),
-                    "first": float(first.value[k]),
-                    "total": float(total.value[k]),
-                    "upper": float(upper.value[k]),
-                }
-                for k, n in enumerate(study.inputs.names)
-            },
-            "upper_holds": bool(np.all(upper.high >= total.low - 1e-12)),
-            "lower_holds": bool(np.all(lower.low <= first.high + 1e-12)),
-            "largest_excess": float(np.max(upper.value - total.value)),
-        }
-    return compared
 
 
 def _none_converges(study: Study, statuses: dict[str, dict[str, int]]) -> str:

@@ -6,10 +6,10 @@ import dataclasses
 
 import jax
 import numpy as np
+from scipy.stats import qmc
 
 from calibration.data import Columns
 from calibration.inference.identifiability import Z95
-from calibration.sensitivity import derivative
 from calibration.sensitivity.study import Study, source_words
 from calibration.sensitivity.uncertain_inputs import Inputs
 
@@ -90,7 +90,9 @@ def _in_words(counts: dict[str, dict[str, int]]) -> dict[str, dict[str, int]]:
 
 def inert_inputs(study: Study, found: Local, seed: int) -> np.ndarray:
     """True for inputs with exactly zero derivatives of all outputs at all tested points, shape (inputs,)."""
-    scores = study.inputs.scores(derivative.derivative_design(len(study.inputs), 1, seed, LOOKS))
+    streams = np.random.default_rng(seed).spawn(LOOKS)
+    unit = np.concatenate([qmc.Sobol(len(study.inputs), scramble=True, rng=rng).random(1) for rng in streams])
+    scores = study.inputs.scores(unit)
     moving = np.zeros(len(study.inputs), bool)
     for g in found.derivative.values():  # not by scores, because those of a posterior mix its parameters
         moving |= (np.nan_to_num(g) != 0).any(0)

@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 
-import jax
 import numpy as np
 
 from calibration.inference.identifiability import Z95
-from calibration.sensitivity import derivative, morris, sobol
+from calibration.sensitivity import morris, sobol
 from calibration.sensitivity.replicates import REPLICATES, Estimate
 from calibration.sensitivity.study import Study
 
 #: Largest share of base points without a value for a point to be studied.
 MOST_LOST = 0.5
-#: Replicates of the derivative method, and points of each.
-GRADIENTS = (8, 8)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,9 +54,7 @@ def _put(into: Estimate, k: int, found: Estimate) -> None:
     into.value[k], into.low[k], into.high[k] = found.value, found.low, found.high
 
 
-def sobol_indices(
-    study: Study, moving: np.ndarray, evaluations: int, seed: int, second: bool = True
-) -> dict[str, Part]:
+def sobol_indices(study: Study, moving: np.ndarray, evaluations: int, seed: int) -> dict[str, Part]:
     """First, total and second-order indices at each point, and over all of them."""
     points, d = len(study.points), len(study.inputs)
     names = [o.name for o in study.model.outputs]
@@ -67,8 +62,8 @@ def sobol_indices(
     lost = {name: np.zeros(points) for name in names}
     spent = {}
     for which, group in group_points(study, moving).items():
-        size = sobol.base_points(evaluations / points, len(which), second)
-        design = sobol.sobol_design(len(which), size, seed, second)
+        size = sobol.base_points(evaluations / points, len(which), True)
+        design = sobol.sobol_design(len(which), size, seed)
         scores = _sampled(study, design.points, np.array(which))
         for k, made in study.sample(study.values_at(scores), group):
             spent[k] = len(design.points)
@@ -161,45 +156,4 @@ def morris_screening(study: Study, moving: np.ndarray, evaluations: int, seed: i
             "sd_effect": Estimate(spread, spread, spread),
         }
         answer[name] = Part(overall, at_points, share, None, None, (), lost[name], studied)
-    return answer
-
-
-def derivative_bounds(study: Study, moving: np.ndarray, seed: int) -> dict[str, Part]:
-    """Bounds of first-order and total indices from exact gradients, at each point."""
-    points, d = len(study.points), len(study.inputs)
-    names = [o.name for o in study.model.outputs]
-    normal = np.arange(d) < len(study.inputs.parameters)
-    replicates, size = GRADIENTS
-    unit = derivative.derivative_design(d, size, seed, replicates)
-    scores = study.inputs.scores(unit)
-    rows = np.tile(scores, (points, 1))
-    conditions = jax.tree.map(lambda x: np.repeat(np.asarray(x), len(scores)), study.conditions)
-    values, gradients = study.gradients(rows, conditions)
-    answer = {}
-    for name in names:
-        lower, upper, sd = _blank(points, d), _blank(points, d), np.full(points, np.nan)
-        y, g = values[name].reshape(points, -1), gradients[name].reshape(points, len(scores), d)
-        lost = 1 - np.isfinite(y).mean(1)
-        whole: derivative.Terms | None = None
-        studied = np.zeros(points, bool)
-        for k in map(int, np.flatnonzero(lost <= MOST_LOST)):
-            output_terms = derivative.derivative_terms(scores, y[k], g[k], normal, replicates)
-            if output_terms is None:
-                continue
-            bounds = derivative.index_bounds(output_terms)
-            _put(lower, k, bounds.lower)
-            _put(upper, k, bounds.upper)
-            sd[k] = np.sqrt(bounds.variance)
-            studied[k] = True
-            whole = output_terms if whole is None else whole + output_terms
-        if whole is None:
-            answer[name] = Part({}, {}, None, None, None, (), lost, studied)
-            continue
-        overall = derivative.index_bounds(whole)
-        share = np.where(np.isfinite(upper.value), np.clip(upper.value, 0.0, 1.0), np.nan)
-        answer[name] = Part(
-            {"lower": overall.lower, "upper": overall.upper},
-            {"lower": lower, "upper": upper},
-            share, sd, None, (), lost, studied,
-        )  # fmt: skip
     return answer

@@ -17,7 +17,7 @@ from mmrjax.model.quantities import Quantity
 
 SCHEMA = "mmrjax.sensitivity/1"
 #: Methods.
-METHODS = ("local", "sobol", "morris", "derivative")
+METHODS = ("local", "sobol", "morris")
 #: Share of an output's variance below which an input is negligible, for all outputs and points [-].
 NEGLIGIBLE = 0.01
 
@@ -150,9 +150,8 @@ class OutputStudy:
     @property
     def overall_share(self) -> np.ndarray:
         """Share over all points together, shape (inputs,): of the method, else the mean over the points."""
-        main = next((self.overall[k].value for k in ("total", "upper") if k in self.overall), None)
-        if main is not None and np.isfinite(main).any():
-            return np.clip(np.nan_to_num(main), 0.0, 1.0)
+        if "total" in self.overall and np.isfinite(self.overall["total"].value).any():
+            return np.clip(np.nan_to_num(self.overall["total"].value), 0.0, 1.0)
         finite = np.isfinite(self.share).any(1)
         weight = np.where(finite, np.nan_to_num(self.sd) ** 2, 0.0)
         if not weight.sum() > 0:
@@ -217,7 +216,6 @@ class SensitivityResult:
         next_runs: None without a candidate that converges.
         evaluations: number of model evaluations.
         seconds: their duration, including compilation.
-        comparison: of bounds with sampled indices, by output, empty for other methods.
         remarks: notes on the result.
     """
 
@@ -233,7 +231,6 @@ class SensitivityResult:
     next_runs: NextRuns | None
     evaluations: int
     seconds: float
-    comparison: dict[str, Json]
     remarks: tuple[Remark, ...]
 
     @property
@@ -315,7 +312,6 @@ class SensitivityResult:
                     for name, study in self.outputs.items()
                     if study.convergence
                 },
-                "comparison": self.comparison,
                 "negligible": self.negligible,
                 "statuses": self.statuses,
                 "statuses_sampled": self.sampled,

@@ -121,21 +121,6 @@ class Study:
             for source, whole in self.sampled.items()
         }
 
-    def gradients(self, scores: np.ndarray, conditions: Conditions) -> tuple[Columns, ...]:
-        """Outputs and their derivatives by the scores of all inputs, for conditions of each row or common ones.
-
-        Counted and timed.
-        """
-        began = time.perf_counter()
-        values = self.values_at(scores)
-        answer = self.model(values, conditions)
-        by_columns = self.model.derivatives(values, conditions)
-        inner = self.inputs.jacobian(scores)
-        moved = {name: np.einsum("pc,pci->pi", x, inner) for name, x in by_columns.items()}
-        finite = {name: np.isfinite(x)[:, None] for name, x in answer.values.items()}
-        self._count(answer, len(scores), began)
-        return answer.values, {name: np.where(finite[name], g, np.nan) for name, g in moved.items()}
-
 
 def source_words(source: str) -> str:
     """Source of outputs in words: the fidelity, or the derived output's module."""

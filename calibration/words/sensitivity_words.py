@@ -19,7 +19,6 @@ METHODS = {
     "local": "exact derivatives at the robot's own values",
     "sobol": "shares of the variance, alone and with others",
     "morris": "screening by elementary effects",
-    "derivative": "bounds of those shares from exact gradients",
 }
 
 
@@ -27,7 +26,6 @@ METHODS = {
 _CAUSES = {
     "local": ("causes", "variance", " (to first order)"),
     "morris": ("has", "squared effects", ""),
-    "derivative": ("causes at most", "variance", ""),
 }
 
 

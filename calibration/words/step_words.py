@@ -24,7 +24,6 @@ STEPS = {
     "gear free": "resolved: the running gear free",
     # a sensitivity study
     "points": "derivatives at every operating point",
-    "sobol": "Sobol indices of the same points, to compare the bounds with",
     "evaluations": "{:,} model evaluations so far, {:,.0f} a second",
     # requirements and sizing
     "requirement": "requirement {} of {}: {}",

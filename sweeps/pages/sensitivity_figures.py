@@ -110,7 +110,6 @@ def draw_indices(study: OutputStudy, found: SensitivityResult) -> Figure:
 #: Names of indices as legends say them, and their colours.
 _WORDS = {
     "first": ("alone (first order)", BLUE), "total": ("with others (total)", ORANGE),
-    "lower": ("first order is at least", BLUE), "upper": ("total is at most", ORANGE),
     "mean_absolute_effect": ("μ*, mean size of effects", GREEN),
 }  # fmt: skip
 

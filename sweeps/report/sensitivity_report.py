@@ -17,7 +17,7 @@ from sweeps.report.document import Block, Document, Note, Section, Table, remark
 #: Pairs of a table of interactions, and outputs that are shown unfolded.
 PAIRS, UNFOLDED = 5, 3
 #: Measure of the shares of the overview, by method.
-_OF = {"local": " to first order", "derivative": ", at most", "morris": ", by squared effects"}
+_OF = {"local": " to first order", "morris": ", by squared effects"}
 
 
 def sensitivity_document(found: SensitivityResult, file: RobotFile) -> Document:
@@ -63,18 +63,6 @@ def _sections(found: SensitivityResult) -> Iterable[Section]:
     if any(study.convergence for study in found.outputs.values()):
         figure = catalogue.figure("sensitivity.convergence", found)
         yield Section("Convergence", (figure,), "convergence-of-indices")
-    if found.comparison:
-        rows = [
-            (
-                found.outputs[name].row.label, *("yes" if c[f"{end}_holds"] else "no" for end in ("upper", "lower")),
-                100 * c["largest_excess"],
-            )
-            for name, c in found.comparison.items()
-        ]  # fmt: skip
-        above = catalogue.note("sensitivity.sampled")
-        yield Section(
-            "Bounds against sampled indices", (above, catalogue.table("sensitivity.bounds", rows)), "bounds"
-        )
 
 
 def _decided(study: OutputStudy) -> bool:
