@@ -258,7 +258,8 @@ def _runs(
     slope, voltage, torque = (tuple(x) for x in zip(*each, strict=True))
     stated = (at.configuration,) if at is not None else ()
     return Run(
-        ", ".join((name, *stated)), (*(kinds or (name,)), *stated), doing, setup, voltage, slope, (payload,) * len(each),
+        ", ".join((name, *stated)), (*(kinds or (name,)), *stated), doing, setup, voltage, slope,
+        (payload,) * len(each),
         tuple(c for c in (read or reach.measured) if c in reach.measured), 0 if at is None else at.index, sides,
         brake, math.inf if at is None else at.steepest, steepest, where=", ".join(stated), motors=reach.motors,
         torque=torque if reach.torques else (),
