@@ -85,7 +85,7 @@ def predict_identifiability(runs: Runs, robot: Robot, noise: str | None = None, 
     """
     runs = used_rows(runs, robot, rows)
     ready = prepare(runs, robot, noise)
-    observe, robot, known = ready.observe, ready.robot, ready.noise
+    observe, robot, table_noise = ready.observe, ready.robot, ready.noise
     present = {robot.configurations.names[k] for k in runs.configurations(robot)}
     names = priors.free_names(robot, present, *observe.free(), () if observe.axis else priors.OVER_TIME)
     if not observe.axis:
@@ -93,7 +93,7 @@ def predict_identifiability(runs: Runs, robot: Robot, noise: str | None = None, 
     if not names:
         raise BadConfiguration("nothing to determine: every loss is zero, so it is held; state yours with a ±")
     coordinates = priors.parameter_coordinates(robot, names, any_surface=robot.rig.inherits)
-    posed = observers.pose_problem(runs, robot, coordinates, known.sd)
+    posed = observers.pose_problem(runs, robot, coordinates, table_noise.sd)
     z = jnp.zeros(len(names))
     observation = optimizers.observe_at(posed, z)
     reached = np.isfinite(np.asarray(observation.reading)).all(1) & ~posed.observe.unreachable(
@@ -114,4 +114,4 @@ def predict_identifiability(runs: Runs, robot: Robot, noise: str | None = None, 
     together = determined_together(
         posterior_of_coordinates(coordinates, np.asarray(z), about.covariance), priors_hold
     )
-    return Foresight(estimates, statuses, known.source, tuple(about.correlated()), together, robot, doubts)
+    return Foresight(estimates, statuses, table_noise.source, tuple(about.correlated()), together, robot, doubts)

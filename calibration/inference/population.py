@@ -276,7 +276,7 @@ def evolve(
     begun = time.perf_counter()
     search = CMA(np.asarray(centre, float), 1.0, population_size=size, seed=seed, cov=np.array(covariance, float))
     z = np.empty((0, len(centre))) if beside is None else np.asarray(beside, float)
-    rows, cost, told = None, np.empty(0), list[Generation]()
+    rows, cost, progress = None, np.empty(0), list[Generation]()
     for number in range(1, generations + 1):
         sample = np.array([search.ask() for _ in range(size)])
         points = sample if number > 1 or not len(z) else np.concatenate([z, sample])
@@ -297,9 +297,9 @@ def evolve(
             ]
         )
         failed = int(np.sum(members.lost(now).any(-1)))
-        told.append(Generation(len(points), failed, float(cost.min()), float(np.median(own_cost))))
+        progress.append(Generation(len(points), failed, float(cost.min()), float(np.median(own_cost))))
         tell(next_step("generation", number, cost.min(), np.median(own_cost), failed))
-        population = Population(z, *rows, cost, tuple(told))
+        population = Population(z, *rows, cost, tuple(progress))
         if population.settled:
             break
     return population

@@ -88,13 +88,13 @@ def prepare(
     noise_sds = (noise_room.infer_noise if assume else noise_room.noise_from_table)(runs, observe.sizes(runs), noise)
     noise_sds, larger = repeats.enlarge_noise(noise_sds, runs)
     robot = observe.with_initial_states(robot, runs, noise_sds)
-    found = Prepared(robot, observe, noise_sds, priors, (), (), (), (), tuple(weighed))
-    names = tuple(choose(found))
+    result = Prepared(robot, observe, noise_sds, priors, (), (), (), (), tuple(weighed))
+    names = tuple(choose(result))
     # The table's masses are compared with those of the file, which are not yet replaced there.
     checked = checks.check_data(runs, as_stated, names, noise_sds)
     begins = observe.check_start(runs, noise_sds, robot)
     return dataclasses.replace(
-        found,
+        result,
         names=names,
         foreign=tuple(inherited_priors(robot, priors)),
         checked=(*larger, *checked),

@@ -270,9 +270,9 @@ def _words(cells: np.ndarray) -> np.ndarray:
 def _columns_with_role(runs: Runs) -> Iterator[np.ndarray]:
     """Columns with a role, except readings and their sds, and the combinations of the labels."""
     readings = {name for c in runs.channels for name in (c.column, c.sd_column)}
-    known = {name: v.astype(str) for name, v in runs.columns.items() if name not in readings}
-    labels = [known[name] for name in _labels(runs)]
-    yield from known.values()
+    word_columns = {name: v.astype(str) for name, v in runs.columns.items() if name not in readings}
+    labels = [word_columns[name] for name in _labels(runs)]
+    yield from word_columns.values()
     if len(labels) > 1:
         yield np.array(["|".join(words) for words in zip(*labels, strict=True)])
 

@@ -152,8 +152,8 @@ def _shown_states(plan: Plan, robot: Robot, row: Rows, shown: Array) -> _Shown:
             unit = unit / robot.gearbox.ratio  # that of the output by the output's
         turning = (row.rate if plan.angle else shown[plan.motion]) / unit
     rolls = chassis.radius * turning / robot.gearbox.ratio
-    at = State(current, turning, rolls, none, row.memory, distance=chassis.radius * row.angle)
-    first = balances.begin_signals(robot, conditions, at)
+    states = State(current, turning, rolls, none, row.memory, distance=chassis.radius * row.angle)
+    first = balances.begin_signals(robot, conditions, states)
     errors = {
         k: balances.effects_sum(robot, first, "sensor", names[k]) for k in (plan.motion, plan.current) if k >= 0
     }
@@ -443,19 +443,21 @@ def search_delay(problem: Problem, plan: Plan) -> Delay:
             means = course.at(float(delay))[0]
             moved = {n: (means[n] - prompt[n])[:, None, None] for n in change}
             f, y = (fixed[k] + sum(moved[n] * change[n][k] for n in change) for k in range(2))
-            whole = np.concatenate([_integrated(plan, w, f, y) for w in cut], 1)[acts]  # (equations, windows, 1 + z)
-            whole[..., 1:] -= whole[..., :1] * growth
-            whole /= unit
-            size = np.sqrt(np.mean(whole[..., 0] ** 2, 1))
+            all_integrals = np.concatenate([_integrated(plan, w, f, y) for w in cut], 1)[
+                acts
+            ]  # (equations, windows, 1 + z)
+            all_integrals[..., 1:] -= all_integrals[..., :1] * growth
+            all_integrals /= unit
+            size = np.sqrt(np.mean(all_integrals[..., 0] ** 2, 1))
             for _ in range(3):  # the noise of each equation is what the regression leaves
-                scaled = whole / np.maximum(size, 1e-300)[:, None, None]
-                flat = scaled.reshape(-1, whole.shape[2])
+                scaled = all_integrals / np.maximum(size, 1e-300)[:, None, None]
+                flat = scaled.reshape(-1, all_integrals.shape[2])
                 jacobian = np.concatenate([flat[:, 1:][:, free], np.eye(len(free))])
                 target = np.concatenate([flat[:, 0], (z - centre)[free]])
                 move = -np.linalg.lstsq(jacobian, target, rcond=None)[0]
-                remainder = whole[..., 0] + whole[..., 1:][..., free] @ move
+                remainder = all_integrals[..., 0] + all_integrals[..., 1:][..., free] @ move
                 size = np.sqrt(np.mean(remainder**2, 1))
-            costs.append(np.sum(np.log(np.maximum(size, 1e-300))) * whole.shape[1] * APART)
+            costs.append(np.sum(np.log(np.maximum(size, 1e-300))) * all_integrals.shape[1] * APART)
             ends.append(z.copy())
             ends[-1][free] += move
         return np.array(costs) - np.min(costs), np.stack(ends)
