@@ -114,7 +114,7 @@ def changed_parameters(robot: Robot, nominal: Robot) -> list[tuple[Any, ...]]:
 
 
 def shown_name(file: RobotFile) -> str:
-    """A robot's name as pages show it; a packaged robot with other parameters is called changed."""
+    """A robot's name as pages show it. A packaged robot with other parameters is called changed."""
     from mmrjax.model.paper_robots import ROBOTS
 
     name = file.name

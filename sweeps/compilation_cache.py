@@ -1,7 +1,7 @@
 """The compilation cache: programs that XLA has compiled, kept on disk so that the next process reads them.
 
-Folder: `$MMRJAX_CACHE`, else `$XDG_CACHE_HOME/mmrjax`, else `~/.cache/mmrjax`; `MMRJAX_CACHE=off` switches it off.
-JAX keys an entry by program, compiler version, flags and device; a folder of its own for each version of jaxlib and
+Folder: `$MMRJAX_CACHE`, else `$XDG_CACHE_HOME/mmrjax`, else `~/.cache/mmrjax`. `MMRJAX_CACHE=off` switches it off.
+JAX keys an entry by program, compiler version, flags and device. A folder of its own for each version of jaxlib and
 each kind of processor keeps native code of one machine from another with the same home. Programs are native code: a
 folder that others could change is not used (`mmrjax.compile.private`). Importable without jax.
 """
@@ -28,10 +28,10 @@ LIMIT = 4 * 2**30
 
 
 def cache_location(path: Path | None = None) -> Path | None:
-    """Folder of the cache, which need not exist yet; None where it is switched off or no place for it is known.
+    """Folder of the cache, which need not exist yet, None where it is switched off or no place for it is known.
 
     Args:
-        path: folder to hold caches; None takes it from the environment.
+        path: folder to hold caches. None takes it from the environment.
     """
     if path is None:
         stated = os.environ.get(VARIABLE, "").strip()
@@ -64,11 +64,11 @@ def keep_programs() -> Path | None:
 
     To be called before anything compiles. A cache that JAX has been given by its own settings
     (`JAX_COMPILATION_CACHE_DIR`) stays. An entry that cannot be read is compiled again. `MMRJAX_CACHE` is the folder
-    to hold caches, or `off`; without it `~/.cache/mmrjax`. A folder that other users could change is not used, which
+    to hold caches, or `off`, without it `~/.cache/mmrjax`. A folder that other users could change is not used, which
     a line on stderr reports.
 
     Returns:
-        The folder; None if the cache is switched off, its place cannot be written to or others could change it.
+        The folder, None if the cache is switched off, its place cannot be written to or others could change it.
     """
     if _refused(os.environ.get(PROGRAMS, "")):
         os.environ[PROGRAMS] = ""

@@ -52,7 +52,7 @@ _out = _Outlet(highlight=False, soft_wrap=True, markup=False, width=_WIDTH)
 
 
 class _Messages(io.TextIOBase):
-    """Standard error; messages that it does not take, for instance because its disk is full, are lost."""
+    """Standard error. Messages that it does not take, for instance because its disk is full, are lost."""
 
     def write(self, text: str) -> int:
         with contextlib.suppress(OSError):
@@ -93,14 +93,14 @@ def print_message(text: str) -> None:
 
 
 def rewrite_line(text: str) -> None:
-    """Write the last line of a terminal anew; a file, which keeps every line, gets none."""
+    """Write the last line of a terminal anew. A file, which keeps every line, gets none."""
     if MESSAGES.isatty():
         MESSAGES.write(f"\r\x1b[K{printable(text)[: COLUMNS - 1]}")
         MESSAGES.flush()
 
 
 def wrap_for_terminal(text: str) -> str:
-    """Text for a terminal, in lines of at most `COLUMNS`, what is listed indented; a file gets it as it is."""
+    """Text for a terminal, in lines of at most `COLUMNS`, what is listed indented. A file gets it as it is."""
     return "\n".join(
         textwrap.fill(
             line, COLUMNS, subsequent_indent="  " * line.startswith("- "), break_long_words=False,
@@ -127,11 +127,13 @@ def report_working(name: str) -> Iterator[None]:
 def step_reporter(
     tell: Callable[[str], None], doing: str, silence: float = SILENCE, again: Callable[[str], None] = rewrite_line
 ) -> Iterator[Callable[[str], None]]:
-    """A function that prints the current step; after a silence the step is repeated with its time and the number of
+    """A function that prints the current step. After a silence the step is repeated with its time and the number of
     programs compiled.
 
     Args:
-        tell: prints a line; doing: step before the first call; silence: longest time without output [s].
+        tell: prints a line.
+        doing: step before the first call.
+        silence: longest time without output [s].
         again: rewrites the progress line.
     """
     import jax
@@ -171,7 +173,7 @@ def step_reporter(
 
 @contextmanager
 def report_stage(number: int, total: int, doing: str, silent: bool = False) -> Iterator[None]:
-    """Report a stage of a command and, while it lasts, its time; `silent`: without the time, next to a bar."""
+    """Report a stage of a command and, while it lasts, its time. `silent`: without the time, next to a bar."""
     text = f"{number} of {total}, {doing}"
     if silent:
         print_message(text)
@@ -195,10 +197,11 @@ class RateColumn(ProgressColumn):
 def progress_bar(
     total: int, quiet: bool, doing: str = "simulating", done: int = 0, rate: bool = False
 ) -> Iterator[Callable[[float], None]]:
-    """A bar on stderr; gives a function that is called with how much more is done.
+    """A bar on stderr. Gives a function that is called with how much more is done.
 
     Args:
-        done: of the total already; rate: whether to show how many are done in a second.
+        done: of the total already.
+        rate: whether to show how many are done in a second.
     """
     columns = [TextColumn(doing), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn()]
     with Progress(*columns, *([RateColumn()] if rate else []), console=_err, disable=quiet) as bar:

@@ -30,9 +30,9 @@ OPTIONS = options_of_fields(OneRun)
 
 
 def load_robot(config: RobotPart) -> RobotFile:
-    """The robot that a configuration names, with its changes; its effects may be the user's own.
+    """The robot that a configuration names, with its changes. Its effects may be the user's own.
 
-    Former names of parameters are taken, and said on stderr; so is a running gear that is an example's.
+    Former names of parameters are accepted, with a note on stderr. A running gear of an example is noted too.
 
     Raises:
         BadConfiguration: no such robot, a file or a change that is refused.
@@ -140,7 +140,8 @@ def read_runs(
     Args:
         source: a file of any format, or a packaged table.
         robot: has the configurations of the table.
-        measured: whether readings are needed; series: whether time histories are taken.
+        measured: whether readings are needed.
+        series: whether time histories are taken.
         columns: a preset or its file, see `records.read_runs`.
         battery: whether the runs are on the battery, see `records.read_runs`.
         of_turns: whether a table of turns has each channel of both sides, and of the yaw, for which it has a column.
@@ -163,14 +164,14 @@ def read_runs(
 
 
 def given_runs(robot: Robot, beside: GivenRuns, config: Simulate, elsewhere: Collection[str] = ()) -> records.Runs:
-    """Runs of a file, or one of options; `elsewhere`: columns that a profile states."""
+    """Runs of a file, or one of options. `elsewhere`: columns that a profile states."""
     if beside.runs is None:
         return one_run(robot, beside.stated, config.battery, elsewhere)
     return read_runs(str(beside.runs), robot, columns=config.columns, measured=False, battery=config.battery)
 
 
 def one_run(robot: Robot, cells: Json, battery: bool = False, elsewhere: Collection[str] = ()) -> records.Runs:
-    """One run from options by column name; without a configuration it is the robot's first.
+    """One run from options by column name, of the robot's first configuration unless stated.
 
     Args:
         elsewhere: columns that a profile states.

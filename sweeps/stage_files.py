@@ -72,7 +72,7 @@ def read_stage(file: Path) -> Any:
 
 
 def read_arrays(file: Path) -> Columns:
-    """Arrays of a file of `np.savez` without objects; a damaged file raises whatever NumPy raises."""
+    """Arrays of a file of `np.savez` without objects. A damaged file raises whatever NumPy raises."""
     with file.open("rb") as stream, np.load(stream, allow_pickle=False) as arrays:
         return {key: arrays[key] for key in arrays.files}
 

@@ -37,7 +37,7 @@ def _integral(time: np.ndarray, speed: np.ndarray) -> np.ndarray:
 
 
 def step_in_ticks(path: Path) -> Path:
-    """Step of voltage; ticks of 8 kHz, comments with %, rows that end with a semicolon, unwritten rows."""
+    """Step of voltage. Ticks of 8 kHz, comments with %, rows that end with a semicolon, unwritten rows."""
     random = np.random.default_rng(1)
     ticks = 3 + np.cumsum(random.integers(40, 60, 400))
     time = ticks / 8000

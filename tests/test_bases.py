@@ -70,7 +70,7 @@ def test_order_of_levels_that_rise_one_way_and_then_the_other_is_that_of_the_lev
 
 @pytest.mark.parametrize("driven", ["supply_voltage_V", "duty"])
 def test_order_of_a_sorted_table_is_no_driver(driven):
-    """A propeller's rows by rising duty, the supply sagging; steps are uneven."""
+    """A propeller's rows by rising duty, the supply sagging. Steps are uneven."""
     level = np.cumsum(np.random.default_rng(3).uniform(0.05, 1, 30) ** 4)
     columns = {
         "configuration": np.full(30, "bench"), "supply_voltage_V": np.full(30, 24.0), "order": np.arange(30.0),
@@ -95,7 +95,7 @@ def test_time_of_a_single_ramp_is_no_driver():
 
 
 def test_collinearity_is_not_made_by_the_number_of_terms():
-    """R² of noise is the share of the parameters; adjusted for them it is about 0."""
+    """R² of noise is the share of the parameters. Adjusted for them it is about 0."""
     found = [order_collinearity(shuffled(table(), seed), COUNTS) for seed in range(40)]
     assert abs(np.mean(found)) < 0.1
 
@@ -267,7 +267,7 @@ def waves_of(turn):
 
 
 def test_a_wave_is_of_the_runs_that_pass_two_of_it_wherever_they_end():
-    """Runs that come back end where they began; each has a phase of its own, in columns of its own."""
+    """Runs that come back end where they began. Each has a phase of its own, in columns of its own."""
     angle, rows, found = waves_of(7.0)
     wave = found["order 2 of the driving shaft"]
     for k, mine in enumerate(rows):
@@ -276,7 +276,7 @@ def test_a_wave_is_of_the_runs_that_pass_two_of_it_wherever_they_end():
 
 
 def test_pieces_of_a_wave_have_one_phase_in_all_runs():
-    """A piece with a phase of its own is any level and trend of a run; no name is held against what can be anything."""
+    """A piece with a phase of its own is any level and trend of a run. No name is held against what can be anything."""
     angle, _, found = waves_of(1.2)
     assert set(found) == {f"order {k} of the driving shaft" for k in (1, 2, 3)}
     for k in (1, 2, 3):

@@ -64,7 +64,7 @@ def written(path, columns):
 
 
 def made_up(robot, unit=None):
-    """Readings of every channel with their sds, told apart by their size; of torque in another unit where asked."""
+    """Readings of every channel with their sds, told apart by their size. Of torque in another unit where asked."""
     found = {"supply_voltage_V": VOLTAGES}
     for k, c in enumerate(robot.channels):
         scale, column = 1.0, c.column

@@ -222,7 +222,7 @@ def test_sweep_track_has_a_bar_a_status_a_run_and_the_share_of_each(mmrjax, tmp_
 
 @pytest.mark.slow
 def test_track_run_is_interrupted_while_it_runs_and_leaves_nothing(mmrjax, tmp_path, monkeypatch):
-    """The bar moves within a batch; an interrupt between two of its moves ends the command."""
+    """The bar moves within a batch. An interrupt between two of its moves ends the command."""
     from rich.progress import Progress
 
     honest, moves = Progress.update, []

@@ -46,7 +46,7 @@ def eventful(recessed):
 
 
 def motion_of(robot, run, k):
-    """In mid-run, no two parts alike; which of the contacts slip beyond V_s differs with `k`."""
+    """In mid-run, no two parts alike. Which of the contacts slip beyond V_s differs with `k`."""
     draw = np.random.default_rng(k)
     setup = half_robot_system(robot, run, STEP)
     low = float(half_robot.axle_height(setup))
@@ -61,7 +61,7 @@ def motion_of(robot, run, k):
 
 @pytest.mark.slow
 def test_slopes_of_the_sums_are_their_derivatives_along_a_direction(recessed):
-    """Of motion, slip and every constant at once, to 1e-9; three motions, one program each for ours and theirs."""
+    """Of motion, slip and every constant at once, to 1e-9. Three motions, one program each for ours and theirs."""
     run = Conditions(**RUNS["tracked"])
     setup = half_robot_system(recessed, run, STEP)
     gained = 1e-3 * jnp.asarray([0.3, -1.0, 0.5, 20.0, 30.0])
@@ -215,7 +215,7 @@ def test_derivatives_of_a_step_are_those_of_what_it_computes(eventful, forward, 
 
 @pytest.mark.slow
 def test_derivative_of_a_step_along_a_direction_is_that_of_what_it_computes(recessed):
-    """Of motion and one parameter of each part at once; every parameter, effects and reverse mode: see below."""
+    """Of motion and one parameter of each part at once. Every parameter, effects and reverse mode: see below."""
     run = Conditions(**RUNS["tracked"])
     names = (
         "running_gear.contact_stiffness", "6T2A.track.guide_friction", "6T2A.ground.friction.static", "6T2A.mass",

@@ -184,7 +184,7 @@ def test_reading_that_stands_alone_is_an_outlier(clean, looks):
 @pytest.mark.nightly
 @pytest.mark.slow
 def test_outliers_of_a_short_table_are_set_aside(clean, looks):
-    """A tenth of sixteen rows is one; and what one reading shows, a curve over the order shows too."""
+    """A tenth of sixteen rows is one, and what one reading shows, a curve over the order shows too."""
     runs = clean.runs.where(np.linspace(0, len(clean.runs) - 1, 16).astype(int))
     runs = changed(runs, "speed_mm_s", 3, 9 * runs["speed_sd_mm_s"][3])
     runs = changed(runs, "motor_speed_rpm", 9, -12 * runs["motor_speed_sd_rpm"][9])

@@ -1,4 +1,4 @@
-"""The laws that every effect of the library obeys; mutants that each law rejects are in tests/mutants.toml."""
+"""The laws that every effect of the library obeys. Mutants that each law rejects are in tests/mutants.toml."""
 
 from __future__ import annotations
 
@@ -274,7 +274,7 @@ SHARED = {
 
 
 def law_family(effect: type[Effect]) -> None:
-    """Its family is its equation and its driver; its term changes with that driver, or is a share without one."""
+    """Its family is its equation and its driver. Its term changes with that driver, or is a share without one."""
     assert effect.family().startswith(base.EQUATION[effect.balance]) and effect.driver in ("", *DRIVERS)
     assert (effect.driver or "same share everywhere") in effect.family()
     assert all(name in {p.name for p in params.walk_parameters(NOMINAL)} for name in effect.rests_on)
@@ -400,7 +400,7 @@ EVEN = (
 
 
 def mirrored(signals: Signals) -> Signals:
-    """Signals of a run in mirror image; what is not followed stays so."""
+    """Signals of a run in mirror image. What is not followed stays so."""
     odd = (f.name for f in dataclasses.fields(Signals) if f.name not in EVEN)
     return dataclasses.replace(signals, **{n: -getattr(signals, n) for n in odd if getattr(signals, n) is not None})
 
@@ -491,7 +491,7 @@ def test_an_instruments_errors_are_added_to_what_it_shows(signed, expected):
 @pytest.mark.quick(1)
 @pytest.mark.parametrize("signed", [True, False])
 def test_a_run_backward_is_read_as_one_forward_of_the_robot_turned_about(signed):
-    """A zero error keeps its sign in space; one of an instrument that shows magnitudes is the same both ways."""
+    """A zero error keeps its sign in space. One of an instrument that shows magnitudes is the same both ways."""
     volts, slope = np.array([12.0, 24.0]), np.array([3.0, 8.0])
     back = steady_batch(metered(signed), Conditions(voltage=-volts, slope_deg=-slope))
     ahead = steady_batch(setups.reversed_(metered(signed)), Conditions(voltage=volts, slope_deg=slope))
@@ -700,7 +700,7 @@ def test_drive_and_steady_both_feel(k, drive_readings, without_amplitudes):
 
 
 def _steady_with(changes=None, **amplitudes):
-    """Steady travel with effects of these amplitudes; the others that are asked for here are there at zero, which
+    """Steady travel with effects of these amplitudes. The others that are asked for here are there at zero, which
     changes nothing (a law above), so that all robots are of one structure and share a program."""
     robot = params.replace(NOMINAL, changes or {})
     names = ("series_resistance", "mass_offset", "winding_heating", "churning", "rolling_radius")
@@ -867,7 +867,7 @@ def _on_shaft(torque_constant, *present):
 
 @pytest.mark.slow
 def test_new_effects_of_a_load_on_a_shaft_are_torques_at_its_output():
-    """C_m I i = M / η where the motor drives M, η M (1 - a) where it is driven; M = M_c + dry, viscous and added loss."""
+    """C_m I i = M / η where the motor drives M, η M (1 - a) where it is driven. M = M_c + dry, viscous and added loss."""
     speed = np.array([100.0, -100.0, 300.0, -300.0])
     sign, output = np.sign(speed), speed / 20.0
 
@@ -896,7 +896,7 @@ def _torque(name, memory, **signals):
 
 
 def test_presliding_is_dahls_friction_in_place_of_coulombs():
-    """After a turn θ from rest z = 1 - e^(-θ/θ_s) (Dahl 1968); once it turns back by θ, z = -1 + 2 e^(-θ/θ_s)."""
+    """After a turn θ from rest z = 1 - e^(-θ/θ_s) (Dahl 1968). Once it turns back by θ, z = -1 + 2 e^(-θ/θ_s)."""
     bent = 1 - np.exp(-0.03 / 0.02)
     term, rate = _torque("presliding", bent, speed_wheel=4.0, direction=1.0)
     assert term == pytest.approx(0.3 * (bent - 1)) and rate == pytest.approx(4.0 * np.exp(-1.5) / 0.02)

@@ -36,7 +36,7 @@ def clamped():
 
 
 def test_a_clamp_carries_what_current_and_friction_leave():
-    """Beside a free row; too little current for the friction leaves the clamp nothing."""
+    """Beside a free row. Too little current for the friction leaves the clamp nothing."""
     current, held = np.array([*AMPERES, 0.03, 5.0]), np.array([1.0, 1, 1, 1, 1, 0])
     conditions = Conditions(motor_current=current, held=held, load_torque=np.array([0.0, 0, 0, 0, 0, 0.4]))
     found = steady_batch(clamped(), conditions)
@@ -163,7 +163,7 @@ def test_rows_of_a_clamp_in_tables(tmp_path):
 
 
 def test_a_log_of_a_clamp_is_read_as_settled_rows(tmp_path):
-    """Windings settle within a millisecond; rows that follow sooner are no settled runs."""
+    """Windings settle within a millisecond. Rows that follow sooner are no settled runs."""
     rows = {"output_torque_Nm": table()["output_torque_Nm"], "motor_voltage_V": table()["motor_voltage_V"]}
     held = rig(tmp_path, "motor_current", '"motor_voltage", "output_torque"')
     log = records.read_runs(table(time_s=0.02 * np.arange(16.0)), robot=held)

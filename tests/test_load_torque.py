@@ -34,7 +34,7 @@ TORQUE = np.array([0.5, 0.1, -0.3, 0.0])  # of a brake: against the way that eac
 
 
 def test_current_at_an_imposed_speed_follows_from_a_brake():
-    """In both directions, a torque that drives the motor among them; its derivative is that of the formula."""
+    """In both directions, a torque that drives the motor among them. Its derivative is that of the formula."""
 
     def shown(torque):
         conditions = Conditions(motor_speed=SPEEDS, load_torque=torque)
@@ -121,7 +121,7 @@ def test_every_fidelity_settles_alike_under_a_brake():
 
 @pytest.mark.slow
 def test_derivatives_by_a_brake_are_differences():
-    """Of settled travel and of a run over time; of a history by the load's own torque, which is the same."""
+    """Of settled travel and of a run over time. Of a history by the load's own torque, which is the same."""
     for settles in (_steady, _driven):
         by_torque = jax.jvp(lambda x: settles(x).motor_speed, (jnp.asarray(TORQUE),), (jnp.ones(4),))[1]  # noqa: B023
         less, more = (settles(TORQUE + h).motor_speed for h in (-1e-4, 1e-4))
@@ -289,7 +289,7 @@ def test_rows_are_held_out_by_levels_of_the_torque(tmp_path):
 
 
 def test_a_drift_that_goes_with_the_torque_is_none():
-    """Tables of a brake are sorted by its torque; their order then shows no drift of its own."""
+    """Tables of a brake are sorted by its torque. Their order then shows no drift of its own."""
     columns = {
         "configuration": np.full(18, "brake"), "order": np.arange(18.0), "supply_voltage_V": np.full(18, 24.0),
         "total_current_A": np.linspace(0, 9, 18),
@@ -302,7 +302,7 @@ def test_a_drift_that_goes_with_the_torque_is_none():
 
 
 def test_a_torque_in_another_unit_is_doubted(tmp_path):
-    """24 V and 0.5 ohm stall at 2.4 N·m; the same torques in mN·m are in order."""
+    """24 V and 0.5 ohm stall at 2.4 N·m. The same torques in mN·m are in order."""
     rows = [f"24,{4565 - 1.91 * m},{m}" for m in (0, 100, 200, 300)]
     for column, doubted in (("load_torque_Nm", True), ("load_torque_mNm", False)):
         runs, rig = read(tmp_path, [f"supply_voltage_V,motor_speed_rpm,{column}", *rows])

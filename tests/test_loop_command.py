@@ -80,7 +80,7 @@ def loaded(p):
 
 @functools.cache
 def commanded(every=False) -> SimpleNamespace:
-    """The whole command on 24 runs of a robot whose track churns, one of them twice; made once for all files.
+    """The whole command on 24 runs of a robot whose track churns, one of them twice. Made once for all files.
 
     It looks for the effects of `FEW` alone, or for `every` one of the library.
     """

@@ -87,7 +87,7 @@ def page_of(folder, found):
 
 @pytest.fixture(scope="module")
 def shown(tmp_path_factory):
-    """A case → its result, result.json, page and terminal output; made once."""
+    """A case → its result, result.json, page and terminal output, made once."""
     known = {}
 
     def of(name, capsys):
@@ -307,7 +307,7 @@ def lines_of(found, capsys):
 
 @pytest.mark.parametrize("name", TOLD)
 def test_a_result_is_told_as_recorded(shown, capsys, name):
-    """What differs from the result as it is found is kept; the words are the same, the numbers to a hundredth."""
+    """What differs from the result as it is found is kept. The words are the same, the numbers to a hundredth."""
     found = shown("churning", capsys).found
     usual = [] if name == "as_found" else lines_of(found, capsys)
     lines = lines_of(TOLD[name](found), capsys)

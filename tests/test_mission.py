@@ -1,4 +1,4 @@
-"""Missions: against SciPy, closed forms, and themselves; energy, derivatives, standing still, limits."""
+"""Missions: against SciPy, closed forms, and themselves. Energy, derivatives, standing still, limits."""
 
 import dataclasses
 
@@ -24,7 +24,7 @@ _run = eqx.filter_jit(mission)
 
 
 def run(robot, conditions, profile, start=None, tolerance=TOLERANCE):
-    """A mission with its course; all that is stated here is a number of the program, so that most tests share one."""
+    """A mission with its course. All that is stated here is a number of the program, so that most tests share one."""
     ambient = robot.motor.temperature_ambient
     start = start or Start(temperature_winding=ambient, temperature_housing=ambient)
     start = jax.tree.map(lambda x: jnp.asarray(x, float), start)
@@ -150,7 +150,7 @@ def test_mission_through_rest_at_the_current_limit_is_that_of_scipy(robot):
 @pytest.mark.parametrize("configuration", [0, 1])
 @pytest.mark.parametrize("battery", [0.0, 1.0])
 def test_energy_in_is_where_it_went_and_what_is_stored(robot, configuration, battery):
-    """Through starts, stops, reversals and a descent; stored energy from the states, not from the integrals."""
+    """Through starts, stops, reversals and a descent. Stored energy from the states, not from the integrals."""
     time, mode, values = MANY
     p = rows(time, mode, **{**values, "slope_deg": [0, 0, 0, 5, 0, -20, -20, 0]})
     found = run(robot, asked(configuration, battery=battery, adhesion=2.0), p, tolerance=2e-6)
@@ -342,7 +342,7 @@ def test_derivatives_through_stops_and_reversals_match_differences(robot):
 @pytest.mark.nightly
 @pytest.mark.slow
 def test_derivatives_by_every_parameter_and_row_match_differences(robot):
-    """Of Wh/m and peak temperature of a mission, in one Jacobian; endurance has its closed form below."""
+    """Of Wh/m and peak temperature of a mission, in one Jacobian. Endurance has its closed form below."""
     time, mode, values = MANY
     start = rows(time, mode, **values)
     fixed = ("battery.", "6T2A", "running_gear.")  # on a supply, on wheels, with contacts lumped: not read

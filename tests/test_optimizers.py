@@ -137,7 +137,7 @@ def bent():
 @pytest.mark.slow
 @pytest.mark.parametrize("places", [2, 16])
 def test_searches_do_not_depend_on_those_beside_them(bent, places):
-    """Whatever waits, ends and takes whose place, each search is what it is alone; steps included."""
+    """Whatever waits, ends and takes whose place, each search is what it is alone, steps included."""
     posed, members, (wanted, seen) = bent
     assert len({*np.asarray(wanted.steps).tolist()}) > 3  # they end at different times
     found, here = fit.search_refilling(posed, members, 40, places)
@@ -285,7 +285,7 @@ BENDS = jnp.asarray([0.8, 0.02, 0.0])
 
 def large_residuals(z, held):
     """z + 1 and b z² + z - 1 of each coordinate, least at z = 0, where a Gauss-Newton step leaves the share b of z
-    (Dennis and Schnabel 1983, example 10.2.4); and a penalty below z₀ = 0.2 where `held`."""
+    (Dennis and Schnabel 1983, example 10.2.4), and a penalty below z₀ = 0.2 where `held`."""
 
     def function(z):
         edge = jnp.where(held, 300.0 * (0.2 - z[0]), -1.0)
@@ -316,7 +316,7 @@ def test_search_is_short_where_residuals_are_large():
 
 
 def test_search_goes_along_the_edge_of_a_penalty():
-    """From where nothing shows it; by steps that know only what is in force where they begin it took hundreds."""
+    """From where nothing shows it. By steps that know only what is in force where they begin it took hundreds."""
     for z in STARTS:
         end = to_the_end(z, True)
         assert steps(end) < 30
@@ -353,7 +353,7 @@ def test_stride_is_the_optimum_beyond_and_along_the_edges_of_penalties():
 @pytest.mark.nightly
 @pytest.mark.slow
 def test_search_of_rollouts_ends_at_the_limit_of_adhesion_from_inside(measured):
-    """With the noise that is estimated of them the rows pull static friction down to the margin; from just inside of
+    """With the noise that is estimated of them the rows pull static friction down to the margin. From just inside of
     it nothing shows the penalty."""
     posed = pose(measured, paper_robots.nominal(), stated="current=10%,motor_speed=6%,speed=4%")
     limit = fit.search_starts(posed, jnp.zeros((1, len(posed.coordinates))), posed.data)[0]
@@ -574,7 +574,7 @@ def test_rival_searches_end_where_three_agree_unless_one_is_lower():
 
 
 def test_a_rival_that_promises_much_and_brings_nothing_ends():
-    """Member 0 is at its optimum of 2; the slopes of member 1 promise a fall from 2000 that does not come."""
+    """Member 0 is at its optimum of 2. The slopes of member 1 promise a fall from 2000 that does not come."""
     slopes = np.array([[[1.0], [0.0], [1e-3]], [[-40.0], [0.0], [1e-3]]])
 
     def evaluate(z, members):

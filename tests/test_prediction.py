@@ -147,7 +147,7 @@ def test_nothing_is_chosen_where_nothing_can_be_held_out(runs):
 @pytest.mark.nightly
 @pytest.mark.slow
 def test_measured_runs_show_a_voltage_drop_and_a_slip_that_rests_on_a_row(tmp_path):
-    """What is written predicts, on the rows that both reach, no worse than this, by kind of block [%]; and swept with
+    """What is written predicts, on the rows that both reach, no worse than this, by kind of block [%], and swept with
     the mass of its own file it is what was fitted."""
     robot = paper_robots.nominal()
     runs = read_runs("measured", robot, measured=True)
@@ -188,7 +188,7 @@ def test_measured_runs_show_a_voltage_drop_and_a_slip_that_rests_on_a_row(tmp_pa
     ],
 )
 def test_a_block_with_parameters_of_its_own_is_not_predicted(names, tied, dropped):
-    """Of two configurations at two voltages each; runs of one at another voltage determine what is its own."""
+    """Of two configurations at two voltages each. Runs of one at another voltage determine what is its own."""
     columns = {
         "configuration": np.repeat(["a", "b"], 4), "supply_voltage_V": np.tile([10.0, 10.0, 20.0, 20.0], 2),
         "order": np.arange(8.0),

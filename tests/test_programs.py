@@ -25,7 +25,7 @@ MATRIX = np.array([[4.0, 1.0], [1.0, 3.0]])
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """An empty one in which programs are kept; JAX's own cache, which other tests fill, is not asked."""
+    """An empty one in which programs are kept. JAX's own cache, which other tests fill, is not asked."""
     monkeypatch.setenv(programs.VARIABLE, str(tmp_path))
     monkeypatch.setattr(jax, "device_count", lambda: 1)
     jax.config.update("jax_enable_compilation_cache", False)

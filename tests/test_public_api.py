@@ -1,4 +1,4 @@
-"""The public API: five lines, one run or a batch, any fidelity; transformations go through, wrong use is said."""
+"""The public API: five lines, one run or a batch, any fidelity. Transformations go through, wrong use is said."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_import_loads_no_jax():
 
 
 def test_layers_above_are_imported_when_they_are_asked_for_and_not_before():
-    """`mm.simulate` loads none of them; the names of `_ABOVE` are theirs."""
+    """`mm.simulate` loads none of them. The names of `_ABOVE` are theirs."""
     loaded = "sorted({m.partition('.')[0] for m in sys.modules} & {'calibration', 'sweeps', 'pydantic'})"
     code = (
         f"import sys, mmrjax as mm; mm.simulate; dir(mm); print({loaded}); mm.calibrate; print({loaded}); mm.sweep; "
@@ -273,7 +273,7 @@ def test_track_keeps_histories_with_reactions(robot):
 
 
 def in_fours(monkeypatch):
-    """Runs in one call of `steady` four at a time; returns the shapes of the calls that are made."""
+    """Runs in one call of `steady` four at a time. Returns the shapes of the calls that are made."""
     sizes = []
     whole = fidelities.get_fidelity("steady")
 
@@ -564,7 +564,7 @@ def test_wrong_arguments_are_refused_in_a_sentence(case, robot, table):
 
 
 def test_lazy_and_masked_tables_are_read_as_others(robot, table):
-    """A lazy frame is collected; a masked reading is missing."""
+    """A lazy frame is collected. A masked reading is missing."""
     wanted = mm.read_runs(table).columns
     lazy = mm.read_runs(pl.from_pandas(table).lazy()).columns
     for name, values in wanted.items():

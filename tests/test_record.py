@@ -1,6 +1,6 @@
 """What the project gave before its rooms were rebuilt, kept in `tests/record`: nothing of it may change unsaid.
 
-A result that is corrected on purpose is changed there too, with a line in CHANGELOG.md; `python tests/test_record.py`
+A result that is corrected on purpose is changed there too, with a line in CHANGELOG.md. `python tests/test_record.py`
 renews what the loop gives (all of its tables, or those that are named), and nothing else.
 """
 

@@ -54,7 +54,7 @@ OWN = {"output_speed_rpm": "output_speed_rpm"}
 
 
 def table(step, late):
-    """Nine settings, three to a step; readings follow the setting of their row, or of the row before (`late`)."""
+    """Nine settings, three to a step. Readings follow the setting of their row, or of the row before (`late`)."""
     volts = np.array([6.0, 11.0, 8.0, 14.0, 7.0, 12.0, 9.0, 13.0, 10.0])
     shown = np.roll(volts, late)
     return {"time_s": step * np.arange(9.0), "supply_voltage_V": volts, "output_speed_rpm": 90 * shown - 100}

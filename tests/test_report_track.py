@@ -123,7 +123,7 @@ def test_robot_that_does_not_get_under_way_is_said_and_not_drawn(robot, written,
 
 @pytest.mark.slow
 def test_stiff_robot_is_run_with_a_step_that_it_bears(robot, monkeypatch):
-    """A sweep of it has been asked for with such a step; the report's own runs must not be refused."""
+    """A sweep of it has been asked for with such a step. The report's own runs must not be refused."""
     stiff = params.replace(robot, {"running_gear.contact_stiffness": np.asarray(1e12)})
     taken = {}
     monkeypatch.setattr(
@@ -137,7 +137,7 @@ def test_stiff_robot_is_run_with_a_step_that_it_bears(robot, monkeypatch):
 
 @pytest.mark.slow
 def test_run_of_the_track_model_shows_its_own_running_gear(robot, tmp_path):
-    """0.9 s on wheels; of a run that has not settled long enough no ripple is drawn, but its slip over the start."""
+    """0.9 s on wheels. Of a run that has not settled long enough no ripple is drawn, but its slip over the start."""
     runs = records.Runs("the test", {
         "configuration": np.array(["4W2T"]), "supply_voltage_V": np.array([33.0]), "payload_kg": np.zeros(1),
         "slope_deg": np.zeros(1),

@@ -243,7 +243,7 @@ def test_times_of_day_count_from_the_first_of_each_run(tmp_path, column, cells):
 
 
 def test_a_run_begins_at_its_first_row_whatever_its_clock_shows(tmp_path):
-    """Each run by its own first row, wherever that stands in the file; in any unit; a row without readings too."""
+    """Each run by its own first row, wherever that stands in the file, in any unit. A row without readings too."""
     rows = "b,0,0.4\na,3600.25,\nb,0.5,0.4\na,3600.5,0.4\nc,12,0.4\n"
     rows = "".join(f"{run},{cell},12,{amps}\n" for run, cell, amps in (r.split(",") for r in rows.split()))
     runs = read(tmp_path, f"run_id,time_s,supply_voltage_V,total_current_A\n{rows}", bench("voltage"))
@@ -258,7 +258,7 @@ def test_a_run_begins_at_its_first_row_whatever_its_clock_shows(tmp_path):
 
 
 def test_a_load_that_drives_its_motors_takes_voltage_from_their_back_emf(tmp_path):
-    """E is 4.71 V: a motor that brakes with 1.3 A of 2 ohm has 2.11 V left; one that takes -0.4 A has not."""
+    """E is 4.71 V: a motor that brakes with 1.3 A of 2 ohm has 2.11 V left. One that takes -0.4 A has not."""
     winch = {"torque_constant": 0.5}
     robot = bench(shown=("motor_current", "motor_voltage"), load=winch)
     header = "motor_speed_rpm,motor_voltage_V,motor_current_A\n"
@@ -650,7 +650,7 @@ def test_step_of_readings_is_their_common_divisor(readings, step):
 
 
 def test_an_instrument_left_free_is_what_its_table_shows(tmp_path):
-    """Both ways, magnitudes in steps of 0.03 A: as if the file had stated that; the noise grows by the step."""
+    """Both ways, magnitudes in steps of 0.03 A: as if the file had stated that. The noise grows by the step."""
     path = tmp_path / "t.csv"
     speeds = [-3000, -2500, -2000, -1000, 1000, 1500, 2000, 3000]
     shown = [0.51, 0.48, 0.42, 0.33, 0.36, 0.39, 0.45, 0.54]

@@ -286,7 +286,7 @@ def test_a_torque_meters_gain_is_named(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("signed", [True, False])
 def test_a_current_sensors_offset_is_named(tmp_path, signed):
-    """Of a bench driven both ways; where the sensor shows magnitudes a friction may look alike."""
+    """Of a bench driven both ways. Where the sensor shows magnitudes a friction may look alike."""
     shown = f"[instruments.motor_current]\nsigned = {str(signed).lower()}\n"
     (tmp_path / "rig.toml").write_text(METERED.replace(', "output_torque"', ', "motor_current"') + shown)
     robot = robot_file.read_robot(tmp_path / "rig.toml")

@@ -77,7 +77,7 @@ def test_curvature_makes_it_larger_and_a_wrong_reading_does_not():
 
 
 def test_uneven_steps_and_repeats_count_as_they_are():
-    """A straight line leaves nothing whatever its steps; of repeats, what they differ by."""
+    """A straight line leaves nothing whatever its steps. Of repeats, what they differ by."""
     uneven = table(0.0, slopes=np.array([0.0, 1.0, 7.0, 9.0, 20.0]), seed=1)
     straight = 1 + 0.1 * uneven["slope_deg"]
     weights, used = series_noise._differences(

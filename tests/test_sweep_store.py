@@ -56,7 +56,7 @@ FOUR = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_coun
 
 @pytest.fixture
 def sweep(mmrjax, tmp_path):
-    """Sweep the configuration above, or another, into a folder; returns exit code, stdout and stderr."""
+    """Sweep the configuration above, or another, into a folder. Returns exit code, stdout and stderr."""
     (tmp_path / "plan.toml").write_text(CONFIG)
 
     def command(out, *options, config=None):
@@ -149,7 +149,7 @@ def test_result_counts_statuses_and_states_ranges(whole):
 
 @pytest.mark.slow
 def test_large_grid_of_options_leaves_a_store_with_the_numbers_of_the_table(mmrjax, tmp_path, monkeypatch):
-    """Above the limit: no runs.csv, which is said; the same command with --export csv writes it, simulating nothing."""
+    """Above the limit: no runs.csv, which is said. The same command with --export csv writes it, simulating nothing."""
     grid = ["sweep", "--slopes", "0,5,20", "--voltages", "24", "--payloads", "0,3", "--no-report"]
     monkeypatch.setattr("sweeps.commands.sweep.TABLE", 12)
     small, _, _ = mmrjax(*grid, "--out", "small")
@@ -559,7 +559,7 @@ def layout():
 
 @pytest.fixture
 def opened(layout, tmp_path):
-    """Open the store `s` as one more process would; `seed` is its identity."""
+    """Open the store `s` as one more process would. `seed` is its identity."""
     stores = []
 
     def open_store(seed=0, force=False):

@@ -106,7 +106,7 @@ def test_a_measured_torque_that_is_a_multiple_of_a_current_is_left_out(tmp_path,
 
 
 def test_a_load_that_is_a_multiple_of_a_current_is_left_out(tmp_path, robot):
-    """The load is what leaves the gearbox at the current; friction, a display and a meter's noise leave no multiple."""
+    """The load is what leaves the gearbox at the current. Friction, a display and a meter's noise leave no multiple."""
     current = np.round(CURRENT, 5)
     runs = table(tmp_path, robot, current, load_torque_Nm=np.round(0.64 * current, 4))
     (note,) = (note for note in runs.notes if "load_torque_Nm: in every row 0.64" in note)
@@ -132,7 +132,7 @@ def test_a_computed_load_is_refused_where_the_current_is_imposed(tmp_path, robot
 
 
 def test_readings_that_a_rigid_gear_ties_are_said_and_not_refused(tmp_path, robot):
-    """The imposed speed is no channel; with the motor's as one, the output's may be of the same instrument."""
+    """The imposed speed is no channel. With the motor's as one, the output's may be of the same instrument."""
     rig = dataclasses.replace(robot.rig, channels=("motor_speed", "output_speed"), imposed="voltage")
     driven = dataclasses.replace(robot, rig=rig)
     columns = {"supply_voltage_V": SPEED / 200, "motor_speed_rpm": SPEED, "output_speed_rpm": SPEED / 20}
@@ -167,7 +167,7 @@ def test_runs_of_one_condition_are_refused_by_the_loop(tmp_path, robot, foreseen
 
 @pytest.mark.parametrize(("factor", "unit"), [(1000.0, "mNm"), (10.0, "")])
 def test_a_torque_in_another_unit_is_refused_where_its_friction_is_not_known(tmp_path, robot, foreseen, factor, unit):
-    """Friction that nobody knows may be ten times another; a thousand times is a matter of units."""
+    """Friction that nobody knows may be ten times another. A thousand times is a matter of units."""
     runs = table(tmp_path, robot)
     foreseen(shown(runs))
     off = table(tmp_path, robot, torque=factor * TORQUE)

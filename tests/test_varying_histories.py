@@ -179,7 +179,7 @@ def test_constant_values_at_every_instant_are_those_of_a_constant_run():
 
 @pytest.mark.slow
 def test_runs_are_those_of_missions(simulated):
-    """Of an engine with steps, events and friction at rest of its own; its noise is all that remains."""
+    """Of an engine with steps, events and friction at rest of its own. Its noise is all that remains."""
     runs, observer = simulated, Histories.of(simulated, paper_robots.nominal())
     truth = params.replace(paper_robots.nominal(), {k: jnp.asarray(v) for k, v in TRUTH.items()})
     seen = np.asarray(eqx.filter_jit(observer)(truth).reading)
@@ -421,7 +421,7 @@ def test_speeds_without_a_sign_are_refused_where_a_run_is_driven_backward(runs):
 
 
 def test_a_rig_may_turn_on_forward_while_it_is_driven_backward(runs):
-    """Its inertia carries it through one stretch; another shows that its speeds have a sign."""
+    """Its inertia carries it through one stretch. Another shows that its speeds have a sign."""
     nothing = Noise(*(None for _ in dataclasses.fields(Noise)))
     back = np.flatnonzero(runs["supply_voltage_V"] * (runs["mode"] == "voltage") < 0)
     speed = runs["motor_speed_rpm"].copy()

@@ -645,7 +645,7 @@ def test_adequacy_is_said(found, said):
 
 
 def clustered(levels, **other):
-    """Residuals of speed that go with a column; levels: means by name."""
+    """Residuals of speed that go with a column. `levels`: means by name."""
     means = tuple(LevelMean(name, "", mean, 9) for name, mean in levels.items())
     known = dict(
         column="wheel", channel="speed", unit="mm/s", within="", reversing=False, levels=means, correlation=None, p=2e-7,

@@ -89,7 +89,7 @@ def _load_at(runs: Runs, robot: Robot, channel: str, current: np.ndarray) -> np.
 
 
 def line_through(x: np.ndarray, y: np.ndarray) -> tuple[float, float] | None:
-    """Intercept and slope of a line through all points, within their digits; None without such a line."""
+    """Intercept and slope of a line through all points, within their digits, None without such a line."""
     both = np.isfinite(x) & np.isfinite(y)
     x, y = x[both], y[both]
     if len(x) < ROWS or min(len(np.unique(x)), len(np.unique(y))) < LEVELS:

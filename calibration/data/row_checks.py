@@ -40,13 +40,13 @@ STEPS = 0.5
 
 
 def reading_period(values: np.ndarray) -> float:
-    """Rows of a log between two readings of a slow sensor; 0 for a channel that is read in every row.
+    """Rows of a log between two readings of a slow sensor, 0 for a channel that is read in every row.
 
     A slow sensor changes at even distances of two rows or more, and rarely sooner. An instrument of coarse steps
     repeats numbers too, but changes by its smallest step, or at any distance.
 
     Args:
-        values: readings of a channel in one recording, in the order of time; NaN if missing.
+        values: readings of a channel in one recording, in the order of time, NaN if missing.
     """
     values = values[np.isfinite(values)]
     changed = np.flatnonzero(np.diff(values) != 0)
@@ -68,11 +68,12 @@ def reading_period(values: np.ndarray) -> float:
 
 def used_once(values: np.ndarray, time: np.ndarray, run: np.ndarray | None = None) -> tuple[np.ndarray, float]:
     """Returns a channel's values with one row for each reading of a slow sensor, NaN in the rows that repeat it, and
-    the rows between readings; the unchanged values and 0 if no reading is repeated.
+    the rows between readings. The unchanged values and 0 if no reading is repeated.
 
     Args:
-        values: NaN for a missing reading, shape (rows,); time: of the rows; run: name of the recording of each row;
-            None: all are of one.
+        values: NaN for a missing reading, shape (rows,).
+        time: of the rows.
+        run: name of the recording of each row. None: all are of one.
     """
     if (np.diff(values) == 0).sum() < LEAST * len(values):
         return values, 0.0
@@ -150,22 +151,17 @@ def _fill(name: str, columns: Columns, rows: int, layout: Layout) -> None:
     if layout.complete:
         return
     if "configuration" not in columns and layout.configurations:
-        columns["configuration"] = np.full(rows, _only(name, columns, layout))
+        labels = np.unique(columns.get("surface", np.zeros(0, str)))
+        found = surfaces.common_configuration(layout.configurations, labels)
+        if found is None:
+            raise BadData(
+                f"{name}: column configuration is missing, and the robot has {', '.join(layout.configurations)}"
+            )
+        columns["configuration"] = np.full(rows, found)
     if layout.imposed_column == SPEED and set(SPEEDS) <= set(columns):
         columns[SPEED] = np.mean([columns[c] for c in SPEEDS], 0)
     for column, value in DEFAULTS.items():
         columns.setdefault(column, np.full(rows, value))
-
-
-def _only(name: str, columns: Columns, layout: Layout) -> str:
-    """Returns the configuration of a table without that column: the only one, or the only one with its surfaces."""
-    labels = np.unique(columns.get("surface", np.zeros(0, str)))
-    found = surfaces.common_configuration(layout.configurations, labels)
-    if found is None:
-        raise BadData(
-            f"{name}: column configuration is missing, and the robot has {', '.join(layout.configurations)}"
-        )
-    return found
 
 
 def _check_driving(name: str, columns: Columns) -> None:
@@ -306,7 +302,7 @@ def inertia_at_motor(robot: Robot, load: Load) -> float:
 
 
 def time_constant(robot: Robot) -> float:
-    """Time constant J R/k² of the motors' speed with the slowest load [s]; infinite if it is unknown."""
+    """Time constant J R/k² of the motors' speed with the slowest load [s]. Infinite if it is unknown."""
     motor, slowest = robot.motor, 0.0
     if not robot.knows(VOLTAGE):
         return math.inf
@@ -328,14 +324,24 @@ def driven_rows(name: str, columns: Columns, layout: Layout) -> tuple[Columns, n
     if note:
         columns = {column: values[driven] for column, values in columns.items()}
     if {*layout.sides, *HEADING} & set(columns):
-        _check_level(name, columns)
+        slope = columns["slope_deg"]
+        if slope.any():
+            row = int(np.flatnonzero(slope)[0])
+            more = (
+                f", and so in {np.count_nonzero(slope)} of {len(slope)} rows" if np.count_nonzero(slope) > 1 else ""
+            )
+            raise BadData(
+                f"{name} row {row + 1}, slope_deg: got {bound_text(slope[row])} in a table of settled turns{more}; "
+                "on a slope the heading changes all the time, so that no turn is settled there: expected 0; remove "
+                "such rows (simulate --left, --right and --slope with --model drive follows one over time)"
+            )
     if not set(layout.sides) & set(columns):
         _check_signs(name, columns, layout)
     return columns, driven, (note,) if note else ()
 
 
 def _driven(name: str, columns: Columns, layout: Layout) -> tuple[np.ndarray, str]:
-    """True for rows of settled runs in which something drives the motors; a sentence on the other rows.
+    """True for rows of settled runs in which something drives the motors. A sentence on the other rows.
 
     Raises:
         BadData: no row is driven, or a speed is read where nothing drives the motors.
@@ -370,19 +376,6 @@ def _driven(name: str, columns: Columns, layout: Layout) -> tuple[np.ndarray, st
     return size != 0, (
         f"{name}: {which} left out, as nothing drives the motors ({zero or column} 0); rows are counted without them"
     )
-
-
-def _check_level(name: str, columns: Columns) -> None:
-    """Refuses readings of turns on a slope, since no turn is settled there."""
-    slope = columns["slope_deg"]
-    if slope.any():
-        row = int(np.flatnonzero(slope)[0])
-        more = f", and so in {np.count_nonzero(slope)} of {len(slope)} rows" if np.count_nonzero(slope) > 1 else ""
-        raise BadData(
-            f"{name} row {row + 1}, slope_deg: got {bound_text(slope[row])} in a table of settled turns{more}; on a "
-            "slope the heading changes all the time, so that no turn is settled there: expected 0; remove such rows "
-            "(simulate --left, --right and --slope with --model drive follows one over time)"
-        )
 
 
 def _check_signs(name: str, columns: Columns, layout: Layout) -> None:

@@ -34,12 +34,13 @@ class ActiveSet(eqx.Module):
 
     z = [base, amplitudes, shapes], all with standard normal priors: an amplitude is width · sd · z, a shape
     its nominal value times exp(spread · z). The effect in a slot is data, not structure, so that fits
-    of many candidates are one vmapped batch; an empty slot keeps its coordinates at 0.
+    of many candidates are one vmapped batch. An empty slot keeps its coordinates at 0.
 
     Attributes:
         base: coordinates of the base parameters.
-        active: index into `names` of the effect in each slot, -1 if it is empty; shape (slots,).
-        sd: of each effect's amplitude, including the width; scales: of each effect's shape, see `shape_scales`.
+        active: index into `names` of the effect in each slot, -1 if it is empty, shape (slots,).
+        sd: of each effect's amplitude, including the width.
+        scales: of each effect's shape, see `shape_scales`.
         names, shapes: names of the robot's effects, and of their shape parameters ("" for none).
     """
 
@@ -98,7 +99,8 @@ class ScoredLibrary:
     Attributes:
         effects: those that the data can show and the robot does not have yet.
         scored: the same, with their grids.
-        of: index of each instance's effect; at: its shape's coordinate; shape (instances,).
+        of: index of each instance's effect.
+        at: its shape's coordinate, shape (instances,).
     """
 
     effects: tuple[Effect, ...]
@@ -134,19 +136,13 @@ class ScoredLibrary:
         return int(mine[np.argmax(np.abs(np.asarray(single)[mine]))])
 
 
-def scored_library(effects: Sequence[Effect]) -> ScoredLibrary:
-    """Library of the effects, each at every point of its shape's grid."""
-    grids = tuple(with_shape_grid(e) for e in effects)
-    effect = np.repeat(np.arange(len(grids)), [len(s.at) for s in grids])
-    return ScoredLibrary(tuple(effects), grids, effect, np.concatenate([s.at for s in grids]))
-
-
 @dataclasses.dataclass(frozen=True)
 class CandidateSpace:
     """Problems of a search: the base, and the base with any effects of a library in a few slots.
 
     Attributes:
-        bare: problem of the base only; equipped: of the base and the effects in the slots, whichever these are.
+        bare: problem of the base only.
+        equipped: of the base and the effects in the slots, whichever these are.
         library: the effects.
         room: names of effects that the program of every fit of histories includes, see `fitted_by`.
         near: coordinates of fits of the same histories with other sds, by their effects. Fits then start there and
@@ -261,4 +257,10 @@ def candidate_space(
     more = tuple(library[e.name]() for e in effects if e.name not in have)
     robot = params.without_weak_types(dataclasses.replace(bare.base, effects=(*bare.base.effects, *more)))
     data = dataclasses.replace(bare.data, centre=jnp.zeros(len(coordinates)))
-    return CandidateSpace(bare, Problem(robot, coordinates, bare.observe, data), scored_library(effects))
+    grids = tuple(with_shape_grid(e) for e in effects)
+    effect = np.repeat(np.arange(len(grids)), [len(s.at) for s in grids])
+    return CandidateSpace(
+        bare,
+        Problem(robot, coordinates, bare.observe, data),
+        ScoredLibrary(tuple(effects), grids, effect, np.concatenate([s.at for s in grids])),
+    )

@@ -41,14 +41,16 @@ class Candidate:
 
     Attributes:
         active: name of the effect in each slot, "" if empty.
-        z: coordinates, see `ActiveSet`; sd: their posterior sds; cost: the objective [½σ²].
+        z: coordinates, see `ActiveSet`.
+        sd: their posterior sds.
+        cost: the objective [½σ²].
         amplitude: in prior sds of each slot's effect (0 if empty).
-        size: of each slot over the largest plausible amplitude in its direction; 0 if empty.
+        size: of each slot over the largest plausible amplitude in its direction, 0 if empty.
         plausible: True if each amplitude has a plausible size, is off its bounds, and has a sign that physics allows.
         nearly: True if it is plausible except for amplitudes up to `settings.stretched` times the largest.
         converged: True if the fit is an optimum.
         supplying: effects that would make their balance supply power.
-        simulated: True for a fit of the model; False for one of its linearised equations (`screening`).
+        simulated: True for a fit of the model, False for one of its linearised equations (`screening`).
     """
 
     active: tuple[str, ...]
@@ -117,8 +119,10 @@ class BaseFit:
     """The base fitted without effects.
 
     Attributes:
-        candidate: without effects; reading: of each row [SI], shape (rows, channels).
-        space: without the rows that it cannot reach; unusable: indices of those.
+        candidate: without effects.
+        reading: of each row [SI], shape (rows, channels).
+        space: without the rows that it cannot reach.
+        unusable: indices of those.
     """
 
     candidate: Candidate
@@ -134,7 +138,7 @@ def fit_base(space: CandidateSpace, settings: Settings, where: str, near: Candid
 
     Args:
         where: first words of the error message.
-        near: a fit of the same runs with other weights or sds, or by regression; for long runs the only start,
+        near: a fit of the same runs with other weights or sds, or by regression. For long runs the only start,
             unless a regression is `UNLIKELY`.
 
     Raises:
@@ -209,7 +213,7 @@ Proposal = tuple[tuple[str, ...], np.ndarray]
 
 
 def fit_candidates(space: CandidateSpace, proposals: Sequence[Proposal], settings: Settings) -> list[Candidate]:
-    """Fit each (active effects, start); those known with other sds take a few steps from there."""
+    """Fit each (active effects, start). Those known with other sds take a few steps from there."""
     if not proposals:
         return []
     problem, active = space.fitted_by(names for names, _ in proposals)
@@ -236,7 +240,7 @@ def fit_in_addition(
     led the search without the effect elsewhere.
 
     Args:
-        wanted: (active effects, the other fit, scores of its residuals); all of its effects are active.
+        wanted: (active effects, the other fit, scores of its residuals). All of its effects are active.
     """
     found = fit_candidates(space, [(w, start_of_fit(space, at, w, settings, by)) for w, at, by in wanted], settings)
     stuck = [k for k, (_, at, _) in enumerate(wanted) if not found[k].cost <= at.cost + STUCK]

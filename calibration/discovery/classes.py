@@ -48,7 +48,7 @@ class Classes:
 
 
 def signature_cosines(space: CandidateSpace, scores: ScoreTable) -> np.ndarray:
-    """Largest |cos| between the projected signatures of two effects, over their shapes; (effects, effects)."""
+    """Largest |cos| between the projected signatures of two effects, over their shapes, (effects, effects)."""
     cosine, effect, count = np.abs(np.asarray(scores.cosine)), space.library.of, len(space.library)
     whole = np.zeros((count, count))
     np.maximum.at(whole, (effect[:, None], effect[None, :]), cosine)
@@ -70,7 +70,8 @@ def find_classes(
     `settings.form` of the sigmas, or `form_family` within the same family.
 
     Args:
-        left: diagnosis of the base; after: diagnosis of the best fit.
+        left: diagnosis of the base.
+        after: diagnosis of the best fit.
     """
     cosine, names = signature_cosines(space, left.scores), space.library.names
     fewer = [base] if len(best.effects) == 1 else without_each(space, best, settings, ladder)

@@ -27,8 +27,11 @@ class Cluster:
     """Outliers that are close together.
 
     Attributes:
-        axis: column, or angle, of the cluster; low, high: its ends; level: of a column of words or levels.
-        inside, of: number of outliers in it, and of all; p: p-value.
+        axis: column, or angle, of the cluster.
+        low, high: its ends.
+        level: of a column of words or levels.
+        inside, of: number of outliers in it, and of all.
+        p: p-value.
     """
 
     axis: str
@@ -48,12 +51,14 @@ def find_cluster(
     error: float,
     seed: int,
 ) -> Cluster | None:
-    """Most significant cluster of outliers; None if it is consistent with chance.
+    """Most significant cluster of outliers, None if it is consistent with chance.
 
     Args:
-        outliers, included: True for outliers, and for other included rows; shape (rows,).
-        axes: positions of rows along continuous variables; levels: columns of conditions.
-        error: family-wise error; seed: random seed of the permutations.
+        outliers, included: True for outliers, and for other included rows, shape (rows,).
+        axes: positions of rows along continuous variables.
+        levels: columns of conditions.
+        error: family-wise error.
+        seed: random seed of the permutations.
     """
     pool = np.flatnonzero(outliers | included)
     mine = np.flatnonzero(outliers)

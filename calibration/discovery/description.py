@@ -1,4 +1,4 @@
-"""Check that a model describes the runs at all; otherwise no effect is named."""
+"""Check that a model describes the runs at all, otherwise no effect is named."""
 
 from __future__ import annotations
 
@@ -52,7 +52,8 @@ def remaining_errors(
     `REMOVED` of the refit's error is gone, or the noise is estimated as that large.
 
     Args:
-        missed: as from `missed_channels`; refit, found: hold-out predictions without and with the effects.
+        missed: as from `missed_channels`.
+        refit, found: hold-out predictions without and with the effects.
     """
     before, after = _unseen_errors(space, runs, refit, found)
     index = {c.name: k for k, c in enumerate(runs.channels)}
@@ -65,8 +66,8 @@ def remaining_errors(
 
 
 def _unseen_errors(space: CandidateSpace, runs: Runs, *scores: HeldOutScore) -> np.ndarray:
-    """rms error of each fit on unseen runs over each channel's measured rms [-], over the readings that all predict;
-    NaN without any; shape (fits, channels)."""
+    """rms error of each fit on unseen runs over each channel's measured rms [-], over the readings that all predict,
+    NaN without any, shape (fits, channels)."""
     measured = runs.measured()
     counts = space.weight[: len(runs)] > 0
     off = [[np.where(counts, reading - measured, np.nan) for reading in s.reading.values()] for s in scores]
@@ -80,7 +81,7 @@ def _unseen_errors(space: CandidateSpace, runs: Runs, *scores: HeldOutScore) -> 
 def _error_shares(
     space: CandidateSpace, runs: Runs, noise: Noise, fit: Linearization
 ) -> tuple[np.ndarray, np.ndarray]:
-    """rms error of each channel over its measured rms [-], and in sds [σ], over included readings; 0 without any."""
+    """rms error of each channel over its measured rms [-], and in sds [σ], over included readings, 0 without any."""
     rows = len(runs)
     counts = space.weight[:rows] > 0
     off = np.where(counts, np.asarray(fit.by_row())[:rows], 0.0)

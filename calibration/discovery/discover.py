@@ -126,22 +126,24 @@ def discover(
 
     Args:
         runs: settled runs, or time histories from rest.
-        robot: its values are the prior means; a mass in the table replaces its own.
-        noise: sds as `noise.parse_noise`; None takes the file's columns, else an estimate from series of conditions,
+        robot: its values are the prior means. A mass in the table replaces its own.
+        noise: sds as `noise.parse_noise`. None takes the file's columns, else an estimate from series of conditions,
             or without series a usual one, halved and doubled.
         stated: parameter → (mean, sd) [SI], priors that replace the fields'.
         library: effects to test.
-        replicates: of the bootstrap; seed: random seed.
+        replicates: of the bootstrap.
+        seed: random seed.
         prefer: criterion for the leader of a class, `fit` or `held-out`.
         forbidden: kinds of experiments (`menu.KINDS`) and configurations that are not proposed.
         rows: number of rows above which they are thinned evenly, those of a log in time and those of a table over its
-            conditions; a note reports it.
-        progress: callback for progress messages; keep: function that stores each stage when it ends.
-        left: remaining time after the verdict [s], for which verdicts at other noises are awaited; None: no limit.
+            conditions. A note reports it.
+        progress: callback for progress messages.
+        keep: function that stores each stage when it ends.
+        left: remaining time after the verdict [s], for which verdicts at other noises are awaited. None: no limit.
 
     Raises:
         BadData, BadConfiguration: data that contradict themselves or are too few, invalid priors, unknown
-            experiments; or a call inside `jax.jit` while JAX uses single precision.
+            experiments, or a call inside `jax.jit` while JAX uses single precision.
     """
     if not is_double():
         raise BadConfiguration(f"discover: {SINGLE}")
@@ -201,10 +203,15 @@ class LoopInput:
     """Input of the loop's stages: a table, its robot, and the settings.
 
     Attributes:
-        runs: without copies; numbers: of the rows, as in messages.
-        robot: as `preparation.prepare` returns it; noise: of the readings; stated: priors (mean, sd) [SI].
-        settings: statistical; library: effects to test.
-        notes: on all of these; at_first: those to report before the first fit.
+        runs: without copies.
+        numbers: of the rows, as in messages.
+        robot: as `preparation.prepare` returns it.
+        noise: of the readings.
+        stated: priors (mean, sd) [SI].
+        settings: statistical.
+        library: effects to test.
+        notes: on all of these.
+        at_first: those to report before the first fit.
     """
 
     runs: Runs
@@ -225,7 +232,7 @@ class LoopInput:
         ahead: bool = False,
         keep: Keep = kept.keep_nothing,
     ) -> LoopStages:
-        """Stages up to a verdict, with this noise or another; other arguments as in the function `trace`."""
+        """Stages up to a verdict, with this noise or another. Other arguments as in the function `trace`."""
         sds = self.noise if noise is None else noise
         return trace(
             self.runs, self.robot, sds, self.settings, self.stated, self.library, progress, known, ahead, keep
@@ -245,7 +252,7 @@ def prepare_loop(
     forbidden: Sequence[str] = (),
     rows: int = ROWS,
 ) -> LoopInput:
-    """Input of the stages from the arguments of `discover`; arguments and errors as there.
+    """Input of the stages from the arguments of `discover`. Arguments and errors as there.
 
     A campaign that needs only verdicts continues with `LoopInput.trace`, and so follows the same path as users.
     """
@@ -282,7 +289,8 @@ class Sds:
     """Noise of a verdict.
 
     Attributes:
-        noise: of the readings; factors: changes of the given sds by channel, empty for none.
+        noise: of the readings.
+        factors: changes of the given sds by channel, empty for none.
         remarks: notes on the noise.
     """
 
@@ -297,17 +305,20 @@ class LoopStages:
 
     Attributes:
         verdict: `none`, `named`, `class`, `mechanism`, `place` or `undescribed`.
-        screened: the base fit without outliers; left: its diagnosis.
+        screened: the base fit without outliers.
+        left: its diagnosis.
         sds: noise of the verdict.
-        searched: the search; alike: effects that cannot be separated, if a name is given.
+        searched: the search.
+        alike: effects that cannot be separated, if a name is given.
         where: location of the discrepancy, or of the remaining one.
         standing: tests of the names.
         held_out: alternatives by hold-out errors, if these chose the leader.
         beside: the curve of the base's discrepancy, if there is one.
         predicted: hold-out predictions of fits, as from `prediction.smallest_predictive_set`.
-        mechanism: if no name is established; it may not be established either.
-        missed: channels that the refit does not describe, except for `undescribed` with the error that the effects
-            leave on unseen runs; unused: columns that vary and have no role.
+        mechanism: if no name is established. It may not be established either.
+        missed: channels that the refit does not describe, except for `undescribed` with the error that the
+            effects leave on unseen runs.
+        unused: columns that vary and have no role.
     """
 
     verdict: str
@@ -340,7 +351,7 @@ class LoopStages:
 
     @property
     def noise_factor(self) -> float | None:
-        """Factor of the sds, the geometric mean of the channels; None if they are unchanged."""
+        """Factor of the sds, the geometric mean of the channels, None if they are unchanged."""
         return float(np.exp(np.mean(np.log(list(self.sds.factors.values()))))) if self.sds.factors else None
 
     @property
@@ -460,7 +471,7 @@ class _Task:
     keep: Keep
 
     def screen(self, noise: Noise, before: BaseFit | None, ranked: list[Ranking]) -> Screening:
-        """The base fit with this noise, from one with another if given, and its outliers; see `windows`."""
+        """The base fit with this noise, from one with another if given, and its outliers. See `windows`."""
         space = pose_candidates(self.runs, self.robot, noise.sd, self.settings, self.stated, self.library)
         known, at = self.known, functools.partial(bases_at_fit, self.runs)
         if before is None:
@@ -477,7 +488,7 @@ class _Task:
         return screen_outliers(fit_base(space, self.settings, self.runs.source, near), at, self.runs, self.settings)
 
     def windows(self, space: CandidateSpace, ranked: list[Ranking]) -> tuple[CandidateSpace, Candidate | None]:
-        """Program and start of the base fit from a log's equations in weak form; their ranking of the library is
+        """Program and start of the base fit from a log's equations in weak form. Their ranking of the library is
         appended to `ranked`."""
         found = screen_by_weak_form(space, self.settings)
         if found is None:
@@ -524,7 +535,7 @@ def _search_effects(task: _Task, screened: Screening, left: Diagnosis) -> tuple[
 def _search_until_clean(
     task: _Task, screened: Screening, sds: Sds, ranked: list[Ranking]
 ) -> tuple[Screening, Diagnosis, Search | None]:
-    """Search, repeated while it leaves outliers; None if the base leaves no discrepancy."""
+    """Search, repeated while it leaves outliers, None if the base leaves no discrepancy."""
     settings, keep, progress = task.settings, task.keep, task.progress
     for k in range(SCREENINGS):
         progress(next_step("bootstrap", settings.replicates))
@@ -609,11 +620,12 @@ def choose_effects(
     """Effects that belong in the model, the updated search, and the tests of their names.
 
     They are those with an established name, and those of the smallest set that predicts as well as any, except
-    stand-ins for a curve; None for no effects. If the largest set leaves no discrepancy, its effects are judged, else
+    stand-ins for a curve, None for no effects. If the largest set leaves no discrepancy, its effects are judged, else
     those of the set that predicts.
 
     Args:
-        left: diagnosis of the base; beside: its curve.
+        left: diagnosis of the base.
+        beside: its curve.
         predicted: collects hold-out predictions of fits.
     """
     base, space, bases = screened.base.candidate, screened.base.space, screened.bases
@@ -669,7 +681,7 @@ def pose_candidates(
 ) -> CandidateSpace:
     """Base problem of a table, with slots for the effects that its data can show.
 
-    Rows are padded to one of a few sizes, so that tables of similar size share compiled programs; padding has weight
+    Rows are padded to one of a few sizes, so that tables of similar size share compiled programs. Padding has weight
     0. A mass in the table replaces the robot's own. Ground friction without a stated prior has that of any surface,
     because the prior of another surface would bias parameters that depend on slip.
     """
@@ -697,7 +709,8 @@ def visible_effects(
     """Effects of a library that such data can show and the robot does not have yet.
 
     Args:
-        either_way: True if the runs go both ways, see `goes_both_ways`; at_duties: see `has_pulses`.
+        either_way: True if the runs go both ways, see `goes_both_ways`.
+        at_duties: see `has_pulses`.
     """
     have = {e.name for e in robot.effects}
     return tuple(
@@ -751,7 +764,8 @@ def diagnosis_of_base(
     """Diagnosis of the base by its own bootstrap.
 
     Args:
-        freedom: degrees of freedom of the sd of each channel; null: replicates, if known.
+        freedom: degrees of freedom of the sd of each channel.
+        null: replicates, if known.
     """
     space, base = screened.base.space, screened.base.candidate
     linear, scores, found = screened.diagnosed
@@ -800,7 +814,7 @@ def brief_verdict(factor: float, traced: LoopStages, numbers: np.ndarray) -> Sen
 
 
 def verdict_summary(traced: LoopStages, numbers: np.ndarray) -> Summary:
-    """Summary of a verdict, as data of its statement; `numbers` as in `assemble_result`."""
+    """Summary of a verdict, as data of its statement. `numbers` as in `assemble_result`."""
     space, alike = traced.screened.base.space, traced.alike
     support = None if traced.standing is None else traced.standing.numbered(numbers)
     best = None if traced.searched is None else traced.searched.best
@@ -852,7 +866,8 @@ class _FitOfVerdict:
     Attributes:
         before, after: fits of the base and of the proposal, None if that is the base.
         robot: of the fit, with its coordinates z, their sds, its cost, and whether it converged.
-        ends: its diagnosis; curve, beside: the curve and the diagnosis with it, if no name is given.
+        ends: its diagnosis.
+        curve, beside: the curve and the diagnosis with it, if no name is given.
     """
 
     before: findings.Fitted
@@ -902,7 +917,7 @@ def _fit_of_verdict(traced: LoopStages, progress: Tell) -> _FitOfVerdict:
 def _predicts_well(traced: LoopStages, written: _FitOfVerdict, gain: prediction.Gain | None) -> bool:
     """True if the proposal predicts well enough to be written instead of the refit.
 
-    A written fit never predicts worse than the refit; a curve, which claims no cause, has to predict better.
+    A written fit never predicts worse than the refit. A curve, which claims no cause, has to predict better.
     """
     refit = traced.best is traced.screened.base.candidate
     if gain is None or (written.curve is None and refit):
@@ -971,8 +986,11 @@ class _ResultInput:
     """Verdict, fit and predictions as input of a result.
 
     Attributes:
-        seen: readings of each row; compared: alternatives by hold-out errors; remaining: residuals of the fit.
-        gain: of the fit's predictions over the refit's; kept: True if the fit is written.
+        seen: readings of each row.
+        compared: alternatives by hold-out errors.
+        remaining: residuals of the fit.
+        gain: of the fit's predictions over the refit's.
+        kept: True if the fit is written.
     """
 
     traced: LoopStages
@@ -1016,6 +1034,7 @@ def _result(
     listed = findings.effect_scores(space, left.scores, settings)
     shown = space.library.indices([s.name for s in listed])
     said = verdict_summary(traced, numbers)
+    kind = type(observe)
     return DiscoveryResult(
         verdict=traced.verdict,
         summary=said,
@@ -1035,8 +1054,10 @@ def _result(
         remains=remains,
         next_experiment=findings.next_experiment(_proposal(space, traced, settings)),
         cannot_see=findings.invisible_effects(space, left.scores, settings),
-        needs_histories=_needs_histories(library, type(observe)),
-        needs_reverse=_needs_reverse(library, runs),
+        needs_histories=tuple(sorted(name for name, e in library.items() if e.transient and not kind.shows(e))),
+        needs_reverse=tuple(
+            sorted(name for name, e in library.items() if e.needs_reverse and not goes_both_ways(runs))
+        ),
         alternatives=near,
         implausible=too_large,
         hidden=concealed,
@@ -1112,7 +1133,7 @@ def noise_remarks_before_verdict(sds: Sds, remaining: Residuals) -> tuple[Remark
 
 
 def _gain(space: CandidateSpace, runs: Runs, seen: ReadingsOfRows) -> prediction.Gain | None:
-    """Gain of the proposal's predictions over the refit's; None if no block can be held out."""
+    """Gain of the proposal's predictions over the refit's, None if no block can be held out."""
     if not seen.held_out:
         return None
     counts, kinds = space.weight[: len(runs)] > 0, blocks_room.predictable_blocks(runs, space.bare)
@@ -1137,7 +1158,8 @@ def _residuals(
     """Residuals of a fit, by reading.
 
     Args:
-        linear: the fit at z, linearised; reading: of each row [SI], shape (rows or more, channels).
+        linear: the fit at z, linearised.
+        reading: of each row [SI], shape (rows or more, channels).
     """
     rows, count = len(runs), len(runs.channels)
     counts = (space.weight[:rows] > 0) & np.isfinite(reading[:rows])
@@ -1149,7 +1171,7 @@ def _residuals(
 
 
 def _proposal(space: CandidateSpace, traced: LoopStages, settings: Settings) -> Proposal | None:
-    """Next experiment; None if there are no alternatives to separate, or if the model does not describe the runs."""
+    """Next experiment, None if there are no alternatives to separate, or if the model does not describe the runs."""
     if traced.verdict == "undescribed":
         return None
     if not space.bare.observe.menu:
@@ -1157,16 +1179,6 @@ def _proposal(space: CandidateSpace, traced: LoopStages, settings: Settings) -> 
     if traced.verdict in WITHOUT_NAME and traced.where is not None:
         return propose_denser_runs(space, traced.where, settings)
     return None if traced.alike is None else propose_separating(space, traced.best, traced.alike, settings)
-
-
-def _needs_histories(library: Library, kind: type[observers.Observer]) -> tuple[str, ...]:
-    """Effects of the library that data of this kind cannot show, but histories could."""
-    return tuple(sorted(name for name, e in library.items() if e.transient and not kind.shows(e)))
-
-
-def _needs_reverse(library: Library, runs: Runs) -> tuple[str, ...]:
-    """Effects of the library that these runs cannot show because they all go in one direction."""
-    return tuple(sorted(name for name, e in library.items() if e.needs_reverse and not goes_both_ways(runs)))
 
 
 def _noise(runs: Runs, noise: Noise, kind: type[observers.Observer]) -> dict[str, dict[str, object]]:
@@ -1240,7 +1252,8 @@ def neighbouring_levels(x: np.ndarray, here: float) -> tuple[float, ...]:
     Empty if all other levels are within `LEVEL` of its range.
 
     Args:
-        x: levels of the series; here: level of the row.
+        x: levels of the series.
+        here: level of the row.
     """
     apart = np.abs(x - here)
     others = apart[apart > LEVEL * np.ptp(x)]

@@ -1,6 +1,6 @@
 """Discrepancy without a name: its location, its shape as a smooth curve fitted with the base, and a formula.
 
-Defects and formulas are linear algebra at a fit, with every column projected against the free parameters; the curve
+Defects and formulas are linear algebra at a fit, with every column projected against the free parameters. The curve
 itself is fitted together with the base.
 """
 
@@ -60,7 +60,8 @@ def locate_discrepancy(left: Diagnosis, bases: Bases, included: np.ndarray) -> D
     The place is that of the most significant curve. The variable is that of the curve with most evidence there.
 
     Args:
-        left: diagnosis of a fit; included: True for included rows, shape (rows,).
+        left: diagnosis of a fit.
+        included: True for included rows, shape (rows,).
     """
     names = bases_room.family_names(bases)
     deviate, explained = np.asarray(left.scores.curve), np.asarray(left.scores.explained)
@@ -104,7 +105,7 @@ def similar_variables(names: Sequence[tuple[str, str]], deviate: np.ndarray, pla
 
 
 def _axis(variable: str) -> str:
-    """Key shared by all windows along an axis; a smooth curve has a key of its own."""
+    """Key shared by all windows along an axis. A smooth curve has a key of its own."""
     happens = bases_room.window_from_name(variable)
     return variable if happens is None else f"{happens.axis} for a while"
 
@@ -114,7 +115,7 @@ def refine_window(
 ) -> tuple[bases_room.Window, float]:
     """Window of an axis that explains most, and its decrease of χ² [σ²].
 
-    Windows begin and end at the axis's instants and hold at most half of the rows; those of the tests are coarser.
+    Windows begin and end at the axis's instants and hold at most half of the rows. Those of the tests are coarser.
 
     Args:
         included: True for included rows, shape (rows,).
@@ -147,7 +148,9 @@ class Shaped(eqx.Module):
     """Coordinates of a base fit, then those of a curve's ordinates: y = L z, all standard normal.
 
     Attributes:
-        base: of the base; root: L, shape (ordinates, ordinates); names: dotted, of the ordinates.
+        base: of the base.
+        root: L, shape (ordinates, ordinates).
+        names: dotted, of the ordinates.
         fitted_once: True, because few fits use such coordinates.
     """
 
@@ -179,9 +182,10 @@ class Discrepancy:
     Attributes:
         balance, variable, unit: its place and variable, and the unit of the balance.
         effect: name of the curve among the effects of `robot`, the fitted robot with the curve.
-        defect: of the balance, by row, at the fit without the curve; None if single rows do not show it.
-        grid: of the variable [SI]; curve, sd: there [unit], shape (points,); the 95 % band is ±1.96 sd. The
-            band includes the uncertainty of the base, so it is wide if base parameters can replace the curve.
+        defect: of the balance, by row, at the fit without the curve, None if single rows do not show it.
+        grid: of the variable [SI].
+        curve, sd: there [unit], shape (points,). The 95 % band is ±1.96 sd. The band includes the uncertainty
+            of the base, so it is wide if base parameters can replace the curve.
         chi2: twice the objective before and after [σ²], priors included.
         z, covariance: posterior of the coordinates of `problem`, the ordinates last.
         problem: of the fit.
@@ -214,7 +218,8 @@ def fit_discrepancy(
     """Discrepancy of a balance over a variable: its defects, its curve, a formula.
 
     Args:
-        base: the fit without the curve; linear: the same, linearised.
+        base: the fit without the curve.
+        linear: the same, linearised.
         balance: one of `bases.BALANCES`, or a channel.
         variable: one of `bases.VARIABLES`, of `bases.ORDERS`, or a window.
     """
@@ -291,7 +296,7 @@ class CurveBeside:
 
 
 def _with_curve(space: CandidateSpace, base: Candidate, curve: Smooth) -> Problem:
-    """Problem of the base and a curve; the coordinates of the curve's ordinates come last."""
+    """Problem of the base and a curve. The coordinates of the curve's ordinates come last."""
     problem = space.problem(base.active) if base.effects else space.bare
     # A curve of this name from an earlier round is replaced, because its parameters have the same names.
     kept = tuple(e for e in problem.base.effects if e.name != curve.effect)

@@ -7,7 +7,7 @@ and Verdinelli, Bayesian experimental design, Statistical Science 10 (1995)). Th
 A, B is √(dᵀ S⁻¹ d), d = y_A - y_B. It takes the S with the smaller result (Hunter and Reiner, Designs for
 discriminating between two rival models, Technometrics 7 (1965)). If one of them is true, the χ² of the other is
 larger by σ² ± 2σ, where σ is their separation. So the probability that the false one is refuted is
-Φ((σ² - refuted) / 2σ). The proposal is expected to separate most of all pairs; if one experiment is not enough, two
+Φ((σ² - refuted) / 2σ). The proposal is expected to separate most of all pairs. If one experiment is not enough, two
 are proposed.
 """
 
@@ -64,8 +64,9 @@ class PredictedReadings:
     Attributes:
         names: of the alternatives, the best fit first.
         experiments: the menu.
-        value: readings [SI], shape (alternatives, readings); sd: of the instruments [SI], shape (readings,).
-        half: J C^½, so that the covariance due to the fit is half halfᵀ; shape
+        value: readings [SI], shape (alternatives, readings).
+        sd: of the instruments [SI], shape (readings,).
+        half: J C^½, so that the covariance due to the fit is half halfᵀ. Shape
             (alternatives, readings, coordinates).
         exists: True for readings that every alternative has, shape (readings,).
         settings: thresholds of the separation.
@@ -98,8 +99,9 @@ class Ranked:
     """One experiment of the menu, or several carried out together.
 
     Attributes:
-        experiments: their names; sigma: separation of every two alternatives, in the order of
-            `itertools.combinations`, so with the pairs of the best fit first [σ].
+        experiments: their names.
+        sigma: separation of every two alternatives, in the order of `itertools.combinations`, so with the
+            pairs of the best fit first [σ].
         separates: alternatives that they separate from the best fit, at `Settings.apart`.
         settings: thresholds of the separation.
     """
@@ -131,10 +133,10 @@ class Proposal:
     """The next experiment, or two if one is not enough.
 
     Attributes:
-        experiments: names of the experiments; only `NONE` if no experiment helps.
+        experiments: names of the experiments. Only `NONE` if no experiment helps.
         instruction: instruction for the experimenter.
         separates: alternatives that it separates from the best fit.
-        expected_sigma: smallest separation of a pair that is worth an experiment; 0 for none.
+        expected_sigma: smallest separation of a pair that is worth an experiment, 0 for none.
         settles: True if it separates every two alternatives, at `Settings.apart`.
         table: the whole menu, the most useful experiment first.
     """
@@ -156,7 +158,7 @@ class Proposal:
 
 
 def alternatives_of_class(best: Candidate, found: Classes, *, stated: bool = True) -> dict[str, Candidate]:
-    """Candidates that the table cannot separate, by the names of their effects; the best fit first.
+    """Candidates that the table cannot separate, by the names of their effects. The best fit first.
 
     Args:
         stated: True to include stated values that may be wrong instead of an effect, by their names.
@@ -188,7 +190,7 @@ def _predicted(
 ) -> tuple[predicted.Predicted, Array]:
     """Readings of the menu, and the square root of their covariance due to the fit, by alternative.
 
-    `other` are coordinates that the table does not show at all, known only by their priors; `informed` is the
+    `other` are coordinates that the table does not show at all, known only by their priors. `informed` is the
     Jacobian of the readings and priors of each fit.
     """
 
@@ -216,10 +218,6 @@ def _predicted(
     return jax.vmap(one)(which, z, informed)
 
 
-def _informed(problem: Problem, at: Candidate, active: tuple[int, ...]) -> Array:
-    return problem.observe.at(problem, at.z, active)[1][informative_residuals(problem.data)]
-
-
 def predict_menu(space: CandidateSpace, candidates: Mapping[str, Candidate], settings: Settings) -> PredictedReadings:
     """Predictions of the menu by these alternatives, with instruments as good as those of the table.
 
@@ -235,7 +233,12 @@ def predict_menu(space: CandidateSpace, candidates: Mapping[str, Candidate], set
     equipped, indices = space.fitted_by(c.active for c in those)
     active = jnp.asarray(indices)
     z = jnp.asarray(np.stack([c.z for c in those]))
-    informed = jnp.stack([_informed(equipped, c, mine) for c, mine in zip(those, indices, strict=True)])
+    informed = jnp.stack(
+        [
+            equipped.observe.at(equipped, c.z, mine)[1][informative_residuals(equipped.data)]
+            for c, mine in zip(those, indices, strict=True)
+        ]
+    )
     within = reach_of_space(space, space.bare.robot(jnp.asarray(those[0].z[: space.free])))
     everything, shown = menu.experiment_menu(within), channels.channel_names(space.bare.channels)
     found, half = jax.device_get(
@@ -295,7 +298,7 @@ def _usefulness(r: Ranked) -> tuple[bool, float]:
 
 
 def rank_experiments(seen: PredictedReadings) -> tuple[Ranked, ...]:
-    """The whole menu by the expected number of separated pairs; ties, within `Settings.enough`, keep the menu's
+    """The whole menu by the expected number of separated pairs. Ties, within `Settings.enough`, keep the menu's
     order, the least effort first."""
     return tuple(sorted((_rank_experiment(seen, e.name) for e in seen.experiments), key=_usefulness, reverse=True))
 
@@ -363,6 +366,6 @@ def propose_nothing(space: CandidateSpace) -> Proposal:
 
 
 def propose_separating(space: CandidateSpace, best: Candidate, found: Classes, settings: Settings) -> Proposal | None:
-    """Experiment that separates the alternatives of a class; None if each effect has one name."""
+    """Experiment that separates the alternatives of a class, None if each effect has one name."""
     left = alternatives_of_class(best, found)
     return choose_experiment(predict_menu(space, left, settings)) if len(left) > 1 else None

@@ -78,7 +78,7 @@ def found_effects(
     """Each effect of the best candidate, with its class, amplitude and evidence.
 
     Args:
-        test: of the base fit; its bootstrap gives the p-values.
+        test: of the base fit. Its bootstrap gives the p-values.
     """
     gains = _without_each(space, base, best, found.ladder, settings)
     null, excess = np.asarray(test.null.single), excess_misfit(space, base)
@@ -154,7 +154,7 @@ def _without_each(
 def unnamed_discrepancy(
     found: Discrepancy, where: DiscrepancyLocation, p_value: float, linear: Linearization, rows: int
 ) -> UnnamedDiscrepancy:
-    """Discrepancy of an `unnamed_discrepancy` verdict, over the rows of the table; curve and rows are of one fit.
+    """Discrepancy of an `unnamed_discrepancy` verdict, over the rows of the table. Curve and rows are of one fit.
 
     Args:
         linear: the fit with the curve, linearised.
@@ -187,13 +187,14 @@ def unnamed_discrepancy(
 def listed_alternatives(
     space: CandidateSpace, best: Candidate, cost: float, ladder: Sequence[Candidate], settings: Settings
 ) -> tuple[tuple[Alternative, ...], tuple[Alternative, ...]]:
-    """Simulated candidates that explain the data nearly as well as the proposal; and those of implausible size.
+    """Simulated candidates that explain the data nearly as well as the proposal, and those of implausible size.
 
     A candidate that only adds effects to the proposal, or to another candidate of the list, is omitted if they
     explain little.
 
     Args:
-        cost: of the proposal [½σ²]; best: the proposal, if it is a candidate.
+        cost: of the proposal [½σ²].
+        best: the proposal, if it is a candidate.
     """
     near: tuple[list[Alternative], list[Alternative]] = ([], [])
     simpler = {best.key: cost} if best.key else {}
@@ -281,7 +282,8 @@ def base_shift(space: CandidateSpace, before: np.ndarray, after: np.ndarray, sd:
     """Every base parameter before and after, in its unit and in prior sds.
 
     Args:
-        before, after: coordinates, the base's first; sd: of `after`.
+        before, after: coordinates, the base's first.
+        sd: of `after`.
     """
     coordinates, p = space.coordinates.base, space.free
     z = [np.asarray(x[:p]) for x in (before, after)]
@@ -305,7 +307,7 @@ def base_shift(space: CandidateSpace, before: np.ndarray, after: np.ndarray, sd:
 
 
 def effect_scores(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> tuple[EffectScore, ...]:
-    """Every effect at its best shape and plausible size, strongest first; equal scores are sorted by name."""
+    """Every effect at its best shape and plausible size, strongest first. Equal scores are sorted by name."""
     listed = []
     for effect in space.library.effects:
         amplitude, explained = _plausible_score(space, effect, scores, settings)
@@ -401,7 +403,7 @@ def readings_of_rows(
     known_before: HeldOutReadings | None = None,
     known_after: HeldOutReadings | None = None,
 ) -> ReadingsOfRows:
-    """Fitted and held-out readings, for every kind of block; `after` None is the same as before.
+    """Fitted and held-out readings, for every kind of block. `after` None is the same as before.
 
     Args:
         kinds: blocks, as from `blocks.predictable_blocks`.

@@ -34,7 +34,7 @@ def headline(said: Summary, others: Sequence[tuple[float, Summary]] = ()) -> Hea
 
 
 def _verdict_without_claim(said: Summary) -> str:
-    """Verdict of a table without a claim of a missing effect; empty for other verdicts."""
+    """Verdict of a table without a claim of a missing effect, empty for other verdicts."""
     return said.verdict if said.verdict in ("none", "undescribed") else ""
 
 

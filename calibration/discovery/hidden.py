@@ -30,9 +30,10 @@ class Hidden:
     """An effect that the names of a fit could hide.
 
     Attributes:
-        name: of the effect; amplitude: the largest possible one [prior sds].
+        name: of the effect.
+        amplitude: the largest possible one [prior sds].
         sigmas: change of the readings by it, without the name [σ].
-        experiment: of the menu, that would show it, with the expected separation [σ]; "" and 0 for none.
+        experiment: of the menu, that would show it, with the expected separation [σ]. "" and 0 for none.
     """
 
     name: str
@@ -55,7 +56,9 @@ def find_hidden_effects(
     """Effects that the names of the best candidate could hide, the largest first.
 
     Args:
-        alike: its classes, which list their members; left: diagnosis of the base; after: diagnosis of that fit.
+        alike: its classes, which list their members.
+        left: diagnosis of the base.
+        after: diagnosis of that fit.
         ask: True to look for experiments that would show the effects.
     """
     found, named = [], {n for members in alike.members for n in members}

@@ -23,7 +23,8 @@ def posterior_of_fit(space: CandidateSpace, active: Names, z: np.ndarray, linear
     """Posterior of a fit of the base with the active effects, from its linearization.
 
     Args:
-        active: effect in each slot, "" if empty; z: its coordinates, those of the base only or of all.
+        active: effect in each slot, "" if empty.
+        z: its coordinates, those of the base only or of all.
         linear: of that fit.
     """
     jacobian = np.asarray(linear.jacobian)
@@ -35,7 +36,7 @@ def posterior_of_fit(space: CandidateSpace, active: Names, z: np.ndarray, linear
 
 
 def posterior_of_curve(space: CandidateSpace, active: Names, curve: Discrepancy) -> Posterior:
-    """Posterior of a fit with a curve; the ordinates, linear in their coordinates, come last."""
+    """Posterior of a fit with a curve. The ordinates, linear in their coordinates, come last."""
     shaped: Shaped = curve.problem.coordinates
     inner = len(shaped.base)
     turn = np.eye(len(shaped))

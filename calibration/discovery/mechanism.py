@@ -51,10 +51,12 @@ def find_mechanism(
     """Mechanism that explains most of the base's discrepancy.
 
     It is that of effects of one family of the library, or that of a smooth curve if none of them explains as
-    much; None for histories if only a curve does.
+    much, None for histories if only a curve does.
 
     Args:
-        left: diagnosis of the base; ladder: candidates that were fitted; beside: the curve of the discrepancy.
+        left: diagnosis of the base.
+        ladder: candidates that were fitted.
+        beside: the curve of the discrepancy.
         predicted: known hold-out predictions of fits.
     """
     ladder = simulate_leading_families(space, base, ladder, settings)
@@ -161,7 +163,8 @@ def share_of_excess(excess: float, explained: float) -> float:
     smaller than the decrease of χ².
 
     Args:
-        excess: see `excess_misfit`; explained: decrease of χ² [σ²].
+        excess: see `excess_misfit`.
+        explained: decrease of χ² [σ²].
     """
     return float(explained / max(excess, explained, 1e-300))
 
@@ -263,7 +266,7 @@ def _within_seen_range(space: CandidateSpace, beside: CurveBeside, masks: Sequen
 
 
 def scored_once(space: CandidateSpace, runs: Runs, candidate: Candidate, predicted: Predicted) -> HeldOutScore:
-    """Hold-out scores of a candidate; its predictions are taken from `predicted`, or added to it."""
+    """Hold-out scores of a candidate. Its predictions are taken from `predicted`, or added to it."""
     prediction_before = predicted.get(prediction.candidate_key(candidate))
     if prediction_before is not None:
         return _scored(space, runs, prediction_before)
@@ -284,7 +287,7 @@ def _reading(space: CandidateSpace, candidate: Candidate) -> np.ndarray:
 
 
 def _whitened(space: CandidateSpace, candidate: Candidate) -> np.ndarray:
-    """Residuals of a candidate in sds, 0 for excluded readings; shape (rows, channels)."""
+    """Residuals of a candidate in sds, 0 for excluded readings, shape (rows, channels)."""
     data = space.equipped.data
     off = (_reading(space, candidate) - np.asarray(data.measured)) / np.asarray(data.sd)
     return np.where(np.asarray(space.weight) > 0, np.nan_to_num(off), 0.0)
@@ -292,7 +295,7 @@ def _whitened(space: CandidateSpace, candidate: Candidate) -> np.ndarray:
 
 def _changed_readings(space: CandidateSpace, runs: Runs, before: np.ndarray, after: np.ndarray) -> np.ndarray:
     """True for readings that a mechanism changes by at least `CHANGED` of the rms of the most changed channel, in
-    sds; others would dilute its gain; shape (rows, channels)."""
+    sds. Others would dilute its gain, shape (rows, channels)."""
     rows = len(runs)
     sd, counts = np.asarray(space.bare.data.sd)[:rows], space.weight[:rows] > 0
     moved = np.where(counts, np.abs(after[:rows] - before[:rows]) / sd, 0.0)

@@ -48,10 +48,11 @@ class Act:
     """A calibration act: a reading that does not depend on a run.
 
     Attributes:
-        name: of it; kinds: of `KINDS`.
+        name: of it.
+        kinds: of `KINDS`.
         reading: function of a robot and of the settings [SI], shape (readings,).
-        at: settings, one tuple a reading [SI]; of `weigh`, the configuration's index and the payload.
-        sd: of a single reading [SI]; None: that of the table's readings of `channel`.
+        at: settings, one tuple a reading [SI]. Of `weigh`, the configuration's index and the payload.
+        sd: of a single reading [SI]. None: that of the table's readings of `channel`.
         repeats: number of readings that are averaged.
         channel: channel of the instrument for a reading of zero, "" for another act.
     """
@@ -70,20 +71,23 @@ class Run:
     """Settled runs under conditions that the table does not have.
 
     Attributes:
-        name: of them; kinds: of `KINDS`, and the configuration where there is one.
-        doing: a row of `experiment_words.DOING`; where: the configuration's name, "" for none; motors: of the robot.
+        name: of them.
+        kinds: of `KINDS`, and the configuration where there is one.
+        doing: a row of `experiment_words.DOING`.
+        where: the configuration's name, "" for none.
+        motors: of the robot.
         setup: how the robot is set up.
         voltage [V], slope [deg], payload [kg]: conditions of each run, shape (runs,).
         channels: names of the channels to read.
         configuration: index of the robot's.
-        sides: number of motors that are on; None: all.
+        sides: number of motors that are on. None: all.
         brake: torque on each motor shaft [N·m].
         beyond: angle above which a slope is steeper than any of the table [deg].
         steepest: True if only the steepest slope that the robot climbs is informative.
         repeats: number of readings that are averaged.
         watch: risks of damage, with their indications.
-        imposed: quantity instead of the voltage, see `Rig`; `motor_speed`: [rad/s]; `motor_current`: [A].
-        torque: of a brake on the output, against forward rotation [N·m]; empty without a brake.
+        imposed: quantity instead of the voltage, see `Rig`. `motor_speed`: [rad/s]. `motor_current`: [A].
+        torque: of a brake on the output, against forward rotation [N·m], empty without a brake.
     """
 
     name: str
@@ -128,7 +132,7 @@ ABOUT = 0.01
 
 
 def step_of_settings(span: float, count: int) -> float:
-    """The step of `STEPS` nearest in ratio to that of `count` even steps over a span; 0 for no span."""
+    """The step of `STEPS` nearest in ratio to that of `count` even steps over a span, 0 for no span."""
     if span <= 0:
         return 0.0
     step = span / count
@@ -137,7 +141,7 @@ def step_of_settings(span: float, count: int) -> float:
 
 
 def last_setting(most: float, step: float) -> float:
-    """Largest multiple of a step up to a number, within the tolerance `ABOUT`; the number itself without a step."""
+    """Largest multiple of a step up to a number, within the tolerance `ABOUT`. The number itself without a step."""
     if step == 0:
         return most
     return float(f"{step * math.floor(most * (1 + ABOUT) / step + 1e-9):.6g}")
@@ -410,8 +414,9 @@ def restrict_run(run: Run, kept: np.ndarray, temperature: np.ndarray, speed: np.
     """A run with only its possible conditions, and with the risks to watch.
 
     Args:
-        kept: by `possible_runs`; temperature: of a winding after long running [°C]; speed: of the motor shaft
-            [rad/s]; both predicted, shape (runs,).
+        kept: by `possible_runs`.
+        temperature: of a winding after long running [°C].
+        speed: of the motor shaft [rad/s]. Both predicted, shape (runs,).
     """
     voltage, slope, payload, torque = (
         tuple(v for v, k in zip(x, kept, strict=True) if k) if x else ()

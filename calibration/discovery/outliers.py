@@ -32,10 +32,11 @@ class Screening:
     """The base fit after isolated outliers were excluded.
 
     Attributes:
-        base: the fit; outliers: indices of the excluded rows, in the order of their exclusion.
+        base: the fit.
+        outliers: indices of the excluded rows, in the order of their exclusion.
         bases: of the curves for a discrepancy, at that fit.
         diagnosed: the fit linearised, and scores of effects and curves on its residuals.
-        cluster: common property of outliers, which were then not excluded; None for none.
+        cluster: common property of outliers, which were then not excluded, None for none.
     """
 
     base: BaseFit
@@ -52,7 +53,7 @@ def compile_ahead(
     """Context that compiles programs on other cores, in parallel with the base fit.
 
     It runs a first diagnosis at the prior's mean, a replicate of a bootstrap there and a fit with slots for effects.
-    The function that it gives takes the base fit; it compiles the prediction of experiments too, or for long runs the
+    The function that it gives takes the base fit. It compiles the prediction of experiments too, or for long runs the
     fits with slots for effects. All results are discarded.
     """
     nothing, none = np.zeros(len(space.coordinates)), empty_slots(settings)
@@ -95,10 +96,11 @@ def compile_ahead(
 def screen_outliers(base: BaseFit, bases_at: Callable[[BaseFit], Bases], runs: Runs, settings: Settings) -> Screening:
     """Exclude rows with an isolated wrong reading: its own shift is more significant than any effect or curve.
 
-    Outliers that form a cluster are not excluded; `cluster` describes it.
+    Outliers that form a cluster are not excluded. `cluster` describes it.
 
     Args:
-        bases_at: bases of curves at a fit of the base; runs: the table.
+        bases_at: bases of curves at a fit of the base.
+        runs: the table.
     """
     where = runs.source
     found = _exclude_outliers(base, bases_at, settings, where)
@@ -114,7 +116,7 @@ def screen_outliers(base: BaseFit, bases_at: Callable[[BaseFit], Bases], runs: R
 def screen_known_rows(
     base: BaseFit, bases_at: Callable[[BaseFit], Bases], known: Screening, settings: Settings
 ) -> Screening:
-    """Diagnosis of a base fit to the included rows of another trace of the same table; no further row is excluded.
+    """Diagnosis of a base fit to the included rows of another trace of the same table. No further row is excluded.
 
     Args:
         base: fitted without the rows that `known` excludes.

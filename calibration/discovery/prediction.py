@@ -34,7 +34,7 @@ class HeldOutScore:
     """Hold-out scores of a fit.
 
     Attributes:
-        by_kind: kind of block → log density of each reading, NaN for excluded ones; shape (rows, channels).
+        by_kind: kind of block → log density of each reading, NaN for excluded ones, shape (rows, channels).
         blocks: kind of block → index of each row's block, -1 for none.
         reading: kind of block → the scored predictions.
     """
@@ -53,7 +53,7 @@ class HeldOutScore:
         """Gain over another score, over the readings of both.
 
         Args:
-            where: True for included readings; None: all.
+            where: True for included readings. None: all.
             fewest: fewest blocks of a kind whose scatter counts: that of two has one degree of freedom.
         """
         if not self.by_kind:
@@ -79,7 +79,7 @@ class Gain:
     """Difference of two scores and its standard error [nat a reading].
 
     Attributes:
-        errors: standard error by kind of block, if `se` is their mean; else empty.
+        errors: standard error by kind of block, if `se` is their mean, else empty.
     """
 
     mean: float
@@ -105,8 +105,9 @@ def score_readings(
     """Scores of hold-out predictions.
 
     Args:
-        reading: kind of block → predictions of each row by a fit without its block; NaN for none.
-        counts: True for included readings; kinds: of blocks, label → mask of its rows each.
+        reading: kind of block → predictions of each row by a fit without its block, NaN for none.
+        counts: True for included readings.
+        kinds: of blocks, label → mask of its rows each.
     """
     by_kind, blocks = {}, {}
     norm = math.lgamma((FREEDOM + 1) / 2) - math.lgamma(FREEDOM / 2) - 0.5 * math.log(FREEDOM * math.pi)

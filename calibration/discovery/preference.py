@@ -143,7 +143,7 @@ def prefer_by_held_out(
 def _classes_of_leader(
     space: CandidateSpace, best: Candidate, leader: Candidate, alike: Classes, settings: Settings
 ) -> Classes:
-    """Classes of another leader, with its effect first in its class; missing members are fitted."""
+    """Classes of another leader, with its effect first in its class. Missing members are fitted."""
     members = dict(zip(best.effects, alike.members, strict=True))
     (new,), (old,) = leader.key - best.key, best.key - leader.key
     members[new] = (new, *(n for n in members.pop(old) if n != new))

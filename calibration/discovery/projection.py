@@ -14,7 +14,7 @@ class Projection:
     """Projection of columns on the complement of the free parameters, as if these were fitted again.
 
     Args:
-        linear: at the base fit of settled rows; its prior rows are those of the free parameters.
+        linear: at the base fit of settled rows. Its prior rows are those of the free parameters.
     """
 
     def __init__(self, linear: Linearization) -> None:
@@ -39,7 +39,7 @@ class Defect:
     """Defect of a place in each row, after the free parameters have absorbed their part.
 
     Attributes:
-        value, sd: [unit of the place], shape (rows,); NaN if the readings do not show it.
+        value, sd: [unit of the place], shape (rows,), NaN if the readings do not show it.
     """
 
     value: np.ndarray

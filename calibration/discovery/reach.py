@@ -25,7 +25,8 @@ class Used:
     """Ranges that a table used of one configuration, each increasing and without repeats.
 
     Attributes:
-        configuration: its name; index: in the robot.
+        configuration: its name.
+        index: in the robot.
         voltages [V], slopes [deg], payloads [kg].
         mass: the largest total [kg].
     """
@@ -56,7 +57,8 @@ class Reach:
     Attributes:
         used: of each configuration in the table.
         measured: names of the channels in the table.
-        voltage: highest of runs under load [V]; geared, alone: of motors with only their gearboxes, or with nothing.
+        voltage: highest of runs under load [V].
+        geared, alone: of motors with only their gearboxes, or with nothing.
         current: largest of one motor in steady travel [A], within its continuous limit.
         motor_speed [rad/s], speed [m/s]: largest in steady travel.
         limit_geared, limit_alone: speed limits of the motor shaft with its gearbox and alone, or the table's largest
@@ -64,11 +66,11 @@ class Reach:
         motors: number of motors driven in the same way.
         resistance [ohm], torque_constant [N·m/A]: of one.
         hot: temperature limit of a winding [°C].
-        imposed: quantity on the motors, see `Rig`; levels: of speed [rad/s] or current [A] that the table
-            used, if these are imposed.
+        imposed: quantity on the motors, see `Rig`.
+        levels: of speed [rad/s] or current [A] that the table used, if these are imposed.
         has_ground: True if it is carried by a ground.
         duties: magnitudes of the driver's duty that the table used [-].
-        torques: magnitudes of a brake's torque that it used [N·m]; empty without a brake.
+        torques: magnitudes of a brake's torque that it used [N·m], empty without a brake.
     """
 
     used: tuple[Used, ...]
@@ -105,7 +107,8 @@ def reach_of_table(robot: Robot, conditions: Conditions, measured: Names) -> Rea
     """Limits of the next experiments with a table's robot.
 
     Args:
-        robot: as in its file, or fitted; conditions: of the table's runs, shape (runs,).
+        robot: as in its file, or fitted.
+        conditions: of the table's runs, shape (runs,).
         measured: names of the channels in the table.
     """
     which, volts, slope, payload = (

@@ -1,6 +1,6 @@
 """Test whether a resolved running gear within its priors explains a discrepancy in slip, track or ground.
 
-The lumped laws assume smooth contacts; the track model has grousers and guides, and vibrates. Friction is fitted
+The lumped laws assume smooth contacts. The track model has grousers and guides, and vibrates. Friction is fitted
 through it twice to the rows on tracks, once with the running gear as stated and once with its constants free.
 """
 
@@ -38,7 +38,7 @@ POPULATION, GENERATIONS = 128, 20
 
 
 def question_of_verdict(found: DiscoveryResult) -> Asked | None:
-    """Part of a verdict that the running gear could explain; None for none."""
+    """Part of a verdict that the running gear could explain, None for none."""
     places = [w for w in (found.unnamed, found.remains) if w is not None]
     for place in places:
         for balance in (place.balance, *place.balances_alike):
@@ -83,7 +83,8 @@ def resolve(
     """Fit the track model to the rows of a verdict.
 
     Args:
-        found: by the loop, from settled rows; noise: as given to the loop.
+        found: by the loop, from settled rows.
+        noise: as given to the loop.
         population, generations, members, seed: of the search, see `calibrate`.
         tell: callback for a progress note, or for a sentence of `calibrate`.
 

@@ -56,7 +56,9 @@ class Member:
     """An effect of a class in place of the leader.
 
     Attributes:
-        amplitude: its own [unit]; size: over the largest plausible one; rise_chi2: compared with the leader [σ²].
+        amplitude: its own [unit].
+        size: over the largest plausible one.
+        rise_chi2: compared with the leader [σ²].
     """
 
     amplitude: float
@@ -69,8 +71,10 @@ class StatedValue:
     """A base parameter with a stated value that may be wrong, instead of an effect.
 
     Attributes:
-        value: that explains as much; stated: its prior mean; both in `unit`.
-        prior_sds: distance from its prior; rise_chi2: compared with the effect [σ²].
+        value: that explains as much.
+        stated: its prior mean, both in `unit`.
+        prior_sds: distance from its prior.
+        rise_chi2: compared with the effect [σ²].
     """
 
     value: float
@@ -85,12 +89,15 @@ class FoundEffect:
     """An effect of the verdict.
 
     Attributes:
-        name: of the leader of its class; members: effects that these data cannot separate from it, itself first.
+        name: of the leader of its class.
+        members: effects that these data cannot separate from it, itself first.
         stated: base parameters that may be wrong instead, by name.
-        families: of the members, the leader's first; a single family identifies the equation and its driver.
-        balance, unit: of the balance that it enters; equation, source: from its docstring.
-        parameters: its amplitude and shape; p_value: compared with the strongest of all effects in each bootstrap
-            table; score: rise of χ² without it after a refit [σ²].
+        families: of the members, the leader's first. A single family identifies the equation and its driver.
+        balance, unit: of the balance that it enters.
+        equation, source: from its docstring.
+        parameters: its amplitude and shape.
+        p_value: compared with the strongest of all effects in each bootstrap table.
+        score: rise of χ² without it after a refit [σ²].
         share: of the excess misfit, χ² less its expectation, that it explains [-].
     """
 
@@ -110,7 +117,7 @@ class FoundEffect:
 
 @dataclasses.dataclass(frozen=True)
 class Formula:
-    """A formula for a curve; see `formula.Proposal`."""
+    """A formula for a curve. See `formula.Proposal`."""
 
     JSON = ("formula", "mark", "coefficients", "sds", "bic_gain_over_curve", "tried")
     expression: str
@@ -133,13 +140,15 @@ class UnnamedDiscrepancy(DiscrepancyLocation):
     Attributes:
         unit: of the balance.
         families: equation and driver, in words, as in `FoundEffect`.
-        window: axis, first and last place of a temporary change; None for other discrepancies.
+        window: axis, first and last place of a temporary change, None for other discrepancies.
         effect: name of the smooth curve in the proposed robot.
-        p_value: family-wise; score: decrease of χ² by the curve [σ²]; score_free_in_each_run: by a wave with a phase
-            for each run, None for other curves.
-        at: of the variable [SI]; value, sd: of the curve there [unit].
+        p_value: family-wise.
+        score: decrease of χ² by the curve [σ²].
+        score_free_in_each_run: by a wave with a phase for each run, None for other curves.
+        at: of the variable [SI].
+        value, sd: of the curve there [unit].
         over, defect, defect_sd: for each row the fitted variable [SI] and the defect of the balance [unit]: the curve
-            there plus the row's residual, along the travel; None if single rows do not show it.
+            there plus the row's residual, along the travel, None if single rows do not show it.
         proposal: a formula.
     """
 
@@ -164,8 +173,10 @@ class HiddenEffect:
     """An effect that the effects found could hide.
 
     Attributes:
-        amplitude: the largest possible one in `unit`; sigmas: its change of the readings without them [σ].
-        experiment: that would show it; separation: expected of it [σ]; "" and 0 for none.
+        amplitude: the largest possible one in `unit`.
+        sigmas: its change of the readings without them [σ].
+        experiment: that would show it.
+        separation: expected of it [σ]. "" and 0 for none.
     """
 
     name: str
@@ -181,7 +192,9 @@ class Alternative:
     """Effects that were fitted and are not proposed.
 
     Attributes:
-        effects: amplitudes; prior_sds: the same in prior sds; sizes: over the largest plausible ones.
+        effects: amplitudes.
+        prior_sds: the same in prior sds.
+        sizes: over the largest plausible ones.
         rise_chi2: over the proposed fit [σ²], negative if they explain more.
         reasons: for their implausibility.
     """
@@ -234,8 +247,11 @@ class Ranked:
     """An effect by regression: all other parameters are refitted on the linearised equations of the base fit.
 
     Attributes:
-        name: of the effect; family: equation and driver in words; unit: of its amplitude.
-        score: that it alone would explain at plausible size [σ²]; amplitude, sd: then [its unit].
+        name: of the effect.
+        family: equation and driver in words.
+        unit: of its amplitude.
+        score: that it alone would explain at plausible size [σ²].
+        amplitude, sd: then [its unit].
         supplies: True if that sign would supply power, so that it explains nothing.
     """
 
@@ -253,10 +269,11 @@ class Ranking:
     """Ranking of the library by regression before any set of effects is fitted, unconfirmed.
 
     Attributes:
-        missing: True if an effect is missing; p_value: of that test, family-wise.
+        missing: True if an effect is missing.
+        p_value: of that test, family-wise.
         chance: critical score of the strongest effect [σ²].
         effects: the strongest first, then those that would supply power.
-        windows: number of equations of the log in weak form; 0 for a ranking by signatures along the base fit.
+        windows: number of equations of the log in weak form, 0 for a ranking by signatures along the base fit.
     """
 
     missing: bool
@@ -278,7 +295,7 @@ class KindOfEvidence:
 
 @dataclasses.dataclass(frozen=True)
 class Evidence:
-    """Evidence in one fit's residuals, by kind and family-wise; adequate: True without a significant discrepancy."""
+    """Evidence in one fit's residuals, by kind and family-wise. A fit without significant evidence is `adequate`."""
 
     kinds: dict[str, KindOfEvidence]
     p_value: float
@@ -298,7 +315,7 @@ class RankedExperiment:
 
 @dataclasses.dataclass(frozen=True)
 class NextExperiment:
-    """The next experiment, with the whole menu; see `experiments.Proposal`."""
+    """The next experiment, with the whole menu. See `experiments.Proposal`."""
 
     JSON = ("name", "experiments", "description", "separates", "expected_sigma", "settles", "menu")
     name: str
@@ -320,7 +337,8 @@ class ReadingsOfRows:
     """Readings of all rows [SI], shape (rows, channels), NaN if missing.
 
     Attributes:
-        measured, sd: of the table; as_stated: by the robot before any fit, at its prior means.
+        measured, sd: of the table.
+        as_stated: by the robot before any fit, at its prior means.
         before, after: by the base and by the proposed robot, fitted to all rows.
         held_out: kind of block → (before, after), each row by fits without its block.
         blocks: kind of block → labels.
@@ -343,8 +361,10 @@ class Worse:
     """A channel with larger hold-out errors of the proposal than of the refit.
 
     Attributes:
-        kind: of the blocks held out; channel: its name.
-        rows: number that both fits predict; before, after: rms error over these [%].
+        kind: of the blocks held out.
+        channel: its name.
+        rows: number that both fits predict.
+        before, after: rms error over these [%].
     """
 
     kind: str
@@ -359,9 +379,11 @@ class HeldOutAlternative:
     """An alternative of a class, refitted without each block.
 
     Attributes:
-        effects: its names; leads: True if it is the one proposed.
+        effects: its names.
+        leads: True if it is the one proposed.
         rise_chi2: of the fit to all rows, above the best one [σ²].
-        rms_sigma: over the readings of all kinds of blocks that every alternative predicts [σ]; by_kind: of each.
+        rms_sigma: over the readings of all kinds of blocks that every alternative predicts [σ].
+        by_kind: of each.
         lost: number of held-out readings without a prediction, because its robot slides or fails there.
     """
 
@@ -383,9 +405,12 @@ class Resolved:
         robot: for `--model track`, with the running gear that fits best.
         constants: of the running gear and the friction, by name.
         alike: strongly correlated pairs of constants, with their correlation.
-        outside: constants further than `PLAUSIBLE` prior sds from their priors; settled: True if both searches ended.
-        fall: decrease of twice the objective by the running gear, priors included [σ²]; p: its p-value.
-        chi2: of the readings with the gear as stated and with the best one [σ²]; readings: number included.
+        outside: constants further than `PLAUSIBLE` prior sds from their priors.
+        settled: True if both searches ended.
+        fall: decrease of twice the objective by the running gear, priors included [σ²].
+        p: its p-value.
+        chi2: of the readings with the gear as stated and with the best one [σ²].
+        readings: number included.
         rms_percent: by channel, with the gear as stated and with the best one [%].
         slip_rms: the same for the slip [percentage points].
         remarks: of the search.
@@ -456,38 +481,48 @@ class DiscoveryResult:
     Attributes:
         verdict: `none`, `named`, `class`, `mechanism`, `place` or `undescribed`.
         summary: the verdict with all data of its statement.
-        robot: as written; refit: with nothing added; written: True if the robot has the proposal.
-        gain: hold-out gain of the proposal over the refit; None if no block can be held out.
-        converged: True if the fit of that robot is an optimum; posterior: of all fitted parameters.
-        runs: the table; numbers: of its rows, as in messages.
-        included: True for included rows; outliers, unusable: numbers of excluded rows.
-        effects: in the model, established or tentative; unnamed: the discrepancy of that verdict; remains: the
-            discrepancy that the effects leave.
-        next_experiment: the most informative one; None if there are no alternatives to separate.
-        cannot_see: effects that the data cannot show; needs_histories: that only histories can; needs_reverse: that
-            only runs in both directions can.
-        alternatives, implausible: candidates nearly as good; those of implausible size or sign.
+        robot: as written.
+        refit: with nothing added.
+        written: True if the robot has the proposal.
+        gain: hold-out gain of the proposal over the refit, None if no block can be held out.
+        converged: True if the fit of that robot is an optimum.
+        posterior: of all fitted parameters.
+        runs: the table.
+        numbers: of its rows, as in messages.
+        included: True for included rows.
+        outliers, unusable: numbers of excluded rows.
+        effects: in the model, established or tentative.
+        unnamed: the discrepancy of that verdict.
+        remains: the discrepancy that the effects leave.
+        next_experiment: the most informative one, None if there are no alternatives to separate.
+        cannot_see: effects that the data cannot show.
+        needs_histories: that only histories can.
+        needs_reverse: that only runs in both directions can.
+        alternatives, implausible: candidates nearly as good. Those of implausible size or sign.
         hidden: effects that the effects found could hide, the largest first.
-        support: tests of the names; None if none was tested.
-        cluster: common property of outliers, which were then not excluded; None for none.
+        support: tests of the names, None if none was tested.
+        cluster: common property of outliers, which were then not excluded, None for none.
         residual_clusters: clusters of the proposed robot's residuals by columns without a role.
         before, after: evidence in the residuals of base and proposed robot.
-        chi2: twice the objective before and after [σ²]; readings: number included.
-        base_shift: of every base parameter; scores: of the library at the base fit, strongest first.
-        cosine: |cos| between the projected signatures of two effects; shape (scores, scores), their order.
+        chi2: twice the objective before and after [σ²].
+        readings: number included.
+        base_shift: of every base parameter.
+        scores: of the library at the base fit, strongest first.
+        cosine: |cos| between the projected signatures of two effects, shape (scores, scores), their order.
         detail: further findings for the kind of data: defects of equations by run, or memory, orders and drift.
         readings_of_rows: measured and simulated.
         errors_as_stated: rms by channel, of the robot before any fit.
-        errors, errors_held_out: rms by channel, before and after, over the rows that both predict; by kind of block.
+        errors, errors_held_out: rms by channel, before and after, over the rows that both predict. By kind of block.
         held_out_unpredictable: kinds with at least one block that the others cannot predict.
         held_out_worse: rises of hold-out errors.
-        alternatives_held_out: of a class, by hold-out errors; empty for a single one, or for histories unless
+        alternatives_held_out: of a class, by hold-out errors, empty for a single one, or for histories unless
             requested.
         noise: channel → source and median sd [%].
-        settings: the statistical constants; replicates: number of bootstrap tables with successful refits.
+        settings: the statistical constants.
+        replicates: number of bootstrap tables with successful refits.
         remarks: notes on the result.
         sensitivity: verdicts with other assumed noise.
-        resolved: result of the track model; None if it was not run, or does not apply.
+        resolved: result of the track model, None if it was not run, or does not apply.
     """
 
     verdict: str
@@ -561,7 +596,7 @@ class DiscoveryResult:
 
     @property
     def standing(self) -> str:
-        """Reasons for or against the names, as a sentence; "" for none."""
+        """Reasons for or against the names, as a sentence, "" for none."""
         return describe(self, "standing")
 
     @property

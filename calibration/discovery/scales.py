@@ -88,11 +88,12 @@ SPEEDS = ("speed_motor", "speed_wheel", "speed_theoretical", "speed", "speed_out
 
 
 def library_of_size(robot: Robot, conditions: Conditions, library: Library, turned: float = math.nan) -> Library:
-    """`library` with priors of a rig's size; unchanged for robots that inherit the nominal one.
+    """`library` with priors of a rig's size. Unchanged for robots that inherit the nominal one.
 
     Args:
-        robot: of the rig; conditions: of its table, shape (runs,).
-        turned: rotation of its output, see `output_rotation`; NaN: not known.
+        robot: of the rig.
+        conditions: of its table, shape (runs,).
+        turned: rotation of its output, see `output_rotation`. NaN: not known.
     """
     if robot.rig.inherits:
         return library
@@ -121,7 +122,7 @@ def nominal_ahead(robot: Robot) -> Iterator[None]:
 
 
 def output_rotation(runs: Runs, robot: Robot) -> float:
-    """Root mean square of the output's angles in a table [rad]; NaN without such a channel."""
+    """Root mean square of the output's angles in a table [rad], NaN without such a channel."""
     measured = runs.measured()
     for k, channel in enumerate(runs.channels):
         if channel.name in PLACED and math.isfinite(size := _size(measured[:, k])):
@@ -172,7 +173,7 @@ def _nominal() -> tuple[Robot, Signals]:
 
 
 def _size(x: object) -> float:
-    """Root mean square of the finite values other than zero, however small; NaN without any."""
+    """Root mean square of the finite values other than zero, however small, NaN without any."""
     sizes = np.abs(np.ravel(np.asarray(x, float)))
     sizes = sizes[np.isfinite(sizes) & (sizes > 0)]
     largest = np.max(sizes, initial=0.0)  # squares of less than 1e-162 are zero
@@ -180,7 +181,7 @@ def _size(x: object) -> float:
 
 
 def _ratio(mine: float, theirs: float) -> float:
-    """Ratio of two sizes; 1 if one of them is NaN."""
+    """Ratio of two sizes, 1 if one of them is NaN."""
     return mine / theirs if math.isfinite(mine) and math.isfinite(theirs) else 1.0
 
 

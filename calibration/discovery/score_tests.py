@@ -45,11 +45,14 @@ class ScoreTable(eqx.Module):
     """Scores of candidates on a fit's residuals.
 
     Attributes:
-        single: signed root of each instance's score, -(r·e)/‖r‖, shape (instances,); amplitude: -(r·e)/‖r‖²,
-            in prior sds; left: ‖r‖, the change of the readings by a prior sd in sigmas.
-        pair: scores of pairs of instances (χ² with two degrees of freedom), shape (instances, instances);
-            zero if they can't be separated; cosine: between two projected signatures.
-        curve: of each family, as a normal deviate, shape (families,); explained: its ridge score [σ²].
+        single: signed root of each instance's score, -(r·e)/‖r‖, shape (instances,).
+        amplitude: -(r·e)/‖r‖², in prior sds.
+        left: ‖r‖, the change of the readings by a prior sd in sigmas.
+        pair: scores of pairs of instances (χ² with two degrees of freedom), shape (instances, instances).
+            Zero if they can't be separated.
+        cosine: between two projected signatures.
+        curve: of each family, as a normal deviate, shape (families,).
+        explained: its ridge score [σ²].
         row: signed root of the score of a shift of each single reading, shape (rows, channels).
         fall: further decrease of the objective predicted by a step of the fit [½σ²].
     """
@@ -70,7 +73,8 @@ class Fit(eqx.Module):
 
     Attributes:
         half: L⁻¹ Jᵀ of the readings, shape (coordinates, readings).
-        step: L⁻¹ Jᵀ e, shape (coordinates,); left: e of the readings after that step.
+        step: L⁻¹ Jᵀ e, shape (coordinates,).
+        left: e of the readings after that step.
     """
 
     half: Float[Array, "coordinates readings"]
@@ -157,7 +161,7 @@ def normal_deviate(chi2: Array, freedom: Array) -> Array:
 class Statistics(eqx.Module):
     """Strongest statistics: |single|, pair [σ²], curve [normal deviate], χ² and memory of the residuals.
 
-    `settled` is True if the fit is an optimum; `white` is `Linearization.memory`.
+    `settled` is True if the fit is an optimum. `white` is `Linearization.memory`.
     """
 
     single: Array
@@ -169,7 +173,7 @@ class Statistics(eqx.Module):
 
 
 def strongest_statistics(scores: ScoreTable, linear: Linearization) -> Statistics:
-    """Largest statistics of a table; a bootstrap draws their distribution."""
+    """Largest statistics of a table. A bootstrap draws their distribution."""
     return Statistics(
         jnp.max(jnp.abs(scores.single)),
         jnp.max(scores.pair),
@@ -189,7 +193,7 @@ def diagnose_fit(
     """A linearised fit, the scores of effects and curves on its residuals, and the strongest of these.
 
     Args:
-        near: linearization of a fit nearby; its signatures and defects are reused for long runs, because a curve
+        near: linearization of a fit nearby. Its signatures and defects are reused for long runs, because a curve
             changes the residuals, but barely the signatures.
     """
     if not problem.observe.long:
@@ -262,7 +266,8 @@ def statistics_with_columns(
     family of curves, -inf for families in the columns' own places.
 
     Args:
-        extra: columns over the readings, shape (readings, columns); names: their places.
+        extra: columns over the readings, shape (readings, columns).
+        names: their places.
     """
     wide: tuple[Any, Any] = augment_with_columns(linear, extra)
     scores, _ = _padded_scores(dataclasses.replace(linear, jacobian=wide[0], residual=wide[1]), bases)
@@ -297,14 +302,15 @@ def bootstrap(
     seed: int,
     freedom: np.ndarray | None = None,
 ) -> Statistics:
-    """Statistics of `replicates` tables drawn from the fitted base and fitted again; shape (replicates,).
+    """Statistics of `replicates` tables drawn from the fitted base and fitted again, shape (replicates,).
 
     Replicates with a refit that did not settle are omitted, so there may be fewer.
 
     Args:
-        problem: of the base only, z its fit; linear: the same fit, linearised.
+        problem: of the base only, z its fit.
+        linear: the same fit, linearised.
         seed: random seed.
-        freedom: degrees of freedom of each channel's estimated sd, infinite if it is known; None if all are known.
+        freedom: degrees of freedom of each channel's estimated sd, infinite if it is known, None if all are known.
             Each table is drawn with random true sds, given such estimates.
     """
     count = -(-replicates // CHUNK)

@@ -47,8 +47,8 @@ class Confirmed:
 
     Attributes:
         candidates: of every set, by simulation if available, else by regression.
-        asked: number of regressions that were simulated; otherwise: number of these that explained less than the
-            regression by more than `Settings.same`.
+        asked: number of regressions that were simulated.
+        otherwise: number of these that explained less than the regression by more than `Settings.same`.
         room: names of the effects in the program of these fits, see `CandidateSpace`.
     """
 
@@ -62,7 +62,8 @@ class Regression:
     """Fits of sets of effects on the linearisation of a fit.
 
     Args:
-        at: the fit; linear, scores: its linearization, and the scores of effects on its residuals.
+        at: the fit.
+        linear, scores: its linearization, and the scores of effects on its residuals.
     """
 
     def __init__(
@@ -78,7 +79,7 @@ class Regression:
         self.signatures = np.asarray(linear.signatures)
 
     def __call__(self, active: tuple[str, ...]) -> Candidate:
-        """Candidate with these effects in the slots; new ones have the shape of their grid with the best score."""
+        """Candidate with these effects in the slots. New ones have the shape of their grid with the best score."""
         p, s, at = self.space.free, self.settings.slots, self.at
         size = self.jacobian.shape[1]  # residuals of the priors come last, in the order of the coordinates
         slopes, residual, own = self.jacobian[:-size], self.residual[:-size].copy(), self.residual[-size:]
@@ -192,7 +193,8 @@ class Beforehand:
         base: the fit without effects, by regression. None if the load may slide on its ground, which the
             equations do not show, so that a search should not begin there.
         room: effects in the program of all fits, if the equations show that one is missing and the log is `BRIEF`.
-        scores: of every instance; windows: number of equations.
+        scores: of every instance.
+        windows: number of equations.
         null: root of the strongest score of tables under the null hypothesis [σ], shape (replicates,).
     """
 
@@ -204,7 +206,7 @@ class Beforehand:
 
 
 def screen_by_weak_form(space: CandidateSpace, settings: Settings) -> Beforehand | None:
-    """Base parameters and effects by regression on a log's equations in weak form; None if it does not show its
+    """Base parameters and effects by regression on a log's equations in weak form, None if it does not show its
     states (`weak_form`)."""
     problem = space.bare
     found = weak_form(problem, space.library.scored) if problem.observe.long else None

@@ -29,9 +29,11 @@ class Search:
 
     Attributes:
         ladder: every candidate that was fitted.
-        best: the proposed one, None without a plausible one; diagnosis: of its residuals.
-        asked, otherwise: number of simulated sets that were screened by regression, and of unconfirmed ones among
-            them, see `screening.Confirmed`; room: effects in the program of these fits.
+        best: the proposed one, None without a plausible one.
+        diagnosis: of its residuals.
+        asked, otherwise: number of simulated sets that were screened by regression, and of unconfirmed ones
+            among them, see `screening.Confirmed`.
+        room: effects in the program of these fits.
     """
 
     ladder: tuple[Candidate, ...]
@@ -63,9 +65,13 @@ def search_effects(
     """Smallest set of effects that explains the discrepancy of the base to within the test's margin.
 
     Args:
-        base: the fit without effects; left: its diagnosis.
+        base: the fit without effects.
+        left: its diagnosis.
     """
-    rounds = [_singles(space, base, left, settings)]
+    names = _ranked(space, left.scores)
+    if not space.bare.observe.long:
+        names = names[: _batch(space)]
+    rounds = [_fit_sets(space, [(fill_slots([name], settings), base, left) for name in names], settings)]
     space = space.with_room(rounds[0].room)
     ladder = list(rounds[0].candidates)
     null = np.asarray(left.test.null.single)
@@ -75,7 +81,9 @@ def search_effects(
     while best is not None:
         seen = best
         diagnosis = diagnose_candidate(space, best, bases, left.test.null, settings)
-        if not diagnosis.test.rejected_with_margin or len(best.effects) == _largest_set_size(space, settings):
+        if not diagnosis.test.rejected_with_margin or len(best.effects) == int(
+            min(settings.slots, max(1, space.included.sum() // settings.rows_per_effect))
+        ):
             break
         progress(next_step("more effects", best.effects))
         rounds.append(_extend(space, best, diagnosis, base, left, settings))
@@ -128,30 +136,17 @@ def without_each(
     return [simulated[w] for w in fewer]
 
 
-def _largest_set_size(space: CandidateSpace, settings: Settings) -> int:
-    """Largest number of effects that the data allow, at most the number of slots."""
-    return int(min(settings.slots, max(1, space.included.sum() // settings.rows_per_effect)))
-
-
 def _ranked(space: CandidateSpace, scores: ScoreTable, without: Sequence[str] = ()) -> list[str]:
-    """Effects by their best |score|, the strongest first; those in `without` come last."""
+    """Effects by their best |score|, the strongest first. Those in `without` come last."""
     strength = space.library.largest(np.abs(np.asarray(scores.single)))
     strength[list(space.library.indices(without))] = 0.0
     return [space.library.names[k] for k in np.argsort(-strength)]
 
 
-def _singles(space: CandidateSpace, base: Candidate, left: Diagnosis, settings: Settings) -> Confirmed:
-    """Single effects: those with the highest scores, or for long runs all of them by regression."""
-    names = _ranked(space, left.scores)
-    if not space.bare.observe.long:
-        names = names[: _batch(space)]
-    return _fit_sets(space, [(fill_slots([name], settings), base, left) for name in names], settings)
-
-
 def _fit_sets(
     space: CandidateSpace, wanted: Sequence[tuple[Names, Candidate, Diagnosis]], settings: Settings
 ) -> Confirmed:
-    """Sets of effects, each in addition to another fit and its diagnosis; for long runs first screened by
+    """Sets of effects, each in addition to another fit and its diagnosis. For long runs first screened by
     regression."""
     if not space.bare.observe.long:
         return Confirmed(tuple(fit_in_addition(space, [(w, at, by.scores) for w, at, by in wanted], settings)))

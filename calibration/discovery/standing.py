@@ -1,6 +1,6 @@
 """Tests of names against smooth curves that would explain as much, or take their significance away.
 
-A name is a claim about a cause; a curve claims only a place and a shape. Effects selected from many
+A name is a claim about a cause. A curve claims only a place and a shape. Effects selected from many
 can together imitate a law that the library lacks. So names are compared with curves by evidence that includes the
 number of alternatives (MacKay, Information Theory, Inference, and Learning Algorithms, 2003, ch. 28). If a fit with
 effects is not adequate, each has to keep its significance in addition to the best curves.
@@ -63,11 +63,12 @@ def judge_names(
 ) -> NameSupport:
     """Tests which effects of the best candidate of a search, or of a given proposal, may be named.
 
-    An adequate set is compared with curves, an inadequate one with a single curve; then each
+    An adequate set is compared with curves, an inadequate one with a single curve. Then each
     effect is tested independently (`name_tests`).
 
     Args:
-        left: diagnosis of the base; blocks: masks of rows that are left out in turn, each of shape (rows,).
+        left: diagnosis of the base.
+        blocks: masks of rows that are left out in turn, each of shape (rows,).
         beside: the curve of the base's discrepancy, if it is shared with others.
     """
     best, after = (searched.best, searched.diagnosis) if proposed is None else proposed
@@ -236,7 +237,9 @@ def _curves_beside(
     """Families of curves, the most significant first, until the residuals with them are noise, and that test.
 
     Args:
-        seen: diagnosis of the fit; without: equations without curves; most: largest number of curves.
+        seen: diagnosis of the fit.
+        without: equations without curves.
+        most: largest number of curves.
     """
     places = [n[0] for n in bases_room.family_names(bases)]
     barred = np.isin([equation_of_place(p) for p in places], list(without))
@@ -267,12 +270,13 @@ def name_tests(
     equation.
 
     The test uses a score instead of an amplitude over its sd. With a free shape that ratio stays small, however
-    much an effect explains (Hauck and Donner, J. Am. Stat. Assoc. 72 (1977); Davies, Biometrika 64 (1977)). Curves in
+    much an effect explains (Hauck and Donner, J. Am. Stat. Assoc. 72 (1977). Davies, Biometrika 64 (1977)). Curves in
     the effect's own equation would absorb it. So they are compared with it in addition to the largest set of
     the search. Without that set, a curve would represent its other effects in the same equation.
 
     Args:
-        after: diagnosis of the fit with all of them; blocks: as in `judge_names`.
+        after: diagnosis of the fit with all of them.
+        blocks: as in `judge_names`.
         better: candidates that are the better explanation but not of a plausible size.
     """
     names, largest, tests = bases_room.family_names(bases), searched.best or best, []
@@ -318,7 +322,7 @@ def name_tests(
 
 
 def _offset_share(space: CandidateSpace, best: Candidate, effect: str, settings: Settings) -> float:
-    """Zero error of an instrument without a stated noise over the rms of its readings [-]; else infinite."""
+    """Zero error of an instrument without a stated noise over the rms of its readings [-], else infinite."""
     kind = space.library[effect]
     if kind.channel not in settings.silent or not getattr(kind, "of_zero", False):
         return math.inf
@@ -349,10 +353,11 @@ def _varies_most(
 
     To first order, the residual of a law of another form is the name's own term with an amplitude that varies. So
     a few columns can test what a whole family of curves, with many more, cannot. For settled runs, where each row
-    depends only on its own term; 0 for histories.
+    depends only on its own term, 0 for histories.
 
     Args:
-        linear: the fit of the candidate, linearised; share: family-wise error of the critical value.
+        linear: the fit of the candidate, linearised.
+        share: family-wise error of the critical value.
     """
     most = 0.0, "", math.inf
     if space.bare.observe.long:
@@ -387,7 +392,8 @@ def _evidence_over_curves(
     Both are penalised for the number of alternatives in that equation: effects, and curves.
 
     Args:
-        without: the same fit without it; linear: linearization of that fit.
+        without: the same fit without it.
+        linear: linearization of that fit.
     """
     equation = _equation(space, effect)
     offered = sum(_equation(space, name) == equation for name in space.library.names)
@@ -402,7 +408,7 @@ def _root(jacobian: np.ndarray, residual: np.ndarray, signatures: np.ndarray) ->
 
 
 def _roots(jacobian: np.ndarray, residual: np.ndarray, signatures: np.ndarray) -> np.ndarray:
-    """Root of the score of each column; 0 for columns that the fit imitates."""
+    """Root of the score of each column, 0 for columns that the fit imitates."""
     left, told = _projected_columns(jacobian, residual, signatures)
     root = np.abs(told) / np.sqrt(np.maximum(left, 1e-12))
     return np.where(left > ABSORBED**2 * np.sum(signatures**2, 0), root, 0.0)
@@ -475,7 +481,7 @@ def _chosen_again(
 ) -> float:
     """Share of the informative blocks without which an effect of these families explains as much as any other.
 
-    The criterion is that of `classes`; informative blocks leave half of the information on an effect; 1 without any.
+    The criterion is that of `classes`. Informative blocks leave half of the information on an effect, 1 without any.
 
     Args:
         beside: Jacobian, residual and the effect's own signatures, as for `_root`.
@@ -504,11 +510,12 @@ def _weakest_run(
     signatures: np.ndarray,
     differ: bool = False,
 ) -> tuple[int | None, float]:
-    """Number of the run without which the root is smallest, and that root; None for fewer than three runs.
+    """Number of the run without which the root is smallest, and that root, None for fewer than three runs.
 
     Args:
-        runs: rows of each; differ: True for runs of different information, as histories have; the root is then scaled
-            to the information of all runs.
+        runs: rows of each.
+        differ: True for runs of different information, as histories have. The root is then scaled to the
+            information of all runs.
     """
     least: tuple[int | None, float] = None, math.inf
     known = np.max(_projected_columns(jacobian, residual, signatures)[0]) if differ else 1.0
@@ -524,7 +531,7 @@ def _weakest_run(
 
 
 def _kept_readings(space: CandidateSpace, out: np.ndarray, readings: int) -> np.ndarray:
-    """True for readings that remain without some rows, which are padded; shape (readings,)."""
+    """True for readings that remain without some rows, which are padded, shape (readings,)."""
     rows = np.concatenate([out, np.zeros(len(space.included) - len(out), bool)])
     return np.repeat(~rows, readings // len(rows))
 

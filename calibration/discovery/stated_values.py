@@ -27,8 +27,9 @@ class Shift:
     """A base parameter without its prior, instead of an effect.
 
     Attributes:
-        name: dotted, of the parameter; index: of its coordinate.
-        fit: of all other parameters; its cost excludes the prior.
+        name: dotted, of the parameter.
+        index: of its coordinate.
+        fit: of all other parameters. Its cost excludes the prior.
     """
 
     name: str
@@ -58,7 +59,8 @@ def find_prior_shifts(
     """Base parameters that, without their prior, would explain at least `needed` σ² of a fit's discrepancy.
 
     Args:
-        at: the fit; its effects stay; linear: the same, linearised, if known.
+        at: the fit. Its effects stay.
+        linear: the same, linearised, if known.
     """
     if linear is None:
         problem, (active,) = space.fitted_by([at.active])

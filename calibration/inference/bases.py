@@ -1,4 +1,4 @@
-"""Bases of smooth curves over the rows; the search for a discrepancy that no effect explains uses them."""
+"""Bases of smooth curves over the rows. The search for a discrepancy that no effect explains uses them."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class Basis(eqx.Module):
 
     Attributes:
         columns: of each family, shape (families, rows, terms).
-        places: place of each family; all are balances, or all are channels.
+        places: place of each family. All are balances, or all are channels.
         variables: independent variable of each family.
     """
 
@@ -110,12 +110,12 @@ Bases = tuple[Basis, ...]
 
 
 def is_channel_place(place: str) -> bool:
-    """True if a place is a channel, whose readings have an error; False if it is a balance."""
+    """True if a place is a channel, whose readings have an error, False if it is a balance."""
     return place not in (*BALANCES, *OF_TURNS) and place in channels.channel_names(channels.EVERY)
 
 
 def balance_of(place: str) -> str:
-    """The balance of a place; `sensor` for a channel."""
+    """The balance of a place, `sensor` for a channel."""
     return "sensor" if is_channel_place(place) else place
 
 
@@ -132,26 +132,26 @@ def place_signature(linear: Linearization, place: str, shapes: np.ndarray) -> np
 
 
 def scale_to_unit_range(x: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """x mapped linearly so that rows of positive weight span -1 to 1; zeros if x does not vary."""
+    """x mapped linearly so that rows of positive weight span -1 to 1. Zeros if x does not vary."""
     counting = x[weight > 0]
     low, high = counting.min(), counting.max()
     return np.clip((2 * x - low - high) / (high - low), -1, 1) if high - low > 1e-9 * max(abs(high), 1e-9) else 0 * x
 
 
 def balances_of(robot: Robot | None, among: Sequence[str] = BALANCES) -> Names:
-    """Balances of `among` that a robot has; all for None."""
+    """Balances of `among` that a robot has. All for None."""
     if robot is None:
         return tuple(among)
     return tuple(b for b in among if b not in absent_balances(robot))
 
 
 def channels_of(robot: Robot | None) -> tuple[Channel, ...]:
-    """Channels of a robot; for None, of the packaged one."""
+    """Channels of a robot. For None, of the packaged one."""
     return Layout.of(robot).channels
 
 
 def axes_of(robot: Robot | None) -> Names:
-    """Columns of conditions that are variables of a robot's curves; for None, of the packaged robot's."""
+    """Columns of conditions that are variables of a robot's curves. For None, of the packaged robot's."""
     axes = Layout.of(robot).axes
     return tuple(c for c in (SPEED, CURRENT, *EVERY_AXIS) if c in axes)
 
@@ -165,7 +165,7 @@ class Scope:
 
     @classmethod
     def of(cls, robot: Robot | None) -> Scope:
-        """All balances and conditions of a robot's straight travel; for None, of the packaged one."""
+        """All balances and conditions of a robot's straight travel. For None, of the packaged one."""
         return cls(balances_of(robot), axes_of(robot))
 
     def over(self, columns: Mapping[str, np.ndarray]) -> Scope:
@@ -196,10 +196,11 @@ def curve_families(
     time or order.
 
     Args:
-        columns: of the table, with fitted readings; weight: 0 for excluded rows, shape (rows,), or of points
-            (see `Linearization`).
-        robot: its channels and balances are searched; scope: None takes `Scope.of` the robot.
-        ways: of each point, shape (rows,); None: all forward.
+        columns: of the table, with fitted readings.
+        weight: 0 for excluded rows, shape (rows,), or of points (see `Linearization`).
+        robot: its channels and balances are searched.
+        scope: None takes `Scope.of` the robot.
+        ways: of each point, shape (rows,). None: all forward.
     """
     scope = (Scope.of(robot) if scope is None else scope).over(columns)
     balances = scope.balances
@@ -244,7 +245,7 @@ def curve_families(
 def condition_polynomials(
     columns: Mapping[str, np.ndarray], weight: np.ndarray, scope: Scope, ways: Ways, place: str
 ) -> Float[np.ndarray, "points terms"]:
-    """Polynomials in all conditions for each configuration; arguments as in `curve_families`."""
+    """Polynomials in all conditions for each configuration. Arguments as in `curve_families`."""
     of_column = {column: variable for variable, column in VARIABLES.items()}
     of_column |= {CURRENT: "current", LOAD: "current"}  # its sign is also that of the torque that drives the shafts
     along = (in_travel_frame(place, of_column[c], np.asarray(columns[c]), ways.__getitem__)[0] for c in scope.axes)
@@ -270,7 +271,7 @@ class Window:
         return f"{self.axis} {self.low:.5g} to {self.high:.5g}"
 
     def holds(self, x: np.ndarray) -> np.ndarray:
-        """True for places of the axis in the window; its ends are rounded to five digits."""
+        """True for places of the axis in the window. Its ends are rounded to five digits."""
         slack = 1e-4 * max(abs(self.low), abs(self.high), 1e-9)
         return (x >= self.low - slack) & (x <= self.high + slack)
 
@@ -282,7 +283,7 @@ class Window:
 
 
 def window_from_name(variable: str) -> Window | None:
-    """Window that a variable's name describes; None if the name is no window's."""
+    """Window that a variable's name describes, None if the name is no window's."""
     match = re.fullmatch(rf"({'|'.join((*AXES, *LEVELS))}) (\S+) to (\S+)", variable)
     return None if match is None else Window(match[1], float(match[2]), float(match[3]))
 
@@ -299,7 +300,8 @@ def window_families(
     Windows of time are at the same instants in all runs. Windows are omitted if the conditions explain time or order.
 
     Args:
-        columns: of the table; weight: 0 for excluded rows, shape (rows,).
+        columns: of the table.
+        weight: 0 for excluded rows, shape (rows,).
         robot, scope, ways: as in `curve_families`.
     """
     counts = weight > 0
@@ -362,8 +364,9 @@ def order_collinearity(
     and polynomials of the others and of their ranks.
 
     Args:
-        columns, weight: as in `curve_families`; axes: columns of the conditions, None: of the packaged robot's;
-            column: `order` or `time_s`.
+        columns, weight: as in `curve_families`.
+        axes: columns of the conditions, None: of the packaged robot's.
+        column: `order` or `time_s`.
     """
     counts = weight > 0
     x = np.asarray(columns[column], float)[counts]
@@ -412,7 +415,8 @@ def wave_families(
     and trend. If all runs are shorter, a wave has one amplitude and phase, as if all runs began at a mark.
 
     Args:
-        on_tracks: True for rows of a run on tracks; angle: of the driving shaft [rad]; shape (rows,).
+        on_tracks: True for rows of a run on tracks.
+        angle: of the driving shaft [rad], shape (rows,).
         rows: indices of each run's rows in the order of time, -1 beyond its last, shape (runs, samples).
         knots: rows between which a defect is linear, shape (runs, knots).
         robot: its balances are searched.

@@ -32,7 +32,7 @@ TURN = "turn"
 
 
 def kind_in_words(by: str, joint: str = " and ") -> str:
-    """Name of a kind of blocks in words; `joint` joins two conditions."""
+    """Name of a kind of blocks in words. `joint` joins two conditions."""
     for one in ("motor_speed", "load_torque"):
         by = by.replace(one, one.replace("_", " "))
     return by.replace("_", joint)
@@ -76,9 +76,9 @@ def blocks_by_sharpness(runs: Runs) -> Columns:
 
 
 def blocks_of_kind(runs: Runs, by: str) -> Columns:
-    """Label → mask of its rows, for each block of `by`; empty if the data do not vary in it.
+    """Label → mask of its rows, for each block of `by`, empty if the data do not vary in it.
 
-    A run of a history in which the quantity changes is a block of its own; empty if it changes in all runs.
+    A run of a history in which the quantity changes is a block of its own, empty if it changes in all runs.
     """
     if by == TURN:
         return blocks_by_sharpness(runs) if runs.turns else {}
@@ -136,7 +136,7 @@ def unpredictable_kinds(runs: Runs, problem: Problem) -> Names:
 
 
 def _configuration_of_parameter(parameter: str, configurations: np.ndarray) -> str:
-    """Configuration that a parameter belongs to, among those of a table's rows; empty for none."""
+    """Configuration that a parameter belongs to, among those of a table's rows, empty for none."""
     first = parameter.partition(".")[0]
     return first if first in configurations else ""
 
@@ -166,8 +166,9 @@ def hold_out_by_kind(problem: Problem, start: np.ndarray, masks: dict[str, Colum
     """Refit without each block of each kind in turn (with the given sds), and predict the omitted rows.
 
     Args:
-        problem: as fitted to all rows; start: its optimum.
-        masks: kind → label → mask, from `blocks_of_kind`; kinds without blocks are omitted from the result.
+        problem: as fitted to all rows.
+        start: its optimum.
+        masks: kind → label → mask, from `blocks_of_kind`. Kinds without blocks are omitted from the result.
     """
     answers = {}
     fits: dict[tuple[bytes, ...], refits.HeldOutFits] = {}  # shared by kinds that divide the rows in the same way

@@ -82,31 +82,32 @@ def calibrate(
 
     Args:
         runs: rows of settled runs, or of time histories.
-        robot: its values are the prior means; a mass in the table replaces its own.
-        free, fix: parameter names, see `priors.choose_free_names`; stated: priors that replace the fields',
-            (mean, sd) [SI].
-        noise: as `noise.parse_noise`; None takes the file's sd columns, or estimates.
-        model: name of a fidelity; None takes `drive` for time histories and `steady` for settled runs.
+        robot: its values are the prior means. A mass in the table replaces its own.
+        free, fix: parameter names, see `priors.choose_free_names`.
+        stated: priors that replace the fields', (mean, sd) [SI].
+        noise: as `noise.parse_noise`. None takes the file's sd columns, or estimates.
+        model: name of a fidelity. None takes `drive` for time histories and `steady` for settled runs.
         starts: number of searches, from the prior mean and `starts - 1` draws from the prior. For settled rows with
             a rollout, they begin at the optimum of `steady` and at draws from its posterior.
-        population: members of each generation of a search without gradients, which precedes a rollout's search;
+        population: members of each generation of a search without gradients, which precedes a rollout's search.
             None takes `POPULATION` if parameters are free that `steady` does not read, else 0.
-        generations: largest number of generations, None `population.GENERATIONS`; members: file that stores the
-            members run so far, so that the same calibration can resume.
-        seed: random seed of the starts and of all other draws; profiles: True to profile each parameter.
-        blocks: kinds of blocks to hold out; True: all that are informative for such data.
+        generations: largest number of generations, None `population.GENERATIONS`.
+        members: file that stores the members run so far, so that the same calibration can resume.
+        seed: random seed of the starts and of all other draws.
+        profiles: True to profile each parameter.
+        blocks: kinds of blocks to hold out. True: all that are informative for such data.
             Defaults of these two depend on the kind of data and the fidelity.
         rows: number of rows above which they are thinned evenly, those of a log in time and those of a table over its
-            conditions; a note reports it.
-        solver: an optimistix solver, or the name of one (`solvers.NAMES`), for the searches from the starts; None
+            conditions. A note reports it.
+        solver: an optimistix solver, or the name of one (`solvers.NAMES`), for the searches from the starts. None
             takes ours, which also serves all fits that begin at the optimum (profiles, blocks). For any other
             solver, penalties on adhesion are cut off at 0.
         tell: callback for progress messages of a long calibration.
 
     Raises:
         BadData: data that cannot be fitted, see `checks.check_data`.
-        BadConfiguration: an unknown fidelity, parameter or solver; a number that is not allowed; an invalid prior or
-            noise, or a prior of a mass that the table states; rows that no robot near the priors reaches; or a call
+        BadConfiguration: an unknown fidelity, parameter or solver. A number that is not allowed. An invalid prior or
+            noise, or a prior of a mass that the table states. Rows that no robot near the priors reaches, or a call
             inside `jax.jit` while JAX uses single precision.
     """
     if not is_double():
@@ -144,7 +145,9 @@ class _Plan:
     """Settings of a calibration, completed by the kind of data and the fidelity.
 
     Attributes:
-        fidelity: its name; starts: of the search; profiles: True to profile every parameter.
+        fidelity: its name.
+        starts: of the search.
+        profiles: True to profile every parameter.
         kinds: of the blocks that are held out.
     """
 
@@ -158,7 +161,7 @@ class _Plan:
 def _make_plan(
     runs: Runs, model: str | None, starts: int | None, profiles: bool | None, blocks: Sequence[str] | bool | None
 ) -> _Plan:
-    """Plan of a calibration from the arguments of `calibrate`; None is replaced by a default for the data."""
+    """Plan of a calibration from the arguments of `calibrate`. None is replaced by a default for the data."""
     observe = observers.observer_kind(runs)
     fidelity = model or (OF_HISTORIES if observe.axis else fidelities.NAMES[0])
     effort = observers.fidelity_facts(fidelity).effort
@@ -210,7 +213,8 @@ class _Setting:
     """A table and a robot, ready for a search.
 
     Attributes:
-        base: the robot at the prior means; of_product: priors of its guide frictions, see `_with_guide_priors`.
+        base: the robot at the prior means.
+        of_product: priors of its guide frictions, see `_with_guide_priors`.
     """
 
     runs: Runs
@@ -363,7 +367,9 @@ class _Optimum:
     """The model at the optimum and before the fit.
 
     Attributes:
-        z: coordinates; robot: the robot at z; after: its observation.
+        z: coordinates.
+        robot: the robot at z.
+        after: its observation.
         status, status_before: codes, shape (rows,).
         seen, seen_before: readings [SI], shape (rows, channels), NaN in rows that the model does not reach.
     """
@@ -402,9 +408,11 @@ class _Analysis:
     """Analysis of an optimum.
 
     Attributes:
-        about: the linear analysis; scanned: scans along parameters, by the number of the coordinate.
+        about: the linear analysis.
+        scanned: scans along parameters, by the number of the coordinate.
         elsewhere: number of searches that ended in a minimum that the scans do not show, see `scans.count_outside`.
-        profile: of each parameter, None without profiles; held: blocks held out, by kind.
+        profile: of each parameter, None without profiles.
+        held: blocks held out, by kind.
         notes: remarks on these.
     """
 
@@ -452,7 +460,7 @@ def _result(
     beside: np.ndarray | None,
     seed: int,
 ) -> CalibrationResult:
-    """The result of a calibration; `beside` is the optimum of `steady` that the search began from, if any."""
+    """The result of a calibration. `beside` is the optimum of `steady` that the search began from, if any."""
     runs, known, posed, about = setting.runs, setting.ready.noise, found.problem, analysis.about
     z, seen, seen_before, observe = optimum.z, optimum.seen, optimum.seen_before, setting.plan.observe
     measured, sd, converged = runs.measured(), np.asarray(posed.data.sd), bool(found.best.converged)

@@ -24,14 +24,21 @@ from mmrjax.model.signals import SLIDES, STATUSES
 
 
 def check_data(runs: Runs, robot: Robot, names: Sequence[str], noise: Noise) -> list[Remark | str]:
-    """Refuse data that cannot be fitted; return notes on data that can.
+    """Refuse data that cannot be fitted. Return notes on data that can.
 
     Raises:
         BadData: too few readings, a stuck channel, contradictory replicates, samples of one run under
             different conditions, a configuration that `robot` does not have, readings in other units.
         BadConfiguration: a free parameter of a configuration that has no rows.
     """
-    _check_configurations(runs, robot, names)
+    present = {robot.configurations.names[k] for k in np.unique(runs.configurations(robot))}
+    for name in names:
+        word = name.split(".")[0]
+        if word in robot.configurations and word not in present:
+            raise BadConfiguration(
+                f"--free {name}: {runs.source} has no {word} rows, so nothing measures it; "
+                f"add {word} runs or leave it fixed"
+            )
     _check_enough_readings(runs, names, noise)
     _check_motion(runs, noise)
     said = [
@@ -83,17 +90,6 @@ def _uninformative(runs: Runs, robot: Robot, noise: Noise) -> list[Remark]:
     return [same] if same is not None else [*copied_channels(runs, robot)]
 
 
-def _check_configurations(runs: Runs, robot: Robot, names: Sequence[str]) -> None:
-    present = {robot.configurations.names[k] for k in np.unique(runs.configurations(robot))}
-    for name in names:
-        word = name.split(".")[0]
-        if word in robot.configurations and word not in present:
-            raise BadConfiguration(
-                f"--free {name}: {runs.source} has no {word} rows, so nothing measures it; "
-                f"add {word} runs or leave it fixed"
-            )
-
-
 def _check_enough_readings(runs: Runs, names: Sequence[str], noise: Noise) -> None:
     levels = int(noise.estimated.sum())
     readings = int(np.isfinite(runs.measured()).sum())
@@ -112,7 +108,7 @@ def _check_enough_readings(runs: Runs, names: Sequence[str], noise: Noise) -> No
 
 
 def _check_stuck_channels(runs: Runs) -> list[Remark]:
-    """Refuses a channel with one value under several conditions; returns notes for a motor voltage with one value."""
+    """Refuses a channel with one value under several conditions. Returns notes for a motor voltage with one value."""
     labels = () if runs.layout.complete else ("configuration", "surface")
     columns = [c for c in (*observers.observer_kind(runs).axes_of(runs), *labels) if runs.has(c)]
     varied = [np.unique(runs[c], return_inverse=True)[1] for c in columns]
@@ -161,8 +157,10 @@ def infeasible_error(
     """Error for rows that the model does not reach at the best point of all searches.
 
     Args:
-        robot: of that point; status: of each row there, shape (rows,).
-        lost: True for rows not reached, shape (rows,); names: of the free parameters.
+        robot: of that point.
+        status: of each row there, shape (rows,).
+        lost: True for rows not reached, shape (rows,).
+        names: of the free parameters.
     """
 
     def rows(which: np.ndarray) -> str:

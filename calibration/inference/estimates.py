@@ -55,10 +55,11 @@ def parameter_estimates(
 
     Args:
         posed, base: the problem, and the robot whose values are the prior means.
-        z: the optimum; beside: the optimum of the same problem with `steady`, or None.
+        z: the optimum.
+        beside: the optimum of the same problem with `steady`, or None.
         about, profile: the linear analysis there, and the profiles, if any.
-        sources: of priors other than the fields' own; scans: of the scanned coordinates, whose intervals are those
-            of their profiles.
+        sources: of priors other than the fields' own.
+        scans: of the scanned coordinates, whose intervals are those of their profiles.
     """
     coordinates = posed.coordinates
     at, sd = np.asarray(z), np.asarray(about.sd)
@@ -133,7 +134,7 @@ def channel_noise(posed: Problem, known: Noise, shares: np.ndarray, measured: np
 def errors_by_channel(
     shown: Sequence[Channel], simulated: np.ndarray, measured: np.ndarray, sd: np.ndarray
 ) -> Errors:
-    """Errors by channel; arrays of shape (rows, channels)."""
+    """Errors by channel, arrays of shape (rows, channels)."""
     return _errors(shown, simulated, measured, sd, sized_error(simulated, measured))
 
 
@@ -177,7 +178,7 @@ def readings_by_channel(
     before: np.ndarray,
     after: np.ndarray,
 ) -> dict[str, ChannelReadings]:
-    """Readings by channel; arrays of shape (rows, channels), NaN for missing ones."""
+    """Readings by channel, arrays of shape (rows, channels), NaN for missing ones."""
     percent, sigma = sized_error(after, measured), (after - measured) / sd
     return {
         name: ChannelReadings(*(x[:, k] for x in (measured, sd, before, after, percent, sigma)))

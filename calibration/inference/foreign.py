@@ -20,7 +20,7 @@ DIFFERS = 0.2
 
 
 def inherited_priors(robot: Robot, stated: Collection[str] = ()) -> list[Remark]:
-    """Parts that differ from the nominal robot's but have the same friction; none for a rig without inheritance.
+    """Parts that differ from the nominal robot's but have the same friction. None for a rig without inheritance.
 
     A configuration is compared with the one of the nominal robot that has the same friction.
 

@@ -32,8 +32,11 @@ class Determined:
     """Information that a table has on a free parameter.
 
     Attributes:
-        name: of the parameter; value: prior mean [unit]; prior_sd: of it [unit].
-        share: posterior over prior sd [-]; held: True if its prior holds it.
+        name: of the parameter.
+        value: prior mean [unit].
+        prior_sd: of it [unit].
+        share: posterior over prior sd [-].
+        held: True if its prior holds it.
     """
 
     name: str
@@ -73,7 +76,7 @@ def predict_identifiability(runs: Runs, robot: Robot, noise: str | None = None, 
     Rows that the robot does not reach with these values are ignored.
 
     Args:
-        noise: as `noise.parse_noise`; None takes the file's sd columns, or shares of the readings.
+        noise: as `noise.parse_noise`. None takes the file's sd columns, or shares of the readings.
         rows: number of rows above which they are thinned.
 
     Raises:

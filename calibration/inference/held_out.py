@@ -22,11 +22,13 @@ def search_each(
     """Fits from several starts, each with its own weights.
 
     Args:
-        starts: coordinates; weights: of the readings, (rows, channels) each; active: sets of effects, None for a
-            problem without slots; most: largest number of steps of each, None for no limit.
+        starts: coordinates.
+        weights: of the readings, (rows, channels) each.
+        active: sets of effects, None for a problem without slots.
+        most: largest number of steps of each, None for no limit.
 
     Returns:
-        Optimum of each search and the model's observation there; the leading axis is the starts.
+        Optimum of each search and the model's observation there. The leading axis is the starts.
     """
     z, weight = (np.stack([np.asarray(x) for x in xs]) for xs in (starts, weights))
     which = None if active is None else np.stack([np.asarray(x) for x in active])
@@ -38,10 +40,12 @@ class HeldOutFits:
     """Fits without each block.
 
     Attributes:
-        reading: of each row by the fit without its block [SI], NaN if no block holds the row or the fit does not
-            reach it, shape (rows, channels); status: of each row, -1 if no block holds it.
-        block: index of each row's block, -1 for none; shape (rows,).
-        z: of each block's fit, shape (blocks, coordinates); converged: True if it is an optimum.
+        reading: of each row by the fit without its block [SI], NaN if no block holds the row or the fit does
+            not reach it, shape (rows, channels).
+        status: of each row, -1 if no block holds it.
+        block: index of each row's block, -1 for none, shape (rows,).
+        z: of each block's fit, shape (blocks, coordinates).
+        converged: True if it is an optimum.
     """
 
     reading: np.ndarray
@@ -57,8 +61,10 @@ def hold_out_blocks(
     """Refit without each block in turn, and predict the omitted rows.
 
     Args:
-        problem: as fitted to all rows; start: its optimum; active: its effects, for one with slots.
-        masks: of the rows of each block, shape (rows of the table,); the problem's rows may be padded beyond these.
+        problem: as fitted to all rows.
+        start: its optimum.
+        active: its effects, for one with slots.
+        masks: of the rows of each block, shape (rows of the table,). The problem's rows may be padded beyond these.
     """
     rows, weight = len(masks[0]), np.asarray(problem.data.weight)
     out = [np.concatenate([m, np.zeros(len(weight) - rows, bool)]) for m in masks]
@@ -76,7 +82,7 @@ def hold_out_blocks(
 def predict_unseen(
     problem: Problem, start: np.ndarray, masks: Sequence[np.ndarray], active: Sequence[int] | None = None
 ) -> HeldOutFits:
-    """Hold-out fits as `hold_out_blocks`; for long runs each refit is one Gauss-Newton step from the fit to all rows.
+    """Hold-out fits as `hold_out_blocks`. For long runs each refit is one Gauss-Newton step from the fit to all rows.
 
     A log has hundreds of readings a parameter, and without one block a fit stays within the linear range.
     """

@@ -59,12 +59,13 @@ class Adequacy:
 
     Attributes:
         adequate: None if it cannot be tested, or the search did not converge.
-        chi2: misfit of the readings [σ²]; degrees_of_freedom: of the residuals.
-        p_value: family-wise, of all tests made; None without tests.
+        chi2: misfit of the readings [σ²].
+        degrees_of_freedom: of the residuals.
+        p_value: family-wise, of all tests made, None without tests.
         shown_by: the test with the smallest p.
         noise_known: True if χ² was among the tests.
         obstacle: reason why no test of residuals decides: the model is `undescribed`, the search `not converged`, or
-            the fit `worse` than the file as stated with the same sds; "" if a test decides.
+            the fit `worse` than the file as stated with the same sds, "" if a test decides.
         misses: of each channel.
     """
 
@@ -79,7 +80,7 @@ class Adequacy:
 
     @property
     def statement(self) -> str:
-        """In one sentence; opens a calibration's output."""
+        """The verdict in one sentence, the first of a calibration's output."""
         return describe(self)
 
     def to_json(self) -> dict[str, object]:
@@ -93,8 +94,9 @@ class Residuals:
 
     Attributes:
         observe: kind of the runs.
-        simulated: fitted readings [SI]; whitened: simulated less measured, in sds, 0 for excluded readings;
-            counts: True for included readings; shape (rows, channels).
+        simulated: fitted readings [SI].
+        whitened: simulated less measured, in sds, 0 for excluded readings.
+        counts: True for included readings, shape (rows, channels).
         jacobian: of the whitened readings, row by row, shape (rows · channels, parameters).
         z: coordinates of the fit, shape (parameters,).
     """
@@ -159,7 +161,8 @@ def judge_adequacy(
     means.
 
     Args:
-        as_stated: readings of the file as stated [SI]; sd: of the readings [SI]; shape (rows, channels).
+        as_stated: readings of the file as stated [SI].
+        sd: of the readings [SI], shape (rows, channels).
         estimated: True for channels with noise estimated from the misfit, shape (channels,).
         converged: True if the search converged.
     """
@@ -206,7 +209,7 @@ def structure_tests(fit: Residuals, *, known: bool) -> list[tuple[float, Shown]]
 
 
 def _p_value(fit: Residuals, columns: np.ndarray, known: bool) -> float | None:
-    """p-value of the misfit that columns (readings, terms) explain; None if too few degrees of freedom remain."""
+    """p-value of the misfit that columns (readings, terms) explain, None if too few degrees of freedom remain."""
     parameters = fit.jacobian.shape[1]
     wide = np.concatenate([columns, np.zeros((parameters, columns.shape[1]))])
     size = np.linalg.norm(wide, axis=0)
@@ -254,7 +257,7 @@ def _curve_columns(fit: Residuals) -> dict[Shown, np.ndarray]:
 
 
 def _autocorrelation_test(fit: Residuals) -> tuple[float, Shown] | None:
-    """Test of autocorrelation at lag 1 within runs; None if the rows of a run have no order."""
+    """Test of autocorrelation at lag 1 within runs, None if the rows of a run have no order."""
     observe, runs, residual, counts = fit.observe, fit.runs, fit.whitened, fit.counts
     if not observe.axis:
         return None
@@ -276,7 +279,7 @@ def _autocorrelation_test(fit: Residuals) -> tuple[float, Shown] | None:
 
 
 def _replicate_test(fit: Residuals) -> tuple[float, Shown] | None:
-    """Test of the residuals against the scatter of rows under the same conditions; None with too few replicates."""
+    """Test of the residuals against the scatter of rows under the same conditions, None with too few replicates."""
     observe, runs, residual, counts = fit.observe, fit.runs, fit.whitened, fit.counts
     freedom, chi2 = float(fit.freedom.sum()), float(fit.chi2.sum())
     columns = [c for c in ("configuration", *observe.axes_of(runs), "surface") if runs.has(c)]

@@ -57,8 +57,8 @@ def _changes_between_contacts(time: np.ndarray, angle: np.ndarray, drive: np.nda
     """Changes between instants at which one flank surely carries: three of each stroke, from its fastest to its end.
 
     Returns:
-        Of the angle; of the time integral of the drive, and of the drive clipped to each of `FRICTIONS`; of the
-        speed; of the drive; and of the direction, 1 or -1 for a reversal.
+        Of the angle. Of the time integral of the drive, and of the drive clipped to each of `FRICTIONS`, of the
+        speed, of the drive, and of the direction, 1 or -1 for a reversal.
     """
     known = np.isfinite(angle) & np.isfinite(drive)
     time, angle, drive = time[known], angle[known], drive[known]

@@ -40,7 +40,7 @@ class Starts:
         cost: objective of each [½σ²], shape (starts,).
         converged: True for converged searches.
         infeasible: number of starts where some row slides or fails.
-        z: end of each search, shape (starts, parameters); None if not kept.
+        z: end of each search, shape (starts, parameters), None if not kept.
     """
 
     cost: np.ndarray
@@ -81,7 +81,8 @@ class SearchResult:
     """Result of the searches.
 
     Attributes:
-        problem: with the noise (and stiffness) of the last round; best: its optimum.
+        problem: with the noise (and stiffness) of the last round.
+        best: its optimum.
         starts: outcome of the searches.
         shares: estimated sd of each channel as a share of its size, NaN if the sd was known.
         searched: the population that preceded the search, None without one.
@@ -95,20 +96,20 @@ class SearchResult:
 
 
 def unreachable_rows(posed: Problem, status: np.ndarray) -> np.ndarray:
-    """True for rows with readings for which the model has no operating point; shape of `status`, (..., rows)."""
+    """True for rows with readings for which the model has no operating point, shape of `status`, (..., rows)."""
     return posed.observe.unreachable(np.asarray(status)) & (np.asarray(posed.data.weight).max(1) > 0)
 
 
 def search_from_starts(
     posed: Problem, noise: Noise, points: np.ndarray, solver: optimizers.Solver | None = None
 ) -> SearchResult:
-    """Search from all points in one batch; where the noise is not known, estimate it and search again until it
+    """Search from all points in one batch. Where the noise is not known, estimate it and search again until it
     settles.
 
     The best optimum so far is one more start, so that every round runs the same compiled batch.
 
     Args:
-        solver: of optimistix; None for ours.
+        solver: of optimistix, None for ours.
     """
     by = functools.partial(optimizers.search_starts, solver=solver)
     z = points[0]
@@ -139,8 +140,10 @@ def search_one_by_one(
     start once each. One that ends lower takes its place, and the noise settles again.
 
     Args:
-        posed: with the initial noise; shares: that noise as shares of the readings.
-        tell: callback for progress after every step; solver: of optimistix, None for ours.
+        posed: with the initial noise.
+        shares: that noise as shares of the readings.
+        tell: callback for progress after every step.
+        solver: of optimistix, None for ours.
     """
     begun = time.perf_counter()
 
@@ -241,7 +244,7 @@ def reestimate_noise_at(posed: Problem, noise: Noise, searched: Population, at: 
 
 
 def initial_noise_shares(noise: Noise) -> np.ndarray:
-    """Initial estimated shares, NaN if the sd is known; shape (channels,)."""
+    """Initial estimated shares, NaN if the sd is known, shape (channels,)."""
     return np.where(noise.estimated, noise_room.START, np.nan)
 
 
@@ -255,7 +258,7 @@ def _outcome_of_searches(found: optimizers.Optimum, feasible: np.ndarray) -> Sta
 
 
 def _reestimate_shares(posed: Problem, noise: Noise, z: np.ndarray, shares: np.ndarray) -> np.ndarray | None:
-    """New estimates of the shares at z; None without unknown noise, or if the shares have settled."""
+    """New estimates of the shares at z, None without unknown noise, or if the shares have settled."""
     if not noise.estimated.any():
         return None
     new = _estimate_shares(posed, noise, z)
@@ -286,7 +289,7 @@ def _search_until_feasible(
 
 
 def _estimate_shares(posed: Problem, noise: Noise, z: np.ndarray) -> np.ndarray:
-    """Sd over size of each channel from the misfit, corrected for degrees of freedom; NaN if known.
+    """Sd over size of each channel from the misfit, corrected for degrees of freedom, NaN if known.
 
     s² = Σ (error / size)² / (readings - Σ leverage). It contains model error as well as noise, so a fit with it can't
     be tested for adequacy.

@@ -1,6 +1,6 @@
 """Maximum a posteriori by least squares with exact Jacobians, from many starts at once.
 
-Searches use solvers of optimistix; the default is ours (`levenberg_marquardt`).
+Searches use solvers of optimistix. The default is ours (`levenberg_marquardt`).
 """
 
 from __future__ import annotations
@@ -78,7 +78,8 @@ class Optimum(eqx.Module):
     Attributes:
         z: coordinates, shape (parameters,).
         covariance: of z, from the Gauss-Newton curvature (JᵀJ)⁻¹ of readings and priors, shape (parameters,
-            parameters); sd: root of its diagonal.
+            parameters).
+        sd: root of its diagonal.
         cost: objective, half the sum of squares of misfit and prior [-].
         decrement: further decrease predicted by the Gauss-Newton step from here [-].
         converged: True if the decrement is small (see `DECREMENT`), whatever the solver reports.
@@ -132,7 +133,7 @@ def residual_function(problem: Problem, data: Data, pin: Pin) -> Function:
 
 
 def _solver(data: Data, long: bool) -> OneSidedLevenbergMarquardt:
-    """Solver of fits to such data; of rollouts if `long`."""
+    """Solver of fits to such data. Of rollouts if `long`."""
     held, tolerance = penalty_slice(data), TOLERANCE_LONG if long else TOLERANCE
     return OneSidedLevenbergMarquardt(tolerance, tolerance, held.start, held.stop)
 
@@ -146,11 +147,15 @@ def _optimum(jacobian: Array, r: Array, z: Array, data: Data, pin: Pin, steps: A
     decrement = half_squares(r, held_rows) - half_squares(ahead, held_rows)
     held = jnp.where(pin.held, pin.at - data.centre, 0.0)
     cost = half_squares(r, held_rows) + 0.5 * jnp.sum(held**2)
-    return Optimum(pin.apply(z), sd, half.T @ half, cost, decrement, _is_converged(decrement, cost), steps)
-
-
-def _is_converged(decrement: Any, cost: Array) -> Array:
-    return jnp.asarray(decrement < DECREMENT + DECREMENT_SHARE * cost)
+    return Optimum(
+        pin.apply(z),
+        sd,
+        half.T @ half,
+        cost,
+        decrement,
+        jnp.asarray(decrement < DECREMENT + DECREMENT_SHARE * cost),
+        steps,
+    )
 
 
 def optimum_at_point(jacobian: np.ndarray, residual: np.ndarray, z: np.ndarray, data: Data) -> Optimum:
@@ -163,7 +168,8 @@ def _begin(solver: OneSidedLevenbergMarquardt, start: Z, size: int, aux: Any) ->
     """State of a search before its first evaluation.
 
     Args:
-        size: number of residuals; aux: shapes and dtypes of an evaluation's auxiliary output.
+        size: number of residuals.
+        aux: shapes and dtypes of an evaluation's auxiliary output.
     """
     struct = jax.ShapeDtypeStruct((size,), start.dtype)
     return start, solver.init(_unevaluated, start, None, {}, struct, aux, frozenset())
@@ -172,12 +178,6 @@ def _begin(solver: OneSidedLevenbergMarquardt, start: Z, size: int, aux: Any) ->
 def _unevaluated(z: Z, args: Any) -> tuple[Array, Any]:
     """A residual function that is never called."""
     raise NotImplementedError
-
-
-def _of_every_row(data: Data) -> Observation:
-    """Shapes and dtypes of an observation of the rows of data."""
-    codes = jnp.zeros(data.measured.shape[0], int)
-    return jax.eval_shape(lambda: Observation(data.measured, data.measured[:, 0], codes, codes))
 
 
 def _step(solver: OneSidedLevenbergMarquardt, function: Function, at: Progress) -> Progress:
@@ -189,7 +189,13 @@ def _step(solver: OneSidedLevenbergMarquardt, function: Function, at: Progress) 
 def _begun(problem: Problem, start: Z, data: Data) -> Progress:
     """State of a problem's search before its first evaluation."""
     size = penalty_slice(data).stop + start.shape[0]
-    return _begin(_solver(data, problem.observe.long), start, size, _of_every_row(data))
+    codes = jnp.zeros(data.measured.shape[0], int)
+    return _begin(
+        _solver(data, problem.observe.long),
+        start,
+        size,
+        jax.eval_shape(lambda: Observation(data.measured, data.measured[:, 0], codes, codes)),
+    )
 
 
 def _advance(problem: Problem, at: Progress, data: Data, max_steps: int | Numbers) -> Progress:
@@ -215,7 +221,7 @@ def _ended(at: Progress, data: Data, pin: Pin) -> Optimum:
 def levenberg_marquardt(
     problem: Problem, start: Z, data: Data, pin: Pin | None = None, max_steps: int = 100
 ) -> tuple[Optimum, Observation]:
-    """Optimum of one search, and the observation there; for `vmap` over starts, data and pins."""
+    """Optimum of one search, and the observation there. For `vmap` over starts, data and pins."""
     pin = no_pin(start.shape[0]) if pin is None else pin
     function: Any = residual_function(problem, data, pin)
     solution: optx.Solution = optx.least_squares(
@@ -233,8 +239,9 @@ class Member(eqx.Module):
     """Data of one of many searches of a problem, with a leading axis for many.
 
     Attributes:
-        start: initial coordinates, shape (parameters,); weight, measured, centre: as in `Data`; active: its effects,
-            see `ActiveSet`, None for those of the problem.
+        start: initial coordinates, shape (parameters,).
+        weight, measured, centre: as in `Data`.
+        active: its effects, see `ActiveSet`, None for those of the problem.
     """
 
     start: Numbers
@@ -279,7 +286,7 @@ _admitted = compiled(_with_fresh, options=SELDOM)
 def _go_on(
     problem: Problem, members: Member, fresh: Numbers, at: Progress, enough: Numbers, max_steps: Numbers
 ) -> tuple[Progress, Optimum]:
-    """Continue parallel searches until `enough` of them are over; `fresh` ones begin at their starts."""
+    """Continue parallel searches until `enough` of them are over. `fresh` ones begin at their starts."""
     pin = no_pin(members.start.shape[-1])
 
     def advance(member: Member, at: Progress) -> Progress:
@@ -294,7 +301,7 @@ def _go_on(
 
 @functools.partial(compiled, options=OVER_TIME)
 def _roots(problem: Problem, z: Numbers, active: Numbers | None) -> tuple[Array, Array]:
-    """Result of `Observer.solve` at each of several z; arguments as in `Member`."""
+    """Result of `Observer.solve` at each of several z. Arguments as in `Member`."""
 
     def one(z: Array, active: Array | None) -> tuple[Array, Array] | None:
         coordinates = problem.coordinates if active is None else problem.coordinates.with_effects(active)
@@ -333,7 +340,7 @@ def _go_on_apart(
 
 
 def with_roots(problem: Problem, z: Z) -> Problem:
-    """Problem with its roots at z, found by the program of searches; unchanged if its observer is not `apart`."""
+    """Problem with its roots at z, found by the program of searches. Unchanged if its observer is not `apart`."""
     if not problem.observe.apart:
         return problem
     active = getattr(problem.coordinates, "active", None)
@@ -344,7 +351,7 @@ def with_roots(problem: Problem, z: Z) -> Problem:
 
 
 def solve_roots(problem: Problem, zs: Numbers) -> tuple[np.ndarray, np.ndarray]:
-    """Roots at several z, by the program of searches, of a problem without slots; the leading axis is z."""
+    """Roots at several z, by the program of searches, of a problem without slots. The leading axis is z."""
     places = problem.observe.places(problem)
     filled = np.resize(zs, (-(-len(zs) // places) * places, zs.shape[1]))
     parts = [jax.device_get(_roots(problem, part, None)) for part in filled.reshape(-1, places, zs.shape[1])]
@@ -356,10 +363,11 @@ _go_on_seldom = compiled(_go_on, options=SELDOM)
 
 
 class Places:
-    """Members of parallel searches; finished members are replaced by queued ones.
+    """Members of parallel searches. Finished members are replaced by queued ones.
 
     Attributes:
-        holds: member in each place, -1 for none; ended: result of each finished member.
+        holds: member in each place, -1 for none.
+        ended: result of each finished member.
     """
 
     def __init__(self, members: Iterable[int], count: int) -> None:
@@ -382,17 +390,17 @@ class Places:
 
     @property
     def member(self) -> np.ndarray:
-        """Member in each place; an arbitrary one in empty places."""
+        """Member in each place. An arbitrary one in empty places."""
         return np.maximum(self.holds, 0)
 
     def fill(self) -> np.ndarray:
-        """Move queued members into empty places; returns these places."""
+        """Move queued members into empty places. Returns these places."""
         fresh = np.flatnonzero(~self.taken)[: len(self._waiting)]
         self.holds[fresh] = [self._waiting.pop() for _ in fresh]
         return fresh
 
     def leave(self, over: np.ndarray, found: Any) -> None:
-        """Remove members whose search is over, and keep their results; the leading axis is the places."""
+        """Remove members whose search is over, and keep their results. The leading axis is the places."""
         for place in np.flatnonzero(over & self.taken):
             self.ended[int(self.holds[place])] = jax.tree.map(lambda x: x[place], found)  # noqa: B023
             self.holds[place] = -1
@@ -476,7 +484,7 @@ _clip_penalties = compiled(clip_penalties, options=SELDOM)
 
 
 def mask_uncomputed(r: Array, jacobian: Array, data: Data) -> tuple[Array, Array]:
-    """Residuals and Jacobian; a reading with a non-finite row of the Jacobian counts as not computed."""
+    """Residuals and Jacobian. A reading with a non-finite row of the Jacobian counts as not computed."""
     counts = jnp.concatenate([data.weight.ravel() > 0, jnp.ones(data.measured.shape[0] + jacobian.shape[1], bool)])
     computed = jnp.all(jnp.isfinite(jacobian), axis=1)
     return jnp.where(computed, r, MISSING * counts), jnp.where(computed[:, None], jacobian, 0.0)
@@ -576,7 +584,8 @@ def search_rollouts(
     Finished members are not evaluated again, and are replaced by queued ones.
 
     Args:
-        starts: shape (members, coordinates); weights: of each member's readings, shape (members, rows, channels).
+        starts: shape (members, coordinates).
+        weights: of each member's readings, shape (members, rows, channels).
         places: number of searches in parallel.
         rivals: True if all search the same optimum. All then end once `AGREE` of them have ended in one place and no
             other is lower. A search ends earlier if it cannot reach the lowest so far: by `HOPELESS` times the

@@ -58,8 +58,10 @@ class Generation:
     """Outcome of a generation.
 
     Attributes:
-        members: number of members run; failed: number with a row that could not be run or left the ground.
-        lowest: objective of the best so far; median: of this generation [½σ²].
+        members: number of members run.
+        failed: number with a row that could not be run or left the ground.
+        lowest: objective of the best so far.
+        median: of this generation [½σ²].
     """
 
     members: int
@@ -76,7 +78,7 @@ class Population:
         z: coordinates, shape (members, parameters).
         reading: of each row [SI], shape (members, rows, channels).
         adhesion_used, status, flags: of each row, shape (members, rows).
-        cost: objective with the final noise of the search [½σ²]; inf for members without one.
+        cost: objective with the final noise of the search [½σ²], inf for members without one.
         generations: in order.
     """
 
@@ -146,7 +148,9 @@ class Members:
     """Runs members and stores their results, optionally in a file, so that a search can resume.
 
     Args:
-        posed: the problem; file: of members; together: number of members in one batch, None takes `TOGETHER`.
+        posed: the problem.
+        file: of members.
+        together: number of members in one batch, None takes `TOGETHER`.
 
     Raises:
         BadConfiguration: the file is not a file of members, belongs to another problem, or cannot be written.
@@ -211,7 +215,7 @@ def _observed(posed: Problem, points: Float[Array, "points parameters"]) -> Obse
 def most_probable_noise(
     posed: Problem, noise: Noise, reading: Float[np.ndarray, "... rows channels"]
 ) -> Float[np.ndarray, "... channels"]:
-    """Most probable sd of each channel for given readings, as a share of its size; NaN if it is known."""
+    """Most probable sd of each channel for given readings, as a share of its size, NaN if it is known."""
     weight, size = np.asarray(posed.data.weight), noise.sd / noise_room.START
     error = np.where(weight > 0, (reading - np.asarray(posed.data.measured)) / size, 0.0)
     share = np.sqrt(np.sum(weight * error**2, -2) / np.maximum(weight.sum(0), 1.0))
@@ -259,9 +263,11 @@ def evolve(
     """Search by generations.
 
     Args:
-        members: runner of members; objective: of members.
+        members: runner of members.
+        objective: of members.
         centre, covariance: of the first generation, in coordinates z.
-        size: number of members in a generation; seed: random seed of the draws.
+        size: number of members in a generation.
+        seed: random seed of the draws.
         beside: further points that are run with the first generation.
         tell: callback for progress after every batch.
     """
@@ -357,9 +363,10 @@ class Searched:
     """Outcome of a search by generations.
 
     Attributes:
-        found: all members; at: index of the best one.
+        found: all members.
+        at: index of the best one.
         apart: names of parameters with derivatives of a run that disagree with finite differences.
-        slope: of the whitened readings, from the members, if derivatives are unreliable; else None.
+        slope: of the whitened readings, from the members, if derivatives are unreliable, else None.
         left: rms residual of the regression that gives the slope [σ], NaN without one.
         edge: of the best member, see `parameters_at_edge`.
     """

@@ -30,11 +30,15 @@ class Prepared:
 
     Attributes:
         robot: with instruments, configurations and mass from the table, and the initial states of its runs.
-        observe: the kind of the data; noise: of the readings.
+        observe: the kind of the data.
+        noise: of the readings.
         stated: priors by name of parameter, (mean, sd) [SI].
         names: free parameters that were chosen, see `prepare`.
-        foreign: remarks on priors of another robot; checked: on the table; begins: on the beginnings of its runs;
-            weighed: on the masses that it states; doubted: on units that may be others.
+        foreign: remarks on priors of another robot.
+        checked: on the table.
+        begins: on the beginnings of its runs.
+        weighed: on the masses that it states.
+        doubted: on units that may be others.
     """
 
     robot: Robot
@@ -61,7 +65,8 @@ def prepare(
     """A table and a robot, prepared for any fit.
 
     Args:
-        noise: as `noise.parse_noise`; stated: parameter → (mean, sd) [SI], by the names that the user knows.
+        noise: as `noise.parse_noise`.
+        stated: parameter → (mean, sd) [SI], by the names that the user knows.
         assume: True to take a usual sd for a channel without one, False to let the fit estimate it.
         choose: function from the preparation to the names of the free parameters.
 

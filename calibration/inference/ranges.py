@@ -1,4 +1,4 @@
-"""Check before any fit that a table's readings are possible for its robot; most failures are wrong units."""
+"""Check before any fit that a table's readings are possible for its robot. Most failures are wrong units."""
 
 from __future__ import annotations
 
@@ -42,14 +42,14 @@ FOLLOWS = 0.9
 
 
 def check_ranges(runs: Runs, robot: Robot) -> list[Remark]:
-    """Refuse readings that no robot like this one has under these conditions; return notes on other doubts.
+    """Refuse readings that no robot like this one has under these conditions. Return notes on other doubts.
 
     Each channel's readings are compared with steady travel of the robot in its file, and with a tenth and four times
     its friction. The result is the median factor between the readings and that range. Of histories, only settled
     ones are compared.
 
     Raises:
-        BadData: a factor beyond `REFUSED`; for histories, which may not reach steady travel, only if a known
+        BadData: a factor beyond `REFUSED`. For histories, which may not reach steady travel, only if a known
             confusion of units explains it.
     """
     runs = runs.of(robot)
@@ -83,13 +83,16 @@ def check_ranges(runs: Runs, robot: Robot) -> list[Remark]:
         ):  # a sliding vehicle may have other speeds
             continue
         typical = _factor(measured[:, k], possible[1:2, :, k])
+        mine = factors[channel]
         found = Remark(
             "off_by",
             column=channel.column,
             unit=channel.unit,
             factor=typical if units else factor,
             units=tuple(units),
-            others=tuple(_columns_with_same_factor(channel, factors)),
+            others=tuple(
+                c.column for c, f in factors.items() if c is not channel and abs(math.log(f / mine)) < math.log(ALIKE)
+            ),
             imposed=runs.layout.imposed_column,
         )
         if off > REFUSED:
@@ -137,7 +140,7 @@ def _turned(runs: Runs, measured: np.ndarray, possible: np.ndarray) -> list[Rema
 
 
 def _rms(off: np.ndarray) -> float:
-    """Least root mean square over the rows among several robots, shape (robots, rows); inf without numbers."""
+    """Least root mean square over the rows among several robots, shape (robots, rows), inf without numbers."""
     return min((float(np.sqrt(np.nanmean(x**2))) for x in off if np.isfinite(x).any()), default=math.inf)
 
 
@@ -152,10 +155,11 @@ def _with_friction_factor(robot: Robot, factor: float) -> Robot:
 
 
 def _factor(measured: np.ndarray, possible: np.ndarray) -> float:
-    """Median factor between readings and the possible range; 1 inside, or if it cannot be determined.
+    """Median factor between readings and the possible range, 1 inside, or if it cannot be determined.
 
     Args:
-        measured: shape (runs,); possible: of several robots, NaN if one does not move, shape (robots, runs).
+        measured: shape (runs,).
+        possible: of several robots, NaN if one does not move, shape (robots, runs).
     """
     finite = np.isfinite(measured) & np.isfinite(possible).any(0)
     if not finite.any():
@@ -171,18 +175,12 @@ def _factor(measured: np.ndarray, possible: np.ndarray) -> float:
 
 
 def _units(channel: Channel, measured: np.ndarray, possible: np.ndarray, robot: Robot) -> list[str]:
-    """Units that would make the readings possible, the most probable first; arguments as in `_factor`."""
+    """Units that would make the readings possible, the most probable first. Arguments as in `_factor`."""
     known = {unit: channel.factor / size for unit, size in channel.sizes.items() if size != channel.factor}
     if channel.name == "motor_speed" and robot.has_ground:
         known["rpm of the driving wheel"] = 1 / float(robot.gearbox.ratio)
     left = {unit: abs(math.log(_factor(measured / f, possible))) for unit, f in known.items()}
     return sorted((u for u, x in left.items() if x < math.log(ALIKE)), key=left.__getitem__)
-
-
-def _columns_with_same_factor(channel: Channel, factors: dict[Channel, float]) -> list[str]:
-    """Columns of the other channels with the same factor."""
-    mine = factors[channel]
-    return [c.column for c, f in factors.items() if c is not channel and abs(math.log(f / mine)) < math.log(ALIKE)]
 
 
 def _slips(robot: Robot, channel: Channel, factor: float) -> bool:

@@ -48,8 +48,10 @@ class LevelMean:
     """Mean residual of the rows at one level of a column.
 
     Attributes:
-        level: of the column; within: of the label within which it was compared, "" for all rows.
-        mean: simulated less measured [unit of the channel]; rows: number of rows.
+        level: of the column.
+        within: of the label within which it was compared, "" for all rows.
+        mean: simulated less measured [unit of the channel].
+        rows: number of rows.
     """
 
     level: str
@@ -68,18 +70,21 @@ class ResidualCluster:
     """Residuals of a channel that are associated with a column without a role.
 
     Attributes:
-        column: its name; channel: of the residuals; unit: of the channel.
+        column: its name.
+        channel: of the residuals.
+        unit: of the channel.
         within: label within whose levels the column matters, "" for all rows.
-        reversing: True for opposite signs in the two directions of travel; means are then of the residual times
+        reversing: True for opposite signs in the two directions of travel. Means are then of the residual times
             the sign of the reading.
-        levels: means by level; empty for a column of many numbers.
-        correlation: of ranks, for such a column; else None.
+        levels: means by level, empty for a column of many numbers.
+        correlation: of ranks, for such a column, else None.
         p: family-wise.
         alike: other columns that explain these residuals no better once this one is known.
         coarser: columns whose levels this one divides further, with the share of the differences between its levels
             that they explain, from `MOSTLY` on.
-        at: the column, or name of the level, of each row; residual: simulated less measured [unit], or that times the
-            sign of the reading; shape (rows,), of histories (runs,).
+        at: the column, or name of the level, of each row.
+        residual: simulated less measured [unit], or that times the sign of the reading, shape (rows,), of
+            histories (runs,).
     """
 
     column: str
@@ -111,7 +116,7 @@ def residual_clusters(fit: Residuals, seed: int = 0) -> tuple[ResidualCluster, .
     """Clusters of a fit's residuals by columns without a role, the most significant first.
 
     Args:
-        fit: residuals of the fit; of histories the mean of each run is tested.
+        fit: residuals of the fit. Of histories the mean of each run is tested.
         seed: random seed of the permutations.
     """
     whole = _by_run(fit) if fit.runs.sampled else _by_row(fit)
@@ -177,8 +182,12 @@ class _Units:
     """Units of comparison, each a settled row or a run of a history.
 
     Attributes:
-        runs: their table; counts: True for included readings; whitened: residuals; jacobian: by the free parameters,
-            shape (units, channels, parameters); residual, simulated: [SI]; covariance: of z, (JᵀJ + 1)⁻¹.
+        runs: their table.
+        counts: True for included readings.
+        whitened: residuals.
+        jacobian: by the free parameters, shape (units, channels, parameters).
+        residual, simulated: [SI].
+        covariance: of z, (JᵀJ + 1)⁻¹.
     """
 
     runs: Runs
@@ -199,7 +208,7 @@ def _by_row(fit: Residuals) -> _Units:
 
 
 def _by_run(fit: Residuals) -> _Units:
-    """Means of each run; whitened means times the root of their number of samples, so that noise has the sd 1."""
+    """Means of each run. Whitened means times the root of their number of samples, so that noise has the sd 1."""
     rows = _by_row(fit)
     run = fit.runs.run_names
     _, first, run_of = np.unique(run, return_index=True, return_inverse=True)
@@ -328,7 +337,8 @@ class _Channel:
     """Residuals of a channel, transformed to be independent with equal variance, and their tests.
 
     Attributes:
-        left: residuals after conditions and parameters are projected out, shape (units,); freedom: of these.
+        left: residuals after conditions and parameters are projected out, shape (units,).
+        freedom: of these.
         taken: orthonormal directions of conditions and parameters, shape (units, directions).
         tests: with orthonormal bases, after the same projection.
     """
@@ -348,7 +358,7 @@ class _Channel:
         return residuals - self.taken @ (self.taken.T @ residuals)
 
     def beside(self, test: _Comparison, other: _Comparison) -> float:
-        """p-value of a test after another one is projected out too; 1 if nothing is left to test."""
+        """p-value of a test after another one is projected out too, 1 if nothing is left to test."""
         own = _orthonormal(test.basis - other.basis @ (other.basis.T @ test.basis))
         left = self.left - other.basis @ (other.basis.T @ self.left)
         freedom = self.freedom - other.basis.shape[1]
@@ -374,7 +384,7 @@ def _orthonormal(columns: np.ndarray, least: float = CLEAR) -> np.ndarray:
 
 
 def _channel(whole: _Units, k: int, columns: Columns) -> _Channel | None:
-    """A channel and its tests; None with too few readings."""
+    """A channel and its tests, None with too few readings."""
     counts = whole.counts[:, k]
     if counts.sum() < FEWEST:
         return None

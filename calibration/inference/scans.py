@@ -126,7 +126,7 @@ def _sorted_scan(at: np.ndarray, cost: np.ndarray, others: np.ndarray) -> Scan:
 
 
 def place_at_minimum(problem: Problem, starts: Float[np.ndarray, "starts z"]) -> Float[np.ndarray, "starts z"]:
-    """Starts with the scanned coordinates at the lowest misfit near the first start; others are unchanged."""
+    """Starts with the scanned coordinates at the lowest misfit near the first start. Others are unchanged."""
     starts = np.array(starts, float)
     for k in scanned_coordinates(problem):
         seen = scan_coordinate(problem, starts[0], problem.data, k)
@@ -145,7 +145,8 @@ def search_lower_basins(
     It has converged if no basin is lower and the other coordinates bring no gain, whatever the gradient at a step is.
 
     Args:
-        found: optimum of a search, and the observation there; search: function that searches from a start.
+        found: optimum of a search, and the observation there.
+        search: function that searches from a start.
     """
     every = scanned_coordinates(problem)
     if not every:
@@ -186,7 +187,7 @@ def scan_all(problem: Problem, z: np.ndarray) -> dict[int, Scan]:
 
 
 def with_scanned_sds(about: Identifiability, scans: dict[int, Scan]) -> Identifiability:
-    """Linear analysis with the sds of scanned coordinates from their profiles; correlations are kept."""
+    """Linear analysis with the sds of scanned coordinates from their profiles. Correlations are kept."""
     sd = about.sd.copy()
     for k, seen in scans.items():
         sd[k] = seen.sd()
@@ -198,7 +199,8 @@ def count_outside(scans: dict[int, Scan], z: np.ndarray | None, converged: np.nd
     """Number of converged searches that ended outside the profiles at the best optimum.
 
     Args:
-        z: end of each, shape (searches, parameters), None if not known; converged: of each.
+        z: end of each, shape (searches, parameters), None if not known.
+        converged: of each.
     """
     if z is None:
         return 0

@@ -58,8 +58,9 @@ class Plan(eqx.Module):
 
     Attributes:
         current: index of the channel of the current, -1 if it follows from an imposed quantity.
-        motion: index of the channel of the motion, -1 if it is imposed; angle: True if it is an angle, which enters
-            integrated twice; travels: True for motion of the load, not of a shaft.
+        motion: index of the channel of the motion, -1 if it is imposed.
+        angle: True if it is an angle, which enters integrated twice.
+        travels: True for motion of the load, not of a shaft.
         others: channels that follow from the states.
         imposed: as in `Rig.imposed`.
     """
@@ -83,7 +84,7 @@ class Plan(eqx.Module):
 
 
 def plan_of(problem: Problem) -> Plan | None:
-    """Returns the plan of a log; None if the log does not show the states."""
+    """Returns the plan of a log, None if the log does not show the states."""
     found = plan_or_lacking(problem)
     return found if isinstance(found, Plan) else None
 
@@ -127,13 +128,18 @@ class Rows(eqx.Module):
     """Conditions, readings and states at each point of a log, shape (points, ...).
 
     Attributes:
-        conditions: means over `cell`; shown: readings [SI], means of their rows; sd: of these means.
-        rate: slope of the channel of the motion, if that is an angle [SI/s]; way: of travel, 0 if it may be at rest.
-        angle: of the output since the run's first row [rad]; since: time since the point before [s], 0 for the first
-            of a run; time: since the run's start [s].
+        conditions: means over `cell`.
+        shown: readings [SI], means of their rows.
+        sd: of these means.
+        rate: slope of the channel of the motion, if that is an angle [SI/s].
+        way: of travel, 0 if it may be at rest.
+        angle: of the output since the run's first row [rad].
+        since: time since the point before [s], 0 for the first of a run.
+        time: since the run's start [s].
         first: a row of the table at the point.
-        delay: of the rig, at which the conditions were taken [s]; drift: their derivatives by the delay, by field;
-            reach: change of the delay within which these hold [s].
+        delay: of the rig, at which the conditions were taken [s].
+        drift: their derivatives by the delay, by field.
+        reach: change of the delay within which these hold [s].
         memory: of the robot's effects that have one, by their names.
     """
 
@@ -152,7 +158,7 @@ class Rows(eqx.Module):
     memory: Mapping[str, Float[Array, " points"]] = eqx.field(default_factory=dict)
 
     def imposed(self, delay: Scalar) -> Conditions:
-        """Conditions at another delay, or the nearest within `reach` of theirs; traceable."""
+        """Conditions at another delay, or the nearest within `reach` of theirs, traceable."""
         conditions, late = self.conditions, jnp.clip(delay - self.delay, -self.reach, self.reach)
         for name, drift in self.drift.items():
             conditions = replaced(conditions, name, getattr(conditions, name) + late * drift)
@@ -160,7 +166,7 @@ class Rows(eqx.Module):
 
 
 def replaced(conditions: Conditions, name: str, value: Any) -> Conditions:
-    """Conditions with another value of a field; unlike a new one, this changes no shape of others."""
+    """Conditions with another value of a field. Unlike a new one, this changes no shape of others."""
     return eqx.tree_at(operator.attrgetter(name), conditions, value)
 
 
@@ -169,8 +175,9 @@ class Course:
     """Imposed quantities over time, as integrals, so that each interval has a mean at any delay.
 
     Attributes:
-        time: of knots of all runs, one run after the other [s]; values: from each on; integrals: up to each. Both by
-            field of `Conditions`.
+        time: of knots of all runs, one run after the other [s].
+        values: from each on.
+        integrals: up to each. Both by field of `Conditions`.
         cell: beginning and end of the interval of each point, in the same clock.
     """
 
@@ -211,7 +218,7 @@ class Windows:
 
 
 def window_function(share: np.ndarray, length: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """w = sin⁸ π s, w' and w'' of a window at shares s of its length [s]; 0 outside.
+    """w = sin⁸ π s, w' and w'' of a window at shares s of its length [s], 0 outside.
 
     Sums over rows integrate w'' times an angle without bias only if the window ends smoothly. With sin⁴ the inertia
     of 100 logs of an angle alone was off by 6 posterior sds, with sin⁸ by 0.1.
@@ -227,8 +234,9 @@ def windows_of_run(time: np.ndarray, piece: np.ndarray, length: float) -> list[t
     """Returns the windows of one run, each as (indices of its points, their positions as shares of its length).
 
     Args:
-        time: of the points [s], increasing; piece: of each, -1 for points in no window; a window is within one piece.
-        length: of a window [s]; a shorter piece has one window of its own length.
+        time: of the points [s], increasing.
+        piece: of each, -1 for points in no window. A window is within one piece.
+        length: of a window [s]. A shorter piece has one window of its own length.
     """
     windows = list[tuple[np.ndarray, np.ndarray]]()
     starts = np.flatnonzero(np.r_[True, np.diff(piece) != 0])
@@ -246,7 +254,7 @@ def windows_of_run(time: np.ndarray, piece: np.ndarray, length: float) -> list[t
 
 
 def correlation_time(time: np.ndarray, speed: np.ndarray, noise: float) -> float:
-    """Lag at which the mean squared change of a speed equals its variance [s]; 0 if shorter than the time of a row.
+    """Lag at which the mean squared change of a speed equals its variance [s], 0 if shorter than the time of a row.
 
     Args:
         noise: sd of the readings of the speed, which does not count.
@@ -264,7 +272,8 @@ def correlation_time(time: np.ndarray, speed: np.ndarray, noise: float) -> float
 def slopes_of(time: np.ndarray, values: np.ndarray, piece: np.ndarray, count: int) -> np.ndarray:
     """Slope at each point of a cubic over the `count` points around it, within its piece."""
     out = np.zeros(len(time))
-    for begin, end in _stretches(piece):
+    starts = np.flatnonzero(np.r_[len(piece) > 0, np.diff(piece) != 0])
+    for begin, end in zip(starts.tolist(), [*starts[1:].tolist(), len(piece)], strict=True):
         wide = min(count, end - begin)
         if wide < FEWEST // 2:
             out[begin:end] = np.gradient(values[begin:end], time[begin:end]) if wide > 1 else 0.0
@@ -279,12 +288,6 @@ def slopes_of(time: np.ndarray, values: np.ndarray, piece: np.ndarray, count: in
             rise = np.einsum("nwi,nw->ni", powers, values[near] - values[here])
             out[begin + part] = np.linalg.solve(normal, rise[..., None])[:, 1, 0] / scale
     return out
-
-
-def _stretches(piece: np.ndarray) -> zip[tuple[int, int]]:
-    """Beginning and end of each stretch of equal values."""
-    starts = np.flatnonzero(np.r_[len(piece) > 0, np.diff(piece) != 0])
-    return zip(starts.tolist(), [*starts[1:].tolist(), len(piece)], strict=True)
 
 
 def slope_rows(time: np.ndarray, angle: np.ndarray, sd: float) -> tuple[int, float]:
@@ -332,10 +335,10 @@ class _Log:
         """Means of `size` rows of a run each, within stretches without a gap or a jump.
 
         Args:
-            delay: of jumps [s]; None for stretches that contain them.
+            delay: of jumps [s], None for stretches that contain them.
 
         Returns:
-            By name: row, time, shown, sd, cell as of `Rows`; stretch of each, -1 for points in no window.
+            By name: row, time, shown, sd, cell as of `Rows`. Stretch of each, -1 for points in no window.
         """
         rows = self.each[run]
         times = self.time[rows]
@@ -370,7 +373,7 @@ class _Log:
         }
 
     def course(self, cells: list[np.ndarray]) -> Course:
-        """Imposed quantities over time; `cells`: of the points of each run."""
+        """Imposed quantities over time. `cells`: of the points of each run."""
         changing = {
             name: np.asarray(x, float)
             for name in IMPOSED
@@ -401,8 +404,8 @@ def rows_and_windows(
     """Returns the points of a log, what is imposed there over time, and the windows of its runs.
 
     Args:
-        delay: between the instant of a jump in its column and its action [s]; across: True for windows that contain
-            jumps.
+        delay: between the instant of a jump in its column and its action [s].
+        across: True for windows that contain jumps.
     """
     log = _Log(problem, plan)
     length = log.length()
@@ -503,16 +506,13 @@ def _ways(
     if plan.imposed == "motor_speed":
         speed, off = conditions.motor_speed / float(problem.base.gearbox.ratio), np.zeros(len(shown))
     else:
-        per = _wheel_per_unit(problem, plan)
+        robot, none = problem.base, jnp.zeros(())
+        chassis = robot.configurations.members[0]
+        rolling = State(none, robot.gearbox.ratio, chassis.radius, none, distance=chassis.radius)
+        per = 1 / float(
+            problem.channels[plan.motion].read(robot, balances.begin_signals(robot, Conditions(0), rolling))
+        )
         speed = per * (rate if plan.angle else shown[:, plan.motion])
         off = abs(per) * (np.full(len(shown), noise) if plan.angle else sd[:, plan.motion])
     limit = np.maximum(REST * np.abs(speed).max(initial=0.0), REST_SD * off)
     return np.where(np.abs(speed) > limit, np.sign(speed), 0.0), speed
-
-
-def _wheel_per_unit(problem: Problem, plan: Plan) -> float:
-    """Speed or angle of the output for one unit of the channel of the motion [rad/unit]."""
-    robot, none = problem.base, jnp.zeros(())
-    chassis = robot.configurations.members[0]
-    rolling = State(none, robot.gearbox.ratio, chassis.radius, none, distance=chassis.radius)
-    return 1 / float(problem.channels[plan.motion].read(robot, balances.begin_signals(robot, Conditions(0), rolling)))

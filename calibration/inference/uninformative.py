@@ -12,7 +12,6 @@ from calibration.inference.fit_notes import Remark
 from calibration.inference.noise import Noise
 from calibration.inference.operating import operating_readings
 from calibration.inference.unused import unused_columns
-from mmrjax.model.channels import Channel
 from mmrjax.model.robot import Robot
 
 #: Range of readings that differ only by noise, in its sds: on average 5 for a hundred rows.
@@ -52,6 +51,7 @@ def copied_channels(runs: Runs, robot: Robot) -> list[Remark]:
         x, y = np.asarray(runs[one.column], float), np.asarray(runs[other.column], float)
         if (line := line_through(x, y)) is not None:
             copies.add(other.name)
+            same = one.unit_si == other.unit_si
             copied.append(
                 Remark(
                     "copied",
@@ -60,13 +60,7 @@ def copied_channels(runs: Runs, robot: Robot) -> list[Remark]:
                     other=one.column,
                     intercept=line[0],
                     slope=line[1],
-                    tied=_tied(one, other, robot),
+                    tied=same or (not robot.has_ground and one.zero_at_rest and other.zero_at_rest),
                 )
             )
     return copied
-
-
-def _tied(one: Channel, other: Channel, robot: Robot) -> bool:
-    """True if the rig ties two channels to each other: readings of one unit, or speeds without slip."""
-    same = one.unit_si == other.unit_si
-    return same or (not robot.has_ground and one.zero_at_rest and other.zero_at_rest)

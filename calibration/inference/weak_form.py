@@ -2,8 +2,8 @@
 
 If a log shows the states, the balances give their rates at its readings. The equation y' = f(y) is
 multiplied by smooth windows w(t) and integrated by parts: ∫ w f(y) dt + ∫ w' y dt = 0. No derivative of a noisy
-reading is taken. References: modulating functions, Preisig and Rippin, Comput. Chem. Eng. 17 (1993) 1; inverse
-dynamic identification, Gautier and Khalil, IEEE Trans. Robot. Autom. 6 (1990) 368; weak SINDy, Messenger and Bortz,
+reading is taken. References: modulating functions, Preisig and Rippin, Comput. Chem. Eng. 17 (1993) 1. Inverse
+dynamic identification, Gautier and Khalil, IEEE Trans. Robot. Autom. 6 (1990) 368. Weak SINDy, Messenger and Bortz,
 Multiscale Model. Simul. 19 (2021) 1474. Both terms contain readings, and overlapping windows share their noise. The
 covariance of this noise follows from the sds of the readings and the steps of their instruments, and weights the
 windows (Bortz, Messenger and Dukic, Bull. Math. Biol. 85 (2023) 110). No window contains a jump of an imposed
@@ -81,7 +81,8 @@ class Terms(eqx.Module):
     """Terms f and y of the equations Σ w f Δt + Σ w' y Δt = 0 at each row, shape (rows, equations, ...).
 
     Attributes:
-        f, y: at the readings; by_z, by_reading, by_effects: their derivatives, those of f first.
+        f, y: at the readings.
+        by_z, by_reading, by_effects: their derivatives, those of f first.
     """
 
     f: Array
@@ -92,7 +93,7 @@ class Terms(eqx.Module):
 
 
 def _current(robot: Robot, conditions: Conditions, state: State, way: Scalar) -> Scalar:
-    """Current of the voltage balance by Newton's method; its derivatives are those of the last step."""
+    """Current of the voltage balance by Newton's method. Its derivatives are those of the last step."""
 
     def left(robot: Robot, state: State, current: Scalar) -> Scalar:
         at = dataclasses.replace(state, current=current)
@@ -111,8 +112,10 @@ class _Shown(eqx.Module):
     """States that the readings of a row show.
 
     Attributes:
-        turning: motor speed [rad/s]; current [A]; unit: reading of the motion per motor speed; per_ampere: reading of
-            the current; errors: of the instruments, by channel.
+        turning: motor speed [rad/s], current [A].
+        unit: reading of the motion per motor speed.
+        per_ampere: reading of the current.
+        errors: of the instruments, by channel.
     """
 
     turning: Scalar
@@ -187,7 +190,8 @@ def row_terms(
     """Returns terms f and y of one row's equations, and its signals.
 
     Args:
-        row: one of `Rows`, without its leading axis; shown: its readings [SI], shape (channels,).
+        row: one of `Rows`, without its leading axis.
+        shown: its readings [SI], shape (channels,).
         probes: names of effects that read no signal.
     """
     names, chassis = channels.channel_names(robot.channels), robot.chassis(row.conditions.configuration)
@@ -356,7 +360,8 @@ class Delay:
 
     Attributes:
         value: later action of the imposed quantity than its column states [s], negative for an earlier one.
-        limit: largest that was searched [s]; ended: True if the best is there.
+        limit: largest that was searched [s].
+        ended: True if the best is there.
     """
 
     value: float
@@ -477,7 +482,8 @@ class WeakForm:
     Attributes:
         z: coordinates of the base that minimise the squared residuals of windows and priors.
         residual: of windows, then z - centre, shape (windows + coordinates,).
-        jacobian: by the coordinates; signatures: derivatives of the windows by each instance's amplitude [prior sd].
+        jacobian: by the coordinates.
+        signatures: derivatives of the windows by each instance's amplitude [prior sd].
         windows: number of equations, one or more for each window.
     """
 
@@ -494,7 +500,8 @@ def weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> WeakF
     None if the log does not show the states, or has too few windows.
 
     Args:
-        problem: of histories, without effects in its coordinates; effects: instances whose signatures are computed.
+        problem: of histories, without effects in its coordinates.
+        effects: instances whose signatures are computed.
     """
     plan = plan_of(problem)
     if plan is None:
@@ -582,7 +589,7 @@ def _slopes(plan: Plan, w: Windows, equations: int) -> list[np.ndarray]:
 
 
 def _factor(plan: Plan, w: Windows, sd: np.ndarray, terms: Terms, unknown: np.ndarray) -> np.ndarray:
-    """Factor of the covariance of some windows; `unknown`: torque and voltage without a model (`disturbances`)."""
+    """Factor of the covariance of some windows. `unknown`: torque and voltage without a model (`disturbances`)."""
     equations, (points, channels) = terms.f.shape[1], sd.shape
     by, also = terms.by_reading
     noise = []
@@ -606,8 +613,9 @@ def disturbances(defect: np.ndarray, noise: np.ndarray, unit: np.ndarray) -> np.
     its fastest part, and parameters would follow that. 0 if the readings' noise explains the defects.
 
     Args:
-        defect: of each window, shape (windows, equations); noise: its variance by the readings; unit: by white noise
-            of intensity 1.
+        defect: of each window, shape (windows, equations).
+        noise: its variance by the readings.
+        unit: by white noise of intensity 1.
     """
     more = np.mean(defect**2 - noise, 0)
     chance = CHANCE * np.sqrt(2 * np.sum(noise**2, 0) / APART) / len(defect)

@@ -13,9 +13,9 @@ from sweeps.store import finish_run_folder, open_folder, print_report
 
 
 def execute(config: configuration.Calibrate, beside: configuration.FittedRuns) -> int:
-    """Calibrate a robot to a table and leave a run folder; returns the exit code.
+    """Calibrate a robot to a table and leave a run folder. Returns the exit code.
 
-    0 done; 3 done, but the search or a fit without a block did not converge, or the solver failed at a row.
+    0 done. 3 done, but the search or a fit without a block did not converge, or the solver failed at a row.
     """
     robot = load_robot(config).robot
     runs = read_runs(beside.data, robot, columns=config.columns, measured=True, series=True)

@@ -1,4 +1,4 @@
-"""The command `check`: compare a robot with requirements; each passes or fails by a margin."""
+"""The command `check`: compare a robot with requirements. Each passes or fails by a margin."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from sweeps.store import RunFolder, finish_run_folder, open_folder, print_report
 
 
 def execute(config: configuration.Check, beside: configuration.FolderPart) -> int:
-    """Compare a robot with requirements and write a run folder; returns the exit code.
+    """Compare a robot with requirements and write a run folder. Returns the exit code.
 
     The code is 0 whether or not requirements are missed, and 3 if the solver failed at a worst corner.
     """

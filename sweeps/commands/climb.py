@@ -41,9 +41,9 @@ WIDTHS, WIDTH = {"payload": 0.2, "levers_front_deg": 1.0, "levers_rear_deg": 1.0
 
 
 def execute(config: configuration.Climb, beside: configuration.FolderPart) -> int:
-    """Climb and leave a run folder; returns the exit code.
+    """Climb and leave a run folder. Returns the exit code.
 
-    0 done, whatever the verdict; 3 numbers went wrong.
+    0 done, whatever the verdict. 3 numbers went wrong.
     """
     file = load_robot(config)
     robot = file.robot
@@ -134,7 +134,7 @@ def _climbed(
 
 
 def _along(config: configuration.Climb, robot: Robot, conditions: Conditions, sequence: Sequence) -> Along | None:
-    """Variables of the derivatives; None: no derivatives.
+    """Variables of the derivatives. None: no derivatives.
 
     Raises:
         BadConfiguration: an unknown name, or one without effect on this climb.
@@ -189,7 +189,7 @@ def _searched(
     what: str, run: Callable[[np.ndarray], tuple[Terrain, Climb]]
 ) -> tuple[Terrain, Climb, int, tuple[tuple[float, str], ...], float | None]:
     """The largest size that is got over [mm]: rounds of sizes side by side, between the largest that was got over
-    below all that were not and the next; the run of the largest, or of the smallest tried, is shown."""
+    below all that were not and the next. The run of the largest, or of the smallest tried, is shown."""
     low, high = SOUGHT[what]
     sizes = np.linspace(low, high, ROUND)
     tried: dict[float, str] = {}

@@ -30,7 +30,7 @@ HISTORIES, OVER = "drive", {"time_s": "time [s]"}
 
 
 def execute(config: configuration.Compare, beside: configuration.ComparedRuns) -> int:
-    """Simulate the runs of a table, compare them with its readings, write a run folder; returns the exit code."""
+    """Simulate the runs of a table, compare them with its readings, write a run folder. Returns the exit code."""
     file = load_robot(config)
     stated = runs = read_runs(
         beside.data, file.robot, columns=config.columns, measured=True, series=True, of_turns=True
@@ -115,7 +115,7 @@ def _written(
     found: Comparison,
     notes: Names,
 ) -> int:
-    """Print a comparison and write its folder, with these notes in `result.json`; returns the exit code."""
+    """Print a comparison and write its folder, with these notes in `result.json`. Returns the exit code."""
     shown = print_report(comparison_report.comparison_document(found), file)
     answer = comparison_report.comparison_answer(found)
     further = {"statement": answer, "errors": found.summary, "notes": [*file.remarks, *notes]}
@@ -138,7 +138,7 @@ def _second_robot(config: configuration.Compare, file: RobotFile) -> RobotFile |
 
 
 def _name_of(config: configuration.Compare, file: RobotFile, second: RobotFile | None) -> str:
-    """Name of the second robot, with its folder if both files have the same name; "" for none."""
+    """Name of the second robot, with its folder if both files have the same name, "" for none."""
     if second is None:
         return ""
     name = capabilities.shown_name(second)

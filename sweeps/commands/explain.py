@@ -35,10 +35,10 @@ EVERY_OUTPUT: tuple[Any, ...] = (*outputs.FURTHER, *derived.TABLE, *mission_batc
 
 
 def explain_name(name: str | None, files: Names = ()) -> int:
-    """Explain an effect, status, flag, output, channel or parameter by its name; without a name, list all.
+    """Explain an effect, status, flag, output, channel or parameter by its name. Without a name, list all.
 
     Raises:
-        BadConfiguration: unknown name; the message lists the nearest.
+        BadConfiguration: unknown name. The message lists the nearest.
     """
     library = {**effect_file.effect_library(files), **effects.BESIDE}
     known = explainable_names(library)
@@ -162,7 +162,7 @@ def _status(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
 
 
 def _meaning(meanings: Mapping[str, str], where: str = "") -> Explain:
-    """Explains names that have a meaning each; `where` they are found in files."""
+    """Explains names that have a meaning each. `where` they are found in files."""
 
     def about(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
         if name in meanings:

@@ -10,7 +10,7 @@ from sweeps.report.terminal_renderer import print_document
 
 
 def inspect_file(file: str, as_json: bool) -> int:
-    """Print the signals of a file and the lines of `[columns]` for them; returns 0.
+    """Print the signals of a file and the lines of `[columns]` for them. Returns 0.
 
     Raises:
         BadData: a file that cannot be read.

@@ -15,7 +15,7 @@ from sweeps.store import PACKAGES
 
 
 def check_installation() -> int:
-    """Print one line for each check; returns 0 if all pass, else 1."""
+    """Print one line for each check. Returns 0 if all pass, else 1."""
     import jax
 
     checks: dict[str, Callable[[], str]] = {

@@ -42,9 +42,9 @@ SCREENING_FILE, SCREENING = "screening.json", "mmrjax.screening/1"
 
 
 def execute(config: configuration.Loop, beside: configuration.LoopBeside) -> int:
-    """Run the closed loop on a table and leave a run folder; returns the exit code.
+    """Run the closed loop on a table and leave a run folder. Returns the exit code.
 
-    0 done, whatever the verdict; 3 done, but the fit that is proposed did not converge, or its time was out before
+    0 done, whatever the verdict. 3 done, but the fit that is proposed did not converge, or its time was out before
     there was a verdict. Stages are kept as they end, so that the same command goes on after that, or an interrupt.
     """
     try:
@@ -129,7 +129,7 @@ def _resolved(
 
 
 def _say_out_of_time(within: float, begun: bool) -> None:
-    """Say that time was out before a verdict [s]; `begun`: a stage has ended."""
+    """Report that time was out before a verdict [s]. `begun`: a stage has ended."""
     more = max(5, math.ceil(within / 30))  # twice as much
     first = "" if begun else f", nor a fit of the base model; give it more, as --within {more}min"
     print_message(f"no verdict within {within:g} s{first}")
@@ -138,7 +138,7 @@ def _say_out_of_time(within: float, begun: bool) -> None:
 @contextlib.contextmanager
 def _alarm(seconds: float | None, wanted: Callable[[], bool]) -> Iterator[None]:
     """Raise `OutOfTime` within once so much time has passed, in the middle of a step too where the platform can,
-    while it is `wanted`; each second again, since what is called may hold it back.
+    while it is `wanted`. It is repeated every second, because a called function may suppress it.
 
     Args:
         seconds: None: never.
@@ -201,7 +201,7 @@ def _say_kept(stages: Mapping[str, Any], folder: RunFolder, robot_name: str) -> 
 
 
 def changes_by_effect(found: DiscoveryResult) -> dict[str, Change]:
-    """Change of settled runs by each effect; empty for histories and for effects that the written robot lacks."""
+    """Change of settled runs by each effect, empty for histories and for effects that the written robot lacks."""
     added = [e.name for e in found.effects if e.name in {x.name for x in found.robot.effects}]
     if not isinstance(found.detail, EquationDefects) or not added:
         return {}

@@ -1,4 +1,4 @@
-"""The command `simulate` over a profile: every run follows one mission; its numbers, segments, course as tables."""
+"""The command `simulate` over a profile: every run follows one mission. Its numbers, segments, course as tables."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _LASTING = MARKS.index("battery_empty")  # events from here on are kept in histo
 
 
 def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> int:
-    """Simulate runs of a file, or one of options, over a profile; returns the exit code.
+    """Simulate runs of a file, or one of options, over a profile. Returns the exit code.
 
     Raises:
         BadConfiguration: a condition that both the options and the profile state, a battery that is empty or below
@@ -66,7 +66,16 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
     source = profiles.read_profile(config.profile)
     for note in source.notes:
         print_message(note)
-    _check_acting(robot, source)
+    ground, shaft = (
+        [f"{source.source}, {column}" for column in columns if column in source.stated]
+        for columns in (("slope_deg", "payload_kg", "surface"), ON_SHAFT)
+    )
+    imposed.check_acting(robot, ground, shaft)
+    if "speed" in source.modes and not robot.shows_travel:
+        raise BadConfiguration(
+            f"{source.source}, speed_mm_s: the robot's load is a shaft, so no channel shows a distance; state "
+            "motor_speed_rpm or duty"
+        )
     source.check_source(config.battery)
     for column in source.stated:
         if column in beside.stated:
@@ -94,20 +103,6 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
         )
 
 
-def _check_acting(robot: Robot, source: ProfileTable) -> None:
-    """Refuse a profile that states what does not act on the robot's load."""
-    ground, shaft = (
-        [f"{source.source}, {column}" for column in columns if column in source.stated]
-        for columns in (("slope_deg", "payload_kg", "surface"), ON_SHAFT)
-    )
-    imposed.check_acting(robot, ground, shaft)
-    if "speed" in source.modes and not robot.shows_travel:
-        raise BadConfiguration(
-            f"{source.source}, speed_mm_s: the robot's load is a shaft, so no channel shows a distance; state "
-            "motor_speed_rpm or duty"
-        )
-
-
 def _check_turning(robot: Robot, runs: records.Runs, source: ProfileTable) -> None:
     """Refuse a robot that cannot turn where the profile drives its sides apart, and more than the supply has."""
     if not source.turns:
@@ -124,7 +119,7 @@ def _check_turning(robot: Robot, runs: records.Runs, source: ProfileTable) -> No
 
 
 def _commanded(robot: Robot, runs: records.Runs, source: ProfileTable, config: configuration.Simulate) -> Conditions:
-    """Conditions of the runs; of robots that turn with the lateral adhesion of a stated surface."""
+    """Conditions of the runs. Of robots that turn with the lateral adhesion of a stated surface."""
     conditions = run.conditions_of_runs(robot, runs, config)
     if not source.turns or not runs.has(profiles.SURFACE) or source.surface is not None:
         return conditions
@@ -247,7 +242,7 @@ def _segments(
 
 
 def _segment_of(found: Mission, k: int) -> np.ndarray:
-    """Segment of each kept step of a run; those after the last are of one beyond the end."""
+    """Segment of each kept step of a run. Those after the last are of one beyond the end."""
     assert found.course is not None  # it was asked for
     segment = np.asarray(found.course.segment[k])
     return np.where(segment < 0, np.iinfo(segment.dtype).max, segment)
@@ -257,8 +252,10 @@ def rows_to_keep(segment: np.ndarray, current: np.ndarray, most: int, marked: np
     """Rows of a course to keep, in order: the peak of current of each segment, marked rows, evenly spread ones.
 
     Args:
-        segment: of each row, not decreasing; current: of each row; most: rows to keep at most; marked: rows to keep,
-            of many the last ones.
+        segment: of each row, not decreasing.
+        current: of each row.
+        most: rows to keep at most.
+        marked: rows to keep, of many the last ones.
     """
     if len(segment) <= most:
         return np.arange(len(segment))

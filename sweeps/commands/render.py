@@ -24,9 +24,9 @@ from sweeps.store import DONE, SOLVER_FAILED
 
 
 def execute(config: configuration.Render, picture: configuration.Picture) -> int:
-    """Draw one run from standstill, or a climb of a folder, as a picture or a film; returns the exit code.
+    """Draw one run from standstill, or a climb of a folder, as a picture or a film. Returns the exit code.
 
-    0 also where the run has not settled; 3 where it ends otherwise.
+    0 also where the run has not settled. 3 where it ends otherwise.
     """
     file, begin, end, slow = picture.file, picture.begin, picture.end, picture.slow
     if picture.climb is not None:

@@ -45,9 +45,9 @@ SHORTEST = 0.5  # [s], of a run
 
 
 def execute(config: configuration.Resonance, beside: configuration.FolderPart) -> int:
-    """Map the ripple of a robot and leave a run folder; returns the exit code.
+    """Map the ripple of a robot and leave a run folder. Returns the exit code.
 
-    0 done; 3 done, but some runs did not settle, or slid, tipped or failed.
+    0 done. 3 done, but some runs did not settle, or slid, tipped or failed.
     """
     file = load_robot(config)
     robot = file.robot
@@ -107,7 +107,7 @@ def _grid(config: configuration.Resonance, voltages: tuple[float, ...], payloads
 
 
 def _points(config: configuration.Resonance, robot: Robot) -> tuple[Runs, np.ndarray]:
-    """The grid, then those points of Table 8 that it lacks; and which rows are of Table 8."""
+    """The grid, then those points of Table 8 that it lacks, and which rows are of Table 8."""
     parts = [
         grid_conditions(_grid(config, v, p), robot)
         for v, p in ((config.voltages_V, config.payloads_kg), (VOLTAGES_V, PAYLOADS_KG))
@@ -124,7 +124,7 @@ def _points(config: configuration.Resonance, robot: Robot) -> tuple[Runs, np.nda
 def _rippled(
     folder: RunFolder, robot: Robot, conditions: Conditions, config: configuration.Resonance, what: Passing
 ) -> Columns:
-    """The columns of ripple, chunk by chunk; chunks that an interrupted run left are not simulated again."""
+    """The columns of ripple, chunk by chunk. Chunks that an interrupted run left are not simulated again."""
     total, parts = conditions.shape[0], []
     size = min(CHUNK, total)
     with progress_bar(total, quiet=False) as advance:
@@ -213,7 +213,7 @@ _COLUMNS = {
 
 
 def _rows(rows: Iterable[Json], kind: type) -> Columns:
-    """Rows of a named tuple as columns with units in their names; without rows the columns alone."""
+    """Rows of a named tuple as columns with units in their names, without rows the columns alone."""
     rows, unit = list(rows), "Hz" if kind is Mode else "m_s"
     keys = list(rows[0]) if rows else list(kind.__annotations__)
     names = _COLUMNS | {"low": f"low_{unit}", "high": f"high_{unit}"}

@@ -43,9 +43,13 @@ class RigCheck:
     """Result of `rig check`.
 
     Attributes:
-        file: that was read; robot: of it; examples: its lines that still hold an example's number.
-        origins: of its numbers; facts: that follow from them.
-        runs: of the table, None without one; foresight: what it can determine.
+        file: that was read.
+        robot: of it.
+        examples: its lines that still hold an example's number.
+        origins: of its numbers.
+        facts: that follow from them.
+        runs: of the table, None without one.
+        foresight: what it can determine.
         doubts: of a log over time, a sentence each: signs that are wrong, time or current in another unit.
     """
 
@@ -273,7 +277,7 @@ def _use(column: str, robot: Robot) -> str:
 
 
 def check_rig_file(file: Path, data: str | None, effects: Names, as_json: bool, columns: str | None = None) -> int:
-    """Say what was understood of a rig's file, and what a table can tell of it; returns 0.
+    """Report how a rig's file was read, and what a table can determine of it. Returns 0.
 
     Raises:
         BadConfiguration: a file that cannot be read, or lacks something, with all that it lacks.

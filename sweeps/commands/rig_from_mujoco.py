@@ -43,7 +43,8 @@ def read_mujoco_hinge(source: Path, joint: str | None) -> JointNumbers:
     With a `<dcmotor>` on the hinge, its winding and effects are those of the motor.
 
     Args:
-        source: the model; joint: by name, None: the only driven one.
+        source: the model.
+        joint: by name, None: the only driven one.
 
     Raises:
         BadConfiguration: a model that MuJoCo refuses, or a joint that it does not have or that is no hinge.
@@ -91,10 +92,11 @@ def check_mujoco_model(source: Path) -> None:
 
 
 def _check_attributes(element: Element, file: Path, folder: Path, inside: Sequence[str]) -> int:
-    """Returns the number of copies that an element makes of its content; refuses its numbers and files.
+    """Returns the number of copies that an element makes of its content. Refuses its numbers and files.
 
     Args:
-        folder: of the model; inside: folders in it that may hold files.
+        folder: of the model.
+        inside: folders in it that may hold files.
     """
     tag, where, sizes = element.tag, f"{file}, <{element.tag}>", [1.0]
     for key, text in element.attrib.items():
@@ -235,7 +237,7 @@ class _Model:
 
 
 def _dc_motor(model: Any, actuator: int, dof: int, ratio: float, file: str) -> dict[str, Stated]:
-    """Numbers of a `<dcmotor>` by dotted name; losses of its bristles act at the joint."""
+    """Numbers of a `<dcmotor>` by dotted name. Losses of its bristles act at the joint."""
     every = (model.actuator_gainprm, model.actuator_dynprm, model.actuator_biasprm)
     gain, dynamic, bias = (x[actuator] for x in every)
     resistance, constant = float(gain[0]), float(gain[1])

@@ -53,7 +53,7 @@ def _number(name: str, text: str) -> float:
 def read_data_sheet(stated: Mapping[str, str]) -> dict[str, Stated]:
     """Returns resistance, torque constant and friction of a motor as lines of a rig's file.
 
-    U = R I_s at stall; U = R I_0 + k ω_0 and friction k I_0 at no load; M_s = k (I_s - I_0) at the stalled shaft.
+    U = R I_s at stall. U = R I_0 + k ω_0 and friction k I_0 at no load. M_s = k (I_s - I_0) at the stalled shaft.
 
     Args:
         stated: text with unit of each of `NUMBERS`.

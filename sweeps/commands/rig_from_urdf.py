@@ -34,7 +34,9 @@ def read_urdf_joint(root: Element, file: str, joint: str | None) -> JointNumbers
     """Returns the numbers of a joint of a robot.
 
     Args:
-        root: element `<robot>`; file: its name; joint: by name, None: the only driven one.
+        root: element `<robot>`.
+        file: its name.
+        joint: by name, None: the only driven one.
 
     Raises:
         BadConfiguration: an unknown joint, a joint that does not turn, a loop of links, a number that is wrong or
@@ -191,7 +193,7 @@ class _Urdf:
         return self._number(element, "value", f"link {link}, <mass>", "kg", 0.0)
 
     def _inertial(self, link: str, pose: Pose, axis: np.ndarray) -> tuple[float, float, np.ndarray]:
-        """Mass, inertia about the axis, and first moment of a link; it adds none without `<inertial>`."""
+        """Mass, inertia about the axis, and first moment of a link. It adds none without `<inertial>`."""
         inertial = self.links[link].find("inertial")
         if inertial is None:
             return 0.0, 0.0, np.zeros(3)

@@ -32,16 +32,20 @@ WIDTHS = {
 
 @dataclasses.dataclass(frozen=True)
 class JointNumbers:
-    """Numbers of a joint and of what it moves [SI]; None where the model has none.
+    """Numbers of a joint and of what it moves [SI], None where the model has none.
 
     Attributes:
-        file, joint: names; rolls: True if the joint turns a wheel of a body that is free to move.
-        mass: of the whole model; sides: joints that are equal, as a wheel on the other side.
-        inertia: of what turns with the joint, about its axis, without `armature`; radius: of the wheel.
+        file, joint: names.
+        rolls: True if the joint turns a wheel of a body that is free to move.
+        mass: of the whole model.
+        sides: joints that are equal, as a wheel on the other side.
+        inertia: of what turns with the joint, about its axis, without `armature`.
+        radius: of the wheel.
         ratio: turns of the motor for one of the joint.
         friction, damping, armature: at the joint.
-        weight: largest torque of gravity; angle: of the load at rest under gravity.
-        drive: numbers of the motor by dotted name; they replace what follows from the others.
+        weight: largest torque of gravity.
+        angle: of the load at rest under gravity.
+        drive: numbers of the motor by dotted name. They replace what follows from the others.
     """
 
     file: str
@@ -134,7 +138,7 @@ def free_unstated_losses(kind: str, numbers: Mapping[str, Stated]) -> dict[str, 
 
 
 def hanging_torque_and_angle(torque: float, torque_quarter: float) -> tuple[float, float] | None:
-    """Largest torque of gravity M and angle θ_0 where it hangs, of -M sin(θ - θ_0) [N·m], [rad]; None: no weight.
+    """Largest torque of gravity M and angle θ_0 where it hangs, of -M sin(θ - θ_0) [N·m], [rad]. None: no weight.
 
     Args:
         torque, torque_quarter: of gravity about the axis at θ = 0 and at a quarter turn [N·m].
@@ -148,8 +152,9 @@ def is_round(centre: np.ndarray, axis: np.ndarray, radius: float, along: np.ndar
     """True if a cylinder or sphere turns about its own axis.
 
     Args:
-        centre: from a point of the joint's axis; axis: of the joint; along: of the cylinder, None: a sphere. Axes are
-            unit vectors, shape (3,).
+        centre: from a point of the joint's axis.
+        axis: of the joint.
+        along: of the cylinder, None: a sphere. Axes are unit vectors, shape (3,).
     """
     off = np.linalg.norm(np.cross(axis, centre))
     tilted = 0.0 if along is None else np.linalg.norm(np.cross(axis, along))

@@ -32,7 +32,10 @@ _HEADER = re.compile(r"(?:# )?\[([\w.]+)\]$")
 class Stated:
     """A number for a line of a rig's file.
 
-    Attributes: value: in `unit`; source: file and element; width: text after ±, empty: none.
+    Attributes:
+        value: in `unit`.
+        source: file and element.
+        width: text after ±, empty: none.
     """
 
     value: float
@@ -42,7 +45,7 @@ class Stated:
 
     @property
     def text(self) -> str:
-        """The number as the file has it; 0 has no share of itself as its width."""
+        """The number as the file has it. 0 has no share of itself as its width."""
         number = repr(self.value if isinstance(self.value, int) else float(f"{self.value:.12g}"))
         exact = not self.width or (self.value == 0 and self.width.endswith("%"))
         return number if exact else f'"{number} ± {self.width}"'
@@ -59,7 +62,8 @@ def fill_rig_template(kind: str, numbers: Mapping[str, Stated], heading: str) ->
     A number whose line the template lacks is added at the end of its table.
 
     Args:
-        numbers: by dotted name, `load.` for the table of the load; heading: sentence for the first line.
+        numbers: by dotted name, `load.` for the table of the load.
+        heading: sentence for the first line.
     """
     lines = rig_template(kind).splitlines()
     at = next(k for k, line in enumerate(lines) if line.startswith("load = "))

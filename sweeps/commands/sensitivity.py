@@ -55,9 +55,9 @@ AXES = {
 
 
 def execute(config: configuration.Sensitivity, beside: configuration.FolderPart) -> int:
-    """Study a robot and leave a run folder; returns the exit code.
+    """Study a robot and leave a run folder. Returns the exit code.
 
-    0 done; 3 done, but the solver failed at some operating points.
+    0 done. 3 done, but the solver failed at some operating points.
     """
     file = load_robot(config)
     if config.method not in METHODS:
@@ -115,7 +115,7 @@ def _ranges(vary: Names) -> dict[str, tuple[float, float]]:
 def _operating_points(
     config: configuration.Sensitivity, robot: Robot, ranges: dict[str, tuple[float, float]]
 ) -> Runs:
-    """The grid of operating points; an axis that varies has one value, the middle of its range."""
+    """The grid of operating points. An axis that varies has one value, the middle of its range."""
     layout = Layout.of(robot)
     if layout.imposed == "motor_current":
         raise BadConfiguration(
@@ -177,7 +177,7 @@ def _inputs(
 
 
 def _candidates(config: configuration.Sensitivity, robot: Robot, points: Runs, turns: bool) -> Candidates:
-    """Runs of a table, or of Table 8 in every configuration; of a rig, and of turns, its operating points."""
+    """Runs of a table, or of Table 8 in every configuration. Of a rig, and of turns, its operating points."""
     if config.candidates:
         runs = read_runs(config.candidates, robot, columns=config.columns, measured=False)
         source = runs.source

@@ -19,7 +19,7 @@ from sweeps.store import finish_run_folder, open_folder, print_report
 
 
 def execute(config: configuration.Settle, beside: configuration.SettledLog) -> int:
-    """Find the settled runs of a log and write a run folder with their table; returns the exit code, 0."""
+    """Find the settled runs of a log and write a run folder with their table. Returns the exit code, 0."""
     robot = load_robot(config).robot
     runs = read_runs(beside.data, robot, columns=config.columns, measured=True, series=True)
     named = [] if config.columns is None else ["--columns", config.columns]
@@ -75,7 +75,7 @@ def stretches_table(found: Settled) -> Columns:
 
 
 def to_json(found: Settled, few: str = "") -> Json:
-    """`result.json`; `few` is the sentence of `words.too_few`."""
+    """`result.json`. `few` is the sentence of `words.too_few`."""
     left = settle_words.left_out(found.stretches, bool(few))
     return {
         "schema": "mmrjax.settle/1",

@@ -52,7 +52,7 @@ PERMISSIBLE = "permissible_time_s"
 
 
 def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> int:
-    """Simulate runs of a file, or one of options; leave a run folder; returns the exit code.
+    """Simulate runs of a file, or one of options. Leave a run folder. Returns the exit code.
 
     Raises:
         BadConfiguration: more runs than histories can be kept of.
@@ -97,7 +97,7 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
 def _simulated(
     folder: RunFolder, robot: Robot, runs: records.Runs, config: configuration.Simulate
 ) -> tuple[Columns, Run | None]:
-    """The table of the runs; where the fidelity keeps them over time these are written, and returned too."""
+    """The table of the runs. Where the fidelity keeps them over time these are written, and returned too."""
     fidelity = fidelities.get_fidelity(config.model)
     if fidelity.histories is None:
         return run.evaluate_runs(robot, runs, config, folder), None
@@ -163,7 +163,7 @@ def over_time(robot: Robot, batch: Run) -> Columns:
 
 
 def permissible_durations(robot: Robot, table: Columns) -> np.ndarray:
-    """Permissible duration of each run's current from ambient temperature [s]; inf: continuous, NaN: no current."""
+    """Permissible duration of each run's current from ambient temperature [s]. inf: continuous, NaN: no current."""
     current = motor_currents(robot, table)
     known = np.isfinite(current)
     filled = np.zeros(len(current) + -len(current) % PAD)
@@ -185,7 +185,7 @@ def _permissible(motor: Motor, currents: Float[Array, " runs"]) -> Scalar:
 
 
 def motor_currents(robot: Robot, table: Columns) -> np.ndarray:
-    """Size of the current of one motor [A], of sides driven apart the larger; NaN where no column tells it."""
+    """Size of the current of one motor [A], of sides driven apart the larger, NaN where no column tells it."""
     if all(column in table for column in _OF_SIDES):
         return np.asarray(np.max([np.abs(table[column]) for column in _OF_SIDES], axis=0))
     for column, motors in (("total_current_A", float(robot.sides)), ("motor_current_A", 1.0)):
@@ -237,7 +237,7 @@ def run_remarks(robot: Robot, table: Columns) -> list[str]:
 
 
 def history_table(robot: Robot, history: History, runs: records.Runs) -> Columns:
-    """Time histories of a batch as one table, a row a sample; the columns that series are read with."""
+    """Time histories of a batch as one table, a row a sample. The columns that series are read with."""
     signals = history.signals
     of_rig = {*robot.rig.channels, *(OF_VEHICLE if robot.has_ground else OF_SHAFT)}
     shown = [c for c in channels.EVERY if c.over_time and c.name in of_rig]
@@ -254,7 +254,7 @@ def history_table(robot: Robot, history: History, runs: records.Runs) -> Columns
 
 
 def starts_from_standstill(robot: Robot, batch: Run, runs: records.Runs) -> list[Json]:
-    """Of each run from standstill its stages, their slip (33) and the acceleration time; no stages where it does not
+    """Of each run from standstill its stages, their slip (33) and the acceleration time. No stages where it does not
     get under way."""
     assert batch.history is not None  # the fidelity was asked for it
     found = stages_of_histories(robot, batch.history, runs.configurations(robot))

@@ -26,7 +26,7 @@ from sweeps.store import RunFolder, finish_run_folder, open_folder, print_report
 
 
 def execute(config: configuration.Size, beside: configuration.FolderPart) -> int:
-    """Search for a design and write a run folder; returns the exit code.
+    """Search for a design and write a run folder. Returns the exit code.
 
     The code is 0 whether or not a design meets everything, and 3 if the solver failed at a worst corner of the best.
     """

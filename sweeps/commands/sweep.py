@@ -43,10 +43,11 @@ PROBED = 64
 
 
 def execute(config: Campaign | Sweep, options: StoreOptions) -> int:
-    """Simulate a design and leave a run folder, of a grid of up to `TABLE` runs with a table; returns the exit code.
+    """Simulate a design and leave a run folder, of a grid of up to `TABLE` runs with a table. Returns the exit code.
 
     Args:
-        config: the configuration; options: of a store; with any of them a small grid leaves one too.
+        config: the configuration.
+        options: of a store. With any of them a small grid leaves one too.
     """
     file = load_robot(config)
     if not isinstance(config, Sweep):
@@ -128,7 +129,7 @@ def _into_store(config: Campaign, file: RobotFile, options: StoreOptions) -> int
 
 
 def dry_run(job: scale.Job, layout: Layout, path: Path) -> None:
-    """Say how many points, chunks and bytes a sweep is, and how long it would take; nothing is written."""
+    """Report the points, chunks and bytes of a sweep, and its expected time. Nothing is written."""
     compiled = scale.Compiled(job)
     blocks, slow = job.blocks, job.task.slow
     if slow and blocks.points > PROBED:
@@ -174,7 +175,8 @@ def _refuse_without_space(size: int, share: float, path: Path) -> None:
     """Refuse a sweep whose results would not fit.
 
     Args:
-        size: of the whole store [bytes]; share: of it that is still to be written.
+        size: of the whole store [bytes].
+        share: of it that is still to be written.
     """
     needed, free = math.ceil(size * share) + MARGIN, _free(path)
     if needed > free:
@@ -215,7 +217,7 @@ def simulate_chunks(store: SweepStore, job: scale.Job, options: StoreOptions, po
     """Compute and write the chunks of this process's share that are not done.
 
     Raises:
-        BadConfiguration: no room on the disk, before anything is computed, or in the middle; the scheduler's workers
+        BadConfiguration: no room on the disk, before anything is computed, or in the middle. The scheduler's workers
             are lost for good.
     """
     store.begin(options.share)
@@ -254,7 +256,7 @@ class DiskFull(InputError):
 def finish_sweep(
     store: SweepStore, config: Campaign, file: RobotFile, job: scale.Job, same: Identity, options: StoreOptions
 ) -> int:
-    """Write what a whole sweep leaves, and move it into place; say how far it is where it is not whole."""
+    """Write the files of a complete sweep and move it into place. Report the progress of an incomplete one."""
     left = False
     if not store.finished:
         with store.last() as left:
@@ -319,6 +321,6 @@ def sweep_summary(layout: Layout, job: scale.Job, done: Iterable[Done]) -> Json:
 
 
 def points_by_status(done: Iterable[Done]) -> dict[str, int]:
-    """Number of points by status; every status is included."""
+    """Number of points by status. Every status is included."""
     total = np.sum([d.statuses for d in done], axis=0, dtype=int)
     return dict(zip(STATUSES, np.broadcast_to(total, len(STATUSES)).tolist(), strict=True))

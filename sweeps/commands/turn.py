@@ -38,7 +38,7 @@ SHOWN = tuple(c.name for c in channels.OF_TURNS)
 
 
 def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> int:
-    """Simulate one run of options whose sides are driven apart; leave a run folder; returns the exit code.
+    """Simulate one run of options whose sides are driven apart. Leave a run folder. Returns the exit code.
 
     Raises:
         BadConfiguration: runs of a file, a robot that cannot turn, a turn without a steady state.
@@ -62,7 +62,10 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
         if settled:
             with report_stage(stages - 1, stages, "settled turns over the duties of the inner side"):
                 batch, swept = _with_others(robot, asked)
-            turns = {**_duties(swept), **_columns(robot, shown, swept, batch)}
+            turns = {
+                **{name: np.asarray(getattr(swept, name)) for name in SIDES},
+                **_columns(robot, shown, swept, batch),
+            }
             folder.write_table("turns.csv", capabilities.without_idle(robot, turns))
             first, history = jax.tree.map(lambda x: x[:1], batch), None
         else:
@@ -111,7 +114,7 @@ def _demanded(robot: Robot, asked: Conditions, runs: Runs, config: configuration
     wanted = np.array([config.speed_m_s, 0.5 * width * config.yaw_rate_rad_s])  # of the turn [m/s]
 
     def driven(volts: np.ndarray) -> Conditions:
-        """Of an external supply that has as much; a battery has what it has."""
+        """Voltage of an external supply. A battery sets its own."""
         most = max(supply, float(np.abs(volts).max()))
         left, right, source = (jax.numpy.full(asked.shape, x) for x in (*volts / most, most))
         voltage = asked.voltage if config.battery else source
@@ -214,10 +217,6 @@ def _with_others(robot: Robot, asked: Conditions) -> tuple[Run, Conditions]:
     rows = dataclasses.replace(rows, duty_left=jax.numpy.asarray(duty_left), duty_right=jax.numpy.asarray(duty_right))
     rows = jax.tree.map(jax.numpy.asarray, rows)
     return jax.device_get(fidelities.get_fidelity(fidelities.NAMES[0]).run(robot, rows, {})), rows
-
-
-def _duties(conditions: Conditions) -> Columns:
-    return {name: np.asarray(getattr(conditions, name)) for name in SIDES}
 
 
 def _columns(robot: Robot, shown: tuple[Channel, ...], conditions: Conditions, batch: Run) -> Columns:

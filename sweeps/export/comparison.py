@@ -34,7 +34,8 @@ class FormatLaw(Protocol):
     """Law of a format in steady travel, with the parameters that a refit may change.
 
     Attributes:
-        names: of the parameters; start: their values by translation [SI], all positive or zero.
+        names: of the parameters.
+        start: their values by translation [SI], all positive or zero.
     """
 
     names: Names
@@ -50,7 +51,9 @@ class Fate:
     """Fate of an effect, or of a term of the base, in a format.
 
     Attributes:
-        name: of the effect or term; verdict: `HELD`, `APPROXIMATED` or `DROPPED`; how: in words.
+        name: of the effect or term.
+        verdict: `HELD`, `APPROXIMATED` or `DROPPED`.
+        how: in words.
         kept: share of its change of current and speed that the exported drive shows [-], NaN where it has none.
     """
 
@@ -73,9 +76,12 @@ class Comparison:
     """An exported drive compared with the native model.
 
     Attributes:
-        situation: the runs; translated, refitted: parameters of the format by name [SI], before and after the refit.
-        fates: of base terms and effects; errors: of native, exported, translated, and exported without the effects.
-        reference: what errors are relative to, in words; readings: of the exported drive [SI], (runs, channels).
+        situation: the runs.
+        translated, refitted: parameters of the format by name [SI], before and after the refit.
+        fates: of base terms and effects.
+        errors: of native, exported, translated, and exported without the effects.
+        reference: what errors are relative to, in words.
+        readings: of the exported drive [SI], (runs, channels).
         exported: at the joint.
     """
 
@@ -197,7 +203,7 @@ def _refitted(law: FormatLaw, least: Any, command: Any, load: Any, way: Any, cur
 def share_kept(law: FormatLaw, bare: FormatLaw, situation: Situation, native: AtJoint, native_bare: AtJoint) -> float:
     """Share of an effect's change of current and speed that a refitted format shows [-], at most 1.
 
-    1 less the rms of what the change of the format's error by the effect is, over that of the change itself; NaN
+    1 less the rms of what the change of the format's error by the effect is, over that of the change itself. NaN
     where the effect changes nothing.
     """
     left = [

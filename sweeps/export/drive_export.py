@@ -31,11 +31,11 @@ def export(
     """Export a robot's drive as the actuator of one joint in another simulator, compared with the native model.
 
     Args:
-        robot: a robot, the name of a packaged one, or its TOML file; the posterior next to it is read.
+        robot: a robot, the name of a packaged one, or its TOML file. The posterior next to it is read.
         to: `mujoco`, `jax`, `onnx`, `mjlab`, `table` or `randomization` (docs/howto/export.md).
-        out: folder for the files and `LAW.md`, made if it does not exist; None: no files are written.
-        data: runs to compare with, or the file of a table or log; None: a grid of operating points.
-        configuration: which of the robot's; None: its first.
+        out: folder for the files and `LAW.md`, made if it does not exist. None: no files are written.
+        data: runs to compare with, or the file of a table or log. None: a grid of operating points.
+        configuration: which of the robot's. None: its first.
         joint: name of the joint in the simulator's model, for `mujoco`.
         posterior: of a robot that comes from no file, as a calibration or the loop returns it.
         draws, seed: of `randomization`.

@@ -43,7 +43,9 @@ class Symbol:
     """A node of an expression: a number, a name, or an operation on other nodes. Equal nodes are one object.
 
     Attributes:
-        op: `const`, `name`, or an operation; args: operands; value: the number or the name.
+        op: `const`, `name`, or an operation.
+        args: operands.
+        value: the number or the name.
     """
 
     __slots__ = ("args", "op", "value")
@@ -105,7 +107,7 @@ def apply_operation(op: str, *args: Symbol) -> Symbol:
 
 
 def choice_symbol(condition: Symbol, yes: Symbol, no: Symbol) -> Symbol:
-    """Returns the symbol of a choice; that of one branch where both are equal or the condition is known."""
+    """Returns the symbol of a choice. That of one branch where both are equal or the condition is known."""
     if condition.is_const:
         return yes if condition.value else no
     return yes if yes is no else Symbol.of("where", (condition, yes, no))
@@ -268,7 +270,8 @@ def trace_function(function: Callable[..., Any], names: Sequence[str], what: str
     """Returns a scalar function of scalars as an expression of their names.
 
     Args:
-        function: traceable, of as many positional scalars; what: opens the message of an error.
+        function: traceable, of as many positional scalars.
+        what: opens the message of an error.
 
     Raises:
         BadConfiguration: the function has a loop, or another operation that has no form as an expression.
@@ -320,7 +323,7 @@ class Dialect:
         self.prefix = prefix
 
     def call(self, op: str, args: Sequence[str], constants: Sequence[bool]) -> str:
-        """Text of a function of arguments in text; `constants`: true for each number."""
+        """Text of a function of arguments in text. `constants`: true for each number."""
         name = {"max": "maximum", "min": "minimum", "asin": "arcsin", "acos": "arccos", "atan": "arctan",
                 "atan2": "arctan2", "not": "logical_not"}.get(op, op)  # fmt: skip
         return f"{self.prefix}.{name}({', '.join(args)})"
@@ -350,7 +353,7 @@ def number_text(value: Any) -> str:
 
 
 def lines_of(result: Symbol, dialect: Dialect, spelled: Callable[[str], str], indent: str = "    ") -> list[str]:
-    """Lines of a function body that returns an expression; what is used more than once is a local variable.
+    """Lines of a function body that returns an expression. What is used more than once is a local variable.
 
     Args:
         spelled: text of a name.

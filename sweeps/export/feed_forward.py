@@ -36,7 +36,8 @@ class Map(eqx.Module):
     """Steady states over a grid.
 
     Attributes:
-        speed, torque: axes [rad/s], [N·m]; values: by name of the quantity, shape (speeds, torques).
+        speed, torque: axes [rad/s], [N·m].
+        values: by name of the quantity, shape (speeds, torques).
     """
 
     speed: np.ndarray
@@ -45,7 +46,7 @@ class Map(eqx.Module):
 
     @property
     def efficiency(self) -> np.ndarray:
-        """Power given over power taken [-], of a joint that drives; its inverse for a driven joint."""
+        """Power given over power taken [-], of a joint that drives. Its inverse for a driven joint."""
         out, taken = np.outer(self.speed, self.torque), self.values["power"]
         share = np.where(out > 0, out / np.where(taken > 0, taken, np.inf), taken / np.where(out < 0, out, -np.inf))
         return np.clip(share, 0.0, 1.0)
@@ -59,7 +60,7 @@ def symmetric_axis(largest: float) -> np.ndarray:
 
 
 def steady_state_map(module: ModuleType, params: Json, speed: np.ndarray, torque: np.ndarray, guess: float) -> Map:
-    """Steady states at each speed [rad/s] and torque [N·m] of the joint; `guess`: resistance, of the first step."""
+    """Steady states at each speed [rad/s] and torque [N·m] of the joint. `guess`: resistance, of the first step."""
     speeds, torques = (jnp.asarray(x.ravel()) for x in np.meshgrid(speed, torque, indexing="ij"))
     params = {name: jnp.asarray(value, float) for name, value in params.items()}
 
@@ -151,7 +152,7 @@ def fates_in_tables(situation: Situation, constants: Sequence[Constant]) -> list
 
 
 def effects_in_tables(joint: Joint) -> dict[str, str]:
-    """Words for each effect inside the joint without a memory; one with a memory is held at its settled value."""
+    """Words for each effect inside the joint without a memory. One with a memory is held at its settled value."""
     settled = "its settled value: a table has no memory"
     return {e.name: settled if e.memory_size is not None else "the tables" for e in joint.inside}
 

@@ -38,8 +38,13 @@ class Export:
     """An exported drive.
 
     Attributes:
-        format: one of `FORMATS`; joint: what is exported; constants: of its law; posterior: of the robot, if any.
-        files: contents by name; comparison: with the native model; checks: numbers found with the files, by name.
+        format: one of `FORMATS`.
+        joint: what is exported.
+        constants: of its law.
+        posterior: of the robot, if any.
+        files: contents by name.
+        comparison: with the native model.
+        checks: numbers found with the files, by name.
     """
 
     format: str
@@ -66,10 +71,12 @@ def export_format(
     """Returns the drive of a robot in a format, compared with the native model over runs.
 
     Args:
-        to: one of `FORMATS`; configuration: name, None: the robot's first.
-        data: runs, or the file of a table or log; None: a grid of operating points.
-        at: name of the joint in the simulator's model; draws, seed: of `randomization`.
-        posterior: of the robot; None: from the folder of its file.
+        to: one of `FORMATS`.
+        configuration: name, None: the robot's first.
+        data: runs, or the file of a table or log. None: a grid of operating points.
+        at: name of the joint in the simulator's model.
+        draws, seed: of `randomization`.
+        posterior: of the robot. None: from the folder of its file.
 
     Raises:
         BadConfiguration, BadData: a format, a drive or a table that is refused.

@@ -32,7 +32,8 @@ PLACES = "jax_traceback_in_locations_limit"
 class ActuatorLaw(eqx.Module):
     """The generated actuator in steady travel, without a refit. Attributes: as of `comparison.FormatLaw`.
 
-    params: of the actuator, of shape (runs,) where they differ; guess: speed of the joint near the solution [rad/s].
+    params: of the actuator, of shape (runs,) where they differ.
+    guess: speed of the joint near the solution [rad/s].
     """
 
     module: ModuleType = eqx.field(static=True)
@@ -113,7 +114,7 @@ def fates_in_actuator(joint: Joint) -> list[Fate]:
 
 
 def effects_in_actuator(joint: Joint) -> dict[str, str]:
-    """Words for each effect inside the joint; the law has all of them."""
+    """Words for each effect inside the joint. The law has all of them."""
     return {e.name: "a function of the law" for e in joint.inside}
 
 

@@ -43,10 +43,14 @@ class Part:
     """One equation of the law.
 
     Attributes:
-        name: a word; balance: which it enters, or what it is; unit: of its value.
+        name: a word.
+        balance: which it enters, or what it is.
+        unit: of its value.
         equation, meaning: in words, from the docstring of what it is made of.
-        value: as an expression; slope: its derivative by the variable `by`; rate, rate_slope: of its memory.
-        effect: name of the effect that it is of; empty: of the robot's base.
+        value: as an expression.
+        slope: its derivative by the variable `by`.
+        rate, rate_slope: of its memory.
+        effect: name of the effect that it is of. Empty: of the robot's base.
     """
 
     name: str
@@ -67,7 +71,8 @@ class Joint:
     """A drive as the actuator of a joint.
 
     Attributes:
-        file: the robot and what its file stated; configuration: name of its load.
+        file: the robot and what its file stated.
+        configuration: name of its load.
         robot: with this configuration and the effects inside alone.
         inside, outside: effects that enter the balances of a joint, and the others.
         idle: names of effects that do not act on this configuration.
@@ -96,7 +101,7 @@ class Joint:
 
     @property
     def limit(self) -> float | None:
-        """Largest current of one motor that the driver lets flow [A]; None: no limit."""
+        """Largest current of one motor that the driver lets flow [A]. None: no limit."""
         limit = float(self.robot.driver.current_limit)
         return limit if limit < UNLIMITED else None
 
@@ -120,7 +125,7 @@ class Joint:
         return tuple(p for p in self.parts if p.balance == balance)
 
     def with_robot(self, robot: Robot) -> Joint:
-        """The same joint of a robot with other numbers; its parts are expressions of names and stay."""
+        """The same joint of a robot with other numbers. Its parts are expressions of names and stay."""
         return dataclasses.replace(self, robot=robot, inside=robot.effects)
 
     def parameters(self) -> dict[str, params.Parameter]:
@@ -146,10 +151,10 @@ def joint_of_robot(file: RobotFile, configuration: str | None = None) -> Joint:
     """Returns the drive of a robot as the actuator of one joint.
 
     Args:
-        configuration: its name; None: the robot's first.
+        configuration: its name. None: the robot's first.
 
     Raises:
-        BadConfiguration: no such configuration; a drive that is not one joint or that no voltage drives; an effect
+        BadConfiguration: no such configuration. A drive that is not one joint or that no voltage drives. An effect
             whose equation has no closed form.
     """
     robot = file.robot
@@ -207,7 +212,7 @@ class _Tracer:
         ]
 
     def __call__(self, function: Callable[[Robot, Signals], Any], what: str, balance: str, by: str = "") -> Symbol:
-        """Expression of a function of robot and signals; of its derivative by a variable, where `by` names one."""
+        """Expression of a function of robot and signals. Of its derivative by a variable, where `by` names one."""
         self.at_wheel = balance != "gearbox"
 
         def value(*numbers: Any) -> Any:
@@ -329,7 +334,7 @@ def memory_grows(part: Part) -> bool:
 
 
 def mean_surroundings(signals: Signals, names: Sequence[str]) -> dict[str, float]:
-    """Mean of signals of the surroundings over runs [SI], by name; 0 if unknown."""
+    """Mean of signals of the surroundings over runs [SI], by name, 0 if unknown."""
     found: dict[str, float] = {}
     for name in names:
         value = np.asarray(getattr(signals, name.removeprefix("surroundings.")), float)

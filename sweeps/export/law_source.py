@@ -31,7 +31,7 @@ OF_POSTERIOR, OF_PRIOR = "95 % interval", "prior, two sds either side: no poster
 
 
 def posterior_of(joint: Joint) -> Posterior | None:
-    """Returns the posterior next to the robot's file; None if there is no such file.
+    """Returns the posterior next to the robot's file, None if there is no such file.
 
     Raises:
         BadData: it cannot be read, or is of another robot.
@@ -98,8 +98,11 @@ class Constant:
     """A number of the law.
 
     Attributes:
-        name: dotted; value: [SI]; unit, meaning, source: in words.
-        low, high: limits of its interval, None: not known; kind: of interval, in words.
+        name: dotted.
+        value: [SI].
+        unit, meaning, source: in words.
+        low, high: limits of its interval, None: not known.
+        kind: of interval, in words.
     """
 
     name: str
@@ -113,7 +116,7 @@ class Constant:
 
     @property
     def interval(self) -> str:
-        """Its interval in words; empty if unknown."""
+        """Its interval in words, empty if unknown."""
         return "" if self.low is None else f"{self.low:.4g} to {self.high:.4g} ({self.kind})"
 
 

@@ -59,8 +59,8 @@ EXCESS, FADE, HEAT = "lugre F_S - F_C", "lugre v_S", "thermal R"
 class MujocoLaw(eqx.Module):
     """Steady law of `<dcmotor>` on a joint with friction loss and damping.
 
-    U = R' I' + g K ω, g K I' = M + f sign ω + d ω, and I = c I'. Attributes: as of `comparison.FormatLaw`; ratio: g;
-    coefficient: of the resistance's temperature [1/K].
+    U = R' I' + g K ω, g K I' = M + f sign ω + d ω, and I = c I'. Its `ratio` is g, and `coefficient` that of
+    the resistance's temperature [1/K]. Further attributes: as of `comparison.FormatLaw`.
     """
 
     names: Names = eqx.field(static=True)
@@ -137,7 +137,7 @@ def translate_law(joint: Joint, normal: float, amplitudes: Mapping[str, float] |
 
 
 def stribeck_friction(joint: Joint, known: Mapping[str, Mapping[str, float]]) -> tuple[float, float] | None:
-    """Excess of friction at a crawl [N·m] and its fading speed [rad/s], at the joint; None without such effects."""
+    """Excess of friction at a crawl [N·m] and its fading speed [rad/s], at the joint, None without such effects."""
     gear = joint.robot.gearbox
     ratio, share = float(gear.ratio), float(gear.efficiency_load)
     found = [
@@ -204,9 +204,10 @@ class Motor:
     """Numbers of the MJCF.
 
     Attributes:
-        values: refitted parameters by name [SI]; ratio, inductance, armature: [-], [H], [kg·m²].
-        thermal, lugre, cogging: attributes of `<dcmotor>`, at the motor's shaft; empty where it has none.
-        limit: largest torque of the motor by its driver's limit [N·m]; None: no limit.
+        values: refitted parameters by name [SI].
+        ratio, inductance, armature: [-], [H], [kg·m²].
+        thermal, lugre, cogging: attributes of `<dcmotor>`, at the motor's shaft, empty where it has none.
+        limit: largest torque of the motor by its driver's limit [N·m]. None: no limit.
     """
 
     values: Mapping[str, float]
@@ -260,7 +261,7 @@ def _digits(*numbers: float) -> str:
 
 
 def _comment(lines: Sequence[str], indent: str) -> str:
-    """Lines as XML comments; names in them come from users, so nothing in them can end the comment."""
+    """Lines as XML comments. Names in them come from users, so nothing in them can end the comment."""
     text = [re.sub("-(?=-)", "- ", t) for line in lines for t in textwrap.wrap(printable(line), 104 - len(indent))]
     return "".join(f"{indent}<!-- {t} -->\n" for t in text)
 
@@ -272,8 +273,10 @@ def mjcf_fragment(
 
     Args:
         volts: highest voltage seen or allowed [V], which the control's range states and does not enforce.
-        about: words for the source and interval of each attribute; notes: of the header.
-        name: of the actuator and the default class; at: name of the joint.
+        about: words for the source and interval of each attribute.
+        notes: of the header.
+        name: of the actuator and the default class.
+        at: name of the joint.
     """
     v = found.values
     share = v[SHARE]
@@ -320,7 +323,8 @@ def mjcf_scene(joint: Joint, mass: float, name: str, at: str, command: float, lo
     `load` gives the torque of slope and ground.
 
     Args:
-        mass: of the vehicle [kg]; command, load: of the key frame `run` [V], [N·m].
+        mass: of the vehicle [kg].
+        command, load: of the key frame `run` [V], [N·m].
     """
     moved = joint.load
     if joint.robot.has_ground:
@@ -439,7 +443,8 @@ def settle_in_mujoco(
     """Current and speed of some runs, settled in MuJoCo C by the scene.
 
     Args:
-        expected: by the steady law, near which each run begins; rows: which runs.
+        expected: by the steady law, near which each run begins.
+        rows: which runs.
     """
     # Model of a scene and the fragment that it includes, in memory
     assets = {name: text.encode() for name, text in files.items()}

@@ -41,7 +41,7 @@ def step_of(joint: Joint, constants: Sequence[Constant]) -> tuple[Any, list[str]
     """Returns the step as a function of arrays, and the names of its inputs and outputs.
 
     Inputs are the state, the command, position and velocity of the joint, each of shape (joints,), and the step's
-    length, of shape (1,); outputs are torque, state, voltage taken and power.
+    length, of shape (1,). Outputs are torque, state, voltage taken and power.
     """
     module = module_from_source(jax_source(joint, constants))
     states = joint.states

@@ -31,10 +31,11 @@ LOADS = (0.0, 1 / 6, 1 / 3, 1 / 2)
 
 @dataclasses.dataclass(frozen=True)
 class AtJoint:
-    """Current and speed of a drive in each run, by one model; arrays of shape (runs,).
+    """Current and speed of a drive in each run, by one model, arrays of shape (runs,).
 
     Attributes:
-        current: of one motor [A]; speed: of the joint [rad/s].
+        current: of one motor [A].
+        speed: of the joint [rad/s].
     """
 
     current: np.ndarray
@@ -46,11 +47,16 @@ class Situation:
     """Runs of one configuration, and the native model in them.
 
     Attributes:
-        joint: the drive; source: of the runs, in words; runs: the table, its rows chosen.
-        conditions: of all rows of the table; kept: True for compared rows.
+        joint: the drive.
+        source: of the runs, in words.
+        runs: the table, its rows chosen.
+        conditions: of all rows of the table.
+        kept: True for compared rows.
         signals: of the joint's own model, with the effects inside alone, of shape (runs,).
-        native: readings of the whole model [SI], shape (runs, channels); measured: likewise, NaN if missing.
-        command: mean voltage at the driver's output [V]; load: torque that the joint has to give at the wheel [N·m].
+        native: readings of the whole model [SI], shape (runs, channels).
+        measured: likewise, NaN if missing.
+        command: mean voltage at the driver's output [V].
+        load: torque that the joint has to give at the wheel [N·m].
     """
 
     joint: Joint
@@ -200,7 +206,7 @@ def _measured(runs: Runs, channels: tuple[Any, ...]) -> np.ndarray:
 
 
 def _table(data: Runs | str, joint: Joint) -> Runs:
-    """Runs of a table in the joint's configuration; of a log its settled stretches."""
+    """Runs of a table in the joint's configuration. Of a log its settled stretches."""
     robot = joint.file.robot
     runs = read_runs(data, robot, measured=True, series=True) if isinstance(data, str) else data.of(robot)
     if runs.turns:

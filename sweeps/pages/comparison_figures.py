@@ -46,7 +46,7 @@ def draw_export_readings(compared: Comparison) -> Figure:
 
 
 def draw_parity(table: Columns, channels: Sequence[Channel], band: bool = True) -> Figure:
-    """Simulated over measured, one panel a channel; a reading that is missing is not drawn.
+    """Simulated over measured, one panel a channel. A reading that is missing is not drawn.
 
     Args:
         band: whether ±5 % are shaded.
@@ -88,7 +88,7 @@ def errors_over(
 
     Args:
         beside: further columns than conditions, with their words, where errors are in units.
-        in_units: errors in the unit of the channel instead, with a band of two sds where they are known; over those
+        in_units: errors in the unit of the channel instead, with a band of two sds where they are known. Over those
             conditions that vary.
     """
     every = {
@@ -135,5 +135,5 @@ def errors_over(
 
 
 def _dots(axes: Axes, x: np.ndarray, y: np.ndarray, marker: str, **look: Any) -> None:
-    """Readings of a configuration; very many of them as a picture."""
+    """Readings of a configuration. Very many of them as a picture."""
     axes.plot(x, y, marker, ms=5, mec="white", mew=0.5, rasterized=len(x) > 500, **look)

@@ -35,8 +35,12 @@ class Gear:
     """One run of the track model.
 
     Attributes:
-        name: heading; on_tracks: or on wheels; status; radius: of the pulleys [m].
-        time: [s]; signals, reactions: over it; guide_share: on average at the end [-].
+        name: heading.
+        on_tracks: or on wheels, status.
+        radius: of the pulleys [m].
+        time: [s].
+        signals, reactions: over it.
+        guide_share: on average at the end [-].
     """
 
     name: str
@@ -63,7 +67,7 @@ class Gear:
 
     @property
     def period(self) -> float:
-        """Eq. (34) [s], at the mean speed of the driving pulley; the belt runs on the pulley on wheels too."""
+        """Eq. (34) [s], at the mean speed of the driving pulley. The belt runs on the pulley on wheels too."""
         speed = float(self.signals.speed_wheel[self.tail(TAIL)].mean())
         return ripple_peaks.period_pitch(PITCH_GROUSER if self.on_tracks else PITCH_TOOTH, speed, self.radius)
 
@@ -79,9 +83,11 @@ def members_with_gear(
     """Members of a batch of runs whose running gear is resolved.
 
     Args:
-        history: time, signals and reactions of the batch; status: codes of how its members ended.
+        history: time, signals and reactions of the batch.
+        status: codes of how its members ended.
         guide_share: of each member [-].
-        which: index of each member's configuration in `robot`; names: headings of the members.
+        which: index of each member's configuration in `robot`.
+        names: headings of the members.
     """
     import jax
 

@@ -90,7 +90,7 @@ _STAGES = (("I", "#fdebd0", "starting"), ("II", "#e3eef7", "slipping"), ("III", 
 
 
 def _largest(time: np.ndarray, values: np.ndarray) -> float:
-    """Value of the largest size of a sampled curve, between its samples too; NaN of none."""
+    """Value of the largest size of a sampled curve, between its samples too. NaN of none."""
     if len(values) < 3:
         return float(values[np.argmax(np.abs(values))]) if values.size else np.nan
     return float(
@@ -103,9 +103,11 @@ class Start:
     """A run from standstill, with numbers up to its last finite sample.
 
     Attributes:
-        name: heading; configuration; status.
-        time: [s]; current: of all motors [A]; speed, theoretical: V and r_k ω_k [mm/s].
-        stages: of the start; current and speeds are drawn, and kept here, times its `sense`. None without numbers.
+        name: heading, configuration, status.
+        time: [s].
+        current: of all motors [A].
+        speed, theoretical: V and r_k ω_k [mm/s].
+        stages: of the start. Current and speeds are drawn, and kept here, times its `sense`. None without numbers.
     """
 
     name: str
@@ -160,8 +162,10 @@ def members_from_standstill(
     """Members of a batch of runs from standstill, of any fidelity that has histories.
 
     Args:
-        history: time and signals of the batch; status: codes of how its members ended.
-        which: index of each member's configuration in `robot`; names: headings of the members.
+        history: time and signals of the batch.
+        status: codes of how its members ended.
+        which: index of each member's configuration in `robot`.
+        names: headings of the members.
     """
     from mmrjax.model.signals import STATUSES
 
@@ -359,7 +363,9 @@ class Course:
     """A run of a shaft over time, up to its last finite sample.
 
     Attributes:
-        name: heading; status; time: [s]; readings: of each channel by name, in the unit of its column.
+        name: heading, status.
+        time: [s].
+        readings: of each channel by name, in the unit of its column.
     """
 
     name: str
@@ -381,7 +387,9 @@ def members_as_read(read: Iterable[Channel], history: Any, status: np.ndarray, n
     """Members of a batch of runs as their instruments show them.
 
     Args:
-        read: channels of the robot; history: of the batch; status: codes of how its members ended.
+        read: channels of the robot.
+        history: of the batch.
+        status: codes of how its members ended.
         names: headings of the members.
     """
     from mmrjax.model.signals import STATUSES

@@ -64,7 +64,7 @@ ABREAST = 110
 
 
 def before_after(table: Columns, channels: Sequence[Channel], verdict: str) -> Figure:
-    """Residual of every reading in sigmas, before and after; runs grouped by configuration and voltage."""
+    """Residual of every reading in sigmas, before and after. Runs grouped by configuration and voltage."""
     own = imposed_column(table)
     beside = [c for c in ("payload_kg", "slope_deg", "load_torque_Nm") if c in table]
     order = np.lexsort((*(table[c] for c in beside), table[own], table["configuration"]))
@@ -113,7 +113,7 @@ def _range(x: np.ndarray) -> str:
 
 
 def over_time(runs: Runs, table: Columns, channels: Sequence[Channel], verdict: str) -> Figure:
-    """Residual of every history over time in sigmas, before and after; one column a run, samples as dots and their
+    """Residual of every history over time in sigmas, before and after. One column a run, samples as dots and their
     running mean as a line. The `table` is of the rows of `runs`."""
     names = list(dict.fromkeys(runs.run_names.tolist()))[:RUNS_SHOWN]
     count = len(channels)
@@ -246,7 +246,7 @@ NEAR = 1 / 12
 
 
 def imposed_axis(table: Columns) -> tuple[np.ndarray, str]:
-    """Imposed quantity of runs and its label; for a supply with a driver, the voltage after the duty."""
+    """Imposed quantity of runs and its label. For a supply with a driver, the voltage after the duty."""
     own = imposed_column(table)
     if own == "supply_voltage_V" and "duty" in table and np.isfinite(table["duty"]).all():
         return table[own] * table["duty"], "voltage given to the motors [V]"
@@ -254,7 +254,7 @@ def imposed_axis(table: Columns) -> tuple[np.ndarray, str]:
 
 
 def roughness(x: np.ndarray, y: np.ndarray) -> float:
-    """Share of the variance of y that its mean over the other rows near x leaves [-]; inf where x is constant."""
+    """Share of the variance of y that its mean over the other rows near x leaves [-], inf where x is constant."""
     if not np.ptp(x) > 0:
         return np.inf
     near = np.exp(-0.5 * ((x[:, None] - x) / (NEAR * np.ptp(x))) ** 2) * (1 - np.eye(len(x)))
@@ -313,7 +313,7 @@ def draw_effect_laws(found: DiscoveryResult, table: Columns, changes: Mapping[st
 
 
 def defects_of(table: Columns, when: str, balance: str) -> Columns:
-    """Defects of a balance by side; the side's name is empty if both sides are the same."""
+    """Defects of a balance by side. The side's name is empty if both sides are the same."""
     sides = {side: f"defect_{when}_{balance}{'_' * bool(side)}{side}" for side in ("", *SIDES)}
     return {side: table[column] for side, column in sides.items() if column in table}
 

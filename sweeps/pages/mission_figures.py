@@ -35,11 +35,13 @@ _COLOURS = {
 
 
 def draw_mission_course(rows: Columns, cycle: float | None, limit: float, linear: bool, sides: float) -> Figure:
-    """A run over its profile, a row a subject; with several cycles, the first one is also drawn.
+    """A run over its profile, a row a subject. With several cycles, the first one is also drawn.
 
     Args:
-        rows: of history.csv, of one run; cycle: end of its first cycle [s], None where it has one only.
-        limit: of the winding's temperature [°C]; linear: whether the profile's values are, between rows.
+        rows: of history.csv, of one run.
+        cycle: end of its first cycle [s], None where it has one only.
+        limit: of the winding's temperature [°C].
+        linear: whether the profile's values are, between rows.
         sides: number of motors.
     """
     spans = [float(rows["time_s"][-1]), *([cycle] if cycle is not None else [])]
@@ -145,13 +147,13 @@ def _current(axes: Axes, time: np.ndarray, rows: Columns, sides: float, legend: 
 
 
 def of_motors(rows: Columns, name: str, unit: str) -> np.ndarray:
-    """Of a motor on average; of motors of two sides, which cancel one another on the spot, of their sizes."""
+    """Of a motor on average. Of motors of two sides, which cancel one another on the spot, of their sizes."""
     of_sides = [np.abs(rows[f"{name}_{side}{unit}"]) for side in SIDES if f"{name}_{side}{unit}" in rows]
     return np.asarray(np.mean(of_sides, axis=0) if of_sides else rows[f"{name}{unit}"])
 
 
 def _near(rows: Columns, limit: float) -> bool:
-    """True if the limit is near enough to be drawn; a far limit would flatten the curve."""
+    """True if the limit is near enough to be drawn. A far limit would flatten the curve."""
     return "housing_temperature_C" in rows and bool(np.max(rows["winding_temperature_C"]) > 0.6 * limit)
 
 

@@ -76,7 +76,7 @@ def belt_outline(side: Outline, belt: tuple[int, int]) -> np.ndarray:
 
 
 def draw_silhouette(axes: Axes, shown: Drawn, title: str) -> None:
-    """Draw a robot on its ground, uphill and forward to the right [mm]; its centre of mass with gravity's line."""
+    """Draw a robot on its ground, uphill and forward to the right [mm]. Its centre of mass with gravity's line."""
     side, cosine, sine = shown.side, np.cos(shown.slope), np.sin(shown.slope)
     tilt = np.array([[cosine, sine], [-sine, cosine]])
 

@@ -35,7 +35,7 @@ _UNREAD = {"slides": ">", "failed": "x", "tips": "^", "stalled": "_", "too_slow"
 
 
 def resonance_map(found: ResonanceResult) -> Figure:
-    """Natural frequencies against harmonics of what passes; below, ripple at every speed and payload."""
+    """Natural frequencies against harmonics of what passes. Below, ripple at every speed and payload."""
     rows = len(found.modes)
     heights = [4.4, *(0.5 + 0.2 * rows for _ in MAPS)]
     fig, grid = new_figure(4, 1, sum(heights) + 0.6, sharex=True, height_ratios=heights)
@@ -127,7 +127,7 @@ def _bands(axes: Axes, found: ResonanceResult) -> None:
 
 
 def ripple_map(axes: Axes, found: ResonanceResult, name: str) -> None:
-    """Ripple of one signal over speed, a row for each payload; bars where a peak is to be avoided."""
+    """Ripple of one signal over speed, a row for each payload. Bars where a peak is to be avoided."""
     table, payloads = found.table, list(found.modes)
     ripple = table[f"{name}_ripple_percent"]
     settled = found.read & (table["status"] == "converged")

@@ -47,7 +47,7 @@ def panels_by_imposed(voltages: np.ndarray, column: str = "supply_voltage_V") ->
 
 
 def runs_with_number(runs: Columns, channel: Channel) -> np.ndarray:
-    """Mask of runs with a settled number; `drive` also leaves instantaneous numbers with other statuses."""
+    """Mask of runs with a settled number. `drive` also leaves instantaneous numbers with other statuses."""
     return np.isin(runs["status"], words.SETTLED) & np.isfinite(runs[channel.column])
 
 
@@ -120,7 +120,7 @@ def _medians(cell: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def _blocks(cells: set[tuple[int, int]], joined: bool) -> list[tuple[int, int, int, int]]:
-    """Rectangles (i, j, width, height) that cover the cells; joined where they touch, or one a cell."""
+    """Rectangles (i, j, width, height) that cover the cells. Joined where they touch, or one a cell."""
     if not joined:
         return [(i, j, 1, 1) for i, j in sorted(cells)]
     blocks = []

@@ -121,7 +121,7 @@ SINKS = {
 
 
 def sink_labels(on_ground: bool) -> dict[str, str]:
-    """Labels of the uses of energy; a shaft has no tracks."""
+    """Labels of the uses of energy. A shaft has no tracks."""
     return SINKS if on_ground else SINKS | {"track": "friction of the load"}
 
 

@@ -34,7 +34,7 @@ _GEAR_SPEEDS = {"15 V": 5000.0, "33 V": 11_500.0}  # motor speeds of the measure
 
 
 def gearbox_efficiency(robots: dict[str, Robot], rows: data.Rows | None) -> Figure:
-    """Fig. 5a: efficiency over output torque; the first robot at two speeds, the others where they differ."""
+    """Fig. 5a: efficiency over output torque. The first robot at two speeds, the others where they differ."""
     fig, grid = new_figure(1, 1, 3.9)
     axes = grid[0, 0]
     name, robot = next(iter(robots.items()))

@@ -30,7 +30,7 @@ MODES = {1: (15.0, 0.0), 2: (33.0, 0.0), 3: (33.0, 5.0), 4: (33.0, 8.0)}
 
 
 def shared_configurations(robot: Robot) -> Names:
-    """The paper's configurations that a robot has; its runs on the bench can be set against these alone."""
+    """The paper's configurations that a robot has. Its runs on the bench can be set against these alone."""
     return tuple(c for c in CONFIGURATIONS if c in robot.configurations)
 
 
@@ -40,7 +40,7 @@ def shown_configurations(robot: Robot) -> Names:
 
 
 def batch_conditions(robot: Robot, configuration: Any, **given: Any) -> Conditions:
-    """A batch of conditions with configurations by name; the total mass, if not given, is the robot's own."""
+    """A batch of conditions with configurations by name. The total mass, if not given, is the robot's own."""
     made = Conditions(np.asarray(configuration), **given).resolved(robot)
     if made.total_mass is not None:
         return made
@@ -148,7 +148,7 @@ def raised_words(robot: Robot, ratio: dict[str, float]) -> str:
 
 
 def channel_percent_errors(simulated: Columns, measured: np.ndarray) -> np.ndarray:
-    """Errors (35) of the paper's channels [%], shape (rows, channels); NaN where there is no number."""
+    """Errors (35) of the paper's channels [%], shape (rows, channels), NaN where there is no number."""
     return simulation_errors.relative_error(stack_channels(simulated), measured)
 
 
@@ -234,7 +234,8 @@ def starts_of(robot: Robot, history: Any, status: Any) -> list[Start]:
     """Runs of the paper's configurations from standstill, of any fidelity that has histories.
 
     Args:
-        history: time, signals and reactions (None where contacts are not resolved); status: codes of how runs ended.
+        history: time, signals and reactions (None where contacts are not resolved).
+        status: codes of how runs ended.
     """
     names = shown_configurations(robot)
     return history_figures.members_from_standstill(
@@ -294,7 +295,7 @@ def energy_split(robot: Robot, asked: Conditions) -> tuple[Columns, Columns]:
     """Operating points and the power [W] that each item of `SPLIT` takes of the supply's power.
 
     Returns:
-        The points, and item → power; `other` is what effects beyond the paper's terms take.
+        The points, and item → power. `other` is what effects beyond the paper's terms take.
     """
     import equinox as eqx
 

@@ -111,7 +111,7 @@ def row_by_row(nominal: Robot, rows: data.Rows) -> list[Json]:
 
 
 def _cells(channel: str, measured: float, paper: float, own: float, raised: float, weighed: float) -> Json:
-    """Texts of one channel in a row; differences by (35) of the nominal (raised, own mass) from paper and bench."""
+    """Texts of one channel in a row. Differences by (35) of the nominal (raised, own mass) from paper and bench."""
     return {
         "measured": reading_text(measured, find_channel(channel)),
         "paper": reading_text(paper, find_channel(channel)),
@@ -161,11 +161,12 @@ def write_paper_page(folder: Path, file: RobotFile, *, model: str, gear: bool) -
 
     Args:
         folder: an existing run folder.
-        file: of any robot; without one of the paper's configurations it is not compared with the bench.
-        model: fidelity; gear: whether it resolves the running gear, so that there are Figs. 23-27 from it too.
+        file: of any robot, without one of the paper's configurations it is not compared with the bench.
+        model: fidelity.
+        gear: whether it resolves the running gear, so that there are Figs. 23-27 from it too.
 
     Returns:
-        The path of the page, and the robot's results for the paper's rows; None without one of their configurations.
+        The path of the page, and the robot's results for the paper's rows, None without one of their configurations.
     """
     nominal = ROBOTS["nominal"]()
     robot, shown = file.robot, page.robot_section(file)

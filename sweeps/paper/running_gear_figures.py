@@ -37,7 +37,7 @@ def draw_running_gear(album: Album, robot: Robot) -> Json:
 
     Returns:
         `left_out` None, `rows` of the ripple table, and for the tracked configuration the guide `friction` and the
-        robot's `share`. `currents` [A] are by `steady` at that share and with the share resolved; None without a
+        robot's `share`. `currents` [A] are by `steady` at that share and with the share resolved, None without a
         tracked configuration. If runs did not settle: `left_out`, the statuses of all, and no figures.
     """
     run, names = simulate_gear_runs(robot), data.shown_configurations(robot)

@@ -45,9 +45,10 @@ class Plan:
     """Points of a sweep and their constant conditions.
 
     Attributes:
-        design: the points; axes: unit and limits of each name.
+        design: the points.
+        axes: unit and limits of each name.
         conditions: constant conditions by name, `configuration` as an index.
-        surface: of Table 5, which scales the adhesion by configuration; None where adhesion is stated or varies.
+        surface: of Table 5, which scales the adhesion by configuration, None where adhesion is stated or varies.
         data: files of the design, in addition to the configuration.
         rows: conditions of the runs of a table, among which the axis `ROW` counts.
     """
@@ -85,7 +86,7 @@ def plan_design(config: Campaign, robot: Robot, where: str) -> Plan:
 
     Raises:
         BadConfiguration: an unknown name, an axis without values, a range upside down, a value out of its bounds, a
-            name stated twice, and the like; one sentence.
+            name stated twice, and the like, one sentence.
     """
     data: list[str] = []
     task = task_of(config, robot)
@@ -162,7 +163,7 @@ def _known(name: str, robot: Robot, where: str) -> Axis:
 
 
 def _value(name: str, value: Any, where: str) -> float:
-    """A number; of the battery also true or false."""
+    """A number. Of the battery also true or false."""
     return float(value) if name == "battery" and isinstance(value, bool) else stated_number(value, where)
 
 

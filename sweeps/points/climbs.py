@@ -78,8 +78,8 @@ def further_variation(obstacle: Obstacle, varied: Columns, robot: Robot, where: 
         varied: what varies or is stated, with its values.
 
     Raises:
-        BadConfiguration: a robot that cannot climb; no size, or a size and a search; angles and a sequence of angles;
-            angles beyond the levers' range or that begin below the ground.
+        BadConfiguration: a robot that cannot climb. No size, or a size and a search. Angles and a sequence of angles.
+            Angles beyond the levers' range or that begin below the ground.
     """
     if (why := climb_refusal(robot)) is not None:
         raise BadConfiguration(f"{where}, obstacle: {why}")
@@ -103,7 +103,7 @@ def further_variation(obstacle: Obstacle, varied: Columns, robot: Robot, where: 
 
 
 def climb_refusal(robot: Robot) -> str | None:
-    """Why a robot cannot climb; None: it can."""
+    """Why a robot cannot climb. None: it can."""
     if not robot.has_ground:
         return "the robot's load is a shaft; expected one with ground under it"
     if robot.rig.imposed != "voltage":
@@ -126,8 +126,9 @@ def compute_climbs(
     """Outputs and status of points, by name.
 
     Args:
-        conditions: what does not vary, of shape (points,); values: of the variation, a row a point.
-        sizes: of the obstacles [mm]; None: they are searched for, all side by side.
+        conditions: what does not vary, of shape (points,).
+        values: of the variation, a row a point.
+        sizes: of the obstacles [mm]. None: they are searched for, all side by side.
         told: what share is done.
     """
     robot, at = variation.at(jnp.asarray(values), conditions)

@@ -87,7 +87,8 @@ def grid_axes(config: GridPart, robot: Robot, battery: bool = False) -> dict[str
     """Values of each axis of a grid by the column of a table, the slope last.
 
     Args:
-        config: as `resolve_grid` makes it; battery: whether the runs are on the battery.
+        config: as `resolve_grid` makes it.
+        battery: whether the runs are on the battery.
 
     Raises:
         BadConfiguration: a configuration that the robot does not have.
@@ -105,7 +106,8 @@ def grid_conditions(config: GridPart, robot: Robot, battery: bool = False) -> Ru
     """Every combination of the axes as a table of conditions, slope varying fastest.
 
     Args:
-        config: as `resolve_grid` makes it, or not yet; battery: whether the runs are on the battery.
+        config: as `resolve_grid` makes it, or not yet.
+        battery: whether the runs are on the battery.
 
     Raises:
         BadConfiguration: as `resolve_grid`.

@@ -45,11 +45,14 @@ PARTS = 4
 
 @dataclasses.dataclass(frozen=True)
 class SimulationResult:
-    """Result of a simulating command; all its files are written from it.
+    """Result of a simulating command. All its files are written from it.
 
     Attributes:
-        command: that simulated; model: fidelity; robot: that was simulated.
-        runs: what was simulated; table: their conditions and outcomes, a column each as in `runs.csv`.
+        command: that simulated.
+        model: fidelity.
+        robot: that was simulated.
+        runs: what was simulated.
+        table: their conditions and outcomes, a column each as in `runs.csv`.
         further: what the command adds to `result.json`.
     """
 
@@ -62,7 +65,7 @@ class SimulationResult:
 
     @property
     def statuses(self) -> dict[str, int]:
-        """Number of runs by status; every status is included."""
+        """Number of runs by status. Every status is included."""
         return {status: int(np.sum(self.table["status"] == status)) for status in STATUSES}
 
     @property
@@ -101,7 +104,7 @@ def check_runs_bearable(robot: Robot, conditions: Conditions, config: FidelityPa
 
 
 def conditions_of_runs(robot: Robot, runs: Runs, config: Part) -> Conditions:
-    """The conditions of the runs, fed as the configuration says; without a say by the external supply."""
+    """The conditions of the runs, with the supply of the configuration, by default the external one."""
     if not isinstance(config, SupplyPart):
         return runs.conditions(robot)
     return runs.conditions(robot, battery=float(config.battery), discharge=config.discharge_mAh * COULOMB_PER_MAH)
@@ -117,7 +120,7 @@ def compute_chunks(
     """Kept outputs of all chunks of a job, in order.
 
     Args:
-        folder: holds chunks under this name; chunks left by an interrupted command are not computed again.
+        folder: holds chunks under this name. Chunks left by an interrupted command are not computed again.
         kept: selects from the outputs of a chunk, by default all: in the units of tables, shape (points,).
     """
     chunks = range(len(job.blocks))
@@ -165,7 +168,7 @@ def evaluate_runs(
     Chunks already in the folder (of an interrupted run of the same configuration) are not simulated again.
 
     Args:
-        advance: called with the number of runs done since its last call; of a chunk under way, its share. None:
+        advance: called with the number of runs done since its last call. Of a chunk under way, its share. None:
             a bar on stderr where it takes long.
     """
     job = job_of(robot, runs, config)
@@ -188,7 +191,8 @@ def follow_histories(robot: Robot, runs: Runs, model: str | None) -> Table:
     Its steps are finer than those of fits, which use the grid up to thousands of times.
 
     Args:
-        robot: prepared for the table; model: requested fidelity; None: the fidelity for histories.
+        robot: prepared for the table.
+        model: requested fidelity. None: the fidelity for histories.
 
     Raises:
         BadConfiguration: a fidelity that cannot follow them.
@@ -226,10 +230,12 @@ def write_run_folder(
     result: SimulationResult,
     page: Page,
 ) -> int:
-    """Write what every simulating command leaves, and move the folder into place; returns the exit code.
+    """Write what every simulating command leaves, and move the folder into place. Returns the exit code.
 
     Args:
-        folder: of the command; config: its configuration, with the robot's name; page: its page.
+        folder: of the command.
+        config: its configuration, with the robot's name.
+        page: its page.
     """
     folder.write_table("runs.csv", capabilities.without_idle(result.robot, result.table))
     folder.write_json("result.json", result.to_json())

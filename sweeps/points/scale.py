@@ -1,6 +1,6 @@
 """The engine of every sweep: chunks of one compiled shape over all local devices, kept while the next is computed.
 
-A grid, a plan, the rows of a table and draws of a posterior are designs of points; a Zarr store and the chunks of a
+A grid, a plan, the rows of a table and draws of a posterior are designs of points. A Zarr store and the chunks of a
 run folder keep what comes out.
 """
 
@@ -53,8 +53,11 @@ class Job:
     """All that is needed to compute any chunk of a sweep, here or in another process.
 
     Attributes:
-        robot: that is varied; task: what every point does.
-        outputs: names; storage: type that they are stored in; profile: that every point follows, if any.
+        robot: that is varied.
+        task: what every point does.
+        outputs: names.
+        storage: type that they are stored in.
+        profile: that every point follows, if any.
     """
 
     robot: Robot
@@ -69,7 +72,7 @@ class Job:
 @dataclasses.dataclass
 class Times:
     """Seconds spent by what overlaps: waiting for points and starting to compute them (on processors that is all of
-    computing); waiting for what is computed, fetching it from the device, writing it; and the whole."""
+    computing). Waiting for what is computed, fetching it from the device, writing it, and the whole."""
 
     points: float = 0.0
     start: float = 0.0
@@ -130,7 +133,7 @@ class Compiled:
     def __call__(
         self, values: Float[np.ndarray, "points names"], told: Callable[[float], None] | None = None
     ) -> dict[str, Array]:
-        """Start computing; returns arrays of the compiled shape that may not be there yet.
+        """Start computing. Returns arrays of the compiled shape that may not be there yet.
 
         Args:
             told: called with the share that is done, where `in_parts`.
@@ -239,8 +242,10 @@ class Piece:
     """A chunk under way.
 
     Attributes:
-        chunk: its number; arrays: by variable, which may be on a device still.
-        values: of its points, a row each, where they are at hand; told: points of it that count as done already.
+        chunk: its number.
+        arrays: by variable, which may be on a device still.
+        values: of its points, a row each, where they are at hand.
+        told: points of it that count as done already.
     """
 
     chunk: int
@@ -309,7 +314,7 @@ def fetch_values(arrays: Json, count: int) -> Columns:
 
 
 def drawn_samples(job: Job, piece: Piece) -> Float[np.ndarray, "names points"] | None:
-    """Sample values along a chunk, a row a name; None if another chunk writes them."""
+    """Sample values along a chunk, a row a name, None if another chunk writes them."""
     design, samples = job.plan.design, job.plan.design.samples
     if samples is None or any(job.blocks.place(piece.chunk)[:-1]):
         return None
@@ -323,10 +328,11 @@ def write_chunks(keep: Keep, job: Job, chunks: Produced, advance: Advance, times
     """Write chunks as they come, in a thread of its own, so that the next is computed meanwhile.
 
     Args:
-        keep: writes one; advance: called with the points of each chunk that is done.
+        keep: writes one.
+        advance: called with the points of each chunk that is done.
 
     Raises:
-        OSError: the disk is full, or the store cannot be written; chunks written before are kept.
+        OSError: the disk is full, or the store cannot be written. Chunks written before are kept.
     """
     waiting: queue.Queue[Piece | None] = queue.Queue(WAITING)
     stop, failures = threading.Event(), list[BaseException]()

@@ -29,12 +29,15 @@ class Task:
     """Task of every point of a sweep.
 
     Attributes:
-        model: its name; options: of a fidelity.
-        attributes: of its outputs in a store, by name; usual: those of a store where none are stated.
-        slow: whether a call takes long and reports progress; at_once: points in one, on processors or accelerators.
+        model: its name.
+        options: of a fidelity.
+        attributes: of its outputs in a store, by name.
+        usual: those of a store where none are stated.
+        slow: whether a call takes long and reports progress.
+        at_once: points in one, on processors or accelerators.
         axes: names that may vary and are neither a condition nor a parameter of the robot.
-        further: returns conditions in addition to the varied and stated ones; refuses impossible points.
-        run: computes points, see `climbs.compute_climbs`; None: a program of the fidelity does.
+        further: returns conditions in addition to the varied and stated ones, refuses impossible points.
+        run: computes points, see `climbs.compute_climbs`. None: a program of the fidelity does.
     """
 
     model: str
@@ -49,7 +52,7 @@ class Task:
 
 
 def task_of(config: Campaign, robot: Robot, turns: bool = False) -> Task:
-    """The task that a configuration states; `turns`: whether its profile drives the sides apart."""
+    """The task that a configuration states. `turns`: whether its profile drives the sides apart."""
     if config.obstacle is None:
         return of_fidelity(config.model, config.options, robot, config.profile is not None, turns)
     obstacle, known = config.obstacle, climbs.climb_attributes(config.obstacle)
@@ -64,7 +67,7 @@ def task_of(config: Campaign, robot: Robot, turns: bool = False) -> Task:
 def of_fidelity(
     model: str, options: Mapping[str, float], robot: Robot, profiled: bool = False, turns: bool = False
 ) -> Task:
-    """Task of a run; `profiled`: over a profile, with its totals as outputs; `turns`: with both sides."""
+    """Task of a run. `profiled`: over a profile, with its totals as outputs. `turns`: with both sides."""
     facts, own, usual = (
         fidelities.fidelity_facts(model),
         fidelities.get_fidelity(model).columns,

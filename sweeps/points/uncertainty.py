@@ -35,8 +35,9 @@ class Intervals:
     """Intervals of every run from draws of a posterior.
 
     Attributes:
-        columns: as `simulate_draws` names them; arrays of shape (runs,).
-        draws: their number; channels: of the robot.
+        columns: as `simulate_draws` names them, arrays of shape (runs,).
+        draws: their number.
+        channels: of the robot.
     """
 
     columns: Columns
@@ -54,7 +55,7 @@ def simulate_draws(
     """Simulate every run with so many robots drawn from the posterior: a sweep of the runs crossed with the draws.
 
     It is the uncertainty of what the model says, without the noise of a reading. Each draw is one robot for all runs.
-    Draws that do not converge at a run count for nothing there; `SHARE` says how many do.
+    Draws that do not converge at a run count for nothing there. `SHARE` says how many do.
 
     Returns:
         For every output's column its sd and the ends of its 95 % interval, NaN where fewer than two draws converge.
@@ -77,7 +78,7 @@ def simulate_draws(
 
 
 def _summary(columns: Columns, counts: np.ndarray) -> Columns:
-    """Spread of each column over draws; arrays of shape (runs, draws), `counts`: where a draw converges."""
+    """Spread of each column over draws, arrays of shape (runs, draws), `counts`: where a draw converges."""
     enough = counts.sum(1) >= 2
     found: Columns = {}
     for column, values in columns.items():
@@ -93,7 +94,7 @@ def _summary(columns: Columns, counts: np.ndarray) -> Columns:
 
 
 def interval_ranges(table: Columns, found: Intervals) -> list[str]:
-    """Range of every channel over the runs, each end with its sd; and how many draws do not converge."""
+    """Range of every channel over the runs, each end with its sd, and how many draws do not converge."""
     first = found.channels[0].column
     finite = np.isfinite(found.sd(first)) & np.isfinite(table[first])
     ranges = []

@@ -1,6 +1,6 @@
 """The store of a sweep: a Zarr group whose chunks are whole or absent, and the record of finished chunks.
 
-Arrays are laid out in the Zarr format 3; each chunk is a file, written under another name and moved into place, so
+Arrays are laid out in the Zarr format 3. Each chunk is a file, written under another name and moved into place, so
 that no file is ever partial. A chunk of the sweep counts as done when its line in a journal is complete. That line
 is written last and has a checksum of each file, which detects later damage.
 """
@@ -62,7 +62,9 @@ def job_identity(config: Part, robot: Robot, files: Iterable[str], device: str) 
     """Sections, each of words by key: configuration, data, code, versions, device.
 
     Args:
-        config: of the sweep, chunk and outputs resolved; files: that it reads; device: kind of the devices.
+        config: of the sweep, chunk and outputs resolved.
+        files: that it reads.
+        device: kind of the devices.
 
     Raises:
         BadConfiguration: a file that cannot be read.
@@ -115,7 +117,7 @@ def _flat(content: Json, prefix: str) -> dict[str, str]:
 def identity_differences(
     stored: Mapping[str, Mapping[str, str]], now: Mapping[str, Mapping[str, str]], most: int = 3
 ) -> str:
-    """In which sections two identities differ, with the first keys; empty where they do not."""
+    """In which sections two identities differ, with the first keys, empty where they do not."""
     said = []
     for section in dict.fromkeys((*now, *stored)):
         old, new = stored.get(section, {}), now.get(section, {})
@@ -147,7 +149,9 @@ class Variable:
     """An array of a store.
 
     Attributes:
-        name: of the array; dtype: in NumPy's words; attributes: units, long_name and the like.
+        name: of the array.
+        dtype: in NumPy's words.
+        attributes: units, long_name and the like.
     """
 
     name: str
@@ -160,9 +164,13 @@ class Layout:
     """Layout of a store.
 
     Attributes:
-        design: the points; blocks: its chunks; variables: outputs, of all dimensions of the design.
-        coordinates: units and long names of the varied names; labels: words of an axis in place of its numbers.
-        attributes: of the group; compression: `none` or `zstd`.
+        design: the points.
+        blocks: its chunks.
+        variables: outputs, of all dimensions of the design.
+        coordinates: units and long names of the varied names.
+        labels: words of an axis in place of its numbers.
+        attributes: of the group.
+        compression: `none` or `zstd`.
     """
 
     design: Design
@@ -195,8 +203,9 @@ class Done:
     """Journal entry of a finished chunk.
 
     Attributes:
-        chunk: its number; statuses: number of points by status; ranges: least and greatest finite value of
-            each output that has one.
+        chunk: its number.
+        statuses: number of points by status.
+        ranges: least and greatest finite value of each output that has one.
         checks: checksum of the chunk's file of each array, CRC-32.
     """
 
@@ -244,7 +253,7 @@ class SweepStore(Folder):
             raise
 
     def _enter(self, force: bool) -> bool:
-        """Begin the store or take it up; False where another process has removed it while this one waited for it."""
+        """Begin the store or take it up, False where another process has removed it while this one waited for it."""
         try:
             self.partial.mkdir(parents=True, exist_ok=True)
             self._lock = (self.partial / LOCK).open("a")
@@ -377,7 +386,7 @@ class SweepStore(Folder):
     # --- chunks -----------------------------------------------------------------------------------
 
     def begin(self, shard: tuple[int, int] = (1, 1)) -> None:
-        """Open the journal of a share of the chunks; from now on no other process may work on it.
+        """Open the journal of a share of the chunks. From now on no other process may work on it.
 
         Raises:
             BadConfiguration: another process does, or has removed the store or begun another one in its place.
@@ -402,7 +411,7 @@ class SweepStore(Folder):
             self._journal.flush()
 
     def _at_work(self) -> str | None:
-        """Share that another process is computing; None: no such share. Call within `_locked`."""
+        """Share that another process is computing. None: no such share. Call within `_locked`."""
         return share_at_work(self.partial, self._share)
 
     def _busy(self, name: str) -> BadConfiguration:
@@ -412,7 +421,7 @@ class SweepStore(Folder):
         )
 
     def done(self) -> dict[int, Done]:
-        """Finished chunks by number, whose files are as they were written; a damaged one is reported once."""
+        """Finished chunks by number, whose files are as they were written. A damaged one is reported once."""
         for chunk, records in self._records().items():
             if chunk in self._sound:
                 continue
@@ -436,7 +445,7 @@ class SweepStore(Folder):
         return found
 
     def _wrong_file(self, record: Done) -> Path | None:
-        """File of a chunk that is not as it was written; None if all are."""
+        """File of a chunk that is not as it was written, None if all are."""
         store = (self.path if self.finished else self.partial) / STORE
         for name, file in self._files(record.chunk).items():
             try:
@@ -458,8 +467,8 @@ class SweepStore(Folder):
         """Write a chunk and count it as done.
 
         Args:
-            arrays: by variable, a value a point of its box; drawn: values of the samples there, a row a name, written
-                by the chunks at the beginning of all axes.
+            arrays: by variable, a value a point of its box.
+            drawn: values of the samples there, a row a name, written by the chunks at the beginning of all axes.
         """
         layout, files = self.layout, self._files(chunk)
         box = layout.blocks.box(chunk)
@@ -484,7 +493,7 @@ class SweepStore(Folder):
         return record
 
     def _chunk(self, file: Path, values: np.ndarray, size: tuple[int, ...], empty: Any) -> int:
-        """Write the chunk of an array; returns its checksum."""
+        """Write the chunk of an array. Returns its checksum."""
         if values.shape != size:  # chunks at the end of an axis are filled up, as the format wants
             full = np.full(size, empty, values.dtype)
             full[tuple(slice(n) for n in values.shape)] = values
@@ -507,7 +516,7 @@ class SweepStore(Folder):
             yield not self.finished and len(self.done()) == len(self.layout.blocks)
 
     def move_into_place(self) -> Path:
-        """The finished folder, where it is to appear; to be called within `last`.
+        """The finished folder, where it is to appear. To be called within `last`.
 
         The folder that it replaces goes into the new one first, and is deleted there: after a kill between any two
         steps the same command does the rest.
@@ -635,7 +644,7 @@ def _line(record: Done) -> str:
 
 
 def _record(line: str) -> Done | None:
-    """A line of a journal; None where it is not whole."""
+    """A line of a journal, None where it is not whole."""
     check, _, body = line.partition(" ")
     if not body or f"{zlib.crc32(body.encode()):08x}" != check:
         return None

@@ -30,7 +30,8 @@ def campaign_document(file: RobotFile, layout: Layout, result: Json, store: Path
     """The report of a store whose every chunk is done.
 
     Args:
-        result: `result.json`; store: folder of the arrays.
+        result: `result.json`.
+        store: folder of the arrays.
     """
     counts, model, total = result["statuses"], result["model"], result["points"]
     reached = sum(counts.get(s, 0) for s in words.SETTLED)
@@ -50,12 +51,26 @@ def _sections(store: Path, layout: Layout, extremes: Json) -> Iterable[Section]:
     values, found = sample_points(store, layout)
     yield Section("What varies", (_varied(layout, values),), "varied")
     if VERDICT in found:
-        yield Section("How the climbs ended", _verdicts(values, found, layout), "verdicts")
+        codes, design = found[VERDICT].astype(int), layout.design
+        meanings = next(v.attributes for v in layout.variables if v.name == VERDICT)["flag_meanings"].split()
+        rows = [(f"`{meanings[k]}`", int((codes == k).sum()), *VERDICTS[meanings[k]]) for k in np.unique(codes)]
+        others = [n for n in design.axes if n != SIZE and len(design.axes[n]) > 1][:1]
+        figure = catalogue.figure("campaign.endings", codes, meanings, values, layout, *others)  # fmt: skip
+        drawn = (figure,) * bool(others and SIZE in design.axes)
+        yield Section(
+            "How the climbs ended",
+            (
+                Note(_largest(values, found, layout), "answer", "largest"),
+                catalogue.table("campaign.endings", rows),
+                *drawn,
+            ),
+            "verdicts",
+        )
     yield Section("What came out", tuple(_outputs(values, found, layout, extremes)), "outputs")
 
 
 def _outputs(values: np.ndarray, found: Columns, layout: Layout, extremes: Json) -> Iterable[Block]:
-    """Outputs with their extremes and quantiles; the first of them are drawn."""
+    """Outputs with their extremes and quantiles. The first of them are drawn."""
     settled = np.isin(found[STATUS], signals.DONE)
     rows, figures = list[tuple[Any, ...]](), list[Figure]()
     for variable in (v for v in layout.variables if "units" in v.attributes):
@@ -75,21 +90,6 @@ def _outputs(values: np.ndarray, found: Columns, layout: Layout, extremes: Json)
     yield catalogue.note("campaign.thinned", len(values), drawn)
     yield catalogue.table("campaign.ranges", rows)
     yield from figures
-
-
-def _verdicts(values: np.ndarray, found: Columns, layout: Layout) -> tuple[Block, ...]:
-    """The largest obstacle, the number of climbs by outcome, and these over size and the first other axis."""
-    codes, design = found[VERDICT].astype(int), layout.design
-    meanings = next(v.attributes for v in layout.variables if v.name == VERDICT)["flag_meanings"].split()
-    rows = [(f"`{meanings[k]}`", int((codes == k).sum()), *VERDICTS[meanings[k]]) for k in np.unique(codes)]
-    others = [n for n in design.axes if n != SIZE and len(design.axes[n]) > 1][:1]
-    figure = catalogue.figure("campaign.endings", codes, meanings, values, layout, *others)  # fmt: skip
-    drawn = (figure,) * bool(others and SIZE in design.axes)
-    return (
-        Note(_largest(values, found, layout), "answer", "largest"),
-        catalogue.table("campaign.endings", rows),
-        *drawn,
-    )
 
 
 def _largest(values: np.ndarray, found: Columns, layout: Layout) -> str:

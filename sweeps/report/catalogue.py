@@ -33,11 +33,14 @@ def text(name: str, *words: Any) -> str:
 
 
 def figure(name: str, *drawn: Any, finding: str = "", words: Sequence[Any] = (), more: str = "") -> Figure:
-    """A figure of the catalogue; what draws it is imported when it is drawn, as matplotlib costs half a second.
+    """A figure of the catalogue. What draws it is imported when it is drawn, as matplotlib costs half a second.
 
     Args:
-        name: in the catalogue, `report.name`; drawn: arguments of the function that draws it.
-        finding: in words, if it depends on the result; words: values in the caption; more: end of the caption.
+        name: in the catalogue, `report.name`.
+        drawn: arguments of the function that draws it.
+        finding: in words, if it depends on the result.
+        words: values in the caption.
+        more: end of the caption.
     """
     entry = _entry(name)
     module, _, function = entry["draws"].partition(".")
@@ -52,7 +55,8 @@ def table(name: str, rows: Sequence[Sequence[Any]], *more: Column | str, **field
     """A table of the catalogue.
 
     Args:
-        name: in the catalogue, `report.name`; more: columns, or their titles, in the place of "..." there.
+        name: in the catalogue, `report.name`.
+        more: columns, or their titles, in the place of "..." there.
     """
     entry = _entry(name)
     heads: list[Column] = []

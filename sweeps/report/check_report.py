@@ -30,7 +30,9 @@ class CheckResult:
     """Requirements and their outcomes for one robot.
 
     Attributes:
-        asked: the requirements; robot: compared with them; outcomes: one for each requirement, in order.
+        asked: the requirements.
+        robot: compared with them.
+        outcomes: one for each requirement, in order.
         drawn: the robot in the posture of each geometric requirement, see `posture_results.of_requirements`.
     """
 
@@ -67,7 +69,7 @@ class CheckResult:
 
 
 def _share(outcome: Outcome) -> float:
-    """Margin as a share of the limit [-]; the least for a requirement without a value."""
+    """Margin as a share of the limit [-]. The least for a requirement without a value."""
     return -math.inf if outcome.margin is None else outcome.margin / max(abs(requirement_limit(outcome)), 1e-12)
 
 
@@ -133,7 +135,7 @@ SHOWN = 3
 
 
 def check_document(found: CheckResult, robot_name: str, changes: bool = True) -> Document:
-    """The report; `changes`: True where changes were searched for."""
+    """The report. `changes`: True where changes were searched for."""
     lead = f"Robot: **{robot_name}**. Requirements: **{found.asked.source}**."
     margins = catalogue.figure("check.margins", found, finding=found.statement())
     sections = [

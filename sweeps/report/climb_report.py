@@ -54,7 +54,9 @@ class Along:
     """Variables of derivatives.
 
     Attributes:
-        names, units: of the values; values, widths: in these units; given: the run that such values make.
+        names, units: of the values.
+        values, widths: in these units.
+        given: the run that such values make.
     """
 
     names: Names
@@ -106,11 +108,13 @@ class ClimbResult:
     """Result of `climb`.
 
     Attributes:
-        robot, configuration, obstacle: of the run; the last in words.
-        terrain: of the run that is shown; climb: that run, alone.
+        robot, configuration, obstacle: of the run. The last in words.
+        terrain: of the run that is shown.
+        climb: that run, alone.
         radius: of the pulleys [m].
-        tried: sizes [mm] and verdicts of a search; largest: that it got over [mm], None: no search or none.
-        sought: name of the searched size; empty: no search.
+        tried: sizes [mm] and verdicts of a search.
+        largest: that it got over [mm], None: no search or none.
+        sought: name of the searched size. Empty: no search.
         along, derivatives: if requested, else None.
     """
 
@@ -172,7 +176,7 @@ class ClimbResult:
 
     @property
     def margins(self) -> dict[str, float]:
-        """Margins of the run, shares by the names of `OUTPUTS`; none of a run without numbers."""
+        """Margins of the run, shares by the names of `OUTPUTS`. None of a run without numbers."""
         if self.verdict == "failed":
             return {}
         found = outputs_of_run(self.robot, self.terrain, self.climb, 0)
@@ -180,7 +184,7 @@ class ClimbResult:
 
     @property
     def slopes(self) -> list[Json] | None:
-        """Derivatives, a row an output and value that it is derived by; None: not asked for."""
+        """Derivatives, a row an output and value that it is derived by. None: not asked for."""
         along, found = self.along, self.derivatives
         if along is None or found is None:
             return None

@@ -31,11 +31,14 @@ class Comparison:
     Attributes:
         table: conditions, `<column>` measured, `simulated_<column>`, `error_<channel>_percent`, `status`.
         summary: errors of all rows and of each configuration.
-        channels: of the readings; source: name of the table; model: fidelity; robot_name: of the simulated robot.
+        channels: of the readings.
+        source: name of the table.
+        model: fidelity.
+        robot_name: of the simulated robot.
         fit: `these` if the robot was fitted to these rows, `others` if to other rows, "" if no fit is recorded.
         over: further columns of histories for the axes of the errors, with their headings.
         notes: sentences on the table.
-        against: name of a second robot, "" for none; its readings are the columns `against_<column>` of the table.
+        against: name of a second robot, "" for none. Its readings are the columns `against_<column>` of the table.
     """
 
     table: Columns
@@ -133,12 +136,22 @@ def comparison_document(found: Comparison) -> Document:
         ),
     )
     errors = catalogue.figure("comparison.errors", *known, True, found.over, finding=_trend(found))
+    status = found.table["status"]
     return Document(
         f"{found.robot_name} against {found.source}",
         comparison_answer(found),
         (
             Note(lead, "lead"),
-            *(Note(text, "warn", terminal=True) for text in _unsolved(found)),
+            *(
+                Note(
+                    f"{words.short_status(name).capitalize()}: {count} of {len(status)} rows; "
+                    f"{words.status_meaning(name)}.",
+                    "warn",
+                    terminal=True,
+                )
+                for name, count in Counter(map(str, status)).items()
+                if name not in words.SETTLED
+            ),
             _errors_table(found),
             *([_both_robots(found)] if found.against else []),
             catalogue.note("comparison.errors-note"),
@@ -154,7 +167,7 @@ def comparison_document(found: Comparison) -> Document:
 
 
 def _over_time(found: Comparison) -> tuple[Section, ...]:
-    """The section with readings over time of a log; none for a table of settled runs."""
+    """The section with readings over time of a log. None for a table of settled runs."""
     if found.over is None:
         return ()
     lines = {"simulated_": found.robot_name, "against_": found.against}
@@ -203,16 +216,6 @@ def _seconds(found: Comparison) -> float:
     time = found.table["time_s"]
     runs = found.table.get("run_id", np.zeros(len(time)))
     return float(sum(np.ptp(time[runs == name]) for name in np.unique(runs)))
-
-
-def _unsolved(found: Comparison) -> list[str]:
-    """A sentence for each status that gives no operating point."""
-    status = found.table["status"]
-    return [
-        f"{words.short_status(name).capitalize()}: {count} of {len(status)} rows; {words.status_meaning(name)}."
-        for name, count in Counter(map(str, status)).items()
-        if name not in words.SETTLED
-    ]
 
 
 def _errors_table(found: Comparison) -> Table:

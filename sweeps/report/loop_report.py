@@ -38,7 +38,8 @@ def loop_document(found: DiscoveryResult, robot_name: str, changes: Mapping[str,
     """The report of a pass of the loop.
 
     Args:
-        robot_name: name or file of the robot that it began with; changes: of settled runs by each effect.
+        robot_name: name or file of the robot that it began with.
+        changes: of settled runs by each effect.
     """
     missing = found.verdict not in ("none", "undescribed")
     moved = list(moved_parameters(found))
@@ -153,15 +154,6 @@ def held_out_table(found: DiscoveryResult) -> Table:
     return catalogue.table("loop.errors", rows, *(f"{c.label} |" for c in found.channels))
 
 
-def check_first(found: DiscoveryResult) -> list[str]:
-    """Points to check before use: the reading with the largest weight, repeated values, contradictions."""
-    far = [describe(note) for note in with_codes(found.remarks, "far_from_prior", "repeats", "copied")]
-    against = [note for note in found.remarks if isinstance(note, str)]
-    said = [loop_words.largest_share(found), *far, *against[:1]]
-    # a sentence begins with a capital, a parameter's name does not
-    return [f"{text if '.' in text.split()[0] else text[0].upper() + text[1:]}." for text in said if text]
-
-
 def _advice(found: DiscoveryResult) -> Table:
     after = found.next_experiment
     if after is None:
@@ -171,9 +163,20 @@ def _advice(found: DiscoveryResult) -> Table:
         tells = f" Tells {', '.join(after.separates)}; expected separation {after.expected_sigma:.1f} σ."
         undecided = " Some pairs stay undecided." if found.headline.level == "class" and not after.settles else ""
         next_step = f"**{after.name}**: {after.description}.{tells * bool(after.separates)}{undecided}"
+    far = [describe(note) for note in with_codes(found.remarks, "far_from_prior", "repeats", "copied")]
+    against = [note for note in found.remarks if isinstance(note, str)]
+    said = [
+        loop_words.largest_share(found),
+        *far,
+        *against[:1],
+    ]  # a sentence begins with a capital, a parameter does not
     rows = [
         ("use it?", " ".join(loop_words.use_it(found)) or "No runs could be held out."),
-        ("check first", " ".join(check_first(found)) or "Nothing unusual."),
+        (
+            "check first",
+            " ".join([f"{text if '.' in text.split()[0] else text[0].upper() + text[1:]}." for text in said if text])
+            or "Nothing unusual.",
+        ),
         ("do next", next_step),
     ]
     return catalogue.table("loop.advice", rows)
@@ -387,8 +390,8 @@ def _named(values: Mapping[str, float]) -> str:
     return ", ".join(f"{name} {value:.3g}" for name, value in values.items())
 
 
-def would_be_seen(found: DiscoveryResult) -> list[tuple[str, str, str, float]]:
-    """From what size each effect of the library would have been noticed, the first in its typical sizes first."""
+def _looked_for(found: DiscoveryResult) -> Iterable[Block]:
+    yield catalogue.note("loop.seen-above")
     level, listed = found.before.kinds["single"].threshold, []
     for s in found.scores:
         if s.name in BY_NAME and s.sigmas_per_prior_sd > 0:
@@ -396,12 +399,7 @@ def would_be_seen(found: DiscoveryResult) -> list[tuple[str, str, str, float]]:
             times = level / s.sigmas_per_prior_sd
             size = f"{times * spec.prior_sd(0.0):.2g} {spec.unit}"
             listed.append((f"`{s.name}`", BY_NAME[s.name].family(), size, times))
-    return sorted(listed, key=lambda row: row[-1])
-
-
-def _looked_for(found: DiscoveryResult) -> Iterable[Block]:
-    yield catalogue.note("loop.seen-above")
-    yield catalogue.table("loop.would_be_seen", would_be_seen(found))
+    yield catalogue.table("loop.would_be_seen", sorted(listed, key=lambda row: row[-1]))
     unseen = {
         "cannot_see": found.cannot_see, "needs_series": found.needs_histories, "needs_reverse": found.needs_reverse
     }  # fmt: skip

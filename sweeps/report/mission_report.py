@@ -22,7 +22,7 @@ from mmrjax.model.signals import FLAGS
 from sweeps import capabilities
 from sweeps.pages import words
 from sweeps.report import catalogue, run_tables
-from sweeps.report.document import Block, Column, Document, Note, Section, Table, columns, remarks
+from sweeps.report.document import Column, Document, Note, Section, Table, columns, remarks
 from sweeps.report.run_tables import quantity_column
 from sweeps.report.runs_report import run_headings
 
@@ -32,8 +32,9 @@ class Missions:
     """Runs over one profile, as tables.
 
     Attributes:
-        table: a row a run, `runs.csv`; segments: a row a segment, `segments.csv`; course: a row an accepted step that
-            is kept, `history.csv`.
+        table: a row a run, `runs.csv`.
+        segments: a row a segment, `segments.csv`.
+        course: a row an accepted step that is kept, `history.csv`.
         source: the profile that they follow.
         whole: whether the course of every run reaches its end.
     """
@@ -84,7 +85,7 @@ _NO_RETURN = "Nothing came back to the source"
 
 
 def missions_document(file: RobotFile, found: Missions) -> Document:
-    """The report of finished missions; in detail the first run."""
+    """The report of finished missions. In detail the first run."""
     table, source = found.table, found.source
     shown = capabilities.without_idle(file.robot, table)
     first, names = {key: value[0] for key, value in table.items()}, _names(table)
@@ -130,7 +131,18 @@ def _sections(robot: Robot, found: Missions, first: Json, answer: str) -> Iterab
     limits = run_tables.limits_table(mission_limits(robot, first), "this mission")
     yield Section("Over time", (course, limits, catalogue.note("run.warming")), "course-section")
     if source.turns:
-        yield Section("From above", _from_above(robot, first, rows), "path-section")
+        place = rows["x_mm"] / 1e3, rows["y_mm"] / 1e3, np.radians(rows["yaw_deg"])
+        sides = [[first[f"{name}_{side}_{unit}"] for side in channels.SIDES]
+                 for name, unit in (("rms_current", "A"), ("winding_peak", "C"))]  # fmt: skip
+        heat = catalogue.text("mission.heat", *sides[1]) if robot.knows(WARMING) else ""
+        yield Section(
+            "From above",
+            (
+                catalogue.figure("mission.path", robot, first, *place, words=(first["turned_deg"],)),
+                catalogue.figure("mission.sides", rows, words=sides[0], more=heat),
+            ),
+            "path-section",
+        )
     back, on_battery = float(first["energy_returned_Wh"]), bool(np.isfinite(first["state_of_charge"]))
     returned = f"{back:.3g} Wh came back to the source." if back > 1e-6 * first["energy_drawn_Wh"] else (
         f"{_NO_RETURN}; what driven motors give feeds the other consumers first." if on_battery else f"{_NO_RETURN}."
@@ -146,19 +158,8 @@ def _sections(robot: Robot, found: Missions, first: Json, answer: str) -> Iterab
     )  # fmt: skip
 
 
-def _from_above(robot: Robot, first: Json, rows: Columns) -> tuple[Block, ...]:
-    place = rows["x_mm"] / 1e3, rows["y_mm"] / 1e3, np.radians(rows["yaw_deg"])
-    sides = [[first[f"{name}_{side}_{unit}"] for side in channels.SIDES]
-             for name, unit in (("rms_current", "A"), ("winding_peak", "C"))]  # fmt: skip
-    heat = catalogue.text("mission.heat", *sides[1]) if robot.knows(WARMING) else ""
-    return (
-        catalogue.figure("mission.path", robot, first, *place, words=(first["turned_deg"],)),
-        catalogue.figure("mission.sides", rows, words=sides[0], more=heat),
-    )
-
-
 def _names(runs: Columns) -> list[str]:
-    """Headings of runs; what the profile states in the place of a run's condition is left out."""
+    """Headings of runs. What the profile states in the place of a run's condition is left out."""
     parts = (label.split(", ") for label in run_headings(runs))
     return [", ".join([head, *(p for p in rest if not p.startswith("nan"))]) for head, *rest in parts]
 

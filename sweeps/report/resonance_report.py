@@ -43,8 +43,10 @@ class ResonanceResult:
     """Result of `resonance`.
 
     Attributes:
-        configuration, slope_deg, surface: of the map; passing: source of the excitation; robot: that was simulated.
-        table: a row a run, as in `points.csv`; the grid's first, then further points of Table 8.
+        configuration, slope_deg, surface: of the map.
+        passing: source of the excitation.
+        robot: that was simulated.
+        table: a row a run, as in `points.csv`. The grid's first, then further points of Table 8.
         modes: by payload [kg].
         peaks, crossings: at every payload.
     """
@@ -61,7 +63,7 @@ class ResonanceResult:
 
     @property
     def resonances(self) -> list[Resonance]:
-        """Peaks over the payloads; those without a mode are confirmed by none."""
+        """Peaks over the payloads. Those without a mode are confirmed by none."""
         return group_resonances(self.peaks)
 
     @property
@@ -77,13 +79,13 @@ class ResonanceResult:
 
     @property
     def speeds(self) -> tuple[float, float]:
-        """Least and greatest speed read [m/s]; NaN without a reading."""
+        """Least and greatest speed read [m/s], NaN without a reading."""
         speed = self.table["speed_mean_mm_s"][self.read] * MM
         return (float(speed.min()), float(speed.max())) if len(speed) else (float("nan"), float("nan"))
 
     @property
     def statuses(self) -> dict[str, int]:
-        """Number of runs by status; every status is included."""
+        """Number of runs by status. Every status is included."""
         return {s: int(np.sum(self.table["status"] == s)) for s in (*STATUSES, SLOW)}
 
     @property
@@ -114,7 +116,7 @@ class ResonanceResult:
 
     @property
     def travel(self) -> np.ndarray:
-        """Speed of every run [mm/s]; where it has none, as its voltage has it in the others (NaN: in none)."""
+        """Speed of every run [mm/s]. Where it has none, as its voltage has it in the others (NaN: in none)."""
         speed, voltage = self.table["speed_mean_mm_s"], self.table["supply_voltage_V"]
         if self.read.sum() < 2:
             return speed
@@ -272,7 +274,7 @@ def ripple_percent(value: float) -> str:
 
 
 def _listed(ranges: list[tuple[float, float, list[Resonance]]], what: str) -> str:
-    """Ranges to avoid, the lowest speed first; only the strongest if there are many."""
+    """Ranges to avoid, the lowest speed first. Only the strongest if there are many."""
     most = sorted(ranges, key=lambda r: -max(x.rise for x in r[2]))[:SAID]
     texts = []
     for low, high, members in sorted(most, key=lambda r: r[0]):

@@ -45,8 +45,10 @@ def runs_document(
     """The report of a few finished runs.
 
     Args:
-        runs: the finished table of runs; histories: the same as a batch with its history, if it is kept.
-        stands: in which posture, where the runs state levers; notes: remarks on the runs.
+        runs: the finished table of runs.
+        histories: the same as a batch with its history, if it is kept.
+        stands: in which posture, where the runs state levers.
+        notes: remarks on the runs.
     """
     robot, names = file.robot, run_headings(runs)
     single, first = len(names) == 1, {key: value[0] for key, value in runs.items()}
@@ -164,7 +166,7 @@ def _histories(robot: Robot, runs: Columns, names: list[str], histories: Run) ->
 
 
 def _starts(starts: Sequence[Any]) -> Table:
-    """Stages, currents and slip of each start; without stages where a run does not get under way."""
+    """Stages, currents and slip of each start, without stages where a run does not get under way."""
     rows = []
     for s in starts:
         numbers: list[float | None] = [None] * 10
@@ -211,7 +213,7 @@ def _power_chain(robot: Robot, runs: Columns, names: Sequence[str]) -> Iterable[
 
 
 def limits_used(robot: Robot, run: Json) -> list[Json]:
-    """Use of each limit by a run; an inrush without a stated limit has no share."""
+    """Use of each limit by a run. An inrush without a stated limit has no share."""
     idle = capabilities.idle_columns(robot)
     radius = float(robot.configurations[str(run["configuration"])].radius)
     shaft = float(run["theoretical_speed_mm_s"]) * MM / radius * float(robot.gearbox.ratio) / RPM
@@ -244,7 +246,7 @@ def limits_used(robot: Robot, run: Json) -> list[Json]:
 
 
 def inrush_limit(robot: Robot, on_battery: bool) -> float | None:
-    """Largest current of the driver, or of the battery less other consumers, for all motors [A]; None: not stated."""
+    """Largest current of the driver, or of the battery less other consumers, for all motors [A]. None: not stated."""
     most, battery = float(robot.driver.current_limit), robot.battery
     stated = [float(robot.sides) * most] if most < float(type(robot.driver)().current_limit) else []
     if on_battery and battery.current_limit is not None:

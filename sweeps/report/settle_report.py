@@ -20,7 +20,7 @@ IMPOSED = {
 
 
 def settle_document(found: Settled, few: str = "", notes: Names = ()) -> Document:
-    """The report; `few`: sentence of `words.too_few`; notes: further sentences on the settled runs."""
+    """The report. `few`: sentence of `words.too_few`. `notes`: further sentences on the settled runs."""
     next_step = Note("Next: `mmrjax loop settled.csv` with the same `--robot`.", "lead")
     next_step = Note(few, "lead", "few", terminal=True) if few else next_step
     said = (*words.settle_remarks(found), *notes)

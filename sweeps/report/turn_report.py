@@ -39,8 +39,10 @@ def turn_document(
     """The report of one turn.
 
     Args:
-        run: its row of `runs.csv`; ended: its time, distance and angle at the end, of a run over time.
-        history: over time, of a fidelity that keeps it; turns: settled ones of other duties of the slower side.
+        run: its row of `runs.csv`.
+        ended: its time, distance and angle at the end, of a run over time.
+        history: over time, of a fidelity that keeps it.
+        turns: settled ones of other duties of the slower side.
         notes: further remarks.
     """
     robot, row = file.robot, {name: values[0] for name, values in run.items()}

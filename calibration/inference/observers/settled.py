@@ -66,18 +66,6 @@ LOST = 0.1
 EQUATIONS = {"electrical": "voltage", "track": "torque_output", "slip": "speed_theoretical"}
 
 
-def _unused(runs: Runs, first: int, second: int, but: str) -> tuple[str, ...]:
-    """Columns that differ between two rows and are no condition: those without a role, and a load's torque.
-
-    Args:
-        but: an omitted column.
-    """
-    without = [c for c, cells in runs.extras.items() if cells.dtype.kind == "f"]
-    torque = [c for c in (LOAD,) if c != but and runs.has(c)]
-    cells = {**runs.extras, **runs.columns}
-    return tuple(c for c in (*without, *torque) if cells[c][first] != cells[c][second])
-
-
 class SettledLinearization(Linearization):
     """Linearization of settled rows.
 
@@ -91,7 +79,7 @@ class SettledLinearization(Linearization):
         return moved.sum(0).reshape(-1, shapes.shape[1])
 
     def of_sides(self, balance: Scalar | int) -> Float[Array, "sides rows channels"]:
-        """Change of the readings by a defect of a balance on each side; identical sides are one."""
+        """Change of the readings by a defect of a balance on each side. Identical sides are one."""
         return self.defects[balance].reshape(-1, *self.scale.shape)
 
     def along_of_sides(self, balance: str) -> np.ndarray:
@@ -164,7 +152,7 @@ class SettledRuns(Observer):
 
     @classmethod
     def check(cls, runs: Runs, noise: Noise) -> list[Remark | str]:
-        """Refuses a table of one condition with readings that differ; notes the repeats that differ most."""
+        """Refuses a table of one condition with readings that differ. Notes the repeats that differ most."""
         measured, alike = runs.measured(), rows_of_same_conditions(runs)
         least, found = cls.least(runs), list[Remark]()
         shared = np.array([source == "series" for source in noise.source])
@@ -183,7 +171,10 @@ class SettledRuns(Observer):
                 in_sds = not (noise.estimated[k] or shared[k])
                 known = f"{apart[at] / sd[at]:.0f} sd" if in_sds else f"{apart[at] / mean[at]:.0%}"
                 values = float(runs[column][first]), float(runs[column][second])
-                others = _unused(runs, first, second, column)
+                without = [c for c, cells in runs.extras.items() if cells.dtype.kind == "f"]
+                torque = [c for c in (LOAD,) if c != column and runs.has(c)]
+                cells = {**runs.extras, **runs.columns}
+                others = tuple(c for c in (*without, *torque) if cells[c][first] != cells[c][second])
                 near = runs.layout.nearest(others[0], runs.columns) if others else ""
                 found.append(
                     Remark(
@@ -390,7 +381,7 @@ class SettledRuns(Observer):
     def detail(self, bases: Bases, included: np.ndarray, before: Diagnosis, after: Diagnosis) -> EquationDefects:
         """Defects of `electrical`, `track` and `slip` that together make each row's residual.
 
-        Residuals are simulated less measured; sides have defects of their own if they are driven independently.
+        Residuals are simulated less measured. Sides have defects of their own if they are driven independently.
         """
         return EquationDefects(_defects(before.linear, included), _defects(after.linear, included))
 

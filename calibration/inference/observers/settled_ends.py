@@ -131,7 +131,10 @@ def starts_from_settled_ends(
     points = np.concatenate(
         [ends, np.where(friction, _spread_over_surfaces(problem, draws), ends[0]), 0 * ends[:1], draws]
     )
-    blunt = _with_blunt_instruments(problem)
+    data = problem.data
+    count = np.maximum(np.sum(np.asarray(data.weight) > 0, 0), 1)
+    rms = np.sqrt(np.sum(np.asarray(data.weight > 0) * np.asarray(data.measured) ** 2, 0) / count)
+    blunt = dataclasses.replace(problem, data=dataclasses.replace(data, sd=jnp.hypot(data.sd, BLUNT * rms)))
     optima = search(blunt, _recombined(blunt, points)[:SEARCHES], STEPS_BLUNT)
     ended = np.asarray(optima.z)[np.argsort(np.asarray(optima.cost))]
     best = _recombined(blunt, ended)[:1]
@@ -141,7 +144,7 @@ def starts_from_settled_ends(
 def _with_peaked_friction(problem: Problem, z: np.ndarray) -> np.ndarray:
     """Copies of z with a friction that falls from a peak, with the same creep and sliding friction.
 
-    Their μ_s, V_s and V_d have the nominal ratios to μ_d and to each other, in one configuration or in all;
+    Their μ_s, V_s and V_d have the nominal ratios to μ_d and to each other, in one configuration or in all,
     shape (points, parameters).
     """
     c, out, every = problem.coordinates, [], z.copy()
@@ -207,14 +210,6 @@ def _coordinate(problem: Problem, k: int, value: float) -> float:
     return float(((np.log(value) if scale else value) - location) / spread)
 
 
-def _with_blunt_instruments(problem: Problem) -> Problem:
-    """Problem with the enlarged sds of blunt instruments."""
-    data = problem.data
-    count = np.maximum(np.sum(np.asarray(data.weight) > 0, 0), 1)
-    rms = np.sqrt(np.sum(np.asarray(data.weight > 0) * np.asarray(data.measured) ** 2, 0) / count)
-    return dataclasses.replace(problem, data=dataclasses.replace(data, sd=jnp.hypot(data.sd, BLUNT * rms)))
-
-
 def _fit_settled_ends(problem: Problem) -> Float[np.ndarray, "starts parameters"]:
     """Fits to the settled ends: with each adhesion of the grid, and with a free adhesion."""
     names = problem.coordinates.names
@@ -234,7 +229,7 @@ def _fit_settled_ends(problem: Problem) -> Float[np.ndarray, "starts parameters"
 
 
 def _slides_at_end(problem: Problem, ends: Ends) -> np.ndarray:
-    """True if a run's movers spin at its end, also while it still gains speed, forwards or back; shape (runs,)."""
+    """True if a run's movers spin at its end, also while it still gains speed, forwards or back, shape (runs,)."""
     if not {"motor_speed", "speed"} <= set(problem.base.rig.channels):
         return np.zeros(len(ends.mean), bool)
     turning, travelling = (
@@ -284,7 +279,7 @@ def _fit_pinned(problem: Problem, starts: Array, held: Array) -> Optimum:
 
 
 def _misfit_of_runs(problem: Problem, points: np.ndarray) -> np.ndarray:
-    """Sum of squares of each run's residuals at each point [σ²], infinite if a run fails; shape (points, runs)."""
+    """Sum of squares of each run's residuals at each point [σ²], infinite if a run fails, shape (points, runs)."""
     observe: Histories = problem.observe  # type: ignore[assignment]
     filled = np.resize(points, (-(-len(points) // TOGETHER) * TOGETHER, points.shape[1]))
     parts = filled.reshape(-1, TOGETHER, points.shape[1])

@@ -1,6 +1,6 @@
 """Time histories: one run from standstill for each `run_id`, one row a sample.
 
-The conditions of a run may change from sample to sample; each value holds from its sample until the next. An imposed
+The conditions of a run may change from sample to sample. Each value holds from its sample until the next. An imposed
 quantity is instead linear between samples if the rig's file says so (`Rig.between_rows`).
 """
 
@@ -88,7 +88,6 @@ from mmrjax.fidelities.histories import (
     time_grid,
 )
 from mmrjax.model import balances, channels
-from mmrjax.model.channels import Channel
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar
 from mmrjax.model.rig import Begin, Begins, Rig
@@ -141,7 +140,7 @@ ROUNDING = 1e-3
 def _by_row(
     of_runs: Float[Array, "runs samples ..."], rows_of: Int[Array, "runs samples"], rows: int
 ) -> Float[Array, "rows ..."]:
-    """Values of each sample of the runs, by the table's rows; values beyond a run's last row are dropped."""
+    """Values of each sample of the runs, by the table's rows. Values beyond a run's last row are dropped."""
     place = jnp.where(rows_of < 0, rows, rows_of)
     return jnp.zeros((rows, *of_runs.shape[2:]), of_runs.dtype).at[place].set(of_runs, mode="drop")
 
@@ -158,7 +157,8 @@ class HistoriesLinearization(Linearization):
     Attributes:
         rows_of: indices of each run's rows in the order of time, -1 beyond its last, shape (runs, samples).
         knots: rows between which a defect is linear, shape (runs, knots).
-        time: of each row since the start of its run [s]; angle: of the driving shaft since then [rad].
+        time: of each row since the start of its run [s].
+        angle: of the driving shaft since then [rad].
     """
 
     rows_of: Int[Array, "runs samples"]
@@ -189,7 +189,7 @@ class HistoriesLinearization(Linearization):
         return jnp.where(self.rows_of[:, :, None] < 0, 0.0, self.by_row()[self.rows_of])
 
     def memory(self) -> Array:
-        """Ljung and Box's (1978) statistic over all runs, as a normal deviate; the largest of the channels."""
+        """Ljung and Box's (1978) statistic over all runs, as a normal deviate. The largest of the channels."""
         x, rows = self.series(), self.rows_of
         count = jnp.sum(rows >= 0, 1)[:, None]
         power = jnp.sum(x**2, 1)
@@ -210,14 +210,15 @@ class Histories(Observer):
     parameter, so refits of a bootstrap stay within the linear range and are linear fits.
 
     Attributes:
-        conditions: of each run; a field that changes within a run has shape (runs, instants), else (runs,).
+        conditions: of each run. A field that changes within a run has shape (runs, instants), else (runs,).
         times: the grid of each run from 0, its last instant repeated to a common length, shape (runs, instants) [s].
-        run: index of each row's run; instant: of its sample in `times`; shape (rows,).
+        run: index of each row's run.
+        instant: of its sample in `times`, shape (rows,).
         rows_of: indices of each run's rows in the order of time, -1 beyond its last, shape (runs, samples).
         knots: rows between which a defect is linear, a run's last repeated, shape (runs, knots).
         delayed: True if imposed quantities may act later than their column says (`Rig.delay`), so that readings are
             taken that much earlier, between the instants.
-        known: the simulated runs of the observed robot; None: not yet known.
+        known: the simulated runs of the observed robot. None: not yet known.
     """
 
     word: ClassVar[str] = "sample"
@@ -244,9 +245,9 @@ class Histories(Observer):
 
     @classmethod
     def of(cls, runs: Runs, robot: Robot, fidelity: str | None = None, parts: int = 1) -> Histories:
-        """Observer of a table; rows may be in any order, and constant conditions of a run are its first row's.
+        """Observer of a table. Rows may be in any order, and constant conditions of a run are its first row's.
 
-        Args: as for `Observer`; parts: number of steps in place of each step of a fit.
+        Args: as for `Observer`. `parts`: number of steps in place of each step of a fit.
         """
         if fidelity is not None and fidelities.get_fidelity(fidelity).name != "drive":
             raise BadConfiguration(f"--model {fidelity}: {runs.source} holds time histories; they need --model drive")
@@ -413,7 +414,7 @@ class Histories(Observer):
     def defective(
         self, robot: Robot, probes: tuple[Effect, ...]
     ) -> Float[Array, "probes runs knots samples channels"]:
-        """Change of the readings by a defect of each probe's balance [its unit]; a probe has amplitude 1.
+        """Change of the readings by a defect of each probe's balance [its unit]. A probe has amplitude 1.
 
         The defect is 1 at a knot of a run and falls linearly to 0 at the neighbouring knots.
         """
@@ -698,7 +699,7 @@ class Histories(Observer):
         most: int | None = None,
         scanned: Problem | None = None,
     ) -> tuple[Optimum, Observation]:
-        """Searches as in the protocol; the runs are compiled once for all steps."""
+        """Searches as in the protocol. The runs are compiled once for all steps."""
         data, steps = problem.data, self.policy.steps if most is None else most
 
         def searched(starts: Numbers) -> tuple[Optimum, Observation]:
@@ -770,12 +771,15 @@ class Histories(Observer):
         def side(diagnosis: Diagnosis) -> TimeSide:
             lags = min(LAGS, self.rows_of.shape[1] // 4)
             test = diagnosis.test
+            x = np.asarray(diagnosis.linear.series())
+            power = np.maximum(np.sum(x**2, (0, 1)), 1e-12)
+            by_lag = [np.sum(x[:, k:] * x[:, :-k], (0, 1)) / power for k in range(1, lags + 1)]
             memory = Memory(
                 float(test.found.white),
                 test.threshold("white"),
                 test.p("white"),
                 lags,
-                _autocorrelation(diagnosis.linear, lags),
+                {name: [float(lag[k]) for lag in by_lag] for k, name in enumerate(diagnosis.linear.channels)},
             )
             waves = {(w, bases_room.ORDERS[w][0]): wave for w in orders if (wave := strongest(diagnosis, w))}
             return TimeSide(memory, waves, strongest(diagnosis, "time"))
@@ -783,14 +787,6 @@ class Histories(Observer):
         samples = int((np.asarray(self.rows_of) >= 0).sum())
         unresolved = tuple(w for w in bases_room.ORDERS if w not in orders)
         return TimeStatistics(self.rows_of.shape[0], samples, unresolved, side(before), side(after))
-
-
-def _autocorrelation(linear: Linearization, lags: int) -> dict[str, list[float]]:
-    """Autocorrelation of each channel's residuals over all runs, at lags 1 to `lags` samples."""
-    x = np.asarray(linear.series())
-    power = np.maximum(np.sum(x**2, (0, 1)), 1e-12)
-    by_lag = [np.sum(x[:, k:] * x[:, :-k], (0, 1)) / power for k in range(1, lags + 1)]
-    return {name: [float(lag[k]) for lag in by_lag] for k, name in enumerate(linear.channels)}
 
 
 def _drive_jumps(runs: Runs, each: list[np.ndarray], rig: Rig) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -816,8 +812,10 @@ def _conditions_over_time(
     """Conditions of runs from those of rows, shape (runs,), or (runs, instants) if they change within a run.
 
     Args:
-        of_rows: shape (rows,); each: rows of each run in the order of time.
-        time: of rows; times: instants of each run [s].
+        of_rows: shape (rows,).
+        each: rows of each run in the order of time.
+        time: of rows.
+        times: instants of each run [s].
         on_lines: fields that are linear between rows: mean over the step that begins at each instant.
     """
     middle = np.concatenate([0.5 * (times[:, 1:] + times[:, :-1]), times[:, -1:]], 1)
@@ -856,7 +854,7 @@ def _conditions_of_rows(conditions: Conditions, rows: np.ndarray) -> Conditions:
 
 
 def _interpolate_at_instants(x: np.ndarray, each: list[np.ndarray], time: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Values at instants of each run, by linear interpolation between its rows; shape (runs, instants)."""
+    """Values at instants of each run, by linear interpolation between its rows, shape (runs, instants)."""
     return np.stack([np.interp(t, time[rows], x[rows]) for rows, t in zip(each, at, strict=True)])
 
 
@@ -872,7 +870,7 @@ FIRST_SAMPLES = 5
 def measure_initial_states(robot: Robot, runs: Runs, noise: Noise) -> Robot:
     """`robot` with the initial states of a table's runs, if its rig says that they do not begin at rest.
 
-    Speed and angle of the first samples are extrapolated to the first; the error of that is the prior of free ones.
+    Speed and angle of the first samples are extrapolated to the first. The error of that is the prior of free ones.
     """
     if robot.rig.start == "rest" or not runs.sampled:
         return robot
@@ -887,7 +885,13 @@ def measure_initial_states(robot: Robot, runs: Runs, noise: Noise) -> Robot:
             field = "motor_speed" if channel.settled else "angle"
             finite = mine[np.isfinite(measured[mine, k])][:FIRST_SAMPLES]
             if channel.zero_at_rest and field not in state and len(finite):
-                factor = 1 / _shown_of_unit(robot, int(rows[mine[0]]), channel)
+                configuration = int(rows[mine[0]])
+                radius = float(robot.configurations.members[configuration].radius)
+                none, one = jnp.zeros(()), jnp.ones(())
+                rolling = State(none, one, radius / robot.gearbox.ratio, none, distance=radius)
+                factor = 1 / float(
+                    channel.read(robot, balances.begin_signals(robot, Conditions(configuration), rolling))
+                )
                 value, sd = _extrapolated(runs["time_s"][finite] - runs["time_s"][mine[0]], measured[finite, k])
                 least = float(np.median(noise.sd[finite, k]))
                 state[field] = factor * value, abs(factor) * max(sd, least)
@@ -897,17 +901,8 @@ def measure_initial_states(robot: Robot, runs: Runs, noise: Noise) -> Robot:
     return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, begins=Begins(begins), priors=priors))
 
 
-def _shown_of_unit(robot: Robot, configuration: int, channel: Channel) -> float:
-    """Reading of a channel [SI] if the motor shafts turn at 1 rad/s, the load rolls with them and the output's angle
-    is 1 rad."""
-    radius = float(robot.configurations.members[configuration].radius)
-    none, one = jnp.zeros(()), jnp.ones(())
-    rolling = State(none, one, radius / robot.gearbox.ratio, none, distance=radius)
-    return float(channel.read(robot, balances.begin_signals(robot, Conditions(configuration), rolling)))
-
-
 def _extrapolated(time: np.ndarray, shown: np.ndarray) -> tuple[float, float]:
-    """Value at time 0 of a line through samples, and its standard error; the mean of fewer than three samples."""
+    """Value at time 0 of a line through samples, and its standard error. The mean of fewer than three samples."""
     if len(time) < 3:
         return float(np.mean(shown)), 0.0
     matrix = np.stack([np.ones_like(time), time], 1)
@@ -960,7 +955,7 @@ def _stop_notes(runs: Runs) -> list[Remark | str]:
 
 
 def _choose_knots(rows: np.ndarray, most: int) -> np.ndarray:
-    """At most `most` of a run's rows, evenly spaced, with its first and last; the last is repeated as padding."""
+    """At most `most` of a run's rows, evenly spaced, with its first and last. The last is repeated as padding."""
     chosen = rows[np.unique(np.round(np.linspace(0, len(rows) - 1, most)).astype(int))]
     return np.concatenate([chosen, np.repeat(chosen[-1], most - len(chosen))])
 
@@ -969,7 +964,8 @@ def _changes_still(speeds: np.ndarray, half: np.ndarray, quarter: np.ndarray) ->
     """True if a speed still changes by more than `STILL` in the later half of an interval.
 
     Args:
-        speeds: shape (rows, channels); half, quarter: rows of the later half and of the last quarter.
+        speeds: shape (rows, channels).
+        half, quarter: rows of the later half and of the last quarter.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # a channel without readings
@@ -993,7 +989,7 @@ def _relative_jumps(driven: np.ndarray) -> np.ndarray:
 
 
 def _usual_interval(apart: np.ndarray) -> float:
-    """Median of the times between a run's rows; infinite for a single row."""
+    """Median of the times between a run's rows. Infinite for a single row."""
     return float(np.median(apart)) if len(apart) else np.inf
 
 
@@ -1003,8 +999,8 @@ def _longest_steps(runs: Runs, robot: Robot) -> list[np.ndarray]:
     With an imposed speed only the memory of effects is simulated. If the drive of a run changes its sign and shafts
     and load do not move as one, friction jumps as a speed passes through zero. Steps then have to be
     short compared with the time between readings, near each such passage and as much earlier as the rig's delay may
-    be. A passage is where the table's speeds, or the rates of its angles and positions, are low or change their sign;
-    it may be anywhere in a table without these.
+    be. A passage is where the table's speeds, or the rates of its angles and positions, are low or change their sign.
+    It may be anywhere in a table without these.
     """
     whole, rig, exact = runs.whole, robot.rig, robot.rig.imposed == "motor_speed"
     moved = [k for k, c in enumerate(runs.channels) if c.zero_at_rest and (c.directed or not c.settled)]
@@ -1035,11 +1031,11 @@ def _longest_steps(runs: Runs, robot: Robot) -> list[np.ndarray]:
 
 
 def _may_pass_rest(speeds: np.ndarray, share: float) -> np.ndarray:
-    """True between rows where a run may pass through rest; all True if no reading shows it.
+    """True between rows where a run may pass through rest. All True if no reading shows it.
 
     Args:
-        speeds: readings that are 0 at rest or their rates, shape (rows, channels); share: of their largest, below
-            which a run may pass through rest.
+        speeds: readings that are 0 at rest or their rates, shape (rows, channels).
+        share: of their largest, below which a run may pass through rest.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # a channel without readings
@@ -1164,7 +1160,8 @@ def _responses(
     """Signatures and defects of `HistoriesLinearization`, signals of each row, and the shaft's angle there.
 
     Args:
-        observe: with known runs; scale: of readings [1/SI], shape (rows, channels).
+        observe: with known runs.
+        scale: of readings [1/SI], shape (rows, channels).
     """
     defects, by_effects = observe.changes(robot, tuple(balance_probe(b) for b in PROBED), effects)
     rows_of, rows = observe.rows_of, len(scale)
@@ -1179,8 +1176,10 @@ class _Probed(NamedTuple):
     """A robot with probes of balances, and the effects that change its readings through them.
 
     Attributes:
-        every: probes, those with requested defects first; size: number of these.
-        effects: with the robot's shapes; entering: index of each instance's probe, shape (instances,).
+        every: probes, those with requested defects first.
+        size: number of these.
+        effects: with the robot's shapes.
+        entering: index of each instance's probe, shape (instances,).
         enters: 1 if that balance has a probe, else 0, shape (instances,).
         at_sensor: 1 if an instance is an error of a channel's instrument, else 0, shape (channels, instances).
     """
@@ -1228,8 +1227,12 @@ class _Probed(NamedTuple):
         """Changes of a run's readings by a defect at each knot, and by each effect.
 
         Args:
-            clock: times of the knots [s]; instants: numbers of the samples' instants; times: of instants [s].
-            along: the run; time: of samples [s]; delayed: True if readings are late.
+            clock: times of the knots [s].
+            instants: numbers of the samples' instants.
+            times: of instants [s].
+            along: the run.
+            time: of samples [s].
+            delayed: True if readings are late.
         """
         robot, size, none = self.robot, self.size, jnp.zeros(len(self.every))
         remembered, hat = _remembered(robot, conditions, along, self.effects), _hats(clock)
@@ -1294,7 +1297,7 @@ def _remembered(
 ) -> Callable[[Array], list[Array]]:
     """Memory of effects along a known run, at each point of their grids, as a function of time.
 
-    It follows the stages of the run (`histories.linearise_run`); a memory's rate is linear in the memory, or nearly
+    It follows the stages of the run (`histories.linearise_run`). A memory's rate is linear in the memory, or nearly
     so.
     """
     mine = [e for e in effects if e.effect.memory_size is not None]

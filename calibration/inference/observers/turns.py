@@ -46,7 +46,7 @@ def signal_by_point(signals: Signals, name: str) -> Float[Array, " points"]:
 
 
 class TurnLinearization(SettledLinearization):
-    """Linearization of settled turns: each side of each row is a point; `signals` have the sides as last axis."""
+    """Linearization of settled turns: each side of each row is a point. `signals` have the sides as last axis."""
 
     probed: ClassVar[Names] = (*PROBED, *ROUND)
 
