@@ -122,8 +122,9 @@ def _noise_of_channel(
 
     A few series do not decide between the forms, and a pure share would give the smallest readings a far too large
     weight. With four series of five, its smallest sd is too small by a factor of 3.7 in one table of twenty. The
-    mixture's is too small by 2.2.
+    mixture's is too small by 2.2. Motors at rest show 0 without noise, so such readings do not count.
     """
+    measured = np.where(channel.zero_at_rest & (measured == 0), np.nan, measured)
     weights, used = _differences(measured, x, series)
     if not used:
         return None

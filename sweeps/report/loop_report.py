@@ -79,7 +79,13 @@ def _findings(found: DiscoveryResult, changes: Mapping[str, Change]) -> Iterable
             size += f", which changes the {changes[e.name].channel.label} by {changes[e.name].rms:.2g} %"
         or_else = f" Or {other}." if other else ""
         kinds = ", or ".join(e.families)
-        yield f"**{kinds}** (`{e.name}`): {size}; {loop_words.how_sure(found, e)}.{or_else}"
+        sure = f"{_noise_alone(found).lower()}{loop_words.how_sure(found, e)}"
+        yield f"**{kinds}** (`{e.name}`): {size}; {sure}.{or_else}"
+
+
+def _noise_alone(found: DiscoveryResult) -> str:
+    """Opening of a claim that does not hold at every noise tried; "" for one that does."""
+    return "" if found.headline.level == found.verdict else "At 1 times the noise alone: "
 
 
 def moved_parameters(found: DiscoveryResult) -> Iterable[str]:
@@ -259,9 +265,8 @@ def _certain(found: DiscoveryResult, missing: bool) -> Iterable[Section]:
     noise = loop_words.at_other_noise(found.sensitivity) if found.sensitivity else ""
     noises = {name: (n["median_percent"], n["source"]) for name, n in found.noise.items()}
     notes = [*found.notes, noise, fit_tables.noise_sentence(noises, found.channels)]
-    opening = "" if found.headline.level == found.verdict else "At 1 times the noise alone: "
     blocks = [
-        Note(f"{opening}{found.verdict_statement}", name="statement", terminal=True),
+        Note(f"{_noise_alone(found)}{found.verdict_statement}", name="statement", terminal=True),
         *([Note(loop_words.cluster_sentence(found.cluster), name="cluster")] if found.cluster else []),
         *(Note(text, name=name, terminal=True) for name, text in reasons.items() if text),
         *remarks(also, "also"),
