@@ -91,12 +91,12 @@ def _command(
             stated, others = made.take_options(kind, given), made.take_options(beside, given)
             aside = config.resolve_beside(beside, file, others, trust)
             if resolve is None:
-                found = config.resolve_configuration(kind, file, stated, beside, trust)
+                resolved = config.resolve_configuration(kind, file, stated, beside, trust)
             else:
-                found = resolve(file, stated, trust)
+                resolved = resolve(file, stated, trust)
             with report_working(name):
-                _prepare(found, given["no_cache"])
-                code: int = importlib.import_module(f"sweeps.commands.{room or name}").execute(found, aside)
+                _prepare(resolved, given["no_cache"])
+                code: int = importlib.import_module(f"sweeps.commands.{room or name}").execute(resolved, aside)
                 return code
 
         keyword = functools.partial(inspect.Parameter, kind=inspect.Parameter.KEYWORD_ONLY)
@@ -669,8 +669,8 @@ def _no_number(error: Any) -> str:
     option = getattr(error, "param", None)
     if option is None or not re.search(r"valid (number|float|integer)", str(getattr(error, "message", ""))):
         return ""
-    told = " ".join(str(option.help or "").replace("\\[", "[").split())
-    return f"{option.opts[0]}: got no number; expected one without its unit. {told}"
+    help_text = " ".join(str(option.help or "").replace("\\[", "[").split())
+    return f"{option.opts[0]}: got no number; expected one without its unit. {help_text}"
 
 
 def _fail(message: str, code: int) -> int:

@@ -166,9 +166,9 @@ def _most(option: str) -> float:
 
 def _usual(option: str, shown: float = math.inf) -> str:
     """Default of a fidelity's option by fidelity. Of `simulate` at most `shown`."""
-    found = {name: o.default for name, o in _having(option).items()}
-    capped = {name: f"{v:g}" + (f", simulate {shown:g}" if v > shown else "") for name, v in found.items()}
-    return "; ".join([f"{name} {text}" for name, text in capped.items()] if len(found) > 1 else capped.values())
+    defaults = {name: o.default for name, o in _having(option).items()}
+    capped = {name: f"{v:g}" + (f", simulate {shown:g}" if v > shown else "") for name, v in defaults.items()}
+    return "; ".join([f"{name} {text}" for name, text in capped.items()] if len(defaults) > 1 else capped.values())
 
 
 Duration = Annotated[float, positive(_most("duration"))]
@@ -823,14 +823,14 @@ def _keys(kind: type[Part], file: Path, beside: type[Part] | None) -> Json:
     table = values.pop("solver", {})
     if not isinstance(table, dict):
         raise BadConfiguration(f"{file.name}, solver: got {table!r}; expected a table, [solver]")
-    own, others = fields_with(kind, "solver"), [] if beside is None else fields_with(beside, "solver")
+    own_fields, others = fields_with(kind, "solver"), [] if beside is None else fields_with(beside, "solver")
     for key in table:
-        if key not in own + others:
-            known = allowed_words(key, own + others) if own + others else "this command has none"
-            raise BadConfiguration(f"{file.name}, solver.{key}: no such key; {known}")
+        if key not in own_fields + others:
+            allowed = allowed_words(key, own_fields + others) if own_fields + others else "this command has none"
+            raise BadConfiguration(f"{file.name}, solver.{key}: no such key; {allowed}")
         if key in values:
             raise BadConfiguration(f"{file.name}, solver.{key}: the file states {key} too; expected it once")
-    return {**values, **{key: value for key, value in table.items() if key in own}}
+    return {**values, **{key: value for key, value in table.items() if key in own_fields}}
 
 
 def resolve_beside(kind: type[C], file: Path | None, options: Json, trust: bool = False) -> C:
@@ -893,8 +893,8 @@ def _sentence(kind: type[Part], error: ValidationError, file: Path | None, given
         return options.get(name, name) if file is None or name in given else name
 
     if first["type"] == "idle":  # whose message has fields between backticks
-        said = re.sub(r"`(\w+)`", lambda found: called(found[1]), first["msg"])
-        return said if file is None else f"{file.name}: {said}"
+        message = re.sub(r"`(\w+)`", lambda found: called(found[1]), first["msg"])
+        return message if file is None else f"{file.name}: {message}"
     key = str(first["loc"][0])
     place = ".".join(str(part) for part in first["loc"])
     where = f"{file.name}, {place}" if file is not None and key not in given else called(key)

@@ -172,11 +172,11 @@ def of_grid(grid: Sweep) -> Campaign:
         "slope_deg": grid.slopes_deg,
     }
     # every run of the grid with every robot drawn, which the store keeps along its last dimension
-    drawn = {"design": "random", "number": grid.posterior, "posterior": str(Path(grid.robot).parent)}
+    sampled = {"design": "random", "number": grid.posterior, "posterior": str(Path(grid.robot).parent)}
     names = "all" if grid.configurations is None else list(grid.configurations)
     return Campaign(
         **{key: getattr(grid, key) for key in Sweep.model_fields if key in Campaign.model_fields},
-        samples=drawn if grid.posterior is not None else {},
+        samples=sampled if grid.posterior is not None else {},
         axes={"configuration": names, **{name: list(values) for name, values in axes.items() if values is not None}},
         conditions={
             **({} if grid.surface is None else {"surface": grid.surface}),

@@ -145,16 +145,6 @@ def test_every_change_meets_its_requirement_and_breaks_what_it_says(folder, resu
     assert tried > (8 if len(names) > 5 else 1)
 
 
-@pytest.mark.slow
-def test_change_follows_the_derivative(result):
-    speed = row(result, "speed_m_s")
-    by = {c["parameter"]: c for c in speed["change"]}
-    assert by["gearbox.ratio"]["gradient"] < 0 and by["gearbox.ratio"]["to"] < 48
-    assert by["6T2A.radius"]["gradient"] > 0
-    linear = by["gearbox.ratio"]["from"] - speed["margin"] / by["gearbox.ratio"]["gradient"]
-    assert by["gearbox.ratio"]["to"] == pytest.approx(linear, rel=0.02)
-
-
 def point(**given):
     usual = {
         "configuration": 0, "adhesion": 1.0, "adhesion_lateral": 1.0, "battery": 1.0, "charge": 1.0, "charge_end": 0.0, "share": 0.0,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import dataclasses
 import functools
 import importlib
@@ -30,7 +29,6 @@ from mmrjax.effects.periodic import Periodic
 from mmrjax.effects.scaled import scaled_effect
 from mmrjax.fidelities.drive import drive, drive_rates, drive_start, state_of_unknowns
 from mmrjax.fidelities.steady import steady, steady_batch
-from mmrjax.fidelities.track import track
 from mmrjax.model import balances, channels, paper_robots, params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar, parameter
@@ -593,23 +591,6 @@ def test_every_file_of_effects_can_be_imported_first():
     assert done.returncode == 0, done.stderr
 
 
-def imported(source: str, modules: set[str]) -> set[str]:
-    """Those of `modules` that a module imports when it is loaded: not for types alone, not within functions."""
-    found, rest = set(), list(ast.parse(source).body)
-    while rest:
-        node = rest.pop()
-        if isinstance(node, ast.ImportFrom):
-            below = {f"{node.module}.{a.name}" for a in node.names}
-            found |= below & modules or {str(node.module)} & modules
-        elif isinstance(node, ast.Import):
-            found |= {a.name for a in node.names} & modules
-        elif isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
-            rest += node.orelse
-        elif not isinstance(node, ast.FunctionDef | ast.Lambda):
-            rest += [n for n in ast.iter_child_nodes(node) if isinstance(n, ast.stmt)]
-    return found
-
-
 def test_units_of_signals_are_all_known():
     fields = {f.name for f in dataclasses.fields(Signals)}
     # Each memory states its own unit, an index has none, and where effects are tried no temperature is followed and no
@@ -846,13 +827,6 @@ def test_stribeck_exponent_has_finite_derivatives_through_rest(exponent):
     step = 1e-6
     at = [term(jnp.asarray(1.0 + s), jnp.asarray(8.0), jnp.asarray(exponent)) for s in (-step, step)]
     assert_allclose(found[0, 5], (at[1] - at[0]) / (2 * step), rtol=1e-6)
-
-
-@pytest.mark.slow
-def test_backdriving_loss_changes_nothing_where_no_load_drives():
-    _, plain = _travel([15.0, 33.0], [0.0, 5.0])
-    _, found = _travel([15.0, 33.0], [0.0, 5.0], backdriving_loss=0.5)
-    _same(found, plain)
 
 
 def _on_shaft(torque_constant, *present):
@@ -1097,19 +1071,4 @@ def test_instant_of_half_robot_with_all_effects_has_finite_derivatives_by_every_
         return jnp.concatenate([x.ravel() for x in leaves if x.dtype == THETA.dtype])
 
     slopes = _slopes(outputs)
-    assert np.isfinite(slopes).all() and np.abs(slopes[0]).max() > 0
-
-
-@pytest.mark.slow
-def test_drive_with_all_effects_has_finite_derivatives_by_every_parameter():
-    times = jnp.asarray([0.0, 1e-3, 5e-3])
-    slopes = _slopes(lambda robot, run: readings(robot, drive(robot, run, times).signals))
-    assert np.isfinite(slopes).all() and np.abs(slopes[0, 1:]).max() > 0
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-@pytest.mark.parametrize("rolling", [False, True], ids=["standstill", "rolling"])
-def test_track_with_all_effects_has_finite_derivatives_by_every_parameter(rolling):
-    slopes = _slopes(lambda robot, run: readings(robot, track(robot, run, duration=2e-3, rolling=rolling).signals))
     assert np.isfinite(slopes).all() and np.abs(slopes[0]).max() > 0

@@ -210,15 +210,6 @@ def test_curves_are_over_a_current_that_is_imposed(robot, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_calibration_of_settled_runs_gives_the_friction_back(robot, tmp_path):
-    runs = settled_table(tmp_path, robot, 0.25)
-    found = calibrate(runs, robot, starts=2, profiles=False, blocks=())
-    dry = found.parameters["bench.loss_coulomb"]
-    assert abs(dry.value - 0.25) < 4 * dry.sd < 0.02
-    assert "motor.resistance" not in found.parameters
-
-
-@pytest.mark.slow
 def test_a_calibration_of_histories_gives_the_friction_back(robot, tmp_path):
     runs = log(tmp_path, robot, 0.5, dry=0.25)
     found = calibrate(runs, robot, starts=2, profiles=False, blocks=())

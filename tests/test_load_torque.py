@@ -9,7 +9,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from test_shaft import SPEEDS, bench, current_of
 from test_worlds_rigs import steady
-from worlds import logs, rigs
+from worlds import rigs
 
 import mmrjax as mm
 from calibration.data import profiles, rig_facts, robot_file
@@ -138,24 +138,6 @@ def test_derivatives_by_a_brake_are_differences():
     torque = 0.3 + 0.2 * jnp.sin(8 * times)
     less, more = (both(torque + h)[0] for h in (-1e-4, 1e-4))
     assert_allclose(both(torque)[1], (more - less) / 2e-4, rtol=1e-3, atol=1e-3)
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-def test_a_log_with_a_brake_is_that_of_another_implementation(tmp_path):
-    from test_worlds_logs import shown
-
-    for imposed in ("voltage", "motor_speed"):
-        rig = logs.rig(np.random.default_rng([5, 1]), imposed)
-        steps = np.random.default_rng(2).uniform(0.0, 0.4 * rig.torque, (logs.RUNS, logs.ROWS // 4 + 1))
-        torque = np.round(np.repeat(steps, 4, 1)[:, : logs.ROWS], 6) * np.sign(rig.inputs)
-        rig = dataclasses.replace(rig, load_torque=torque)
-        case = logs.case(rig, "", 0.0, 1)
-        clean = logs.whitened(rig, logs.histories(rig, [rig.p])[0])
-        free = logs.whitened(rig, logs.histories(dataclasses.replace(rig, load_torque=None), [rig.p])[0])
-        mine = shown(tmp_path / imposed, case)[0]
-        assert np.sqrt(np.mean((mine - clean) ** 2)) < 0.3
-        assert np.sqrt(np.mean((free - clean) ** 2)) > 3.0
 
 
 def test_a_brake_on_a_vehicle_is_refused():

@@ -146,24 +146,6 @@ def test_numbers_of_a_page_agree(shown, capsys, name):
 
 
 @pytest.mark.slow
-def test_what_is_too_large_is_said_beside_the_verdict(shown, capsys):
-    got = shown("heated", capsys)
-    (ruled_out,) = (a for a in got.document["implausible"] if list(a["effects"]) == ["winding_heating"])
-    times = f"{ruled_out['sizes']['winding_heating']:.2g}"
-    assert got.document["verdict"] in WITHOUT_NAME and 2.7 < float(times) < 3.3
-    said = (
-        "winding_heating would explain as much as the curve, but is ruled out by size or sign alone: "
-        f"winding_heating at {times} times its largest plausible size; "
-        "check motor.resistance_thermal_housing and motor.resistance_thermal_winding."
-    )
-    assert said in got.printed and said in got.page.text
-    assert got.text.index('id="ruled_out"') < got.text.index('id="effects"')
-    why = f"Why no name: {got.found.standing}."
-    assert why in got.printed and why in got.page.text and "one smooth curve in the electrical balance" in why
-    assert got.page.tables["implausible"][1][-1] == ruled_out["why"]
-
-
-@pytest.mark.slow
 def test_what_happens_for_a_while_has_a_window(shown, capsys):
     got = shown("happening", capsys)
     (effect,) = got.document["effects"]

@@ -78,10 +78,6 @@ def residuals(problem, z):
     return jnp.concatenate([problem.misfit(z, problem.data), z - problem.data.centre])
 
 
-def starts(size, count, seed=0):
-    return jnp.asarray(np.random.default_rng(seed).standard_normal((count, size)))
-
-
 class Bent(eqx.Module):
     """An observer of rows with residuals a function of four numbers: curved, and with a penalty beyond a line."""
 
@@ -369,20 +365,6 @@ def test_search_of_rollouts_ends_at_the_limit_of_adhesion_from_inside(measured):
 
 
 @pytest.mark.slow
-def test_truth_is_recovered_from_clean_readings(clean, truth):
-    found, _, _ = fit.search_starts(clean, starts(len(truth), 16), clean.data)
-    assert np.all(found.converged)
-    assert_allclose(found.z, np.broadcast_to(truth, found.z.shape), atol=2e-4)
-
-
-@pytest.mark.slow
-def test_64_starts_on_the_packaged_data_agree(posed):
-    found, _, _ = fit.search_starts(posed, starts(len(posed.coordinates), 64), posed.data)
-    assert np.all(found.converged)
-    assert_allclose(found.cost, np.asarray(found.cost).min(), rtol=1e-6)
-
-
-@pytest.mark.slow
 def test_intervals_cover_the_truth(posed, truth):
     measured = dataclasses.replace(
         posed, data=dataclasses.replace(posed.data, measured=posed.observation(truth).reading)
@@ -477,12 +459,6 @@ def test_blocks_of_what_does_not_vary_are_none(measured):
     assert holdout.blocks_of_kind(flat, "run") == {}
 
 
-@pytest.mark.slow
-def test_drive_and_steady_agree_on_settled_rows(measured, truth, posed):
-    same = pose(measured, paper_robots.nominal(), model="drive")
-    assert_allclose(same.observation(truth).reading, posed.observation(truth).reading, rtol=2e-4)
-
-
 def history_runs(robot, seed=None, noise_share=0.01):
     """Starts of both configurations as a table of histories, from `drive`."""
     from mmrjax.fidelities.drive import drive_batch
@@ -510,23 +486,6 @@ def history_runs(robot, seed=None, noise_share=0.01):
         for column in Layout().measured_columns:
             columns[column] = columns[column] * (1 + noise_share * rng.standard_normal(len(columns[column])))
     return records.Runs("made", columns)
-
-
-@pytest.mark.slow
-def test_histories_calibrate_with_drive():
-    """A start tells the inductance and the rotor's inertia, which no steady row can."""
-    base = paper_robots.nominal()
-    names = ("motor.inductance", "motor.inertia", "6T2A.track.loss_coulomb", "6T2A.ground.friction.static")
-    c = priors.parameter_coordinates(base, names)
-    truth = jnp.asarray([1.0, -0.8, 1.2, 1.8])
-    runs = history_runs(c.robot(base, truth), seed=5)
-    assert observers.observer_kind(runs) is observers.Histories
-    posed = observers.pose_problem(runs, base, c, sds(runs, "current=0.1A,motor_speed=20rpm,speed=5mm/s"), "drive")
-    best = solve(posed, jnp.zeros(4), posed.data)
-    assert best.converged
-    about = identifiability.analyse_identifiability(posed, best.z)
-    assert np.all(about.sd[:2] < 0.5)
-    assert np.all(np.abs(np.asarray(best.z - truth)) < 4 * about.sd)
 
 
 @pytest.mark.slow

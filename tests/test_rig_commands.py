@@ -441,27 +441,6 @@ def test_compare_shows_a_vehicles_conditions(mmrjax, tmp_path, rover):
     assert words_of_others(out, err, *left_in(tmp_path / "compared")) == []
 
 
-@pytest.mark.slow
-def test_calibrate_shows_a_vehicles_conditions(mmrjax, tmp_path, rover):
-    rig, data = rover
-    _, said, err = ends(
-        mmrjax("calibrate", data, "--robot", rig, "--starts", "2", "--no-profiles", "--out", "fitted"), code=0
-    )
-    priors = json.loads((tmp_path / "fitted" / "result.json").read_text())["parameters"]
-    assert {p["prior"]["source"] for p in priors.values()} <= {params.STATED, params.DEFAULT}
-    assert words_of_others(said, err, *left_in(tmp_path / "fitted")) == []
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["linear", pytest.param("tracked", marks=pytest.mark.slow)])
-def test_compare_takes_a_table_by_voltage(mmrjax, tmp_path, kind):
-    rig = of_kind(tmp_path, kind)
-    levels = [8, 12, 18, 24, 8, 12, 18, 24]
-    data = table_of(rig, {}, levels, np.tile([0.0, 5.0], 4) if kind == "tracked" else None)
-    _, out, err = ends(mmrjax("compare", data, "--robot", rig, "--out", "compared"), code=0)
-    assert words_of_others(out, err, *left_in(tmp_path / "compared")) == []
-
-
 # --- sensitivity --------------------------------------------------------------------------------------------------
 
 

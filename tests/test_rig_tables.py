@@ -27,7 +27,6 @@ from mmrjax.model.signals import STALLED
 from mmrjax.model.track_friction import Track
 from sweeps import config as configuration
 from sweeps.points import run
-from tests.commands import ends
 
 DRIVE = {
     "motor.resistance": 2.0,
@@ -551,18 +550,6 @@ def test_curves_of_runs_both_ways_count_along_the_travel(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_bench_with_imposed_speed_and_current_alone_is_calibrated(tmp_path):
-    robot, speed = bench(), np.repeat(np.linspace(500, 4000, 6), 3)
-    true = {"rig.loss_coulomb": 0.07, "rig.loss_viscous": 0.006}
-    conditions = Conditions(np.zeros(len(speed), int), motor_speed=speed * np.pi / 30)
-    runs = measured(tmp_path, robot, conditions, {"motor_speed_rpm": speed}, true)
-    found = calibrate(runs, robot, noise="current=1%", **QUICK)
-    assert found.converged and found.adequacy.adequate
-    assert set(found.parameters) == set(true) and max(inside(found, true).values()) < 3
-    assert list(found.held_out) == ["speed"] and "supply_voltage_V" not in found.rows()
-
-
-@pytest.mark.slow
 def test_three_motors_forward_and_reverse_are_calibrated(tmp_path):
     robot = bench("voltage", ("total_current", "motor_speed"), sides=3.0)
     volts = np.array([-24.0, -18, -12, -6, 6, 12, 18, 24] * 2)
@@ -595,39 +582,6 @@ def test_a_vehicle_on_two_surfaces_is_calibrated(tmp_path):
     found = calibrate(runs, robot, noise="current=1%,speed=0.5%", free=["rig.ground.rolling_resistance"], **QUICK)
     named = {"rig-felt.ground.rolling_resistance": 0.15, "rig-tiles.ground.rolling_resistance": 0.03}
     assert set(found.parameters) == set(named) and max(inside(found, named).values()) < 3
-
-
-RIG = """
-schema = "mmrjax.robot/2"
-base = "none"
-sides = 1
-imposed = "motor_speed"
-channels = ["total_current"]
-[motor]
-torque_constant = 0.05
-friction_coulomb = 0.004
-[gearbox]
-ratio = 16
-efficiency_load = 0.8
-[bench]
-load = "shaft"
-inertia = 1e-3
-loss_coulomb = "0.05 ± 50 %"
-loss_viscous = 0.004
-"""
-
-
-@pytest.mark.slow
-def test_a_bench_is_compared_and_calibrated_from_two_files(mmrjax, tmp_path):
-    (tmp_path / "rig.toml").write_text(RIG, encoding="utf-8")
-    rows = "".join(f"{n},{0.16 + n * 2.4e-5 + 1e-3 * (k % 3)}\n" for k, n in enumerate(range(500, 4500, 500)))
-    (tmp_path / "runs.csv").write_text(BENCH + rows, encoding="utf-8")
-    both = ("runs.csv", "--robot", "rig.toml", "--out")
-    ends(mmrjax("compare", *both, "a"), code=0)
-    ends(mmrjax("calibrate", *both, "b", "--starts", "2", "--no-profiles", "--noise", "current=2%"), code=0)
-    for page in (tmp_path / "a" / "report.html", tmp_path / "b" / "report.html"):
-        text = page.read_text(encoding="utf-8")
-        assert "n [rpm]" in text and "slope [°]" not in text and "6T2A" not in text
 
 
 # --- instruments of which the table tells --------------------------------------------------------------

@@ -120,19 +120,6 @@ def test_store_is_opened_by_xarray_with_units_and_long_names(whole):
     assert [meanings[k] for k in range(len(STATUSES))] == list(STATUSES) and found.status.dtype == np.uint8
 
 
-@pytest.mark.slow
-def test_store_holds_each_point_as_it_is_by_itself(whole):
-    found = xr.open_zarr(whole / zarr_store.STORE).load()
-    for which, slope, sample in [(0, 0, 0), (1, 1, 49), (0, 2, 17)]:
-        at = found.isel(configuration=which, slope_deg=slope, sample=sample)
-        robot = params.replace(paper_robots.nominal(), {"motor.resistance": float(at["motor.resistance"])})
-        alone = steady(robot, Conditions(which, float(at.voltage), float(at.slope_deg), 3.0))
-        assert int(at.status) == int(alone.status)
-        assert_allclose(at.total_current, alone.total_current, rtol=1e-12)
-        assert_allclose(at.speed, 1e3 * alone.speed, rtol=1e-12)
-    assert not np.isfinite(found.speed.values[found.status.values == 2]).any()
-
-
 def test_result_counts_statuses_and_states_ranges(whole):
     found = xr.open_zarr(whole / zarr_store.STORE).load()
     result = json.loads((whole / "result.json").read_text())

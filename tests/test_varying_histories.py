@@ -222,18 +222,6 @@ def test_derivatives_of_a_varying_run_are_differences(of_values, solved):
         assert (error < DERIVATIVES).all(), (name, error)
 
 
-@pytest.mark.slow
-def test_derivative_of_a_varying_run_along_one_direction_is_a_difference(of_values, solved):
-    """All of these parameters at once, by shares drawn at random."""
-    names, theta, readings, several = of_values
-    along = theta * np.random.default_rng(6).uniform(0.3, 1.0, len(names)) * np.array([1, -1, 1, -1, 1, 1])
-    slope = np.asarray(jax.jit(lambda x: jax.jvp(readings, (x,), (along,))[1])(theta))
-    ends = jnp.resize(theta + DIFFERENCE * along * np.array([[1.0], [-1.0]]), (len(names), len(names)))
-    up, down, *_ = np.asarray(several(ends))  # as many as the differences above have, whose program it is
-    expected = (up - down) / (2 * DIFFERENCE)
-    assert (np.abs(slope - expected).max(0) < DERIVATIVES * np.abs(expected).max(0)).all() and slope.any(0).all()
-
-
 # --- what inference makes of it
 
 

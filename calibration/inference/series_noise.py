@@ -161,8 +161,8 @@ def _differences(measured: np.ndarray, x: np.ndarray, series: list[np.ndarray]) 
         share = np.where(wide > 0, (x[after] - x[middle]) / np.where(wide > 0, wide, 1.0), 0.5)
         k = np.tile(np.arange(len(middle)), 3)
         weights = np.concatenate([-share, np.ones(len(middle)), share - 1.0])
-        at = k, np.concatenate([before, middle, after])
-        differences.append(sparse.csr_array((weights, at), (len(middle), len(measured))))
+        second_differences = k, np.concatenate([before, middle, after])
+        differences.append(sparse.csr_array((weights, second_differences), (len(middle), len(measured))))
         used += bool(len(middle))
     return sparse.csr_array(sparse.vstack(differences)) if differences else sparse.csr_array((0, len(measured))), used
 

@@ -95,11 +95,11 @@ def imposed_levels(robot: Robot, option: str, notes: list[str] | None = None) ->
     most = imposed_limit(robot)
     if most is None:
         raise BadConfiguration(_missing(robot, option, SAID[robot.rig.imposed].several))
-    found = tuple(_digits(share * most) for share in SHARES)
+    levels = tuple(_digits(share * most) for share in SHARES)
     if notes is not None:
-        shown = ",".join(f"{v:g}" for v in found)
-        notes.append(f"{option}: not stated; thirds of the {_of(robot)} of the robot's file are taken: {shown}")
-    return found
+        level_text = ",".join(f"{v:g}" for v in levels)
+        notes.append(f"{option}: not stated; thirds of the {_of(robot)} of the robot's file are taken: {level_text}")
+    return levels
 
 
 def _of(robot: Robot) -> str:
@@ -118,9 +118,9 @@ def _missing(robot: Robot, option: str, example: str) -> str:
 
 def option_refusal(robot: Robot, option: str, instead: str) -> str:
     """Why an option of what is not imposed is refused."""
-    said = SAID[robot.rig.imposed]
+    reason = SAID[robot.rig.imposed]
     if robot.rig.imposed != "voltage":
-        return f"{option}: the {said.words} is imposed on this robot; state {instead} [{said.unit}]"
+        return f"{option}: the {reason.words} is imposed on this robot; state {instead} [{reason.unit}]"
     return f"{option}: the voltage is imposed on this robot, and its motors' speed follows; state {instead} [V]"
 
 

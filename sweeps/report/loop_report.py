@@ -142,8 +142,8 @@ def held_out_table(found: DiscoveryResult) -> Table:
         for c in both[0]:
             texts = [f"{e[c]['rms_percent']:.1f}" if e[c]["rows"] else "-" for e in both[: 1 + many]]
             change = both[1][c]["rms_percent"] - both[0][c]["rms_percent"] if many else 0.0
-            shown = np.inf if c in worse else change if not kind or change < 0 else 0.0
-            cells.append(_marked(" → ".join(texts), shown))
+            change_shown = np.inf if c in worse else change if not kind or change < 0 else 0.0
+            cells.append(_marked(" → ".join(texts), change_shown))
         reached = max(int(e["rows"]) for e in both[0].values())
         what = f"unseen: another {blocks.kind_in_words(kind)}" if kind else "seen by the fit"
         rows.append((what, *cells, f"{reached} of {total}"))
@@ -165,7 +165,7 @@ def _advice(found: DiscoveryResult) -> Table:
         next_step = f"**{after.name}**: {after.description}.{tells * bool(after.separates)}{undecided}"
     far = [describe(note) for note in with_codes(found.remarks, "far_from_prior", "repeats", "copied")]
     against = [note for note in found.remarks if isinstance(note, str)]
-    said = [
+    sentences = [
         loop_words.largest_share(found),
         *far,
         *against[:1],
@@ -174,7 +174,9 @@ def _advice(found: DiscoveryResult) -> Table:
         ("use it?", " ".join(loop_words.use_it(found)) or "No runs could be held out."),
         (
             "check first",
-            " ".join([f"{text if '.' in text.split()[0] else text[0].upper() + text[1:]}." for text in said if text])
+            " ".join(
+                [f"{text if '.' in text.split()[0] else text[0].upper() + text[1:]}." for text in sentences if text]
+            )
             or "Nothing unusual.",
         ),
         ("do next", next_step),
@@ -327,9 +329,9 @@ def _where_missing(found: DiscoveryResult, table: Columns, changes: Mapping[str,
         more = catalogue.text("loop.unresolved", names) if names else ""
         yield catalogue.figure("loop.series", detail, found.channels, verdict, words=numbers, more=more)
     else:
-        drawn = table, verdict, sized
+        figure_input = table, verdict, sized
         yield catalogue.figure(
-            "loop.defects", *drawn, words=(_closed(found, table) if sized else catalogue.text("loop.three"),)
+            "loop.defects", *figure_input, words=(_closed(found, table) if sized else catalogue.text("loop.three"),)
         )
     if found.unnamed is not None:
         curve = found.unnamed
