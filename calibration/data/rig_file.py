@@ -364,7 +364,7 @@ def moved_priors(robot: Robot, values: Mapping[str, float]) -> Robot:
 
 
 def rig_lines(rig: Rig) -> tuple[list[str], dict[str, list[str]]]:
-    """Lines of a robot file that state a rig: of its head, and by table."""
+    """Lines of a robot file that state a rig: those of its head, then those of each table."""
     head = [
         f'imposed = "{rig.imposed}"  # on the drives: voltage, motor_speed or motor_current',
         f"channels = {toml_value(list(rig.channels))}  # what its instruments show",
