@@ -75,7 +75,7 @@ def in_parallel(module: Any, environments: int, steps: int) -> dict[str, float]:
 
 
 def against_motor(module: Any, environments: int, steps: int) -> dict[str, float]:
-    """Times of a joint in MJX with its own `<motor>`, and with the exported actuator [s]; none without MJX."""
+    """Times of a joint in MJX with its own `<motor>`, and with the exported actuator [s], none without MJX."""
     try:
         import mujoco
         from mujoco import mjx

@@ -78,10 +78,11 @@ SIZES = 3.0
 
 
 def refused(label: Mapping[str, Any], low: float, sizes: bool = True, sigmas: bool = True) -> str:
-    """Reason for leaving out a case; empty for a valid one.
+    """Reason for leaving out a case, empty for a valid one.
 
     Args:
-        low: sigmas that each effect has to leave; sizes, sigmas: True to check these.
+        low: sigmas that each effect has to leave.
+        sizes, sigmas: True to check these.
     """
     if label.get("rows_lost"):
         return "rows would slide or stand still"
@@ -152,7 +153,7 @@ def _make_room() -> None:
 
 
 def known(path: Path) -> list[dict]:
-    """Lines of a file; the last one may be cut off."""
+    """Lines of a file. The last one may be cut off."""
     lines = []
     for text in path.read_text(encoding="utf-8").splitlines() if path.exists() else ():
         try:
@@ -186,7 +187,7 @@ class Shares:
         self.at_work: Counter[Hashable] = Counter()
 
     def next(self, before: Hashable | None) -> tuple[Task, Hashable] | None:
-        """A task for a worker whose last one had shape `before`, and its shape; None if no task is left.
+        """A task for a worker whose last one had shape `before`, and its shape, None if no task is left.
 
         If no task of that shape is left, the one of the shape with the most waiting tasks per worker.
         """
@@ -276,7 +277,8 @@ def campaign(
     """Reads the command line, makes and judges cases in separate processes, and prints the figures.
 
     Args:
-        work: a function of a module; summary: function of all lines.
+        work: a function of a module.
+        summary: function of all lines.
         program: function of a module that returns the shape of a task's programs, or the line of an invalid case.
     """
     parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)

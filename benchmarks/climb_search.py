@@ -1,4 +1,4 @@
-"""The highest step that a robot climbs, found by a search over sequences of lever angles; and time of 1000 climbs.
+"""The highest step that a robot climbs, found by a search over sequences of lever angles, and time of 1000 climbs.
 
     python benchmarks/climb_search.py --surface asphalt --members 1024 --generations 4 --out found.csv
     mmrjax climb --step 400 --surface asphalt --sequence found.csv --film
@@ -6,7 +6,7 @@
 Members have angles of front and rear levers at times, and a step height. The best ones are parents of the next
 generation, with angles and height changed at random. One success may be luck, because the grouser
 that reaches the edge first decides the outcome. Each member therefore climbs `--tries` steps within `BAND` below its
-height; its score is the height less `MISSED` times the share of failures. `--adhesion 4` is a ground of unlimited
+height. Its score is the height less `MISSED` times the share of failures. `--adhesion 4` is a ground of unlimited
 grip, which shows the limits of geometry and torque. `--begin` makes the first generation from a sequence, which
 `--stretch` slows down.
 """

@@ -81,8 +81,8 @@ def table8() -> Conditions:
 def sensitivities() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Three arrays of changes of the shown readings.
 
-    By one prior sd of each settled effect at `examples`, shape (2, 3, effects); the same whitened over Table 8, shape
-    (540, effects); and whitened changes by the freed parameters, shape (540, parameters).
+    By one prior sd of each settled effect at `examples`, shape (2, 3, effects). The same whitened over Table 8, shape
+    (540, effects), and whitened changes by the freed parameters, shape (540, parameters).
     """
     full = robot(SETTLED)
     names = [f"effects.{e.name}.amplitude" for e in SETTLED] + list(FREED)
@@ -123,7 +123,7 @@ def look_alikes(effects: np.ndarray, base: np.ndarray) -> tuple[list[list[str]],
 def passing() -> np.ndarray:
     """Largest change of each reading in 2 s from standstill by one prior sd of each effect that only histories show.
 
-    At `examples`, on the battery if an effect needs one; shape (effects, 2, 3).
+    At `examples`, on the battery if an effect needs one, shape (effects, 2, 3).
     """
     full = robot(PASSING)
     names = [f"effects.{e.name}.amplitude" for e in PASSING]

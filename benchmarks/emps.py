@@ -123,7 +123,7 @@ def page(folder: Path, listing: str, seconds: float, record: Path) -> str:
 
 
 def main() -> int:
-    """Runs the benchmark; returns the exit code of the loop."""
+    """Runs the benchmark. Returns the exit code of the loop."""
     wanted = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     wanted.add_argument("--data", type=Path, required=True)
     wanted.add_argument("--out", type=Path, default=Path("docs/lab/emps.md"))

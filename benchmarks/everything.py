@@ -73,7 +73,7 @@ def outcomes(log: Path) -> dict[str, dict[str, Any]]:
 
 
 def summary(tier: str, log: Path) -> dict[str, Any]:
-    """Row of the table: counts, minutes, and what is missing; it follows from the log alone."""
+    """Row of the table: counts, minutes, and what is missing. It follows from the log alone."""
     lines, tests = entries(log), outcomes(log)
     row: dict[str, Any] = {"tier": tier}
     row |= {outcome: sum(test["outcome"] == outcome for test in tests.values()) for outcome in OUTCOMES}
@@ -94,7 +94,7 @@ def summary(tier: str, log: Path) -> dict[str, Any]:
 
 
 def table(out: Path, tiers: list[str]) -> list[dict[str, Any]]:
-    """Rows of all tiers; printed, and written to `table.json`."""
+    """Rows of all tiers. Printed, and written to `table.json`."""
     rows = [summary(tier, out / f"{tier}.jsonl") for tier in tiers]
     (out / "table.json").write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
     print(f"\n{'tier':10}" + "".join(f"{name:>9}" for name in (*OUTCOMES, "minutes")))
@@ -107,7 +107,7 @@ def table(out: Path, tiers: list[str]) -> list[dict[str, Any]]:
 
 
 def commands(tier: str, options: argparse.Namespace) -> dict[str, list[str]]:
-    """Commands of a tier by name; the results of pytest and of the mutants are logged one test at a time."""
+    """Commands of a tier by name. The results of pytest and of the mutants are logged one test at a time."""
     python, log = options.python, options.out / f"{tier}.jsonl"
     finished = outcomes(log)
     if tier == "lint":
@@ -132,7 +132,7 @@ def commands(tier: str, options: argparse.Namespace) -> dict[str, list[str]]:
 
 @functools.cache
 def known_flags(python: str, *flags: str) -> str:
-    """Those of the flags that this version of XLA accepts; XLA aborts each process that is given another one."""
+    """Those of the flags that this version of XLA accepts. XLA aborts each process that is given another one."""
 
     def accepted(flag: str) -> bool:
         command = [python, "-c", "import jax; jax.devices()"]
@@ -155,7 +155,7 @@ def environment(python: str, log: Path, done: Path) -> dict[str, str]:
 
 
 def run(command: list[str], log: Path, seconds: float, extra: dict[str, str]) -> int | None:
-    """Exit code of a command, None if it was stopped at its limit; its output is appended to `TIER.txt`."""
+    """Exit code of a command, None if it was stopped at its limit. Its output is appended to `TIER.txt`."""
     process = subprocess.Popen(
         command, cwd=ROOT, env=extra, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace",
         start_new_session=True,

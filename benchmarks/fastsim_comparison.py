@@ -3,9 +3,9 @@
     python benchmarks/fastsim_comparison.py                # needs fastsim in the same environment
 
 A battery vehicle without aerodynamic drag follows a speed trace of ramps, a climb and a descent with regeneration.
-Its only losses are rolling resistance and a constant efficiency of its transmission; no parameter is fitted.
+Its only losses are rolling resistance and a constant efficiency of its transmission. No parameter is fitted.
 Two sizes: this project's robot, and a car. A third result is the integral of rolling, climbing and acceleration.
-Prints a line of JSON for each vehicle. Exit code 2: fastsim is not installed; 3: an energy misses the goals (0.5 % at
+Prints a line of JSON for each vehicle. Exit code 2: fastsim is not installed. 3: an energy misses the goals (0.5 % at
 the wheel, 1 % in Wh/km, at either step of FASTSim).
 """
 
@@ -46,11 +46,15 @@ class Vehicle:
     """Parameters of the vehicle for both simulators, in SI units.
 
     Attributes:
-        mass: [kg]; rolling: coefficient of rolling resistance [-]; radius: of the wheels [m]; inertia: of all wheels
-            together [kg·m²]; efficiency: of the transmission, in both directions [-].
-        cells: in series, of 4 V at any charge, without resistance; capacity: of one [C].
-        ratio, torque_constant [N·m/A], resistance [Ω], inductance [H]: of gearbox and motors, which FASTSim lacks;
-            the resistance is small enough for negligible losses.
+        mass: [kg].
+        rolling: coefficient of rolling resistance [-].
+        radius: of the wheels [m].
+        inertia: of all wheels together [kg·m²].
+        efficiency: of the transmission, in both directions [-].
+        cells: in series, of 4 V at any charge, without resistance.
+        capacity: of one [C].
+        ratio, torque_constant [N·m/A], resistance [Ω], inductance [H]: of gearbox and motors, which FASTSim lacks.
+            The resistance is small enough for negligible losses.
     """
 
     name: str
@@ -69,7 +73,7 @@ class Vehicle:
 
 @dataclasses.dataclass(frozen=True)
 class Trace:
-    """Ground speed [m/s] and slope [deg] at `time` [s], linear in between; corners are at whole seconds."""
+    """Ground speed [m/s] and slope [deg] at `time` [s], linear in between. Corners are at whole seconds."""
 
     time: np.ndarray
     speed: np.ndarray
@@ -138,7 +142,7 @@ def followed(robot: Robot, conditions: Conditions, course: Profile) -> Mission:
 
 
 def energies(time: np.ndarray, wheel: np.ndarray) -> dict[str, float]:
-    """Work of the power at the `wheel` [W] over `time` [s], by sign; the power is linear in between."""
+    """Work of the power at the `wheel` [W] over `time` [s], by sign. The power is linear in between."""
     out, back = (np.trapezoid(np.maximum(sign * wheel, 0.0), time) for sign in (1, -1))
     return {"wheel_J": float(out), "wheel_back_J": float(back)}
 
@@ -178,7 +182,7 @@ def mmrjax_of(vehicle: Vehicle, asked: Trace) -> dict[str, Any]:
 def fastsim_of(vehicle: Vehicle, asked: Trace, step: float, *, sine: bool = False) -> dict[str, Any]:
     """FASTSim's run in steps of `step` [s].
 
-    Its grade is rise over run, tan α; with `sine` it is given sin α instead.
+    Its grade is rise over run, tan α. With `sine` it is given sin α instead.
     """
     import fastsim
 

@@ -7,7 +7,7 @@ python benchmarks/free_chain.py --shaking --track    at set S of docs/explanatio
 
 One side of 6T2A on level ground without payload. The masses of the belt are free in the plane, joined by stiff
 springs. Two 48-tooth pulleys hold them from inside by one-sided springs and drive them by tooth
-springs; the guides are one-sided springs. Every seventh mass has a grouser, normal to the line of its
+springs. The guides are one-sided springs. Every seventh mass has a grouser, normal to the line of its
 two neighbours, which meets the ground by (27)-(29) and Fig. 7, the library's own laws. The chassis is rigid
 (travel, height, pitch), the driving pulley turns at a given speed, the driven one is free.
 
@@ -59,7 +59,7 @@ FIRST = jnp.arange(GROUSERS) * (TEETH_BELT // GROUSERS)  # the masses that carry
 
 
 class Motion(NamedTuple):
-    """Masses of the belt and their velocities (168, 2); chassis (x, z, pitch nose down); driven pulley."""
+    """Masses of the belt and their velocities (168, 2). Chassis (x, z, pitch nose down), driven pulley."""
 
     place: jax.Array
     speed: jax.Array
@@ -70,7 +70,7 @@ class Motion(NamedTuple):
 
 
 class Sums(NamedTuple):
-    """Sums of an instant [N]; `off`: distance of the outermost mass from the nominal path [m]."""
+    """Sums of an instant [N]. `off`: distance of the outermost mass from the nominal path [m]."""
 
     normal: jax.Array
     guide: jax.Array
@@ -230,7 +230,7 @@ def forces(c: Chain, m: Motion, turn, speed):
 
 @partial(jax.jit, static_argnames=("samples",))
 def run(c: Chain, speed, step_s, samples: int):
-    """Semi-implicit Euler; means over every sample of SAMPLE µs."""
+    """Semi-implicit Euler. Means over every sample of SAMPLE µs."""
     weight = c.half.chassis + 2 * c.half.pulley
     offset = jnp.stack([c.half.forward, c.half.up]) * c.half.chassis / weight
     parts = c.half.chassis * jnp.sum((jnp.stack([c.half.forward, c.half.up]) - offset) ** 2)

@@ -71,7 +71,7 @@ class Job:
 
 
 def work(job: Job, line: Connection, core: int | None = None) -> None:
-    """Runs the methods of a record; sends ("begin", method) and ("line", line) for each."""
+    """Runs the methods of a record. Sends ("begin", method) and ("line", line) for each."""
     if core is not None:
         os.sched_setaffinity(0, {core})
     if job.packages is not None:
@@ -82,7 +82,7 @@ def work(job: Job, line: Connection, core: int | None = None) -> None:
 
 
 def lines(job: Job, begin: Any = lambda method: None) -> Iterable[tuple[str, dict[str, Any]]]:
-    """Yields (method, its line) for the methods of a record; a failure is a line too.
+    """Yields (method, its line) for the methods of a record. A failure is a line too.
 
     Args:
         begin: called with each method before it runs.
@@ -116,7 +116,7 @@ def _why(error: Exception) -> str:
 
 
 def measured(posed: Any, found: Any, answer: public_records.Answer) -> dict[str, Any]:
-    """Errors of a method in percent of the measured rms, by kind of block, row and channel; and its claim."""
+    """Errors of a method in percent of the measured rms, by kind of block, row and channel, and its claim."""
     size = np.sqrt(np.nanmean(np.where(posed.counts, posed.measured, np.nan) ** 2, 0))
     off: dict[str, np.ndarray] = {}
     for fold, reading in zip(posed.folds, found.unseen, strict=True):
@@ -216,10 +216,13 @@ class Compared:
     """A record's methods on the rows that all of them predict.
 
     Attributes:
-        record: its name; truth: kind of its answer; channels: names.
+        record: its name.
+        truth: kind of its answer.
+        channels: names.
         percent: method → rms error of each channel [% of the measured rms].
-        partial: the same for a method that predicts too few rows, over its own rows; with their share.
-        rows: compared rows, over the kinds of blocks; lines: method → line.
+        partial: the same for a method that predicts too few rows, over its own rows, with their share.
+        rows: compared rows, over the kinds of blocks.
+        lines: method → line.
     """
 
     record: str
@@ -231,13 +234,13 @@ class Compared:
     lines: dict[str, dict[str, Any]]
 
     def over_all(self, method: str) -> float:
-        """Rms over the channels [%]; NaN for a method outside the comparison."""
+        """Rms over the channels [%], NaN for a method outside the comparison."""
         there = self.percent.get(method)
         return float("nan") if there is None else float(np.sqrt(np.nanmean(there**2)))
 
     @property
     def ceiling(self) -> float:
-        """The lower error of the two regressions [%]; NaN without both."""
+        """The lower error of the two regressions [%], NaN without both."""
         values = [self.over_all(m) for m in CEILING]
         return float(np.nanmin(values)) if np.isfinite(values).any() else float("nan")
 
@@ -258,7 +261,7 @@ class Compared:
 
 
 def compared(every: Sequence[dict[str, Any]]) -> list[Compared]:
-    """Records in their order; for a repeated method the last line counts."""
+    """Records in their order. For a repeated method the last line counts."""
     by: dict[str, dict[str, dict[str, Any]]] = {}
     for line in every:
         by.setdefault(line["record"], {})[line["method"]] = line

@@ -3,12 +3,12 @@
     python benchmarks/loop.py --clean-wide 1000 --library 500 --variants 300 --outside 300 --pairs 200 --jobs 2
     python benchmarks/loop.py --clean-unstated 300 --clean-heavy 100 --clean-uneven 100 --clean-rounded 100 --jobs 2
 
-Tables come from `tests/worlds/tables.py`, which shares no code with the simulator; only the scorer reads the
+Tables come from `tests/worlds/tables.py`, which shares no code with the simulator. Only the scorer reads the
 labels. Every table is one line of `--out`, and a restarted run continues where it ended.
 Surfaces are wide (adhesion 0.2 to 1, V_s 2 to 60 mm/s, known only by the fields' priors), and some tables come from
 other robots or poor instruments. With `--narrow` all come from the paper's robot on one stated surface.
-Kinds with a special noise (`NOISES`) have no sds in the table, or heavy-tailed, uneven or coarsely rounded readings;
-of these every other table states sds.
+Kinds with a special noise (`NOISES`) have no sds in the table, or heavy-tailed, uneven or coarsely rounded readings.
+Of these every other table states sds.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ STATED = {f"{c}.ground.friction.static": (0.6, 0.09) for c in ("6T2A", "4W2T")}
 
 
 def attempt(kind: str, seed: int, narrow: bool = False, only: str = "") -> Case | str:
-    """The case of a kind and a seed, or the reason why it is invalid; `only`: of one stratum."""
+    """The case of a kind and a seed, or the reason why it is invalid. `only`: of one stratum."""
     rng = np.random.default_rng([KINDS.index(kind), seed])
     own, rounded = kind in NOISES, kind == "clean_rounded"
     kind, law, stated = NOISES.get(kind, (kind, "normal", True))
@@ -135,7 +135,7 @@ def _names(kind: str, seed: int, rng: np.random.Generator, library: tuple[str, .
 
 
 def _refused(case: Case, kind: str, low: float) -> str:
-    """Reason why a case of a kind is invalid; empty for a valid one."""
+    """Reason why a case of a kind is invalid, empty for a valid one."""
     return refused(case.label, low, kind not in ("drift", "cluster", "blind"), kind != "compensating")
 
 
@@ -255,7 +255,7 @@ def carried_out(case: Case, found, settings) -> list[dict]:
 
 
 def program(task: Task) -> tuple | dict:
-    """Properties that tables with the same programs share; or the line of an invalid case."""
+    """Properties that tables with the same programs share, or the line of an invalid case."""
     from calibration.discovery.discover import padded_rows
     from calibration.inference.observers.settled import SettledRuns
 

@@ -2,7 +2,7 @@
 
     python benchmarks/loop_baselines.py --clean 40 --library 66 --outside 36 --pairs 30 --jobs 2
 
-Tables, priors and fits are the loop's; only the selection of effects is plain. PySINDy comes with the extra
+Tables, priors and fits are the loop's. Only the selection of effects is plain. PySINDy comes with the extra
 `bench`. Every table is one line of `--out`, and a restarted run continues where it ended.
 """
 
@@ -50,7 +50,8 @@ class Ladder:
     """Fits of sets of effects, each computed once.
 
     Args:
-        runs: the table; fitted: its base fit.
+        runs: the table.
+        fitted: its base fit.
         settings: of the loop.
     """
 
@@ -120,11 +121,12 @@ def stepwise(ladder: Ladder, criterion) -> list[str]:
 
 
 def sparse(theta: np.ndarray, target: np.ndarray, known: bool) -> np.ndarray:
-    """Columns that STLSQ keeps at the threshold of the lowest BIC; possibly none.
+    """Columns that STLSQ keeps at the threshold of the lowest BIC, possibly none.
 
     Args:
-        theta: columns, shape (points, columns); target: shape (points,).
-        known: True if the target's noise has an sd of 1; else BIC uses that of the residual.
+        theta: columns, shape (points, columns).
+        target: shape (points,).
+        known: True if the target's noise has an sd of 1, else BIC uses that of the residual.
     """
     n = len(target)
 
@@ -178,12 +180,12 @@ def sindy(space, linear, scores) -> list[str]:
 
 
 def sindy_refit(space, linear, scores, sees=None) -> list[str]:
-    """STLSQ on all three equations together, weighted by the readings' sds; the constants are refitted too.
+    """STLSQ on all three equations together, weighted by the readings' sds. The constants are refitted too.
 
     Both sides are the residuals of a linear refit of the constants (Frisch, Waugh and Lovell).
 
     Args:
-        sees: mask of the residuals to use; None: all.
+        sees: mask of the residuals to use. None: all.
     """
     jacobian, residual = np.asarray(linear.jacobian), np.asarray(linear.residual)
     theta = np.zeros((len(residual), len(space.library)))

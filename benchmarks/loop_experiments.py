@@ -16,7 +16,8 @@ class Verdict:
     """Judgement of alternatives by the readings of experiments.
 
     Attributes:
-        chi2: of each alternative, by name; best: the one with the smallest.
+        chi2: of each alternative, by name.
+        best: the one with the smallest.
         refuted: alternatives whose χ² is larger by `Settings.refuted` or more.
         resolved: True if only the best is left.
     """
@@ -37,7 +38,7 @@ class Verdict:
 
 
 def among(seen: experiments.PredictedReadings, names: Sequence[str]) -> experiments.PredictedReadings:
-    """The readings of these alternatives, in their order; the first is the best fit only if that is among them."""
+    """The readings of these alternatives, in their order. The first is the best fit only if that is among them."""
     kept = [k for k, n in enumerate(seen.names) if n in names]
     return dataclasses.replace(
         seen, names=tuple(seen.names[k] for k in kept), value=seen.value[kept], half=seen.half[kept]
@@ -49,7 +50,7 @@ def supported(seen: experiments.PredictedReadings, carried_out: Mapping[str, Map
 
     Args:
         seen: predicted readings.
-        carried_out: experiment → `value` and `sd` of its readings [SI], repeats averaged, in the menu's order;
+        carried_out: experiment → `value` and `sd` of its readings [SI], repeats averaged, in the menu's order,
             NaN for missing ones.
     """
     spans = predicted.reading_spans(seen.experiments)

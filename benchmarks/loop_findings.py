@@ -54,7 +54,8 @@ def findings(given: Any, found: Any) -> dict[str, Any]:
     """Effects of the model, tests of each, the noise, and the written model.
 
     Args:
-        given: result of `discover.prepare_loop`; found: the `LoopStages` of it.
+        given: result of `discover.prepare_loop`.
+        found: the `LoopStages` of it.
     """
     alike, best, base = found.alike, found.best, found.screened.base.candidate
     members = () if alike is None else alike.members
@@ -84,7 +85,7 @@ def findings(given: Any, found: Any) -> dict[str, Any]:
 
 
 def _tests(found: Any) -> list[dict[str, Any]]:
-    """Tests of each effect that was tested separately; None for an infinite root without any one row."""
+    """Tests of each effect that was tested separately, None for an infinite root without any one row."""
     tests = () if found.standing is None else found.standing.tests
     return [
         {f.name: getattr(t, f.name) for f in dataclasses.fields(t)}
@@ -151,8 +152,8 @@ def _held_out(runs: Any, found: Any) -> dict[str, Any]:
 def elsewhere(given: Any, found: Any, runs: Any) -> dict[str, Any]:
     """Improvement of the model over the refit for runs at other conditions, and errors by channel.
 
-    The blocks of `prediction` also choose the written model; these runs chose nothing. The score uses the same
-    density of errors over the stated sds; empty if the model is the refit.
+    The blocks of `prediction` also choose the written model. These runs chose nothing. The score uses the same
+    density of errors over the stated sds, empty if the model is the refit.
 
     Args:
         runs: further runs of the same robot, with an equal number, so that programs are shared.

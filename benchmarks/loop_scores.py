@@ -129,7 +129,7 @@ def false_finding(x: dict) -> bool:
 
 
 def located(x: dict) -> bool:
-    """True if a finding has a name or a place; a noise that differs from the stated one has neither."""
+    """True if a finding has a name or a place. A noise that differs from the stated one has neither."""
     return x["verdict"] in ("named", "class") or (x["verdict"] in WITHOUT_NAME and bool(x.get("where")))
 
 
@@ -237,7 +237,7 @@ def in_place(x: dict, alike: bool = False) -> bool:
 
 
 def sigmas(truth: dict) -> float:
-    """Sigmas of an effect after the base is refitted; by the loop's own base if known."""
+    """Sigmas of an effect after the base is refitted. By the loop's own base if known."""
     left = truth.get("sigmas_left")
     return truth["sigmas"] if left is None else left
 
@@ -346,7 +346,7 @@ def all_in(x: dict, *standings: str) -> bool:
 
 
 def mechanisms(f: Figures) -> None:
-    """Right and wrong mechanisms, of laws and others, by kind; the levels that verdicts reach."""
+    """Right and wrong mechanisms, of laws and others, by kind. The levels that verdicts reach."""
     known = [x for x in f.lines if "verdict" in x]
     for kind in dict.fromkeys(x["kind"] for x in known):
         those = [x for x in known if x["kind"] == kind and x.get("truth")]
@@ -372,7 +372,7 @@ def _one_driver(truth: dict) -> bool:
 
 
 def clean(f: Figures, kinds: Sequence[str]) -> None:
-    """False findings, by stratum and by property; a stratum with too many is marked."""
+    """False findings, by stratum and by property. A stratum with too many is marked."""
     for kind in kinds:
         f.say(f"{kind}: a false finding (goal <= 5 %)", f.of(kind), false_finding)
     wide = f.of("clean_wide")
@@ -385,7 +385,7 @@ def clean(f: Figures, kinds: Sequence[str]) -> None:
 
 
 def values(x: dict, name: str) -> list[float]:
-    """Values of a property of a case; a property of a surface has one for each configuration."""
+    """Values of a property of a case. A property of a surface has one for each configuration."""
     made = x.get("made", {})
     if name in ("adhesion", "V_s"):
         return [s[name] for s in made.get("surface", {}).values()]

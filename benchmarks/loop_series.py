@@ -84,9 +84,9 @@ def attempt(kind: str, seed: int, narrow: bool = False, only: str = "") -> histo
 
 
 def program(task: Task) -> tuple | dict:
-    """Properties that sets with the same programs share; or the line of an invalid case.
+    """Properties that sets with the same programs share, or the line of an invalid case.
 
-    Making a set takes long; sets of the plain stratum are equal without it.
+    Making a set takes long. Sets of the plain stratum are equal without it.
     """
     if task.stratum == "plain":
         return ("plain",)

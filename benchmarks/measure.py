@@ -92,7 +92,7 @@ def in_turn(calls: dict[str, Callable[[], Any]], rounds: int) -> dict[str, np.nd
 
 
 def memory() -> dict[str, int]:
-    """Peak of this process on the device so far and its limit [bytes]; empty if the device does not report them."""
+    """Peak of this process on the device so far and its limit [bytes], empty if the device does not report them."""
     stats = jax.devices()[0].memory_stats() or {}
     wanted = {"peak": "peak_bytes_in_use", "limit": "bytes_limit"}
     return {name: int(stats[key]) for name, key in wanted.items() if key in stats}

@@ -58,8 +58,12 @@ class Sequence:
     """Rows that are simulated in sequence.
 
     Attributes:
-        rows: of the table, in order; configuration: name; step: [s]; at: instants of the rows since the start [s].
-        control: of every step, shape (steps, 5); settled: True if each row is held until it has settled.
+        rows: of the table, in order.
+        configuration: name.
+        step: [s].
+        at: instants of the rows since the start [s].
+        control: of every step, shape (steps, 5).
+        settled: True if each row is held until it has settled.
         speed: of the output shaft at the start [rad/s].
     """
 
@@ -82,7 +86,7 @@ class Rig:
     def fitted(
         self, measured: np.ndarray, sd: np.ndarray, counts: np.ndarray, start: np.ndarray | None = None
     ) -> np.ndarray:
-        """Parameters found by the toolbox from `start` [prior sds]; arrays of shape (rows, channels)."""
+        """Parameters found by the toolbox from `start` [prior sds], arrays of shape (rows, channels)."""
         free = sysid.ParameterDict()
         begin = np.zeros(self.drive.constants) if start is None else start
         for name, z in zip(self.drive.coordinates.names, begin, strict=True):

@@ -1,8 +1,8 @@
 """Applies the plausible mistakes of tests/mutants.toml: each has to make one of its listed tests fail.
 
 Each mutant replaces one piece of text in a copy of the tree and runs its tests in a separate process. Before that the
-same tests have to pass without any mutant. Tests of `make test` kill at least 97 % of the list;
-a mutant with `slow = true` is killed by a slow test, one of `make test-all`.
+same tests have to pass without any mutant. Tests of `make test` kill at least 97 % of the list.
+A mutant with `slow = true` is killed by a slow test, one of `make test-all`.
 
     python benchmarks/mutants.py                          # all of them, one at a time
     python benchmarks/mutants.py --jobs 2
@@ -54,8 +54,10 @@ class Mutant:
     """A plausible mistake.
 
     Attributes:
-        kind: where it is; file: from the root of the tree.
-        text: replaced, once in the file; by: its replacement.
+        kind: where it is.
+        file: from the root of the tree.
+        text: replaced, once in the file.
+        by: its replacement.
         killed_by: node ids of tests, at least one of them has to fail.
         slow: these tests are marked slow.
     """
@@ -104,7 +106,7 @@ class _Passed:
 
 
 def _run(tree: str, tests: list[str], marks: str, log: str, answer: str, options: tuple[str, ...]) -> None:
-    """Runs tests of a tree in this process; writes pytest's exit code and the passed tests to a file."""
+    """Runs tests of a tree in this process. Writes pytest's exit code and the passed tests to a file."""
     os.chdir(tree)
     os.environ["PYTHONPATH"] = tree  # for processes that tests start
     sys.path.insert(0, tree)

@@ -1,9 +1,9 @@
 """The paper's simulated rows fitted by one set of constants: errors, and the gain by each freed constant.
 
-    python benchmarks/paper_rows.py            # the lumped model, several ways; some minutes on two cores
+    python benchmarks/paper_rows.py            # the lumped model, several ways. Some minutes on two cores
     python benchmarks/paper_rows.py --track    # also the best constants in the track model, on the tracked rows
 
-Fifteen rows: the five tracked ones at 15 V imply 0.88 ohm while all others imply 0.61; they are left out. Errors are
+Fifteen rows: the five tracked ones at 15 V imply 0.88 ohm while all others imply 0.61. They are left out. Errors are
 (ours / the paper's - 1) in percent. Prints a line of JSON for each way.
 """
 

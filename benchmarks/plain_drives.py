@@ -31,9 +31,11 @@ class Drive:
     """A table's rig.
 
     Attributes:
-        runs: the table; robot: with its constants; coordinates: of the free ones, `priors.Coordinates`.
-        known: name → value of every constant [SI]; term: an additional term of the rig, its amplitude one more
-            unknown.
+        runs: the table.
+        robot: with its constants.
+        coordinates: of the free ones, `priors.Coordinates`.
+        known: name → value of every constant [SI].
+        term: an additional term of the rig, its amplitude one more unknown.
         given: of each row: configuration, sides, supply [V], duty, motor_speed [rad/s], slope [rad], mass [kg],
             direction d.
     """
@@ -51,7 +53,7 @@ class Drive:
         return len(self.coordinates.names)
 
     def start(self) -> np.ndarray:
-        """Unknowns at the means of their priors; for the term a tenth of its ordinary size."""
+        """Unknowns at the means of their priors. For the term a tenth of its ordinary size."""
         return np.concatenate([np.zeros(self.constants), np.zeros(0) if self.term is None else [0.1]])
 
     def values(self, z: np.ndarray) -> dict[str, float]:
@@ -61,7 +63,7 @@ class Drive:
         return {**self.known, **dict(zip(self.coordinates.names, theta, strict=True)), **tied}
 
     def of_rows(self, values: Mapping[str, float]) -> dict[str, Any]:
-        """Constants by their names without the configuration; those of a load have a value for each row."""
+        """Constants by their names without the configuration. Those of a load have a value for each row."""
         names, which = list(self.robot.configurations.names), self.given.configuration
         found: dict[str, Any] = {}
         for name, value in values.items():
@@ -159,7 +161,8 @@ class Drive:
         """Readings of the rows `kept` of one run, shape (members, rows, channels).
 
         Args:
-            time: of every sample since the start [s]; every: indices of the samples in the whole table.
+            time: of every sample since the start [s].
+            every: indices of the samples in the whole table.
         """
         values = [self.values(z) for z in members]
         whole = conditions_of(self.runs.whole, self.robot)
@@ -181,8 +184,10 @@ class Shaft:
     """A motor, its gear and a load on level ground, over time.
 
     Attributes:
-        p: constants without their configuration, of each member; sides: motors.
-        vehicle: True for a load that travels; fast: True for a driver that lets motors coast between pulses.
+        p: constants without their configuration, of each member.
+        sides: motors.
+        vehicle: True for a load that travels.
+        fast: True for a driver that lets motors coast between pulses.
     """
 
     p: Mapping[str, np.ndarray]
@@ -192,12 +197,12 @@ class Shaft:
 
     @property
     def radius(self) -> np.ndarray:
-        """Travel per radian of the output [m/rad]; 1 for a shaft."""
+        """Travel per radian of the output [m/rad], 1 for a shaft."""
         return self.p.get("radius", np.ones_like(self.p["motor.resistance"]))
 
     @property
     def mass(self) -> np.ndarray:
-        """Mass that one side moves [kg]; 0 for a shaft."""
+        """Mass that one side moves [kg], 0 for a shaft."""
         return self.p["mass"] / self.sides if self.vehicle else np.zeros_like(self.radius)
 
     def follow(
@@ -205,15 +210,16 @@ class Shaft:
     ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """Returns instants [s] and the state of the motors at them, each of shape (members, instants).
 
-        The state is the speed `w` [rad/s] and current `I` [A]; and for the step from there its acceleration `rate`
+        The state is the speed `w` [rad/s] and current `I` [A], and for the step from there its acceleration `rate`
         [rad/s²] and the settled currents `from` and `to` of its voltage at both ends [A].
 
         In each step the voltage is constant, the winding's lag exact, and the shaft's equation linear with an exact
-        solution; a shaft that would reverse stops.
+        solution. A shaft that would reverse stops.
 
         Args:
-            time: of the samples [s]; volts: mean voltage of the pulses [V], duty: their share, of each sample; start:
-                speed [rad/s].
+            time: of the samples [s].
+            volts: mean voltage of the pulses [V], duty: their share, of each sample.
+            start: speed [rad/s].
         """
         p, i = self.p, self.p["gearbox.ratio"]
         C, R, eta, J = (
@@ -276,7 +282,9 @@ class Shaft:
         """Channel → its values [SI] of one member.
 
         Args:
-            when: instants [s]; m: index of the member; grid, followed: as for `follow`.
+            when: instants [s].
+            m: index of the member.
+            grid, followed: as for `follow`.
         """
         p = {n: x[m] for n, x in self.p.items()}
         k = np.clip(np.searchsorted(grid, when, side="right") - 1, 0, len(grid) - 1)
@@ -302,7 +310,7 @@ class Shaft:
 
 
 def _tiled(x: Any, count: int, rows: int) -> Any:
-    """A column of rows repeated `count` times; other values are returned unchanged."""
+    """A column of rows repeated `count` times. Other values are returned unchanged."""
     return np.tile(x, count) if isinstance(x, np.ndarray) and x.shape == (rows,) else x
 
 
@@ -353,7 +361,9 @@ def drive(runs: Any, robot: Any, coordinates: Any, term: Term | None = None) -> 
     """The rig of a table in these equations.
 
     Args:
-        robot: of the problem; coordinates: of its free constants; term: of a synthetic rig.
+        robot: of the problem.
+        coordinates: of its free constants.
+        term: of a synthetic rig.
 
     Raises:
         Unable: a kind of data or channel that they do not support.

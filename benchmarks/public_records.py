@@ -1,7 +1,7 @@
 """Records of the comparison: the packaged table, public records of others, cases of a folder, synthetic rigs.
 
 A record is a robot's file, a table and the known part of the answer. Public tables stay in the folder stated on the
-command line; this module holds the data for a robot's file of each.
+command line. This module holds the data for a robot's file of each.
 """
 
 from __future__ import annotations
@@ -43,7 +43,9 @@ class Record:
     """A robot, a table and the answer.
 
     Attributes:
-        name: of the record; robot: file of the robot, or name of a packaged one; table: file of the runs.
+        name: of the record.
+        robot: file of the robot, or name of a packaged one.
+        table: file of the runs.
         case: of a synthetic rig the generator's `rigs.Case`, else None.
     """
 
@@ -258,7 +260,9 @@ def record(name: str, folder: Path, public: Path | None, cases: Path | None, see
     """A record by its name, with its files written into `folder`.
 
     Args:
-        public: folder of the public records; cases: folder of cases; seed: of the synthetic rigs.
+        public: folder of the public records.
+        cases: folder of cases.
+        seed: of the synthetic rigs.
 
     Raises:
         NoRecord: a missing file, a folder that is not given, or a rig that cannot be drawn.
@@ -326,10 +330,11 @@ def _place(effect: dict[str, Any]) -> str:
 
 
 def judged(level: str, claims: list[list[str]], families: list[str], answer: Answer) -> bool | None:
-    """True for a wrong claim; None if the answer is not known.
+    """True for a wrong claim, None if the answer is not known.
 
     Args:
-        level: word of the verdict; claims: classes of established effects.
+        level: word of the verdict.
+        claims: classes of established effects.
         families: mechanisms, or the place.
     """
     if answer.kind == "unknown":
@@ -351,6 +356,6 @@ def _off(level: str, claims: list[list[str]], families: list[str], answer: Answe
 
 
 def _equation(family: str) -> str:
-    """The equation of a family in words; losses, weights and inertias act on the same one."""
+    """The equation of a family in words. Losses, weights and inertias act on the same one."""
     what = family.partition(" that ")[0]
     return "torque" if what in ("loss torque", "resistance to travel", "mass", "inertia") else what

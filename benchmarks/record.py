@@ -1,6 +1,6 @@
 """Digests of the results of every command, in `tests/record/commands`, so that no result changes unnoticed.
 
-    python benchmarks/record.py --check             # to the tolerance of each case; exits with 1 for a difference
+    python benchmarks/record.py --check             # to the tolerance of each case. Exits with 1 for a difference
     python benchmarks/record.py --check --exact     # to the last digit, if only code was moved
     python benchmarks/record.py --write --only size # after a correction, with a line in CHANGELOG.md
 
@@ -50,7 +50,7 @@ SHORT = 6
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """A command, as words; `after`: a case whose folders it reads, if any; `rtol`: tolerance of its numbers."""
+    """A command, as words. `after`: a case whose folders it reads, if any. `rtol`: tolerance of its numbers."""
 
     words: str
     after: str = ""
@@ -143,7 +143,7 @@ Leaf = tuple[str, Any]
 
 
 def _read(path: Path) -> Iterator[Leaf]:
-    """Yields names and values of a file in order; nothing for a store's identity or a picture."""
+    """Yields names and values of a file in order. Nothing for a store's identity or a picture."""
     if path.suffix == ".csv":
         with path.open(encoding="utf-8", newline="") as stream:
             rows = csv.reader(stream)
@@ -165,7 +165,7 @@ def _number(cell: str) -> Any:
 
 
 def _flat(value: Any, name: str = "") -> Iterator[Leaf]:
-    """Leaves of nested tables under dotted names; those of a list under one name."""
+    """Leaves of nested tables under dotted names. Those of a list under one name."""
     if isinstance(value, dict):
         yield f"{name}{{}}", " ".join(key for key in value if key not in PROVENANCE)
         for key, item in value.items():
@@ -180,7 +180,7 @@ def _flat(value: Any, name: str = "") -> Iterator[Leaf]:
 
 
 def digest(leaves: list[Leaf]) -> dict[str, Any]:
-    """Values by name: numbers as a list, or as count, norm and two weighted sums; others and the whole as a hash."""
+    """Values by name: numbers as a list, or as count, norm and two weighted sums. Others and the whole as a hash."""
     groups: dict[str, list[Any]] = {}
     for name, value in leaves:
         groups.setdefault(name, []).append(value)

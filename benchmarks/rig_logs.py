@@ -7,8 +7,8 @@ compared with independent least squares.
     python benchmarks/rig_logs.py --stratum varied --seed 700 --clean 80 --library 80 --outside 40 --brief --jobs 32
 
 Logs come from `tests/worlds/logs.py`, which shares no code with the simulator: four runs of 200 rows, 50 to
-200 Hz, of one drive and a load on a shaft; voltage, current or speed imposed in turn; some with a delay that no file
-states. The loop reads only `rig.toml` and `table.csv`; only the scorer reads the labels. Every log is one line
+200 Hz, of one drive and a load on a shaft. Voltage, current or speed imposed in turn. Some with a delay that no file
+states. The loop reads only `rig.toml` and `table.csv`. Only the scorer reads the labels. Every log is one line
 of `--out`, and a restarted campaign continues where it ended. With `--brief` there is no
 hold-out. In the stratum `varied` half of the tables have no sds, a quarter of the logs show an angle alone and a
 quarter have coarse instruments, and effects of the library leave 5 σ.
@@ -41,14 +41,14 @@ TENTH = 0.1
 
 
 def inputs(seed: int) -> tuple[str, float]:
-    """Imposed quantity and sampling interval [s], in turn; each step occurs with each effect."""
+    """Imposed quantity and sampling interval [s], in turn. Each step occurs with each effect."""
     turn = seed // len(logs.IMPOSED)
     return logs.IMPOSED[seed % len(logs.IMPOSED)], logs.EVERY[(turn + turn // 9) % len(logs.EVERY)]
 
 
 @functools.lru_cache(maxsize=2)
 def attempt(kind: str, seed: int, varied: bool = False) -> logs.Case | str:
-    """The case of a kind and a seed, or the reason why it is invalid; `varied` as the stratum."""
+    """The case of a kind and a seed, or the reason why it is invalid. `varied` as the stratum."""
     rng = np.random.default_rng([41, KINDS.index(kind), seed])
     imposed, every = inputs(seed)
     turn = seed // 2 % 4 if varied else 0

@@ -3,8 +3,8 @@
     python benchmarks/rigs.py --clean 500 --library 400 --outside 200 --jobs 16 --cache runs/cache
 
 Rigs come from `tests/worlds/rigs.py`, which shares no code with the simulator: one to six drives on wheels, tracks,
-a bench, a winch or a linear unit; voltage, duty or motor speed imposed; one to three channels. The loop reads only
-`rig.toml` and `table.csv`; only the scorer reads the labels. Every rig is one line of `--out`, and a restarted
+a bench, a winch or a linear unit. Voltage, duty or motor speed imposed. One to three channels. The loop reads only
+`rig.toml` and `table.csv`. Only the scorer reads the labels. Every rig is one line of `--out`, and a restarted
 campaign continues where it ended.
 
     python benchmarks/rigs.py --confounded 200 --jobs 16 --cache runs/cache
@@ -88,7 +88,7 @@ def attempt(kind: str, seed: int) -> gr.Case | str:
 
 
 def _confounded(seed: int, like: gr.Rig, rows: tuple[int, int], rng: np.random.Generator) -> gr.Case | str:
-    """A case with rows by rising drive and a temperature that rises with them; it says nothing of the readings."""
+    """A case with rows by rising drive and a temperature that rises with them. It says nothing of the readings."""
     kind = CONFOUNDED[seed % len(CONFOUNDED)]
     pool = {"clean": {"": None}, "library": laws.RIGS, "outside": laws.OUTSIDE_RIGS}[kind]
     whys: Counter[str] = Counter()

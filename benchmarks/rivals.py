@@ -30,7 +30,9 @@ class Fold:
     """A block of runs left out.
 
     Attributes:
-        kind: of the block; out: mask of its rows, shape (rows,); z: our fit without it.
+        kind: of the block.
+        out: mask of its rows, shape (rows,).
+        z: our fit without it.
         reading: of that fit in every row [SI], NaN for rows it does not reach, shape (rows, channels).
     """
 
@@ -45,8 +47,12 @@ class Posed:
     """A record in the form that every method gets.
 
     Attributes:
-        given: `discover.prepare_loop`; fitted: our base fit, `candidates.BaseFit`; folds: the blocks left out.
-        measured, sd: [SI], shape (rows, channels); counts: True for a fitted reading; case: see `Record`.
+        given: `discover.prepare_loop`.
+        fitted: our base fit, `candidates.BaseFit`.
+        folds: the blocks left out.
+        measured, sd: [SI], shape (rows, channels).
+        counts: True for a fitted reading.
+        case: see `Record`.
     """
 
     given: Any
@@ -74,10 +80,13 @@ class Found:
     """Readings of a method.
 
     Attributes:
-        unseen: readings of each fold's rows by a fit without them [SI], one array of shape (rows, channels) per fold;
-            rows of other folds are not read.
-        level: the claim, a word for verdicts; claims: classes of effects; families: mechanisms, or the place.
-        seconds: of the claim alone, if that is a part; note: to print next to the record.
+        unseen: readings of each fold's rows by a fit without them [SI], one array of shape (rows, channels) per fold.
+            Rows of other folds are not read.
+        level: the claim, a word for verdicts.
+        claims: classes of effects.
+        families: mechanisms, or the place.
+        seconds: of the claim alone, if that is a part.
+        note: to print next to the record.
     """
 
     unseen: list[np.ndarray]
@@ -92,7 +101,9 @@ def posed(robot: str, table: Any, seed: int, replicates: int, case: Any = None) 
     """A record prepared as in `mmrjax loop`, its base fitted to all rows and without each block.
 
     Args:
-        robot: file, or name of a packaged robot; table: file of the runs; case: of a synthetic rig.
+        robot: file, or name of a packaged robot.
+        table: file of the runs.
+        case: of a synthetic rig.
 
     Raises:
         Unable: a table with an unused column.
@@ -161,7 +172,7 @@ def verdict(p: Posed) -> Found:
 
 
 def scipy_fit(p: Posed) -> Found:
-    """`scipy.optimize.least_squares` on independent NumPy physics; tolerances of the file are residuals too."""
+    """`scipy.optimize.least_squares` on independent NumPy physics. Tolerances of the file are residuals too."""
     return _least_squares(p, plain_drives.drive(p.given.runs, p.space.bare.base, p.space.bare.coordinates))
 
 
@@ -301,7 +312,7 @@ def _regressed(p: Posed, regression: Regression) -> Found:
 def _features(p: Posed, reading: np.ndarray) -> np.ndarray:
     """Features of every row, shape (rows, features), each within -1 and 1.
 
-    Conditions, direction, position in the table and the base's readings; in a log also those of the rows before.
+    Conditions, direction, position in the table and the base's readings. In a log also those of the rows before.
     """
     runs, conditions = p.given.runs, p.given.runs.conditions(p.given.robot)
     names = ("voltage", "slope_deg", "payload", "duty", "motor_speed", "motor_current", "total_mass")
@@ -328,7 +339,7 @@ def _scaled(columns: Sequence[np.ndarray]) -> list[np.ndarray]:
 
 
 def _before(runs: Any, x: np.ndarray, back: int) -> np.ndarray:
-    """A column shifted by `back` rows within the run of each row; before that the run's first row."""
+    """A column shifted by `back` rows within the run of each row. Before that the run's first row."""
     found = np.empty_like(x)
     for name in dict.fromkeys(runs.run_names.tolist()):
         rows = runs.in_order(name)

@@ -4,7 +4,7 @@
     python benchmarks/sensitivity.py speed          # model evaluations of a study: SciPy loop, NumPy, ours
     python benchmarks/sensitivity.py table8         # derivative-based indices of the whole of Table 8
 
-The SciPy implementation is `tests/worlds/paper.py`, a loop of `scipy.optimize.root` over points; the NumPy one is the
+The SciPy implementation is `tests/worlds/paper.py`, a loop of `scipy.optimize.root` over points. The NumPy one is the
 closed form of the same balances without effects, vectorised. `--json FILE` writes every number.
 """
 

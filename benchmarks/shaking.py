@@ -1,9 +1,9 @@
 """The paper's findings at a shaking running gear (set S of docs/explanation/vibration.md), and C MuJoCo.
 
     python benchmarks/shaking.py            # findings: twenty rows at two steps, a minute on two cores
-    python benchmarks/shaking.py --native   # C MuJoCo stepped with the same forces, two points; two minutes
+    python benchmarks/shaking.py --native   # C MuJoCo stepped with the same forces, two points, two minutes
 
-Findings: ripple of speed, current and reaction; repetition with eq. (34); position of the maxima of current and
+Findings: ripple of speed, current and reaction, repetition with eq. (34). Position of the maxima of current and
 reaction within the pitch, from the landing of a grouser, Figs. 26, 27. Prints lines of JSON.
 """
 

@@ -5,7 +5,7 @@ python benchmarks/steady_yardstick.py
 python benchmarks/steady_yardstick.py --platform gpu --batches 4194304,67108864
 
 On a CPU: a closed form without effects (only currents and speeds; every output), and Newton's method with four
-effects, in NumPy on one core; `steady` on two. All sides of a ratio are timed in turn, in rounds, so that other work
+effects, in NumPy on one core, `steady` on two. All sides of a ratio are timed in turn, in rounds, so that other work
 on the machine affects all equally. Ratios are of the best times, of the medians, and of processor times divided by
 the cores that each side uses, which other work barely affects. The last line is JSON.
 On a GPU: points per second, bytes per point, and the shares of the device's bandwidth and arithmetic, from XLA's

@@ -4,7 +4,7 @@ python benchmarks/sweep_options.py            # 2.4e6 points: without stored pro
 python benchmarks/sweep_options.py --repeats 5
 
 Each run is a separate process, with an empty folder of compiled programs before the first of them. Prints a line per
-run; the last line is JSON.
+run. The last line is JSON.
 """
 
 from __future__ import annotations

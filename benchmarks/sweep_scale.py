@@ -177,7 +177,7 @@ def memory(arguments: argparse.Namespace) -> list[dict[str, Any]]:
 
 
 def weak(arguments: argparse.Namespace) -> list[dict[str, Any]]:
-    """The same number of runs per device, for increasing numbers of devices; the second of two sweeps is timed.
+    """The same number of runs per device, for increasing numbers of devices. The second of two sweeps is timed.
 
     The points are samples, so that each device has its share of easy and hard runs.
     """

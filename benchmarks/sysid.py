@@ -4,8 +4,8 @@ python benchmarks/sysid.py            needs the toolbox's own requirements: pip 
 
 The tracked robot lifted off the ground, driven at two voltages from standstill: one shaft with the inertia of
 rotor and pulley, viscous and dry losses, a motor whose torque decreases with speed. In mmrjax it is `drive` without
-adhesion; in MuJoCo a hinge with armature, damping and frictionloss. The truth is the exact solution
-ω = A/B (1 - exp(-B t / J)), with noise; three parameters are fitted from starts that are wrong by a factor 1.5 to 2.
+adhesion. In MuJoCo a hinge with armature, damping and frictionloss. The truth is the exact solution
+ω = A/B (1 - exp(-B t / J)), with noise. Three parameters are fitted from starts that are wrong by a factor 1.5 to 2.
 """
 
 from __future__ import annotations

@@ -94,7 +94,7 @@ def speed(batches: list[int]) -> dict:
 def derivatives(size: int = 30) -> dict:
     """Times of forward Jacobians of the settled readings by 1, 4 and 12 parameters, a gradient by 4, and the run.
 
-    30 runs of 0.6 s from Table 8, rolling; least processor time of five rounds, with each call in turn.
+    30 runs of 0.6 s from Table 8, rolling. Least processor time of five rounds, with each call in turn.
     """
     robot = paper_robots.nominal()
     values = {p.name: p.value for p in params.walk_parameters(robot)}

@@ -14,7 +14,7 @@ search run again at half and a quarter of the step. Its answer is the member wit
 steps, on the rows that its search saw.
 
 With `--simulated` the paper's simulated slip of all ten tracked rows counts too, also for rows whose measured slip is
-left out; its sd is the rms of simulated less measured slip over the tracked rows that the search sees. With
+left out. Its sd is the rms of simulated less measured slip over the tracked rows that the search sees. With
 `--state FILE` the searches are stored, and the same command continues them. Prints lines of JSON.
 """
 
@@ -143,9 +143,11 @@ class Search:
     """One search: the rows that it sees, and the members that it drew and found.
 
     Attributes:
-        name; seen: rows that count; together: True if speeds share an error, so that slip has a separate one.
+        name. `seen`: rows that count. `together`: True if speeds share an error, so that slip has a separate one.
         prior: sd of the paper's simulated slip [points], inf if it does not count.
-        cma: draws; z: members drawn; cost: of each.
+        cma: draws.
+        z: members drawn.
+        cost: of each.
     """
 
     name: str
@@ -182,8 +184,11 @@ class Posed:
     """A problem and its rows.
 
     Attributes:
-        problem: of runs (rows with their repeats); row: of each run; measured: of each row, (rows, channels).
-        slope, voltage, tracked: of each row; what: `slip` or `table`.
+        problem: of runs (rows with their repeats).
+        row: of each run.
+        measured: of each row, (rows, channels).
+        slope, voltage, tracked: of each row.
+        what: `slip` or `table`.
         simulated: slip of the paper's simulation [%], NaN for wheeled rows.
     """
 
@@ -197,7 +202,7 @@ class Posed:
     simulated: np.ndarray
 
     def percent(self, reading: np.ndarray) -> np.ndarray:
-        """Errors of runs [% of simulated, eq. (35)], and of slip [points]; shape (..., runs, channels + 1)."""
+        """Errors of runs [% of simulated, eq. (35)], and of slip [points], shape (..., runs, channels + 1)."""
         measured = self.measured[self.row]
         with np.errstate(all="ignore"):
             error = 100 * (reading - measured) / reading
@@ -358,7 +363,7 @@ def begun(posed: Posed, arguments: argparse.Namespace, robot: Robot, table: Runs
 
 
 def generations(posed: Posed, searches: list[Search], members: Members, arguments: argparse.Namespace) -> int:
-    """Runs generations of all searches together; returns their number."""
+    """Runs generations of all searches together, returns their number."""
     start = time.perf_counter()
     for number in range(arguments.generations):
         if time.perf_counter() - start > arguments.seconds:

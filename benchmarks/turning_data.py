@@ -37,7 +37,7 @@ TRACK = _NODES[0] / 2, _NODES[1] / 2
 
 
 def read(path: Path, words: tuple[str, ...] = ("surface", "run_id")) -> Table:
-    """Columns of a table; text in the columns `words`."""
+    """Columns of a table. Text in the columns `words`."""
     with path.open() as lines:
         rows = list(csv.DictReader(lines))
     return {c: np.array([r[c] if c in words else float(r[c]) for r in rows]) for c in rows[0]}
@@ -59,8 +59,13 @@ def balance(v, ratio, V_s, f, length, width, contacts=WHEELS, rule=1.0, fall=1.0
     """Traction of both sides over φ_x W, v_x, ω and the residual, at speeds v (2, n) of the movers.
 
     Args:
-        v: left and right [m/s]; ratio: φ_y/φ_x; V_s: of Fig. 7 [m/s]; f: rolling resistance over φ_x.
-        contacts: positions over the length and shares; rule: a of the direction rule; fall: μ_d/μ_s.
+        v: left and right [m/s].
+        ratio: φ_y/φ_x.
+        V_s: of Fig. 7 [m/s].
+        f: rolling resistance over φ_x.
+        contacts: positions over the length and shares.
+        rule: a of the direction rule.
+        fall: μ_d/μ_s.
         left: share of the weight on the left side.
     """
     y = np.array([width / 2, -width / 2])[:, None, None]
@@ -126,7 +131,7 @@ def sides(d: Table) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def features(own, other, yaw, basis: str) -> np.ndarray:
-    """Inputs of a regression of a side's current; yaw is positive if it loads this side more."""
+    """Inputs of a regression of a side's current. Yaw is positive if it loads this side more."""
     one, total, apart = np.ones_like(own), own + other, own - other
     f = [one, abs(own), abs(total)]
     if basis == "linear":
@@ -177,9 +182,9 @@ def kind(fixed: dict[str, float | None] | None = None, **changes) -> SimpleNames
 
     Args:
         fixed: parameters with their values, None for free ones.
-        changes: `rule`, `fall`, `width` of the balance; `yaw`: weight of yaw rates against currents [A s/rad];
-            `tied`: one creep stiffness k φ_x W / V_s [A s/m] and `one_ratio`: one φ_y/φ_x for all surfaces;
-            `by_speed`: V_s is proportional to the rolling speed; `every`: see `fit`.
+        changes: `rule`, `fall`, `width` of the balance. `yaw`: weight of yaw rates against currents [A s/rad].
+            `tied`: one creep stiffness k φ_x W / V_s [A s/m] and `one_ratio`: one φ_y/φ_x for all surfaces.
+            `by_speed`: V_s is proportional to the rolling speed. `every`: see `fit`.
     """
     base = {"rule": 1.0, "fall": 1.0, "width": HUSKY.width, "yaw": 30.0}
     base |= {"tied": False, "one_ratio": False, "by_speed": False, "every": 0}
@@ -209,7 +214,7 @@ def fit(d: Table, m: Table, use: np.ndarray, of: SimpleNamespace, start: np.ndar
     """All parameters by least squares on the means of currents [A] and, times `of.yaw`, of yaw rates.
 
     A window's mean is compared with the balance at its mean speeds or, with `of.every`, with the mean of the
-    balances at every n-th of its samples; magnitudes and saturation make the two different.
+    balances at every n-th of its samples. Magnitudes and saturation make the two different.
 
     Returns:
         Parameters, result of `least_squares`, mask of the free parameters.
@@ -340,8 +345,8 @@ TRACKED_START = {
 def slips(p: np.ndarray, v: np.ndarray, ratio: float, rule: float) -> np.ndarray:
     """Slip of left and right and lateral speed (3, n) [m/s] at nominal track speeds v (2, n).
 
-    `left`, `right`: true over nominal speed; `ahead`: distance of the instantaneous centre before the measured point;
-    `askew`: angle of the instrument [rad]; `by_speed`: growth of V_s with the rolling speed [per 0.2 m/s].
+    `left`, `right`: true over nominal speed. `ahead`: distance of the instantaneous centre before the measured point.
+    `askew`: angle of the instrument [rad]. `by_speed`: growth of V_s with the rolling speed [per 0.2 m/s].
     """
     true = v * p[3:5, None]
     V_s = np.exp(p[1]) * (1 + p[7] * np.abs(true).mean(0) / 0.2)

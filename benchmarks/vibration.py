@@ -4,7 +4,7 @@
     python benchmarks/vibration.py            # 24 running gears drawn at random, ten rows each
 
 A track that runs over its grousers shakes: reaction and sliding speed of each contact oscillate about their means.
-Friction is nonlinear, so a robot may slip far more than Fig. 7 gives for its mean demand (Section 3.2.4, ref. [46];
+Friction is nonlinear, so a robot may slip far more than Fig. 7 gives for its mean demand (Section 3.2.4, ref. [46].
 Blekhman, Vibrational Mechanics, 2000: dry friction becomes an apparent viscous one).
 docs/explanation/vibration.md derives it.
 For each run the slip computed from the measured ripple of its contacts is compared with the run's own slip
@@ -87,7 +87,7 @@ def coefficient(friction: Friction, speed: Scalar, swing: Scalar) -> Scalar:
 def speed_sliding(friction: Friction, demanded: Scalar, swing: Scalar) -> Scalar:
     """Mean sliding speed [m/s] that shaking contacts need for the coefficient `demanded` [-], scalars.
 
-    The inverse of `coefficient`; without swing `Friction.speed_creep`. NaN if no speed suffices.
+    The inverse of `coefficient`, without swing `Friction.speed_creep`. NaN if no speed suffices.
     """
     furthest = friction.speed_static + swing * float(np.abs(WAVE).max())
 
@@ -111,8 +111,9 @@ class Ripple(eqx.Module):
     The resulting loss of speed is the mean sliding speed for the demand (`speed_sliding`), less the lead.
 
     Attributes:
-        swing: mean size of the sliding speed less its mean [m/s]; lead: mean less plain mean of the sliding speed
-            [m/s], positive if contacts slide faster while their load is larger. Means are weighted by load.
+        swing: mean size of the sliding speed less its mean [m/s].
+        lead: mean less plain mean of the sliding speed [m/s], positive if contacts slide faster while their
+            load is larger. Means are weighted by load.
         normal: sd over mean of the ground's reaction [-].
         demanded: mean traction over mean reaction and adhesion [-].
     """
@@ -162,7 +163,7 @@ def gear(rng: np.random.Generator) -> Robot:
 
 @eqx.filter_jit
 def compared(robot: Robot, voltage: Array, slope: Array, payload: Array) -> dict[str, Array]:
-    """Slip of each row [%]: of the run, of the averaged law, of Fig. 7 alone; its ripple and status."""
+    """Slip of each row [%]: of the run, of the averaged law, of Fig. 7 alone. Its ripple and status."""
 
     def one(voltage: jax.Array, slope: jax.Array, payload: jax.Array) -> dict[str, jax.Array]:
         conditions = Conditions(0, voltage=voltage, slope_deg=slope, payload=payload)

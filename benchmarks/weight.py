@@ -4,9 +4,9 @@
     python benchmarks/weight.py --write                     # lower the ceilings to the figures
     python benchmarks/weight.py --write --reason "..."      # raise those that are exceeded, too
 
-nodes: of the syntax trees without docstrings; functions: with methods; records: dataclasses, named tuples,
-enumerations and modules of equinox; modules: files; once: functions of a module that the source names in one place;
-words: of English in string constants and templates. The circle is the largest set of modules that import each other,
+nodes: of the syntax trees without docstrings. Functions: with methods. Records: dataclasses, named tuples,
+enumerations and modules of equinox. Modules: files. Once: functions of a module that the source names in one place.
+Words: of English in string constants and templates. The circle is the largest set of modules that import each other,
 imports in functions included.
 """
 

@@ -12,11 +12,11 @@ def describe(found: Any, part: str = "", *about: str) -> str:
 
     Args:
         found: a note, a result, or a sentence, which is returned as it is.
-        part: of a result: `header` of its robot's file, or `standing` of the loop's names; "": its answer.
+        part: of a result: `header` of its robot's file, or `standing` of the loop's names. "": its answer.
         about: the robot's name, for a header.
 
     Returns:
-        The sentence; "" where there is nothing to report.
+        The sentence, "" where there is nothing to report.
 
     Raises:
         TypeError: nothing is known about this kind of object or part.

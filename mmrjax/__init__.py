@@ -5,8 +5,8 @@
     robot = mm.nominal()
     one = mm.simulate(robot, mm.Conditions(configuration="6T2A", voltage=24.0, slope_deg=10.0, payload=3.0))
 
-Importing the package does not import jax; jax is imported when a name is first used. No setting of jax changes.
-Called outside a trace, the functions compute in double precision; within a trace, in JAX's own precision.
+Importing the package does not import jax. jax is imported when a name is first used. No setting of jax changes.
+Called outside a trace, the functions compute in double precision. Within a trace, in JAX's own precision.
 """
 
 from __future__ import annotations

@@ -37,7 +37,7 @@ def shorten(message: str, longest: int = LONGEST) -> str:
 
 
 class UsageError(ValueError):
-    """Wrong use of the public API; one sentence: where, what came, what is allowed."""
+    """Wrong use of the public API. One sentence: where, what came, what is allowed."""
 
     def __init__(self, message: str) -> None:
         """Stores the message, `shorten` and `printable`."""
@@ -45,7 +45,7 @@ class UsageError(ValueError):
 
 
 def count_noun(count: int, noun: str) -> str:
-    """Returns a count with its noun, `1 run` or `2,000 runs`; the noun is singular and its plural ends in s."""
+    """Returns a count with its noun, `1 run` or `2,000 runs`. The noun is singular and its plural ends in s."""
     return f"{count:,} {noun}{'' if count == 1 else 's'}"  # a comparison of NumPy integers gives no Python bool
 
 
@@ -53,7 +53,8 @@ def allowed_words(word: str, allowed: Iterable[str], most: int = 1, shown: Itera
     """Returns «did you mean X? allowed: ...» for an unknown word.
 
     Args:
-        word: the unknown word; allowed: all valid words.
+        word: the unknown word.
+        allowed: all valid words.
         most: largest number of suggestions.
         shown: the words to list as allowed, if not all.
     """

@@ -1,4 +1,4 @@
-"""The command line `mmrjax`: options only; what a command does is in `commands`, imported when it is needed."""
+"""The command line `mmrjax`: options only. What a command does is in `commands`, imported when it is needed."""
 
 from __future__ import annotations
 
@@ -68,8 +68,11 @@ def _command(
     The command is the function `execute` of its module in `commands`, called with both once jax is ready.
 
     Args:
-        kind: the configuration; beside: that of options that change no number; a file may state its `[solver]` only.
-        group: heading in `--help`; room: the module, if it has another name; failure: meaning of exit code 3.
+        kind: the configuration.
+        beside: that of options that change no number. A file may state its `[solver]` only.
+        group: heading in `--help`.
+        room: the module, if it has another name.
+        failure: meaning of exit code 3.
         resolve: in place of `config.resolve_configuration`.
     """
 
@@ -88,12 +91,12 @@ def _command(
             stated, others = made.take_options(kind, given), made.take_options(beside, given)
             aside = config.resolve_beside(beside, file, others, trust)
             if resolve is None:
-                found = config.resolve_configuration(kind, file, stated, beside, trust)
+                resolved = config.resolve_configuration(kind, file, stated, beside, trust)
             else:
-                found = resolve(file, stated, trust)
+                resolved = resolve(file, stated, trust)
             with report_working(name):
-                _prepare(found, given["no_cache"])
-                code: int = importlib.import_module(f"sweeps.commands.{room or name}").execute(found, aside)
+                _prepare(resolved, given["no_cache"])
+                code: int = importlib.import_module(f"sweeps.commands.{room or name}").execute(resolved, aside)
                 return code
 
         keyword = functools.partial(inspect.Parameter, kind=inspect.Parameter.KEYWORD_ONLY)
@@ -182,7 +185,7 @@ def sweep() -> None:
     """Simulate every combination of a grid in one batch.
 
     The default grid is the paper's Table 8. An axis is a list, 0,5,10, or a range, first:last:step, such as
-    0:20:0.5. Up to 100 000 runs are written to runs.csv. Larger sweeps write a Zarr store; --export csv writes
+    0:20:0.5. Up to 100 000 runs are written to runs.csv. Larger sweeps write a Zarr store. --export csv writes
     runs.csv too. In a CONFIG.toml any parameter or condition can vary, on a grid or by sampling
     (docs/reference/plans.md). An interrupted sweep continues with the same command and the same --out.
     """
@@ -462,7 +465,7 @@ def rig_check(
 
     Lists values, their sources and their plausibility. With data it lists each column's use and range, and the
     parameters that these data determine. A parameter is not determined if its posterior sd is above 0.9 of its
-    prior sd. Nothing is fitted or written. Exit codes: 0 usable; 2 the file is not usable; 4 the data are not
+    prior sd. Nothing is fitted or written. Exit codes: 0 usable, 2 the file is not usable, 4 the data are not
     usable.
     """
     _start_jax(no_cache)
@@ -480,7 +483,7 @@ def inspect_file(
 ) -> int:
     """List the signals of a data file, and propose column names.
 
-    Signals have units, rates, ranges and gaps. Exit codes: 0 readable; 4 not readable.
+    Signals have units, rates, ranges and gaps. Exit codes: 0 readable, 4 not readable.
     """
     from sweeps.commands import inspect as room
 
@@ -510,7 +513,7 @@ def _prepare(resolved: Any, no_cache: bool = False) -> None:
     """Make the environment ready for the jax that a command of this configuration will import.
 
     Runs of the track model have hung for good, one sweep in seven on two cores, with every thread asleep in
-    XLA's CPU executor (jax 0.10.2); with one thread none of twelve did (docs/lab/figures.md). Whoever sets
+    XLA's CPU executor (jax 0.10.2). With one thread none of twelve did (docs/lab/figures.md). Whoever sets
     XLA_FLAGS, be it to nothing, is heeded.
     """
     model = getattr(resolved, "model", None)  # None: of a calibration, whose data decide
@@ -563,7 +566,7 @@ def _refuse_little_memory() -> None:
 
 
 def main() -> None:
-    """Run the command line; every failure is one sentence on stderr and a documented exit code."""
+    """Run the command line. Every failure is one sentence on stderr and a documented exit code."""
     for number in (signal.SIGTERM, signal.SIGALRM):  # ended or interrupted: both can be taken up again
         signal.signal(number, signal.default_int_handler)
     unraised, sys.unraisablehook = sys.unraisablehook, _obey_interrupt
@@ -618,7 +621,7 @@ def _replace_closed_streams() -> None:
 
 
 def _answered(error: BaseException) -> int:
-    """Say why a command failed; returns its exit code."""
+    """Report why a command failed. Returns its exit code."""
     if isinstance(error, typer.Abort) and isinstance(error.__context__, EOFError):
         error = error.__context__  # of a file, which the option parser takes for the end of its own input
     if isinstance(error, InputError):
@@ -662,12 +665,12 @@ def _memory_exhausted(error: BaseException | None) -> bool:
 
 
 def _no_number(error: Any) -> str:
-    """Error message for a text in place of a number; most often the text includes a unit."""
+    """Error message for a text in place of a number. Most often the text includes a unit."""
     option = getattr(error, "param", None)
     if option is None or not re.search(r"valid (number|float|integer)", str(getattr(error, "message", ""))):
         return ""
-    told = " ".join(str(option.help or "").replace("\\[", "[").split())
-    return f"{option.opts[0]}: got no number; expected one without its unit. {told}"
+    help_text = " ".join(str(option.help or "").replace("\\[", "[").split())
+    return f"{option.opts[0]}: got no number; expected one without its unit. {help_text}"
 
 
 def _fail(message: str, code: int) -> int:

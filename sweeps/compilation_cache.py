@@ -1,7 +1,7 @@
 """The compilation cache: programs that XLA has compiled, kept on disk so that the next process reads them.
 
-Folder: `$MMRJAX_CACHE`, else `$XDG_CACHE_HOME/mmrjax`, else `~/.cache/mmrjax`; `MMRJAX_CACHE=off` switches it off.
-JAX keys an entry by program, compiler version, flags and device; a folder of its own for each version of jaxlib and
+Folder: `$MMRJAX_CACHE`, else `$XDG_CACHE_HOME/mmrjax`, else `~/.cache/mmrjax`. `MMRJAX_CACHE=off` switches it off.
+JAX keys an entry by program, compiler version, flags and device. A folder of its own for each version of jaxlib and
 each kind of processor keeps native code of one machine from another with the same home. Programs are native code: a
 folder that others could change is not used (`mmrjax.compile.private`). Importable without jax.
 """
@@ -28,10 +28,10 @@ LIMIT = 4 * 2**30
 
 
 def cache_location(path: Path | None = None) -> Path | None:
-    """Folder of the cache, which need not exist yet; None where it is switched off or no place for it is known.
+    """Folder of the cache, which need not exist yet, None where it is switched off or no place for it is known.
 
     Args:
-        path: folder to hold caches; None takes it from the environment.
+        path: folder to hold caches. None takes it from the environment.
     """
     if path is None:
         stated = os.environ.get(VARIABLE, "").strip()
@@ -52,10 +52,10 @@ def cache_location(path: Path | None = None) -> Path | None:
 def _processor() -> str:
     """Short hash of the processor features that native code depends on."""
     try:
-        known = re.findall(r"^(?:flags|Features)\s*:.*", Path("/proc/cpuinfo").read_text(encoding="utf-8"), re.M)[:1]
+        flags = re.findall(r"^(?:flags|Features)\s*:.*", Path("/proc/cpuinfo").read_text(encoding="utf-8"), re.M)[:1]
     except OSError:
-        known = []
-    kind = " ".join([platform.machine(), platform.processor(), *known])
+        flags = []
+    kind = " ".join([platform.machine(), platform.processor(), *flags])
     return f"{platform.machine()}-{hashlib.sha256(kind.encode()).hexdigest()[:8]}"
 
 
@@ -64,11 +64,11 @@ def keep_programs() -> Path | None:
 
     To be called before anything compiles. A cache that JAX has been given by its own settings
     (`JAX_COMPILATION_CACHE_DIR`) stays. An entry that cannot be read is compiled again. `MMRJAX_CACHE` is the folder
-    to hold caches, or `off`; without it `~/.cache/mmrjax`. A folder that other users could change is not used, which
+    to hold caches, or `off`, without it `~/.cache/mmrjax`. A folder that other users could change is not used, which
     a line on stderr reports.
 
     Returns:
-        The folder; None if the cache is switched off, its place cannot be written to or others could change it.
+        The folder, None if the cache is switched off, its place cannot be written to or others could change it.
     """
     if _refused(os.environ.get(PROGRAMS, "")):
         os.environ[PROGRAMS] = ""
@@ -83,12 +83,12 @@ def keep_programs() -> Path | None:
     os.environ.setdefault("EQX_ON_ERROR", "nan")
     import jax
 
-    own = jax.config.values["jax_compilation_cache_dir"]
-    if own is not None:
-        if "://" not in own and _refused(own):
+    own_folder = jax.config.values["jax_compilation_cache_dir"]
+    if own_folder is not None:
+        if "://" not in own_folder and _refused(own_folder):
             jax.config.update("jax_enable_compilation_cache", False)
             return None
-        return Path(own)
+        return Path(own_folder)
     try:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     except OSError:
@@ -119,15 +119,15 @@ def _refused(folder: str) -> bool:
 
 def _entries(folder: Path) -> list[tuple[float, int, Path]]:
     """Time of writing, size [bytes] and path of every entry."""
-    found = []
+    entries = []
     for path in folder.iterdir() if folder.is_dir() else ():
         try:
             state = path.stat()
         except OSError:  # dropped by another process meanwhile
             continue
         if stat.S_ISREG(state.st_mode):  # XLA has a folder of its own there, with a GPU
-            found.append((state.st_mtime, state.st_size, path))
-    return found
+            entries.append((state.st_mtime, state.st_size, path))
+    return entries
 
 
 def _prune(caches: Path) -> None:

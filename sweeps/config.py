@@ -51,21 +51,22 @@ Seed = Annotated[int, Field(ge=0, le=SEEDS)]
 
 
 def option_field(default: Any, description: str, **extra: Any) -> Any:
-    """Field with its description; options, their help and the schema are made from it (`sweeps.options`).
+    """Field with its description. Options, their help and the schema are made from it (`sweeps.options`).
 
     Args:
-        default: value if not stated; description: meaning without the unit (the name ends with the unit).
-        extra: `usual`, the meaning of a default of None, in words; `flag`, its option, if it differs from its name;
-            `solver`, how its command solves, which few need: hidden in `--help`, and a key of `[solver]`;
-            `verbatim`, a list each of whose texts may have commas; `metavar` of an argument; `format`, such as path;
-            `minimum`, where the command asks for more than the field; `executes`, whose value is code that is run,
-            or leads to such: a file may state it with `--trust` only; `argument`, if it is no option.
+        default: value if not stated.
+        description: meaning without the unit (the name ends with the unit).
+        extra: `usual`, the meaning of a default of None, in words. `flag`, its option, if it differs from its name.
+            `solver`, how its command solves, which few need: hidden in `--help`, and a key of `[solver]`.
+            `verbatim`, a list each of whose texts may have commas. `metavar` of an argument. `format`, such as path.
+            `minimum`, where the command asks for more than the field. `executes`, whose value is code that is run,
+            or leads to such: a file may state it with `--trust` only. `argument`, if it is no option.
     """
     return Field(default=default, description=description, json_schema_extra=extra or None)
 
 
 class Part(BaseModel):
-    """A part of a command's configuration; unknown keys are refused."""
+    """A part of a command's configuration. Unknown keys are refused."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -83,7 +84,7 @@ class RobotPart(Part):
 
 
 class FolderPart(Part):
-    """Run folder of a command; it changes no number."""
+    """Run folder of a command. It changes no number."""
 
     out: Path | None = option_field(None, "The run folder", usual="runs/COMMAND-TIME")
     force: bool = option_field(False, "Replace an existing run folder")
@@ -164,17 +165,17 @@ def _most(option: str) -> float:
 
 
 def _usual(option: str, shown: float = math.inf) -> str:
-    """Default of a fidelity's option by fidelity; of `simulate` at most `shown`."""
-    found = {name: o.default for name, o in _having(option).items()}
-    capped = {name: f"{v:g}" + (f", simulate {shown:g}" if v > shown else "") for name, v in found.items()}
-    return "; ".join([f"{name} {text}" for name, text in capped.items()] if len(found) > 1 else capped.values())
+    """Default of a fidelity's option by fidelity. Of `simulate` at most `shown`."""
+    defaults = {name: o.default for name, o in _having(option).items()}
+    capped = {name: f"{v:g}" + (f", simulate {shown:g}" if v > shown else "") for name, v in defaults.items()}
+    return "; ".join([f"{name} {text}" for name, text in capped.items()] if len(defaults) > 1 else capped.values())
 
 
 Duration = Annotated[float, positive(_most("duration"))]
 
 
 class FidelityPart(ModelPart):
-    """Fidelity of the simulation and its options; None takes the fidelity's default."""
+    """Fidelity of the simulation and its options. None takes the fidelity's default."""
 
     duration_s: Duration | None = option_field(None, "Length of a run", usual=_usual("duration", SHOWN))
     step_s: Annotated[float, positive(_most("step"))] | None = option_field(
@@ -203,7 +204,7 @@ class FidelityPart(ModelPart):
 
 
 class BatchPart(FidelityPart):
-    """Number of runs in one batch; None takes the fidelity's."""
+    """Number of runs in one batch. None takes the fidelity's."""
 
     chunk: Annotated[int, Field(ge=1, le=1_000_000_000)] | None = option_field(
         None,
@@ -242,7 +243,7 @@ def _shown(values: Iterable[float]) -> str:
 
 
 class OneRun(Part):
-    """The conditions of one run, by the columns of a table of runs; None is left to the robot.
+    """The conditions of one run, by the columns of a table of runs. None is left to the robot.
 
     The run itself checks its values (`inputs.one_run`), like a row of a table.
     """
@@ -314,9 +315,9 @@ class Picture(OneRun):
 
 
 class AxesPart(Part):
-    """Axes of a grid; None leaves them to `sweeps.points.grid.resolve_grid`: Table 8 for the packaged robot.
+    """Axes of a grid. None leaves them to `sweeps.points.grid.resolve_grid`: Table 8 for the packaged robot.
 
-    A robot has voltages or motor speeds, on the battery neither; payloads, slopes and surface are of a vehicle.
+    A robot has voltages or motor speeds, on the battery neither. Payloads, slopes and surface are of a vehicle.
     """
 
     configurations: Several[str] | None = option_field(
@@ -367,7 +368,7 @@ class InferencePart(Part):
 
 
 class MembersPart(Part):
-    """Folder in which a population keeps its runs; it changes no number."""
+    """Folder in which a population keeps its runs. It changes no number."""
 
     members: Path | None = option_field(
         None, "File that keeps the population's runs; the same command with it goes on from there", solver=True
@@ -387,7 +388,7 @@ class LoopBeside(FittedRuns):
 
     @property
     def seconds(self) -> float | None:
-        """The time [s]; None: as long as it takes."""
+        """The time [s]. None: as long as it takes."""
         if self.within is None:
             return None
         number = self.within.rstrip("sminh")
@@ -395,7 +396,7 @@ class LoopBeside(FittedRuns):
 
 
 class TurnPart(Part):
-    """Different drive of the two sides of one run; None: the same."""
+    """Different drive of the two sides of one run. None: the same."""
 
     left_V: Voltage | None = option_field(
         None, "Voltage of the left motor (V); with --right the robot is free to turn"
@@ -492,12 +493,12 @@ class ProfilePart(FidelityPart):
 
     @property
     def options(self) -> dict[str, float]:
-        """Every option of the fidelity; over a profile it has none."""
+        """Every option of the fidelity. Over a profile it has none."""
         return super().options if self.profile is None else {}
 
 
 class Simulate(RobotPart, DataPart, ProfilePart, SupplyPart, TurnPart, PosteriorPart, OutputPart):
-    """A few given runs; those over time from standstill, or over a profile."""
+    """A few given runs. Those over time from standstill, or over a profile."""
 
     @model_validator(mode="after")
     def _certain(self) -> Self:
@@ -513,7 +514,7 @@ class Simulate(RobotPart, DataPart, ProfilePart, SupplyPart, TurnPart, Posterior
 
     @property
     def options(self) -> dict[str, float]:
-        """Every option of the fidelity; a run is short where its length is not stated."""
+        """Every option of the fidelity. A run is short where its length is not stated."""
         options = super().options
         if self.duration_s is None and "duration" in options:
             options["duration"] = min(options["duration"], SHOWN)
@@ -660,7 +661,7 @@ class FeedforwardPart(Part):
 
 
 class Calibrate(RobotPart, DataPart, InferencePart, FeedforwardPart, OutputPart):
-    """Options of a calibration; for None the fidelity or the data decide."""
+    """Options of a calibration. For None the fidelity or the data decide."""
 
     model: Annotated[str, AfterValidator(_fidelity)] | None = option_field(
         None, f"Fidelity: {', '.join(fidelities.NAMES)}", usual="drive for a log over time, else steady"
@@ -780,7 +781,7 @@ class Size(RequirementsPart, RobotPart, OutputPart):
 
 
 class Sensitivity(RobotPart, DataPart, FidelityPart, SupplyPart, AxesPart, OutputPart):
-    """A sensitivity study; methods that draw a sample take corners and middle of the axes that are not stated."""
+    """A sensitivity study. Methods that draw a sample take corners and middle of the axes that are not stated."""
 
     method: str = option_field(
         "sobol",
@@ -842,18 +843,18 @@ def _keys(kind: type[Part], file: Path, beside: type[Part] | None) -> Json:
     table = values.pop("solver", {})
     if not isinstance(table, dict):
         raise BadConfiguration(f"{file.name}, solver: got {table!r}; expected a table, [solver]")
-    own, others = fields_with(kind, "solver"), [] if beside is None else fields_with(beside, "solver")
+    own_fields, others = fields_with(kind, "solver"), [] if beside is None else fields_with(beside, "solver")
     for key in table:
-        if key not in own + others:
-            known = allowed_words(key, own + others) if own + others else "this command has none"
-            raise BadConfiguration(f"{file.name}, solver.{key}: no such key; {known}")
+        if key not in own_fields + others:
+            allowed = allowed_words(key, own_fields + others) if own_fields + others else "this command has none"
+            raise BadConfiguration(f"{file.name}, solver.{key}: no such key; {allowed}")
         if key in values:
             raise BadConfiguration(f"{file.name}, solver.{key}: the file states {key} too; expected it once")
-    return {**values, **{key: value for key, value in table.items() if key in own}}
+    return {**values, **{key: value for key, value in table.items() if key in own_fields}}
 
 
 def resolve_beside(kind: type[C], file: Path | None, options: Json, trust: bool = False) -> C:
-    """Returns the options of a command outside its configuration; a file may state their `[solver]` keys only.
+    """Returns the options of a command outside its configuration. A file may state their `[solver]` keys only.
 
     Args:
         trust: as of `resolve_configuration`.
@@ -876,8 +877,8 @@ def resolve_configuration(
     """The configuration of a command: defaults, then the file's keys, then the options given (not None).
 
     Args:
-        beside: further options of the command; the file's table `[solver]` may state them too.
-        trust: true if the file may state code to execute; otherwise only options may.
+        beside: further options of the command. The file's table `[solver]` may state them too.
+        trust: true if the file may state code to execute, otherwise only options may.
 
     Raises:
         BadConfiguration: unreadable file, unknown key, a value out of range, or what a file may not state.
@@ -912,8 +913,8 @@ def _sentence(kind: type[Part], error: ValidationError, file: Path | None, given
         return options.get(name, name) if file is None or name in given else name
 
     if first["type"] == "idle":  # whose message has fields between backticks
-        said = re.sub(r"`(\w+)`", lambda found: called(found[1]), first["msg"])
-        return said if file is None else f"{file.name}: {said}"
+        message = re.sub(r"`(\w+)`", lambda found: called(found[1]), first["msg"])
+        return message if file is None else f"{file.name}: {message}"
     key = str(first["loc"][0])
     place = ".".join(str(part) for part in first["loc"])
     where = f"{file.name}, {place}" if file is not None and key not in given else called(key)
@@ -930,7 +931,7 @@ def _sentence(kind: type[Part], error: ValidationError, file: Path | None, given
 
 
 def as_toml(config: Part) -> str:
-    """The resolved configuration; `--config` accepts it."""
+    """The resolved configuration, which `--config` accepts."""
     from calibration.data.writing import toml_value  # with NumPy, which --help does not wait for
 
     lines = []

@@ -42,7 +42,7 @@ SIZE = "obstacle_mm"
 
 
 class Obstacle(Part):
-    """Obstacle that every point of a sweep climbs (`sweeps.points.climbs`); its size is the axis `obstacle_mm`, or
+    """Obstacle that every point of a sweep climbs (`sweeps.points.climbs`). Its size is the axis `obstacle_mm`, or
     found by a search."""
 
     kind: Literal["step", "stairs", "gap"]
@@ -64,14 +64,14 @@ class Obstacle(Part):
 
 
 class Campaign(RobotPart, ProfilePart, BatchPart, OutputPart):
-    """A sweep of any size over any names, into a Zarr store; `sweeps.points.axes` reads its tables.
+    """A sweep of any size over any names, into a Zarr store. `sweeps.points.axes` reads its tables.
 
     Attributes:
         conditions: constant conditions, by name.
         axes: of the grid, by name: a list, `first:last:step`, or a table with start, stop, number and scale.
         samples: a sampled design: design, number, seed, over (distributions by name), posterior.
-        outputs: names of `mmrjax.fidelities.outputs.output_table()`, of columns of the fidelity, or flags; empty: the
-            channels. Over a profile columns of `missions.mission_batch.OUTPUTS`, or flags; empty: its `USUAL`.
+        outputs: names of `mmrjax.fidelities.outputs.output_table()`, of columns of the fidelity, or flags. Empty: the
+            channels. Over a profile columns of `missions.mission_batch.OUTPUTS`, or flags. Empty: its `USUAL`.
         storage: type in which outputs are stored.
         compression: of the store's chunks.
         obstacle: that every point climbs, in place of a run of the fidelity.
@@ -87,7 +87,7 @@ class Campaign(RobotPart, ProfilePart, BatchPart, OutputPart):
 
 
 class StoreOptions(FolderPart):
-    """Execution and storage options of a sweep; they do not affect results."""
+    """Execution and storage options of a sweep. They do not affect results."""
 
     plan: Path | None = option_field(
         None, "TOML file with [axes] or [samples] (docs/reference/plans.md)", argument=True, metavar="[CONFIG.toml]"
@@ -144,7 +144,7 @@ def resolve_campaign(file: Path | None, options: Json, trust: bool = False) -> C
     A grid is one of a store's once the robot is known (`of_grid`).
 
     Raises:
-        BadConfiguration: as `resolve`; an option of the grid with a file that has its own axes.
+        BadConfiguration: as `resolve`. An option of the grid with a file that has its own axes.
     """
     if file is not None and not set(KEYS).isdisjoint(read_toml(file)):
         assert file is not None
@@ -172,11 +172,11 @@ def of_grid(grid: Sweep) -> Campaign:
         "slope_deg": grid.slopes_deg,
     }
     # every run of the grid with every robot drawn, which the store keeps along its last dimension
-    drawn = {"design": "random", "number": grid.posterior, "posterior": str(Path(grid.robot).parent)}
+    sampled = {"design": "random", "number": grid.posterior, "posterior": str(Path(grid.robot).parent)}
     names = "all" if grid.configurations is None else list(grid.configurations)
     return Campaign(
         **{key: getattr(grid, key) for key in Sweep.model_fields if key in Campaign.model_fields},
-        samples=drawn if grid.posterior is not None else {},
+        samples=sampled if grid.posterior is not None else {},
         axes={"configuration": names, **{name: list(values) for name, values in axes.items() if values is not None}},
         conditions={
             **({} if grid.surface is None else {"surface": grid.surface}),

@@ -52,7 +52,7 @@ _out = _Outlet(highlight=False, soft_wrap=True, markup=False, width=_WIDTH)
 
 
 class _Messages(io.TextIOBase):
-    """Standard error; messages that it does not take, for instance because its disk is full, are lost."""
+    """Standard error. Messages that it does not take, for instance because its disk is full, are lost."""
 
     def write(self, text: str) -> int:
         with contextlib.suppress(OSError):
@@ -93,14 +93,14 @@ def print_message(text: str) -> None:
 
 
 def rewrite_line(text: str) -> None:
-    """Write the last line of a terminal anew; a file, which keeps every line, gets none."""
+    """Write the last line of a terminal anew. A file, which keeps every line, gets none."""
     if MESSAGES.isatty():
         MESSAGES.write(f"\r\x1b[K{printable(text)[: COLUMNS - 1]}")
         MESSAGES.flush()
 
 
 def wrap_for_terminal(text: str) -> str:
-    """Text for a terminal, in lines of at most `COLUMNS`, what is listed indented; a file gets it as it is."""
+    """Text for a terminal, in lines of at most `COLUMNS`, what is listed indented. A file gets it as it is."""
     return "\n".join(
         textwrap.fill(
             line, COLUMNS, subsequent_indent="  " * line.startswith("- "), break_long_words=False,
@@ -127,18 +127,20 @@ def report_working(name: str) -> Iterator[None]:
 def step_reporter(
     tell: Callable[[str], None], doing: str, silence: float = SILENCE, again: Callable[[str], None] = rewrite_line
 ) -> Iterator[Callable[[str], None]]:
-    """A function that prints the current step; after a silence the step is repeated with its time and the number of
+    """A function that prints the current step. After a silence the step is repeated with its time and the number of
     programs compiled.
 
     Args:
-        tell: prints a line; doing: step before the first call; silence: longest time without output [s].
+        tell: prints a line.
+        doing: step before the first call.
+        silence: longest time without output [s].
         again: rewrites the progress line.
     """
     import jax
 
     from calibration.words.step_words import still_running_sentence
 
-    compiled, said = 0, [(doing, time.monotonic(), 0)]
+    compiled, state = 0, [(doing, time.monotonic(), 0)]
     spoke, over = threading.Event(), threading.Event()
 
     def count(event: str, duration_secs: float, **_: Any) -> None:
@@ -146,7 +148,7 @@ def step_reporter(
         compiled += event.endswith("backend_compile_duration")
 
     def say_it(text: str) -> None:
-        said[:] = [(text, time.monotonic(), compiled)]
+        state[:] = [(text, time.monotonic(), compiled)]
         spoke.set()
         tell(text)
 
@@ -155,7 +157,7 @@ def step_reporter(
             heard = spoke.wait(silence)
             spoke.clear()
             if not heard and not over.is_set():
-                text, since, before = said[0]
+                text, since, before = state[0]
                 again(still_running_sentence(text, time.monotonic() - since, compiled - before))
 
     jax.monitoring.register_event_duration_secs_listener(count)
@@ -171,7 +173,7 @@ def step_reporter(
 
 @contextmanager
 def report_stage(number: int, total: int, doing: str, silent: bool = False) -> Iterator[None]:
-    """Report a stage of a command and, while it lasts, its time; `silent`: without the time, next to a bar."""
+    """Report a stage of a command and, while it lasts, its time. `silent`: without the time, next to a bar."""
     text = f"{number} of {total}, {doing}"
     if silent:
         print_message(text)
@@ -195,10 +197,11 @@ class RateColumn(ProgressColumn):
 def progress_bar(
     total: int, quiet: bool, doing: str = "simulating", done: int = 0, rate: bool = False
 ) -> Iterator[Callable[[float], None]]:
-    """A bar on stderr; gives a function that is called with how much more is done.
+    """A bar on stderr. Gives a function that is called with how much more is done.
 
     Args:
-        done: of the total already; rate: whether to show how many are done in a second.
+        done: of the total already.
+        rate: whether to show how many are done in a second.
     """
     columns = [TextColumn(doing), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn()]
     with Progress(*columns, *([RateColumn()] if rate else []), console=_err, disable=quiet) as bar:

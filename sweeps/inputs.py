@@ -30,9 +30,9 @@ OPTIONS = options_of_fields(OneRun)
 
 
 def load_robot(config: RobotPart) -> RobotFile:
-    """The robot that a configuration names, with its changes; its effects may be the user's own.
+    """The robot that a configuration names, with its changes. Its effects may be the user's own.
 
-    Former names of parameters are taken, and said on stderr; so is a running gear that is an example's.
+    Former names of parameters are accepted, with a note on stderr. A running gear of an example is noted too.
 
     Raises:
         BadConfiguration: no such robot, a file or a change that is refused.
@@ -65,8 +65,8 @@ def _unlike(name: str, robot: Robot) -> Names:
     if why := turn_error(robot, robot.configurations):
         return (turn_words.unlike_sides_note(name, robot.unlike, f"how it would turn is not known: {why}"),)
     value = imposed.imposed_example(robot)
-    found = turns_under_equal_commands(robot, value * RPM if robot.rig.imposed == "motor_speed" else value)
-    turns = turn_words.by_itself(robot, found, value)
+    turn_rows = turns_under_equal_commands(robot, value * RPM if robot.rig.imposed == "motor_speed" else value)
+    turns = turn_words.by_itself(robot, turn_rows, value)
     return (turn_words.unlike_sides_note(name, robot.unlike, turns),) if turns else ()
 
 
@@ -82,9 +82,9 @@ def beside_robot(file: RobotFile) -> Posterior:
             f"--posterior: {file.source} has none; expected --robot FOLDER/robot.toml of calibrate or loop"
         )
     path = Path(file.source).with_name(posterior_file.FILE)
-    found = posterior_file.read_posterior(path)
-    found.check(file.robot, str(path))
-    return found
+    posterior = posterior_file.read_posterior(path)
+    posterior.check(file.robot, str(path))
+    return posterior
 
 
 def fit_of(file: RobotFile, runs: records.Runs) -> str:
@@ -116,8 +116,8 @@ def check_surface(robot: Robot, names: Collection[str], surface: str | None, whe
     Raises:
         BadConfiguration: the message has `where` and the known surfaces.
     """
-    known = surface is None or surface in SURFACES or not robot.rig.scales_adhesion
-    if not known and not all(
+    is_allowed = surface is None or surface in SURFACES or not robot.rig.scales_adhesion
+    if not is_allowed and not all(
         surface_labels.configuration_on_surface(name, str(surface)) in robot.configurations for name in names
     ):
         raise BadConfiguration(
@@ -140,7 +140,8 @@ def read_runs(
     Args:
         source: a file of any format, or a packaged table.
         robot: has the configurations of the table.
-        measured: whether readings are needed; series: whether time histories are taken.
+        measured: whether readings are needed.
+        series: whether time histories are taken.
         columns: a preset or its file, see `records.read_runs`.
         battery: whether the runs are on the battery, see `records.read_runs`.
         of_turns: whether a table of turns has each channel of both sides, and of the yaw, for which it has a column.
@@ -163,14 +164,14 @@ def read_runs(
 
 
 def given_runs(robot: Robot, beside: GivenRuns, config: Simulate, elsewhere: Collection[str] = ()) -> records.Runs:
-    """Runs of a file, or one of options; `elsewhere`: columns that a profile states."""
+    """Runs of a file, or one of options. `elsewhere`: columns that a profile states."""
     if beside.runs is None:
         return one_run(robot, beside.stated, config.battery, elsewhere)
     return read_runs(str(beside.runs), robot, columns=config.columns, measured=False, battery=config.battery)
 
 
 def one_run(robot: Robot, cells: Json, battery: bool = False, elsewhere: Collection[str] = ()) -> records.Runs:
-    """One run from options by column name; without a configuration it is the robot's first.
+    """One run from options by column name, of the robot's first configuration unless stated.
 
     Args:
         elsewhere: columns that a profile states.
@@ -204,7 +205,7 @@ def one_run(robot: Robot, cells: Json, battery: bool = False, elsewhere: Collect
         given = {**bench, "payload_kg": 0.0, "slope_deg": 0.0, **given}
         check_surface(robot, (name,), given.get("surface"), "--surface")
     run = records.single_run({**given, "configuration": name}, layout)
-    if found := misplaced_levers(run, robot):
-        _, column, why = found
+    if misplaced := misplaced_levers(run, robot):
+        _, column, why = misplaced
         raise BadConfiguration(f"{OPTIONS[column]}: {why}")
     return run

@@ -60,8 +60,10 @@ def finish_run_folder(
     """Write the configuration and the page (if wanted), move the folder into place and print its path.
 
     Args:
-        folder: with the command's own files; robot: written as `robot.toml` with a note, if it is not among them.
-        manifest: entries besides program, versions and hashes; runs: the table whose hash is recorded, if any.
+        folder: with the command's own files.
+        robot: written as `robot.toml` with a note, if it is not among them.
+        manifest: entries besides program, versions and hashes.
+        runs: the table whose hash is recorded, if any.
         solved: True if every solver gave an answer.
 
     Returns:
@@ -146,7 +148,8 @@ class Folder:
         """Refuse a `.partial` that is not ours, or holds a file that is not, or interrupted work of another command.
 
         Args:
-            command: that is to go on there; force: begin anew in place of another command.
+            command: that is to go on there.
+            force: begin anew in place of another command.
 
         Raises:
             BadConfiguration: it does.
@@ -171,7 +174,7 @@ class Folder:
         """Refuse to move the finished folder to a path where something has appeared meanwhile.
 
         Raises:
-            OSError: it has; the partial folder is left.
+            OSError: it has, the partial folder is left.
         """
         try:
             self.refuse_taken(force)
@@ -181,12 +184,12 @@ class Folder:
     def _foreign(self) -> set[str]:
         """Names in the partial folder that no command of ours wrote.
 
-        Before the results are written these are all but `PARTS`; later the lock's file lists them.
+        Before the results are written these are all but `PARTS`. Later the lock's file lists them.
         """
-        found = {p.name for p in self.partial.iterdir()} - PARTS
+        foreign = {p.name for p in self.partial.iterdir()} - PARTS
         listed = _json(self.partial / LOCK).get(FOREIGN)
         kept = (self.partial / CHUNKS).glob("*")
-        return (found & set(map(str, listed)) if isinstance(listed, list) else found) | {
+        return (foreign & set(map(str, listed)) if isinstance(listed, list) else foreign) | {
             f"{CHUNKS}/{p.name}" for p in kept if p.suffix not in KEPT
         }
 
@@ -206,7 +209,7 @@ class Folder:
                 shutil.rmtree(entry) if entry.is_dir() and not entry.is_symlink() else entry.unlink()
 
     def _remove_partial(self) -> None:
-        """Delete the partial folder, the lock last; foreign files stay."""
+        """Delete the partial folder, the lock last, foreign files stay."""
         with contextlib.suppress(OSError):
             self._clear()
             if {p.name for p in self.partial.iterdir()} <= {LOCK}:
@@ -230,15 +233,15 @@ class Folder:
             (self.results() / name).write_bytes(content)
 
     def write_json(self, name: str, content: Json) -> None:
-        """Write a JSON file; what is not finite becomes null."""
+        """Write a JSON file. What is not finite becomes null."""
         writing.write_json(self.results() / name, content)
 
     def write_table(self, name: str, columns: Columns) -> None:
-        """Write a table as CSV, and as Parquet too where asked; what is not finite is an empty cell."""
+        """Write a table as CSV, and as Parquet too where asked. What is not finite is an empty cell."""
         writing.write_table(self.results() / name, columns, self.tables)
 
     def finish(self, manifest: Json, runs: Runs | None = None) -> Path:
-        """Write the manifest and move the folder into place; returns its path.
+        """Write the manifest and move the folder into place, returns its path.
 
         Hashes of the folder's `robot.toml` and of the file that `runs` came from, if any, are added, and the names of
         all that the folder holds: `--force` deletes nothing else.
@@ -280,16 +283,16 @@ class Folder:
 
 
 def listed_names(folder: Path) -> list[str] | None:
-    """Names that the manifest of a run folder lists; None if it is no run folder of ours."""
-    found = _json(folder / "manifest.json")
-    names = found.get("contents")
-    if found.get("schema") != MANIFEST or not isinstance(names, list):
+    """Names that the manifest of a run folder lists, None if it is no run folder of ours."""
+    manifest = _json(folder / "manifest.json")
+    names = manifest.get("contents")
+    if manifest.get("schema") != MANIFEST or not isinstance(names, list):
         return None
     return [name for name in names if isinstance(name, str)]
 
 
 def interrupted_run(partial: Path) -> dict[str, str] | None:
-    """Command and identity of an interrupted run; None if a folder is not one of ours.
+    """Command and identity of an interrupted run, None if a folder is not one of ours.
 
     Of a run that was killed before it could write them both are empty.
     """
@@ -317,7 +320,7 @@ def holds_work(partial: Path) -> bool:
 
 
 def share_at_work(partial: Path, own: Path | None = None) -> str | None:
-    """Share of a sweep that another process is computing; None: no such share.
+    """Share of a sweep that another process is computing. None: no such share.
 
     Args:
         own: journal of this process.
@@ -331,7 +334,7 @@ def share_at_work(partial: Path, own: Path | None = None) -> str | None:
 
 
 def try_to_lock(file: TextIO) -> bool:
-    """Lock an open file until it is closed; False if another process has locked it."""
+    """Lock an open file until it is closed, False if another process has locked it."""
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -342,20 +345,20 @@ def try_to_lock(file: TextIO) -> bool:
 
 
 def _json(file: Path) -> Json:
-    """Object of a small JSON file; empty if it cannot be read."""
+    """Object of a small JSON file, empty if it cannot be read."""
     try:
         with file.open("rb") as stream:
-            found = json.loads(stream.read(LARGEST))
+            content = json.loads(stream.read(LARGEST))
     except (OSError, ValueError, RecursionError):
         return {}
-    return found if isinstance(found, dict) else {}
+    return content if isinstance(content, dict) else {}
 
 
 class RunFolder(Folder):
     """A folder that appears at `path` only when `finish` is called.
 
     If the command is stopped, the same command with the same configuration finds its finished chunks in `partial`
-    and goes on; another configuration begins the partial folder anew with `force`. One process at a time works on it.
+    and goes on. Another configuration begins the partial folder anew with `force`. One process at a time works on it.
     """
 
     def __init__(self, path: Path, identity: Json, *, force: bool = False) -> None:
@@ -363,7 +366,7 @@ class RunFolder(Folder):
 
         Args:
             path: where the folder is to appear.
-            identity: what makes this run what it is, its `command` among it; two runs with the same identity share
+            identity: what makes this run what it is, its `command` among it. Two runs with the same identity share
                 their chunks.
             force: replace an existing run folder, and an interrupted one of another command.
 
@@ -392,7 +395,7 @@ class RunFolder(Folder):
             ) from error
 
     def _entered(self) -> TextIO | None:
-        """Lock of the partial folder; None if another process has removed or moved the folder meanwhile."""
+        """Lock of the partial folder, None if another process has removed or moved the folder meanwhile."""
         self.partial.mkdir(parents=True, exist_ok=True)
         lock = (self.partial / LOCK).open("a+", encoding="utf-8")
         if not try_to_lock(lock) or share_at_work(self.partial) is not None:
@@ -457,7 +460,7 @@ class RunFolder(Folder):
             self._lock = None
 
     def chunk(self, name: str) -> Columns | None:
-        """Chunk finished by an interrupted run; None if missing or unreadable."""
+        """Chunk finished by an interrupted run, None if missing or unreadable."""
         from sweeps import stage_files
 
         file = self.partial / CHUNKS / f"{name}.npz"
@@ -489,10 +492,10 @@ class RunFolder(Folder):
                 return kept
             except stage_files.Unreadable:
                 print_message(f"{file}: damaged; computed again")
-        made = make()
+        result = make()
         with contextlib.suppress(OSError, stage_files.Unwritable), writing.replacing(file) as aside:
-            stage_files.write_stage(aside, made)
-        return made
+            stage_files.write_stage(aside, result)
+        return result
 
     def keeps(self, name: str) -> bool:
         """True if the result of a stage is kept."""
@@ -502,10 +505,10 @@ class RunFolder(Folder):
         return self.partial / CHUNKS / f"{re.sub(r'[^a-z0-9.]', '-', name)}.stage"
 
     def move_into_place(self) -> Path:
-        """Drop the chunks, and move the folder to where it is to appear; the lock's file goes last.
+        """Drop the chunks, and move the folder to where it is to appear. The lock's file goes last.
 
         Raises:
-            OSError: something has appeared there meanwhile; the partial folder is left.
+            OSError: something has appeared there meanwhile, the partial folder is left.
         """
         self.refuse_appeared(self._force)
         shutil.rmtree(self.partial / CHUNKS)
@@ -526,7 +529,9 @@ def open_folder(
     Files kept by another version are not continued.
 
     Args:
-        command: its name; config: its configuration; robot: of the configuration, with its changes.
+        command: its name.
+        config: its configuration.
+        robot: of the configuration, with its changes.
         beside: says where the folder is to appear, and if it replaces an existing one.
         runs: the table that it was given, if any.
     """
@@ -548,9 +553,9 @@ def open_folder(
 
 
 def rows_of_fit(robot: Path) -> frozenset[str]:
-    """Hashes of the tables that a robot was fitted to, from the manifest in its folder; may be empty."""
-    found = _json(robot.parent / "manifest.json") if robot.is_file() else {}
-    hashes, arguments = found.get("hashes"), found.get("arguments")
+    """Hashes of the tables that a robot was fitted to, from the manifest in its folder, may be empty."""
+    manifest = _json(robot.parent / "manifest.json") if robot.is_file() else {}
+    hashes, arguments = manifest.get("hashes"), manifest.get("arguments")
     if not isinstance(hashes, dict) or not isinstance(arguments, list) or arguments[:1] not in FITS:
         return frozenset()
     fitted = robot.name != "robot.toml" or hashes.get("robot") == sha256_hex(robot.read_bytes())

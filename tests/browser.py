@@ -64,7 +64,7 @@ class Browser:
         return json.loads(first)
 
     def __call__(self, method: str, **params: object) -> dict:
-        """Call a method of the protocol; what happens meanwhile is kept in `events`."""
+        """Call a method of the protocol. What happens meanwhile is kept in `events`."""
         self.count += 1
         mine = {"id": self.count, "method": method, "params": params}
         if self.session:
@@ -87,7 +87,7 @@ class Browser:
             self.events.append(self._next())
 
     def value(self, script: str) -> object:
-        """What an expression in the page is; it has to be of JSON."""
+        """What an expression in the page is. It has to be of JSON."""
         got = self("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
         if "exceptionDetails" in got:
             raise RuntimeError(got["exceptionDetails"]["exception"].get("description", "?"))

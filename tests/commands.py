@@ -13,7 +13,7 @@ from sweeps import cli
 
 
 def command(arguments: Iterable[object]) -> int:
-    """Run a command, its first words as one string; returns its exit code."""
+    """Run a command, its first words as one string. Returns its exit code."""
     words, *rest = arguments
     with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as end:
         patch.setattr(sys, "argv", ["mmrjax", *str(words).split(), *map(str, rest)])

@@ -48,7 +48,7 @@ STARTED = pytest.StashKey[float]()
 
 
 def _crowded() -> bool:
-    """Whether this process has too many programs to begin another file; where Linux's files are not there: no."""
+    """Whether this process has too many programs to begin another file. Where Linux's files are not there: no."""
     own = Path("/proc/self")
     if not (own / "statm").exists():
         return False
@@ -111,7 +111,7 @@ def pytest_collection_finish():
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
-    """Mark as slow the parameter sets that `quick` leaves to `make test-all`; files that share results come first."""
+    """Mark as slow the parameter sets that `quick` leaves to `make test-all`. Files that share results come first."""
     met: Counter[str] = Counter()
     for item in items:
         mark = item.get_closest_marker("quick")
@@ -305,7 +305,7 @@ def compilations():
 
 @pytest.fixture
 def mmrjax(monkeypatch, capsys, tmp_path):
-    """Run a command in this process, its first words as one string; returns exit code, stdout and stderr."""
+    """Run a command in this process, its first words as one string. Returns exit code, stdout and stderr."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XLA_FLAGS", os.environ.get("XLA_FLAGS", ""))  # a command may set it, for this process alone
 

@@ -60,7 +60,7 @@ def coverage(problem: Problem, truth: Array, draws: int, seed: int, profiles: bo
     Each draw takes new readings (with their sds) and new bench values (the prior means, with theirs): a
     prior is a measurement made beforehand, and intervals that use it cover only if it errs as it says.
     The truth lies within a profile interval where the objective, refitted with the parameter held at its
-    truth, rises by less than the 95 % quantile of χ² with one degree of freedom; that is one refit more
+    truth, rises by less than the 95 % quantile of χ² with one degree of freedom. That is one refit more
     for each parameter and draw.
     """
     keys = jax.random.split(jax.random.key(seed), draws)

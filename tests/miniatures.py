@@ -20,7 +20,7 @@ efficiency_load = "{5} ± 5 %"
 """
 _SHAFT = '[bench]\nload = "shaft"\ninertia = 1e-6\nloss_coulomb = 0.0\n'
 _WHEELS = '[car]\nload = "vehicle"\nmovers = "wheels"\nmass = "{} ± 10 %"\nradius = "{} ± 3 %"\n[car.track]\nloss_coulomb = 0.0\n'
-_WHEELS += '[car.ground]\nrolling_resistance = "0.02 ± 100 %"\n[car.ground.friction]\nstatic = "0.8 ± 30 %"\n'
+_WHEELS += '[car.ground]\nrolling_resistance = "0.02 ± 100 %"\n[car.ground.friction]\nstatic = "0.8 ± 0"\n'
 
 
 def _speed(time: np.ndarray, drive: np.ndarray, gain: float, constant: float, dry: float) -> np.ndarray:
@@ -37,7 +37,7 @@ def _integral(time: np.ndarray, speed: np.ndarray) -> np.ndarray:
 
 
 def step_in_ticks(path: Path) -> Path:
-    """Step of voltage; ticks of 8 kHz, comments with %, rows that end with a semicolon, unwritten rows."""
+    """Step of voltage. Ticks of 8 kHz, comments with %, rows that end with a semicolon, unwritten rows."""
     random = np.random.default_rng(1)
     ticks = 3 + np.cumsum(random.integers(40, 60, 400))
     time = ticks / 8000

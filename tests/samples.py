@@ -100,7 +100,7 @@ def mat73(path: Path, columns: dict[str, np.ndarray]) -> None:
 
 
 def _messages(store, names: tuple[str, str, str], fast_signals, slow_signals, stamped: Callable):
-    """(topic, time [ns], message) of both rates in the order of time; joint states and voltages."""
+    """(topic, time [ns], message) of both rates in the order of time. Joint states and voltages."""
     joint, volts, current = names
     found = []
     for t, v, a in zip(*fast_signals.values(), strict=True):

@@ -103,7 +103,7 @@ def small(p: Mapping[str, float] = settled.CLIMBING) -> settled.Conditions:
 
 @functools.cache
 def calibrated() -> CalibrationResult:
-    """The packaged table from four starts, without profiles and without what is left out; made once for all files."""
+    """The packaged table from four starts, without profiles and without what is left out. Made once for all files."""
     return calibrate(read_runs("measured"), paper_robots.nominal(), starts=4, profiles=False, blocks=())
 
 

@@ -185,7 +185,7 @@ HEAVY = (
 
 @pytest.fixture
 def ended(monkeypatch, capsys, base, tmp_path):
-    """Run a command in a folder that has the valid inputs; gives its exit code, stdout, stderr and what is wrong."""
+    """Run a command in a folder that has the valid inputs. Gives its exit code, stdout, stderr and what is wrong."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XLA_FLAGS", os.environ.get("XLA_FLAGS", ""))
     monkeypatch.setattr(os, "_exit", lambda code: (_ for _ in ()).throw(SystemExit(code)))
@@ -223,7 +223,7 @@ def ended(monkeypatch, capsys, base, tmp_path):
 
 @pytest.fixture
 def asked(ended, tmp_path):
-    """Run a command; returns what is wrong with its answer, empty if nothing is, and its exit code."""
+    """Run a command. Returns what is wrong with its answer, empty if nothing is, and its exit code."""
 
     def ask(*arguments):
         before = inventory(tmp_path)
@@ -370,7 +370,7 @@ def harmed(file, rng):
 
 
 def stopped(monkeypatch, after):
-    """Interrupt a sweep after so many chunks; returns a function that heals it."""
+    """Interrupt a sweep after so many chunks. Returns a function that heals it."""
     honest, count = scale.Compiled.__call__, iter(range(10**6))
 
     def interrupted(*arguments):

@@ -86,7 +86,7 @@ def bounded():
 
 
 def asked(*questions):
-    """What is wrong with the answers to some questions, empty if nothing is; and the refusals."""
+    """What is wrong with the answers to some questions, empty if nothing is, and the refusals."""
     wrong, refused = [], []
     for question in questions:
         began = time.process_time()
@@ -145,7 +145,7 @@ FORMATS = [*TABLES, *LOGS, "robot.wpilog"]
 
 
 def write(folder, name):
-    """Writes a valid file; returns the path to read, and the path of the bytes to damage."""
+    """Writes a valid file. Returns the path to read, and the path of the bytes to damage."""
     path = folder / name
     if name in TABLES:
         TABLES[name](path, samples.table())
@@ -356,7 +356,7 @@ NAMES = [
 
 
 def named(name):
-    """Tables of two columns, one with a name, in each container that can hold it; and files of those that can."""
+    """Tables of two columns, one with a name, in each container that can hold it, and files of those that can."""
     columns = {name: np.arange(4.0), "rpm": np.arange(4.0)}
     yield "a dict", columns
     yield "records", [{name: 1.0, "rpm": 2.0}] * 3

@@ -5,15 +5,13 @@ import csv
 import numpy as np
 import pytest
 import worlds.histories
-from synthetic import SETTLED, known, table
+from synthetic import SETTLED, table
 from test_loop_command import mmrjax
 from worlds import settled, tables
 
 from calibration.data.runs import Runs
-from calibration.inference import checks
-from calibration.inference.calibration import calibrate
 from calibration.inference.conduct import conduct_notes
-from calibration.inference.fit_notes import Remark, Shown, with_codes
+from calibration.inference.fit_notes import Remark, with_codes
 from mmrjax.model import paper_robots, params
 
 CLIMBING = params.replace(paper_robots.nominal(), settled.CLIMBING)
@@ -82,13 +80,6 @@ def test_runs_of_ten_milliseconds_are_said(short):
     assert said.code == "ends_early" and said.runs == RUNS and np.isnan(said.share)
 
 
-@pytest.mark.slow
-def test_loop_and_calibrate_say_both(sliding, short):
-    """Both ask `checks.check_data` before they fit, and keep what it says."""
-    for runs, code in ((sliding, "never_grips"), (short, "ends_early")):
-        assert with_codes(checks.check_data(runs, CLIMBING, (), known(runs)), code)
-
-
 #: A table or histories, and what is said of it by every command that fits.
 REFUSED = {
     "moving": "run start0 is moving at 0 s",
@@ -128,15 +119,6 @@ def tenth(case):
     for name in columns:
         columns[name] = columns[name] / 10 if "_sd_" in name else columns[name]
     return Runs("runs.csv", columns)
-
-
-@pytest.mark.slow
-def test_calibrate_says_that_sds_are_ten_times_too_small():
-    runs = tenth(tables.narrow(seed=3, free=settled.FRICTION))
-    found = calibrate(runs, CLIMBING, starts=2, profiles=False, blocks=())
-    (off,) = with_codes(found.remarks, "noise_off")
-    assert 9.0 < off.factor < 11.0 and off.channel == "" and off.source == "stated"
-    assert found.adequacy.adequate is False and found.adequacy.shown_by == Shown(what="stated")
 
 
 @pytest.mark.slow

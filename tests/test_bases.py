@@ -70,7 +70,7 @@ def test_order_of_levels_that_rise_one_way_and_then_the_other_is_that_of_the_lev
 
 @pytest.mark.parametrize("driven", ["supply_voltage_V", "duty"])
 def test_order_of_a_sorted_table_is_no_driver(driven):
-    """A propeller's rows by rising duty, the supply sagging; steps are uneven."""
+    """A propeller's rows by rising duty, the supply sagging. Steps are uneven."""
     level = np.cumsum(np.random.default_rng(3).uniform(0.05, 1, 30) ** 4)
     columns = {
         "configuration": np.full(30, "bench"), "supply_voltage_V": np.full(30, 24.0), "order": np.arange(30.0),
@@ -88,12 +88,14 @@ def test_time_of_a_single_ramp_is_no_driver():
     columns = {"configuration": np.full(40, "bench"), "time_s": time, "total_current_A": RNG.uniform(1, 5, 40)}
     scope = bases.Scope(("electrical",), ("supply_voltage_V",))
     for voltage, expected in ((time / 4, False), (np.full(40, 9.0), True), (np.abs(time - 19.5), True)):
-        families = curve_families(columns | {"supply_voltage_V": voltage}, np.ones(40), scope=scope)
-        assert ("time" in variables(families)) == expected
+        logged = columns | {"supply_voltage_V": voltage}, np.ones(40)
+        assert ("time" in variables(curve_families(*logged, scope=scope))) == expected
+        windows = [v for v in variables(window_families(*logged, scope=scope)) if v.startswith("time")]
+        assert bool(windows) == expected
 
 
 def test_collinearity_is_not_made_by_the_number_of_terms():
-    """R² of noise is the share of the parameters; adjusted for them it is about 0."""
+    """R² of noise is the share of the parameters. Adjusted for them it is about 0."""
     found = [order_collinearity(shuffled(table(), seed), COUNTS) for seed in range(40)]
     assert abs(np.mean(found)) < 0.1
 
@@ -168,7 +170,8 @@ def test_order_is_told_by_combinations_of_conditions():
 
 def test_windows_of_histories_are_in_time_at_the_same_instants_of_all_runs():
     time = np.tile(np.linspace(0, 1.5, 30), 2)
-    for basis in window_families(table(time_s=time), COUNTS):
+    columns = table(time_s=time, supply_voltage_V=np.full(ROWS, 24.0), slope_deg=np.zeros(ROWS))
+    for basis in window_families(columns, COUNTS):
         over_time = [k for k, (_, v) in enumerate(basis.names) if window_from_name(v).axis == "time"]
         assert over_time
         for shape in np.asarray(basis.columns)[over_time, :, 0]:
@@ -264,7 +267,7 @@ def waves_of(turn):
 
 
 def test_a_wave_is_of_the_runs_that_pass_two_of_it_wherever_they_end():
-    """Runs that come back end where they began; each has a phase of its own, in columns of its own."""
+    """Runs that come back end where they began. Each has a phase of its own, in columns of its own."""
     angle, rows, found = waves_of(7.0)
     wave = found["order 2 of the driving shaft"]
     for k, mine in enumerate(rows):
@@ -273,7 +276,7 @@ def test_a_wave_is_of_the_runs_that_pass_two_of_it_wherever_they_end():
 
 
 def test_pieces_of_a_wave_have_one_phase_in_all_runs():
-    """A piece with a phase of its own is any level and trend of a run; no name is held against what can be anything."""
+    """A piece with a phase of its own is any level and trend of a run. No name is held against what can be anything."""
     angle, _, found = waves_of(1.2)
     assert set(found) == {f"order {k} of the driving shaft" for k in (1, 2, 3)}
     for k in (1, 2, 3):

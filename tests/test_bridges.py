@@ -104,13 +104,6 @@ def test_every_run_with_a_limit_or_a_diode_is_solved(kind, one_way):
     checked(kind, one_way, 400)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("one_way", [False, True])
-@pytest.mark.parametrize("kind", ["robot", "dyno"])
-def test_ten_thousand_runs_with_a_limit_or_a_diode_are_solved(kind, one_way):
-    checked(kind, one_way, 10_000)
-
-
 @pytest.mark.parametrize("one_way", [False, True])
 def test_derivatives_in_each_mode_are_differences_of_the_bisection(one_way):
     """Along a change of limit and voltage together."""

@@ -166,7 +166,7 @@ def test_a_table_is_sorted_by_its_headings_and_a_figure_says_its_values(browser,
 
 
 def drag(browser, element, begin, end):
-    """Press the mouse in an element and release it elsewhere; both are shares of its width."""
+    """Press the mouse in an element and release it elsewhere. Both are shares of its width."""
     x, y, width, height = browser.value(f"""(() => {{
       const e = document.querySelector("{element}");
       e.scrollIntoView({{block: "center"}});

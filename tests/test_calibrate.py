@@ -4,8 +4,6 @@ import dataclasses
 import json
 import math
 import re
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -35,7 +33,6 @@ from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import channels, paper_robots
 from sweeps.report import calibration_report
 from sweeps.report.terminal_renderer import print_document
-from tests.commands import ends
 from tests.commands import rows as rows_of
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -351,37 +348,6 @@ def test_drive_reads_settled_rows_rolling_and_agrees_with_steady(measured):
     assert any(note.startswith("rows 3: computed from a rolling start; from standstill") for note in made.notes)
 
 
-@pytest.mark.slow
-def test_the_command_leaves_a_folder_that_other_commands_take(tmp_path, monkeypatch, capsys):
-    from sweeps import cli
-
-    monkeypatch.chdir(tmp_path)
-
-    def mmrjax(*arguments):
-        monkeypatch.setattr(sys, "argv", ["mmrjax", *arguments])
-        with pytest.raises(SystemExit) as end:
-            cli.main()
-        out = capsys.readouterr()
-        return end.value.code, out.out, out.err
-
-    _, out, err = ends(mmrjax("calibrate", "measured", "--starts", "4", "--no-profiles", "--out", "c"), code=0)
-    assert all(line.startswith("still fitting (") for line in err.splitlines())
-    assert out.rstrip().splitlines()[-1] == "c"
-    result = json.loads((tmp_path / "c" / "result.json").read_text())
-    assert result["schema"] == "mmrjax.calibrate/1" and result["optimizer"]["status"] == "converged"
-    assert len(rows_of(tmp_path / "c" / "rows.csv")) == 20
-    page = (tmp_path / "c" / "report.html").read_text()
-    assert "http://" not in page.replace("http://www.w3.org", "") and "6T2A.track.guide_share" in page
-    ends(mmrjax("compare", "measured", "--robot", "c/robot.toml", "--no-report", "--out", "d"), code=0)
-    # Percentages differ: `compare` keeps equation (35), so the readings themselves are compared.
-    fitted, compared = (rows_of(tmp_path / folder) for folder in ("c/rows.csv", "d/comparison.csv"))
-    for mine, theirs in zip(fitted, compared, strict=True):
-        for c in channels.channels_named(channels.USUAL):
-            assert float(theirs[f"simulated_{c.column}"]) == pytest.approx(float(mine[f"after_{c.column}"]), rel=1e-6)
-    ends(mmrjax("calibrate", "measured", "--free", "6T2A.mu"), "--free 6T2A.mu: no such parameter")
-    ends(mmrjax("calibrate", "nowhere.csv"), "no such file", code=4)
-
-
 # --- missing readings -----------------------------------------------------------------------------------
 
 
@@ -465,33 +431,6 @@ static = 0.6
 """
 
 
-@pytest.mark.slow
-def test_a_robot_with_a_configuration_of_its_own_calibrates_from_its_file_alone(tmp_path):
-    (tmp_path / "rover.toml").write_text(ROVER)
-    rover = robot_file.read_robot(tmp_path / "rover.toml")
-    conditions = records.Runs(
-        "rover.csv",
-        {
-            "configuration": np.full(8, "rover"), "supply_voltage_V": np.repeat([15.0, 24.0], 4),
-            "total_mass_kg": np.full(8, 6.0), "payload_kg": np.zeros(8), "slope_deg": np.tile([0.0, 4.0, 8.0, 12.0], 2),
-        },
-    )  # fmt: skip
-    creep = "rover.ground.friction.speed_static"
-    truth = robot_file.change_robot(rover, {creep: 0.05}, where="test")
-    shown = steady_batch(truth, conditions.conditions(truth))
-    runs = changed(
-        conditions, **{c.column: np.asarray(shown.reading[c.name]) / c.factor for c in channels.usual_channels()}
-    )
-    made = quick(runs, rover, noise="current=1%,motor_speed=0.5%,speed=1%")
-    assert set(made.parameters) == {f"rover.{name}" for name in priors.FRICTION}
-    low, high = made.parameters[creep].interval
-    assert made.converged and low < 0.05 < high and made.parameters[creep].value > 0.03  # nominal 0.02
-    assert max(e.rms_sigma for e in made.errors_after.values()) < 0.5
-    made.save(tmp_path / "fitted")
-    again = robot_file.read_robot(tmp_path / "fitted" / "robot.toml")
-    assert again.configurations.names == ("rover",) and again.sides == 4 and again.battery.cells == 4
-
-
 def test_a_configuration_that_the_robot_lacks_lists_those_that_it_has(measured, tmp_path):
     (tmp_path / "rover.toml").write_text(ROVER)
     says = r"measured row 1?1?, configuration: got (4W2T|6T2A); expected one of these; .*allowed: rover"
@@ -499,52 +438,7 @@ def test_a_configuration_that_the_robot_lacks_lists_those_that_it_has(measured, 
         quick(measured, robot_file.read_robot(tmp_path / "rover.toml"))
 
 
-FOURTH_CHANNEL = """
-import dataclasses, jax
-jax.config.update("jax_enable_x64", True)
-import numpy as np
-from mmrjax.model import quantities
-quantities.TABLE["channel"] += (quantities.Channel(
-    "terminal_voltage", "V", "terminal voltage", (0.0, 100.0), 10.0, word="voltage", signal="voltage"
-),)
-from mmrjax.model import channels
-channels.USUAL += ("terminal_voltage",)
-import calibration
-from mmrjax.model import paper_robots as robots
-runs = calibration.read_runs("measured")
-volts = runs["supply_voltage_V"] * 1.001
-runs = dataclasses.replace(runs, columns={**runs.columns, "terminal_voltage_V": volts})
-stated = "current=9%,motor_speed=6%,speed=4%,voltage=0.1%"
-found = calibration.calibrate(runs, robots.nominal(), starts=2, profiles=False, blocks=(), noise=stated)
-assert found.converged and found.readings["terminal_voltage"].after.shape == (20,)
-assert_allclose(found.readings["terminal_voltage"].sigma, -1 / 1.001, rtol=1e-6)
-assert_allclose(found.rows()["after_terminal_voltage_V"], runs["supply_voltage_V"])
-assert found.chi_square.degrees_of_freedom > 80 - len(found.parameters)
-assert found.to_json()["errors"]["after"]["fitted"]["terminal_voltage"]["rows"] == 20
-"""
-
-
-@pytest.mark.slow
-def test_a_fourth_channel_is_one_row_of_the_table():
-    done = subprocess.run(
-        [sys.executable, "-c", FOURTH_CHANNEL], cwd=ROOT, capture_output=True, text=True, timeout=600
-    )
-    assert done.returncode == 0, done.stderr
-
-
 # --- from Python ------------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_public_names_load_no_jax_until_they_are_asked_for():
-    code = (
-        "import calibration, sys; print('jax' in sys.modules, calibration.read_runs.__name__, len(dir(calibration)))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)
-    assert done.stdout.startswith("False read"), done.stdout + done.stderr
-    assert calibration.calibrate is calibrate and calibration.read_robot is robot_file.load_robot
-    with pytest.raises(AttributeError, match="no attribute calibrat"):
-        calibration.calibrat  # noqa: B018
 
 
 @pytest.mark.slow

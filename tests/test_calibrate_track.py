@@ -134,7 +134,7 @@ def test_a_belt_too_stiff_for_the_step_is_said(base, made):
 @pytest.mark.nightly
 @pytest.mark.slow
 def test_packaged_data_calibrate_through_the_track_model_and_agree_with_steady():
-    """docs/lab/figures.md, Calibration through the track model; some ten minutes on two cores."""
+    """docs/lab/figures.md, Calibration through the track model. Some ten minutes on two cores."""
     runs = records.read_runs("measured")
     found = calibrate(runs, paper_robots.nominal(), model="track", starts=1)
     assert found.converged and (found.status == "converged").all()

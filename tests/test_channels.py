@@ -24,7 +24,6 @@ from calibration.inference import estimates, noise, observers
 from calibration.inference.result import CalibrationResult
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import channels, params, quantities
-from sweeps.commands import rig_new
 
 RIG = """base = "none"
 sides = 1
@@ -64,7 +63,7 @@ def written(path, columns):
 
 
 def made_up(robot, unit=None):
-    """Readings of every channel with their sds, told apart by their size; of torque in another unit where asked."""
+    """Readings of every channel with their sds, told apart by their size. Of torque in another unit where asked."""
     found = {"supply_voltage_V": VOLTAGES}
     for k, c in enumerate(robot.channels):
         scale, column = 1.0, c.column
@@ -280,20 +279,6 @@ def test_two_rigs_are_calibrated_side_by_side_as_alone(tmp_path):
         again = list(pool.map(lambda case: calibration.calibrate(case[1], case[0], **OPTIONS), cases * 2))
     for one, other in zip(again, alone * 2, strict=True):
         assert one.to_json() == other.to_json()
-
-
-@pytest.mark.slow
-def test_the_file_of_a_new_bench_is_calibrated_and_saved(tmp_path):
-    (tmp_path / "bench.toml").write_text(rig_new.rig_template("bench"), encoding="utf-8")
-    robot = calibration.read_robot(str(tmp_path / "bench.toml"))
-    shown = made_up(robot)
-    columns = {"configuration": np.full(12, robot.configurations.names[0]), "supply_voltage_V": VOLTAGES}
-    reading = steady_batch(robot, Runs("made", columns, layout=Layout.of(robot)).conditions(robot)).reading
-    shown |= {c.column: np.asarray(reading[c.name]) / c.factor for c in robot.channels}
-    runs = calibration.read_runs(written(tmp_path / "t.csv", shown), robot=robot)
-    found = calibration.calibrate(runs, robot, **OPTIONS)
-    found.save(tmp_path / "found")
-    assert (tmp_path / "found" / "rows.csv").exists() and found.channels == robot.channels
 
 
 @pytest.mark.slow

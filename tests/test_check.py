@@ -34,7 +34,7 @@ def read(text):
 
 
 def some_of_the_papers(*kept: str) -> str:
-    """The paper's file with some of its aims, in the same envelope; of the endurances that of standing still."""
+    """The paper's file with some of its aims, in the same envelope. Of the endurances that of standing still."""
     text = (Path(requirements_file.__file__).parent / "aims" / "paper.toml").read_text("utf-8")
     head, envelope, tail = text.partition("[envelope]")
     lines = [line for line in head.splitlines() if line.partition(" ")[0] in ("schema", *kept)]
@@ -54,7 +54,7 @@ def folder(request, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def values(folder):
-    """The result of more aims; where the folder lacks them, without what would change them."""
+    """The result of more aims. Where the folder lacks them, without what would change them."""
     found = json.loads((folder / "result.json").read_text())
     if "winding_C" in {r["name"] for r in found["requirements"]}:
         return found
@@ -82,7 +82,7 @@ def test_result_is_as_its_schema_says(result):
 
 @pytest.mark.slow
 def test_papers_robot_misses_the_papers_aims(values):
-    """0.95 m/s on a full battery; 2200 mAh with 1.5 A for other consumers last 88 minutes standing still."""
+    """0.95 m/s on a full battery, 2200 mAh with 1.5 A for other consumers last 88 minutes standing still."""
     speed, standing = row(values, "speed_m_s"), row(values, "endurance_min")
     assert not speed["met"] and speed["value"] == pytest.approx(0.95, abs=0.005)
     assert speed["at"] == {
@@ -120,7 +120,7 @@ def test_worst_corner_is_the_worst_of_a_finer_grid(values, robot):
 
 @pytest.mark.slow
 def test_every_change_meets_its_requirement_and_breaks_what_it_says(folder, result, robot):
-    """Each stated value, put into the robot as `--set` does, and checked anew; and half of the change does not."""
+    """Each stated value, put into the robot as `--set` does, and checked anew, and half of the change does not."""
     asked, tried = requirements_file.load_requirements(folder / "requirements.toml"), 0
     names = [r["name"] for r in result["requirements"]]
     for k, r in enumerate(result["requirements"]):
@@ -143,16 +143,6 @@ def test_every_change_meets_its_requirement_and_breaks_what_it_says(folder, resu
             assert not short.met, (r["name"], c, near)
             tried += 1
     assert tried > (8 if len(names) > 5 else 1)
-
-
-@pytest.mark.slow
-def test_change_follows_the_derivative(result):
-    speed = row(result, "speed_m_s")
-    by = {c["parameter"]: c for c in speed["change"]}
-    assert by["gearbox.ratio"]["gradient"] < 0 and by["gearbox.ratio"]["to"] < 48
-    assert by["6T2A.radius"]["gradient"] > 0
-    linear = by["gearbox.ratio"]["from"] - speed["margin"] / by["gearbox.ratio"]["gradient"]
-    assert by["gearbox.ratio"]["to"] == pytest.approx(linear, rel=0.02)
 
 
 def point(**given):
@@ -410,7 +400,7 @@ def of_posture(robot):
 
 @pytest.mark.slow
 def test_steps_and_sizes_of_section_2_2(of_posture):
-    """300 mm no posture allows; 400 and 100 mm hold."""
+    """300 mm no posture allows, 400 and 100 mm hold."""
     assert of_posture["step_mm"].value == pytest.approx(245.6, abs=0.1) and not of_posture["step_mm"].met
     assert of_posture["step_mm"].at["payload_kg"] == 8
     assert of_posture["gap_mm"].value == pytest.approx(352.7, abs=0.1) and of_posture["gap_mm"].met
@@ -431,7 +421,7 @@ def test_longer_levers_would_get_over_the_step(robot):
 
 @pytest.mark.slow
 def test_stairs_need_friction_reach_and_a_tread(robot):
-    """A flat belt holds up to its friction; on asphalt its length decides."""
+    """A flat belt holds up to its friction. On asphalt its length decides."""
     text = 'stairs_rise_mm = {{ least = 170, tread_mm = 290, surface = "{}" }}'
 
     def rise(surface):

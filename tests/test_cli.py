@@ -28,59 +28,6 @@ HEADER = (
 CLIMBS = ["--set", "6T2A.ground.friction.static=0.6", "--set", "4W2T.ground.friction.static=0.6"]
 
 
-@pytest.mark.slow
-def test_sweep_is_table_8_in_both_configurations(mmrjax, tmp_path):
-    _, out, _ = ends(mmrjax("sweep --no-report --out s"), code=0)  # that some slide is an answer
-    assert out.rstrip().splitlines()[-1] == "s"
-    rows = table(tmp_path / "s" / "runs.csv")
-    points = {(r["configuration"], r["supply_voltage_V"], r["payload_kg"], r["slope_deg"]) for r in rows}
-    assert len(rows) == len(points) == 180 == 2 * 3 * 6 * 5
-    for row in rows:  # never a silent NaN: no number only where the status says so
-        assert (row["total_current_A"] == "") == (row["status"] != "converged")
-        assert float(row["total_mass_kg"]) == (13.1 if row["configuration"] == "6T2A" else 11.5) + float(
-            row["payload_kg"]
-        )
-    result = json.loads((tmp_path / "s" / "result.json").read_text())
-    assert result["schema"] == "mmrjax.sweep/1" and sum(result["statuses"].values()) == 180
-    manifest = json.loads((tmp_path / "s" / "manifest.json").read_text())
-    assert manifest["float"] == "float64" and manifest["versions"]["jax"] and "devices" in manifest
-    assert sorted(p.name for p in (tmp_path / "s").iterdir()) == [
-        "config.resolved.toml", "manifest.json", "result.json", "robot.toml", "runs.csv",
-    ]  # fmt: skip
-
-
-@pytest.mark.slow
-def test_sweep_repeats_from_what_it_left(mmrjax, tmp_path):
-    assert mmrjax("sweep --slopes 0:10:5 --voltages 24 --payloads 0 --no-report --out a --set motor.resistance=0.9")[0] == 0  # fmt: skip
-    assert mmrjax("sweep --config a/config.resolved.toml --out b")[0] == 0
-    assert mmrjax("sweep --config a/config.resolved.toml --robot a/robot.toml --out c")[0] == 0
-    runs = [(tmp_path / k / "runs.csv").read_text() for k in "abc"]
-    assert runs[0] == runs[1] == runs[2] and runs[0].count("\n") == 7
-
-
-@pytest.mark.slow
-def test_simulate_runs_from_a_file_of_conditions(mmrjax, tmp_path):
-    (tmp_path / "plan.csv").write_text(
-        "configuration,supply_voltage_V,payload_kg,slope_deg,run_id,note\n6T2A,24,2,3,a,x\n"
-    )
-    ends(mmrjax("simulate --runs plan.csv --no-report --out p"), "not used: note", code=0)
-    assert table(tmp_path / "p" / "runs.csv")[0]["run_id"] == "a"
-
-
-@pytest.mark.slow
-def test_battery_sags_and_ends_clearly(mmrjax, tmp_path):
-    code, _, _ = mmrjax("simulate --battery --no-report --out full")
-    (full,) = table(tmp_path / "full" / "runs.csv")
-    current = float(full["total_current_A"])
-    assert code == 0 and float(full["voltage_V"]) == pytest.approx(8 * (4.17 - 0.049 * (current + 1.5)))
-    ends(
-        mmrjax("simulate --battery --discharge 2300 --no-report --out empty"),
-        "battery empty",
-        "the battery's capacity is used up",
-        code=0,
-    )
-
-
 def test_compare_own_mass_takes_the_robots(mmrjax, tmp_path):
     mmrjax("compare --no-report --out stated", *CLIMBS)
     mmrjax("compare --no-report --own-mass --out own", *CLIMBS)
@@ -222,7 +169,7 @@ def test_sweep_track_has_a_bar_a_status_a_run_and_the_share_of_each(mmrjax, tmp_
 
 @pytest.mark.slow
 def test_track_run_is_interrupted_while_it_runs_and_leaves_nothing(mmrjax, tmp_path, monkeypatch):
-    """The bar moves within a batch; an interrupt between two of its moves ends the command."""
+    """The bar moves within a batch. An interrupt between two of its moves ends the command."""
     from rich.progress import Progress
 
     honest, moves = Progress.update, []
@@ -528,17 +475,6 @@ def test_check_passes_on_this_installation(mmrjax):
     _, out, _ = ends(mmrjax("--check"), "24 V / C_E", code=0)
     assert "FAILED" not in out
     assert "compilation cache" in out and ("programs" in out or "off" in out)
-
-
-@pytest.mark.slow
-def test_cache_is_neither_read_nor_written_when_it_is_not_wanted(tmp_path):
-    here = {**os.environ, "MMRJAX_CACHE": str(tmp_path / "cache"), "JAX_PLATFORMS": "cpu"}
-    for name, option in (("without", ["--no-cache"]), ("with", [])):
-        words = [*MMRJAX, "simulate", "--no-report", "--out", str(tmp_path / name), *option]
-        assert subprocess.run(words, capture_output=True, env=here).returncode == 0
-        kept = list((tmp_path / "cache").rglob("*")) if (tmp_path / "cache").exists() else []
-        assert bool(kept) == (name == "with")
-    assert (tmp_path / "with" / "runs.csv").read_text() == (tmp_path / "without" / "runs.csv").read_text()
 
 
 def test_axis_takes_values_and_ranges():

@@ -27,7 +27,7 @@ MEMBERS, POINTS = 12, 6  # of every batch of whole climbs, for the same reason
 
 
 def batch(runs, robot=ROBOT, **options):
-    """Runs of (terrain, front, rear in degrees, volts, further conditions); pairs of angles are at 0.1 and 0.6 s."""
+    """Runs of (terrain, front, rear in degrees, volts, further conditions). Pairs of angles are at 0.1 and 0.6 s."""
     grounds = jax.tree.map(lambda *x: jnp.stack(x), *[r[0] for r in runs])
     angles = [[jnp.asarray(np.radians(np.broadcast_to(a, 2))) for a in r[1:3]] for r in runs]
     sequences = [Sequence(jnp.array([0.1, 0.6]), *pair, over_time=True) for pair in angles]
@@ -43,7 +43,7 @@ def batch(runs, robot=ROBOT, **options):
 
 @functools.cache
 def first_second():
-    """Onto a step, and against a wall; a member without numbers and one with levers in the ground beside them."""
+    """Onto a step, and against a wall. A member without numbers and one with levers in the ground beside them."""
     runs = [
         (terrain.single_step(0.05, size=SIZE), (45, 20), (-8.4, -60), 24),
         (terrain.single_step(0.25, size=SIZE), (45, 80), (-8.4, -60), 24),
@@ -124,7 +124,7 @@ def test_samples_have_all_their_steps_each_at_its_time(monkeypatch):
 
 
 def test_tracks_of_levers_lose_what_table_3_says_at_their_own_speed():
-    """(350 - 70) / 2 mN·m and (16 - 3) / 2 mN·m·s each; all three as one where the levers stand."""
+    """(350 - 70) / 2 mN·m and (16 - 3) / 2 mN·m·s each. All three as one where the levers stand."""
     wheeled, tracked = (
         climb_system(
             ROBOT, Conditions(k, voltage=6.0).resolved(ROBOT), terrain.flat_ground(), constant_angles(0.5, 0.3)
@@ -159,7 +159,7 @@ def test_motors_of_levers_load_the_battery():
 
 @pytest.mark.slow
 def test_a_positive_voltage_raises_either_lever():
-    """Angles are positive up; of the rear pair ψ falls then."""
+    """Angles are positive up. Of the rear pair ψ falls then."""
     volts = jnp.full(2, 6.0)
     asked = Sequence(jnp.arange(2.0), volts, volts, over_time=True, begins=jnp.full(2, 0.5))
     run = climb_system(ROBOT, Conditions(0, voltage=6.0).resolved(ROBOT), terrain.flat_ground(), asked)
@@ -271,7 +271,8 @@ def beside_mujoco(slope, ground, angles, volts, clear):
     """Coordinates of 10 000 steps, ours and MuJoCo's under the forces that each of ours had, impulses over its time.
 
     Args:
-        angles: of front and rear levers at 0.1 and 0.8 s [deg]; clear: from the obstacle in the beginning [m].
+        angles: of front and rear levers at 0.1 and 0.8 s [deg].
+        clear: from the obstacle in the beginning [m].
     """
     conditions = Conditions(0, voltage=volts, slope_deg=slope, payload=5.0).resolved(ROBOT)
     pairs = (jnp.radians(jnp.array(pair)) for pair in angles)
@@ -442,7 +443,7 @@ def test_level_ground_is_travelled_as_settled_balances_have_it():
 @pytest.mark.slow
 def test_pairs_of_the_paper_s_full_model_are_counted_on_the_belts_of_its_geometry():
     """1680 (Section 3.4.5): grousers on the ground and teeth on two guides, of two main and four levers' belts. The climb
-    resolves the grousers alone, each beside corners of the ground; its teeth run rigidly."""
+    resolves the grousers alone, each beside corners of the ground. Its teeth run rigidly."""
     run = climb_system(
         ROBOT, Conditions(0, voltage=6.0).resolved(ROBOT), terrain.flat_ground(), constant_angles(0.5, 0.3)
     )

@@ -35,7 +35,7 @@ def drawn(mask, count, seed=1):
 
 @pytest.mark.slow
 def test_scattered_outliers_are_no_cluster(monkeypatch):
-    """As seldom as stated, over 200 draws; a test of the test: of outliers that lie together, nearly always."""
+    """As seldom as stated, over 200 draws. A test of the test: of outliers that lie together, nearly always."""
     monkeypatch.setattr(clusters, "PERMUTATIONS", 400)
     axes, levels, error = {"time": TIME}, {"supply_voltage_V": VOLTAGE}, 0.05
     count = np.random.default_rng(2).integers(3, 16, 200)
@@ -80,7 +80,7 @@ def test_outliers_of_one_level_are_found_there():
 
 
 def test_the_least_probable_cluster_is_told():
-    """Outliers of one run are also within its stretch of the order; the run says it with fewer words and a level."""
+    """Outliers of one run are also within its stretch of the order. The run says it with fewer words and a level."""
     got = found(drawn(RUN == "start3", 12), axes={}, levels=LEVELS)
     assert got is not None and (got.axis, got.level) == ("run_id", "start3")
 

@@ -39,7 +39,7 @@ print(json.dumps({"folder": folder and str(folder), "answer": slope.tolist(),
 
 
 def process(cache: Path | str, more: str = "", **environment: str) -> dict:
-    """What one process did with this value of MMRJAX_CACHE; warnings are errors."""
+    """What one process did with this value of MMRJAX_CACHE. Warnings are errors."""
     clean = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "XDG_", "TF_CPP"))}
     answer = subprocess.run(
         [sys.executable, "-W", "error:Error", "-c", PROGRAM.replace("{more}", more)],

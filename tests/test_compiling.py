@@ -96,7 +96,7 @@ def candidate(active, cost):
 
 
 def test_a_fit_that_ends_above_the_one_it_builds_on_starts_again_there(monkeypatch):
-    """A start where no solution exists keeps no effect from being found; nor does a base in another valley, which what it
+    """A start where no solution exists keeps no effect from being found. Nor does a base in another valley, which what it
     lacks led there: the lowest is fitted from the prior mean too."""
     asked = []
     # By an effect, a coordinate of the base and an amplitude: from a large one the second is lost beyond a fold.

@@ -114,7 +114,7 @@ def test_steepest_slope_derivatives_are_finite_differences(robot, static, voltag
 
 @pytest.mark.slow
 def test_derivatives_are_sound_without_optimizations_as_the_command_line_compiles():
-    """The test above once more, in a process of its own; by LLVM's quick selection they were NaN."""
+    """The test above once more, in a process of its own. By LLVM's quick selection they were NaN."""
     code = (
         f"import pytest; ended = pytest.main(['-q', {__file__!r}, '-k', 'finite_differences and 2.5-2.0'])\n"
         "from mmrjax.compile.compiling import SELDOM; assert SELDOM['xla_backend_optimization_level'] == 0 == ended"

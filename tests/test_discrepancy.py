@@ -148,7 +148,7 @@ def test_defect_of_each_row_shows_the_discrepancy(found):
 
 
 def test_formula_finds_the_variable(found):
-    """One term where a term explains the curve; no term does for a step of the voltage, which words describe."""
+    """One term where a term explains the curve. No term does for a step of the voltage, which words describe."""
     proposal = found.what.proposal
     if found.what.balance == "electrical":
         seen = SimpleNamespace(
@@ -236,7 +236,7 @@ def test_variables_over_which_a_curve_is_as_improbable_are_told():
 
 
 def test_a_window_is_refined_to_its_rows():
-    """Eighty settled rows, of which 13 to 24 lack something in one balance; coarse windows begin every 2.5 rows."""
+    """Eighty settled rows, of which 13 to 24 lack something in one balance. Coarse windows begin every 2.5 rows."""
     rng = np.random.default_rng(5)
     rows, p = 80, 4
     defects = rng.standard_normal((len(PROBED), rows, 3))

@@ -1,4 +1,4 @@
-"""Reports as documents: page, terminal and CSV show the same cells; one text of each document is kept."""
+"""Reports as documents: page, terminal and CSV show the same cells. One text of each document is kept."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def size() -> Document:
 
 
 def comparison(log: bool = False) -> Document:
-    """The bench's rows with a simulation 4 % above them, the first row without one; of a log as its first 2.8 s."""
+    """The bench's rows with a simulation 4 % above them, the first row without one. Of a log as its first 2.8 s."""
     measured = records.read_runs("measured")
     error = np.where(np.arange(len(measured)) == 0, np.nan, 1.04 + 0.001 * measured["slope_deg"])
     simulated = {c: measured[c] for c in ("configuration", *measured.axes)}

@@ -71,7 +71,7 @@ def expected_runs(grid):
 @pytest.mark.slow
 @pytest.mark.parametrize(("tolerance", "error"), [(1e-6, 2e-6), pytest.param(1e-9, 5e-9, marks=pytest.mark.slow)])
 def test_drive_matches_solve_ivp(robot, grid, expected_runs, tolerance, error):
-    """To `error` of each state's largest value in the run, at every instant; SciPy's Radau at 1e-10."""
+    """To `error` of each state's largest value in the run, at every instant. SciPy's Radau at 1e-10."""
     w, s, p, v = grid[list(ROWS)].T
     runs = Conditions(
         voltage=np.append(v, 0.0),
@@ -141,7 +141,7 @@ def check_settled(run, point, where):
 
 @pytest.mark.slow
 def test_drive_settles_on_steady_over_table8(robot, table8, drive_table8, steady_table8, times_fine):
-    """Within 2 s wherever it grips; the rest of what `steady` can hold after 60 s.
+    """Within 2 s wherever it grips. The rest of what `steady` can hold after 60 s.
 
     A run that breaks away by spinning its movers is pushed by μ_d only, and what that leaves over the
     demand can be little: 0.001-0.02 of the weight on 10 degrees (6T2A) and 15 degrees (4W2T).
@@ -182,7 +182,7 @@ def test_drive_that_breaks_away_between_static_and_dynamic_friction_never_regain
 @pytest.mark.nightly
 @pytest.mark.slow
 def test_drive_that_starts_rolling_stays_at_the_operating_point(robot):
-    """Also on the slope where a start from standstill slides; above the limit it slides all the same."""
+    """Also on the slope where a start from standstill slides. Above the limit it slides all the same."""
     runs = Conditions(voltage=[24.0, 24.0, 24.0], slope_deg=[5.0, 12.0, 20.0], configuration=[1.0, 0.0, 0.0])
     go = jax.jit(lambda r: jax.vmap(lambda c: drive(r, c, jnp.asarray([0.0, 4.0]), rolling=True).result)(runs))
     answer, point = go(robot), steady_batch(robot, runs)
@@ -216,7 +216,7 @@ def test_drive_that_starts_rolling_remembers_as_if_it_had_long_been(robot):
 
 
 def test_drive_start_has_three_stages(drive_table8, grid):
-    """Figs. 23, 24: a current peak, slipping acceleration, steady travel; 33 V, level."""
+    """Figs. 23, 24: a current peak, slipping acceleration, steady travel, 33 V, level."""
     for wheeled in (0.0, 1.0):
         k = int(np.flatnonzero((grid == [wheeled, 0.0, 0.0, 33.0]).all(1))[0])
         s = jax.tree.map(lambda x, k=k: np.asarray(x[k]), drive_table8.signals)
@@ -310,7 +310,7 @@ def test_drive_out_of_steps_has_failed(robot):
 
 @pytest.mark.slow
 def test_drive_discharges_a_full_battery_to_its_clear_end(small):
-    """Charge is what flowed; the voltage falls all the way; past the capacity the run says so."""
+    """Charge is what flowed. The voltage falls all the way. Past the capacity the run says so."""
     robot, go = small
     runs = Conditions(configuration=[0.0, 1.0, 0, 0, 0, 0, 0, 0, 0], battery=1.0, voltage=0.0)
     run = go(runs, 1200.0)

@@ -54,7 +54,7 @@ def run_derivatives(drive_numbers, scales):
 
 @pytest.fixture(scope="session")
 def jacobians(theta, run_derivatives):
-    """Values and forward derivatives of every run: the signals, then the result; last axis the parameters."""
+    """Values and forward derivatives of every run: the signals, then the result. Last axis the parameters."""
     forward, _ = run_derivatives
     return {name: jax.tree.map(np.asarray, forward(theta, Conditions(**run))) for name, run in RUNS.items()}
 

@@ -29,7 +29,7 @@ WAY = np.where(np.arange(ROWS) % 3, 1.0, -1.0)
 
 def linearised(kind, slopes, defects, **others):
     """A fit whose rows have defects along their way (equations, sides, rows), by slopes (equations, sides, rows,
-    channels); `others`: sizes of signals."""
+    channels). `others`: sizes of signals."""
     sides = slopes.shape[1]
     whole = np.zeros((len(kind.probed), *slopes.shape[1:]))
     for slope, name in zip(slopes, EQUATIONS, strict=True):
@@ -148,7 +148,7 @@ def test_defects_of_turns_are_drawn_by_side_over_what_that_side_does():
 
 
 def test_change_of_a_reading_that_crosses_zero_is_of_its_size(monkeypatch):
-    """A turn's yaw rate may be next to nothing; what an effect changes of it is no share of that."""
+    """A turn's yaw rate may be next to nothing. What an effect changes of it is no share of that."""
     robot = dataclasses.replace(mm.nominal(), effects=(effects.BY_NAME["iron_loss"](amplitude=1.0),))
     (yaw,) = channels.channels_named(["yaw_rate"])
     rates = [np.array([1.0, -1.0, 1e-9]), np.array([1.1, -1.1, 0.1])]

@@ -46,7 +46,7 @@ def robot_of(bench):
 @pytest.fixture(scope="module")
 def simulated():
     """Signals of a bench without a backlash at the samples, and derivatives of current [A] and motor speed [rad/s] by
-    shares of its parameters `MOVED`; one program serves all."""
+    shares of its parameters `MOVED`. One program serves all."""
     times = time_grid(SAMPLES, CHANGES[1:], start=CHANGE)
     run = Conditions(voltage=VOLTS[np.searchsorted(CHANGES, times, side="right") - 1])
     at = np.searchsorted(times, SAMPLES)

@@ -1,4 +1,4 @@
-"""One rule for exit codes: whatever the answer 0, and 3 where a solver failed; documented for each command."""
+"""One rule for exit codes: whatever the answer 0, and 3 where a solver failed. Documented for each command."""
 
 import dataclasses
 import shlex

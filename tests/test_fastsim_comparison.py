@@ -25,7 +25,7 @@ def missions() -> dict[str, dict[str, Any]]:
 @pytest.mark.slow
 @pytest.mark.parametrize("case", range(len(comparison.CASES)))
 def test_mission_follows_the_integral(case: int, missions: dict[str, dict[str, Any]]) -> None:
-    """Work at the wheel both ways, distance and Wh/km; the rest is what windings and sliding take."""
+    """Work at the wheel both ways, distance and Wh/km. The rest is what windings and sliding take."""
     vehicle, asked = comparison.CASES[case]
     ours, exact = missions[vehicle.name], comparison.integral_of(vehicle, asked)
     for name in ("wheel_J", "wheel_back_J", "distance_m", "Wh_per_km"):

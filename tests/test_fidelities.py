@@ -140,13 +140,6 @@ def test_contract_can_be_broken(law, of, change, robot):
 
 
 @pytest.mark.slow
-def test_settled_fidelities_agree_where_the_robot_drives(robot):
-    steady, drive = (fidelities.get_fidelity(name).settled(robot, RUNS) for name in ("steady", "drive"))
-    for name in channels.USUAL:
-        np.testing.assert_allclose(drive.reading[name], steady.reading[name], rtol=1e-3)
-
-
-@pytest.mark.slow
 def test_settled_gives_numbers_where_the_robot_slides(robot):
     runs = Conditions(voltage=24.0, slope_deg=[20.0])
     for name in ("steady", "drive"):

@@ -4,8 +4,11 @@ from types import SimpleNamespace
 
 import pytest
 
+from calibration.described import describe
 from calibration.discovery.headline import headline
 from calibration.discovery.loop_notes import Mechanism, Missing, Summary
+from calibration.discovery.result import DiscoveryResult
+from calibration.inference.fit_notes import Remark
 from calibration.words import loop_words
 
 DROP, SLIP = "voltage drop that changes with current", "slip that changes with demand"
@@ -72,3 +75,14 @@ def test_one_mechanism_is_claimed_once():
     """Two laws of one family, of which another noise leaves the mechanism alone."""
     two = Summary("class", 0.001, None, (*law("a").missing, *law("b").missing))
     assert headline(two, [(0.7, of_mechanism(DROP, SLIP))]).claims == ((DROP, SLIP),)
+
+
+def test_lost_motion_comes_before_what_the_library_explains():
+    """A servo with backlash: no effect explains it, and the answer was a reading that changes with time."""
+    lost = Remark(
+        "lost_motion", source="r.csv", column="output_angle_deg", reversals=20, width=0.958, unit="deg", angle=0.0167
+    )
+    of = lambda *remarks: SimpleNamespace(remarks=remarks, headline=headline(law("a"), []))  # noqa: E731
+    alone = DiscoveryResult.statement.fget(of())
+    first = DiscoveryResult.statement.fget(of("a note", lost))
+    assert first == f"{describe(lost)}. {alone}" and "each of 20 reversals loses about 0.96 deg" in first

@@ -36,7 +36,7 @@ def clamped():
 
 
 def test_a_clamp_carries_what_current_and_friction_leave():
-    """Beside a free row; too little current for the friction leaves the clamp nothing."""
+    """Beside a free row. Too little current for the friction leaves the clamp nothing."""
     current, held = np.array([*AMPERES, 0.03, 5.0]), np.array([1.0, 1, 1, 1, 1, 0])
     conditions = Conditions(motor_current=current, held=held, load_torque=np.array([0.0, 0, 0, 0, 0, 0.4]))
     found = steady_batch(clamped(), conditions)
@@ -147,7 +147,7 @@ def test_rows_of_a_clamp_in_tables(tmp_path):
     with pytest.raises(BadData, match=r"row 1, load_torque_Nm: got 1 where held is 1; expected 0, .* output_torque"):
         records.read_runs(table(load_torque_Nm=np.ones(16)), robot=held)
     with pytest.raises(BadData, match="column held is for settled rows"):
-        records.read_runs(table(time_s=np.arange(16.0)), robot=held)
+        records.read_runs(table(time_s=np.arange(16.0)) | {"held": np.repeat([0.0, 1.0], 8)}, robot=held)
     speed = rig(tmp_path, "motor_speed", '"motor_current", "output_torque"')
     with pytest.raises(BadData, match=r'nothing drives the motors; .* a held shaft: state imposed = "motor_current"'):
         records.read_runs(table(held=False, motor_speed_rpm=np.zeros(16)), robot=speed)
@@ -160,6 +160,23 @@ def test_rows_of_a_clamp_in_tables(tmp_path):
     assert "80 A, where the file's numbers turn the load" in rig_facts.doubtful_current(
         records.read_runs(strong, robot=held), held
     )
+
+
+def test_a_log_of_a_clamp_is_read_as_settled_rows(tmp_path):
+    """Windings settle within a millisecond. Rows that follow sooner are no settled runs."""
+    rows = {"output_torque_Nm": table()["output_torque_Nm"], "motor_voltage_V": table()["motor_voltage_V"]}
+    held = rig(tmp_path, "motor_current", '"motor_voltage", "output_torque"')
+    log = records.read_runs(table(time_s=0.02 * np.arange(16.0)), robot=held)
+    assert not log.sampled and any("held in every row: each row is read as a settled run" in n for n in log.notes)
+    same = records.read_runs(table(), robot=held)
+    assert all((log[c] == same[c]).all() for c in ("motor_current_A", "held", *rows))
+    with pytest.raises(BadData, match="column held is for settled rows"):
+        records.read_runs(table(time_s=1e-4 * np.arange(16.0)), robot=held)
+    speed = rig(tmp_path, "motor_speed", '"motor_current", "motor_voltage"')
+    columns = {c: v for c, v in table(held=False).items() if c != "output_torque_Nm"}
+    columns |= {"motor_speed_rpm": np.zeros(16), "load_torque_Nm": rows["output_torque_Nm"]}
+    log = records.read_runs({**columns, "time_s": 0.02 * np.arange(16.0)}, robot=speed)
+    assert not log.sampled and len(log) == 16
 
 
 def test_check_does_not_call_a_held_shaft_stalled(tmp_path, capsys):

@@ -133,22 +133,6 @@ def test_calibration_says_it_of_every_parameter_everywhere(case, found, capsys, 
     assert all(name in first.split("not determined")[-1] for name in held)
 
 
-@pytest.mark.slow
-def test_calibrations_have_what_the_rule_is_for(found):
-    unmeasured, bound, noisy = (found(c).parameters for c in ("unmeasured", "at a bound", "noisy"))
-    assert unmeasured["motor.inductance"].held_by_prior and unmeasured["6T2A.mass"].held_by_prior
-    assert any(not p.held_by_prior for p in unmeasured.values())
-    at_bound = {name: p for name, p in bound.items() if p.at_bound}
-    assert at_bound and all(p.held_by_prior == (np.sqrt(p.variance_ratio) > HELD) for p in at_bound.values())
-    assert all(p.held_by_prior for p in noisy.values()) and any(
-        p.prior.family == "log-normal" for p in noisy.values()
-    )
-    between = [
-        p for name in CALIBRATIONS for p in found(name).parameters.values() if 0.5 < p.variance_ratio < HELD**2
-    ]
-    assert between and not any(p.held_by_prior for p in between)  # held by the rule of variances that was before
-
-
 def test_no_other_word_is_left_for_it():
     root = Path(__file__).parents[1]
     old = re.compile(

@@ -46,7 +46,7 @@ NOISE = "motor_current_left=1A,motor_current_right=1A,yaw_rate=0.03rad/s"
 
 
 def test_loop_frees_the_friction_that_turns_show(robot, runs):
-    """Of each surface; in straight travel nothing but a speed shows it."""
+    """Of each surface. In straight travel nothing but a speed shows it."""
     ours = surfaces.with_surface_configurations(robot, runs)
     present = runs.configurations_named(ours)
     freed = priors.free_names(ours, present, *SettledTurns.free())
@@ -59,7 +59,7 @@ def test_loop_frees_the_friction_that_turns_show(robot, runs):
 @pytest.mark.nightly
 @pytest.mark.slow
 def test_base_of_the_loop_fits_currents_as_calibrate_does(robot, runs):
-    """18.8 % held out; the currents' own friction held at the file's numbers left 37 and 26 %."""
+    """18.8 % held out. The currents' own friction held at the file's numbers left 37 and 26 %."""
     ready = discover.prepare_loop(runs, dataclasses.replace(robot, effects=()), noise=NOISE)
     space = discover.pose_candidates(ready.runs, ready.robot, ready.noise.sd, ready.settings)
     base = fit_base(space, ready.settings, "husky.csv")

@@ -48,7 +48,7 @@ def traced(looks="few"):
 
 @functools.cache
 def unnamed(looks="few"):
-    """Their result; made once for all files."""
+    """Their result. Made once for all files."""
     return HOT[looks][0].result(*traced(looks))
 
 

@@ -125,7 +125,7 @@ def test_a_run_follows_its_first_order_law(robot):
 
 
 def test_a_shaft_turns_through_rest_and_is_held_there_at_its_very_moment(tmp_path):
-    """Friction jumps there; by steps of 5 ms from 3 A to -2 A to 0.1 A, against the law of either way. Its derivative by
+    """Friction jumps there. By steps of 5 ms from 3 A to -2 A to 0.1 A, against the law of either way. Its derivative by
     the dry friction too: it goes on from the first way to the second, and what friction holds forgets it."""
     (tmp_path / "rig.toml").write_text(RIG.replace(f"load = {ETA}", "load = 1.0"), encoding="utf-8")
     robot = robot_file.read_robot(tmp_path / "rig.toml")
@@ -207,15 +207,6 @@ def test_curves_are_over_a_current_that_is_imposed(robot, tmp_path):
     runs = settled_table(tmp_path, robot, DRY)
     found = observers.observer_kind(runs).of(runs, robot).bases(runs.columns, np.ones(len(runs), bool), robot)
     assert ("track", "current") in bases.family_names(found)
-
-
-@pytest.mark.slow
-def test_a_calibration_of_settled_runs_gives_the_friction_back(robot, tmp_path):
-    runs = settled_table(tmp_path, robot, 0.25)
-    found = calibrate(runs, robot, starts=2, profiles=False, blocks=())
-    dry = found.parameters["bench.loss_coulomb"]
-    assert abs(dry.value - 0.25) < 4 * dry.sd < 0.02
-    assert "motor.resistance" not in found.parameters
 
 
 @pytest.mark.slow

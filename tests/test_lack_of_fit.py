@@ -29,7 +29,8 @@ def toy(rng, noise=1.0, missing=0.0, parameters=8, repeats=1):
     """A linear fit with priors to readings of Table 8's rows, and what `adequacy_of_residuals` takes of it.
 
     Args:
-        noise: true sd over the stated one; missing: of a trend of the first channel over the slope [σ].
+        noise: true sd over the stated one.
+        missing: of a trend of the first channel over the slope [σ].
     """
     rows = np.repeat(np.arange(90), repeats)
     slope, volts = np.degrees(GRID.slope)[rows], GRID.U[rows]
@@ -164,7 +165,7 @@ def test_noise_of_one_channel_that_is_off_is_said_of_that_channel():
 
 
 def test_what_is_said_of_sds_beside_an_answer_is_of_what_it_leaves():
-    """Before: 130 times the sds, everywhere; the answer leaves noise, or twice as much as was stated."""
+    """Before: 130 times the sds, everywhere. The answer leaves noise, or twice as much as was stated."""
     noise = SimpleNamespace(word="stated")
     before = Sds(noise, {}, tuple(noise_remarks(toy(np.random.default_rng(7), noise=130.0))))
     assert (

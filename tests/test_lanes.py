@@ -12,7 +12,7 @@ from mmrjax.numerics import lanes
 
 
 def halves(own):
-    """How often a number is halved until it is below one, and what is left; `own` is the number and the divisor."""
+    """How often a number is halved until it is below one, and what is left. `own` is the number and the divisor."""
     begun = lambda own: (own[0], jnp.asarray(0))  # noqa: E731
     return lanes.loop_until(begun, lambda own, s: (s[0] / own[1], s[1] + 1), lambda s: s[0] < 1.0, own)
 

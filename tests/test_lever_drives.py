@@ -92,7 +92,7 @@ def test_rate_that_is_asked_for_is_had_until_the_voltage_or_the_current_ends():
 
 
 def test_both_pairs_obey_their_law_together_at_random_states():
-    """What carries them and what drives them agree; a pair that moves has its friction against it, one that stands
+    """What carries them and what drives them agree. A pair that moves has its friction against it, one that stands
     what friction can hold, and a voltage is at its end where a rate is not what is asked for."""
     random = np.random.default_rng(3)
     drives = [lever_drive(with_worm(efficiency)) for efficiency in (0.5, 0.7)]

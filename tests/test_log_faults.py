@@ -1,4 +1,4 @@
-"""Logs with faults that no reader sees: one sentence each; sound logs have none."""
+"""Logs with faults that no reader sees: one sentence each. Sound logs have none."""
 
 from __future__ import annotations
 

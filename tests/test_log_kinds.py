@@ -33,7 +33,7 @@ def sampled(rng, speed, angle, imposed, rate, delay, step, jitter=0.1):
 
 
 def servo(rng, levels=(0.4, 0.7, 1.0, -0.6, -0.9), hold=1.2, dry=0.05):
-    """U d = k ω_m + R I, J dω/dt = i η (k I - M_f) - M_0 - K ω, of the template's numbers; angle in degrees."""
+    """U d = k ω_m + R I, J dω/dt = i η (k I - M_f) - M_0 - K ω, of the template's numbers, angle in degrees."""
     volts, r, k, friction, ratio, eta, viscous = 6.0, 4.0, 0.006, 2e-4, 200.0, 0.7, 0.005
     inertia = 0.0005 + eta * 1e-7 * ratio**2
     duty = np.repeat(levels, round(hold / STEP))
@@ -56,7 +56,7 @@ def servo(rng, levels=(0.4, 0.7, 1.0, -0.6, -0.9), hold=1.2, dry=0.05):
 
 
 def carriage(rng, levels=(1.2, 1.6, 2.0, -1.4, -1.8), hold=1.5):
-    """m x'' = i k / r - F_0 - b x', of the template's numbers with more that rises with speed; position in mm."""
+    """m x'' = i k / r - F_0 - b x', of the template's numbers with more that rises with speed, position in mm."""
     k, friction, mass, radius, dry, viscous = 0.05, 0.004, 2.5, 5e-3 / (2 * np.pi), 12.0, 400.0
     inertia = mass * radius**2 + 1e-5
     current = np.repeat(levels, round(hold / STEP))
@@ -113,7 +113,7 @@ def test_the_model_follows_such_a_log_with_the_numbers_that_it_was_made_of(tmp_p
 
 @pytest.mark.slow
 def test_curves_are_over_the_voltage_at_motors_whose_speed_no_channel_reads(tmp_path, monkeypatch):
-    """Of a servo on PWM the duty's share of the supply; while the circuit is open, the back-EMF of the run itself."""
+    """Of a servo on PWM the duty's share of the supply. While the circuit is open, the back-EMF of the run itself."""
     log = {name: column[::2] for name, column in servo(np.random.default_rng(4), levels=(0.9,), hold=0.5).items()}
     driven = np.arange(len(log["time_s"])) < 15
     log["duty"] = np.where(driven, log["duty"], 0.0)

@@ -80,7 +80,7 @@ def loaded(p):
 
 @functools.cache
 def commanded(every=False) -> SimpleNamespace:
-    """The whole command on 24 runs of a robot whose track churns, one of them twice; made once for all files.
+    """The whole command on 24 runs of a robot whose track churns, one of them twice. Made once for all files.
 
     It looks for the effects of `FEW` alone, or for `every` one of the library.
     """
@@ -202,25 +202,6 @@ def test_copies_count_once_and_are_said(done):
     assert any(
         "rows 25 are exact copies" in note or "row 25 is an exact copy" in note for note in done.result["notes"]
     )
-
-
-@pytest.mark.slow
-def test_robot_is_accepted_by_the_other_commands(done):
-    robot = tomllib.loads((done.folder / "found" / "robot.toml").read_text())
-    (name,) = robot["effects"]
-    assert name == done.result["effects"][0]["name"]
-    found = done.result["effects"][0]["parameters"]["amplitude"]["value"]
-    assert robot["effects"][name]["amplitude"] == pytest.approx(found, rel=1e-12)
-    run = ["simulate", "--voltage", 33, "--no-report", "--force", "--out", "s"]
-    shown = []
-    for given in ("nominal", "found/robot.toml"):
-        assert mmrjax(done.folder, *run, "--robot", given).code == 0
-        with (done.folder / "s" / "runs.csv").open(newline="") as stream:
-            shown.append(float(next(csv.DictReader(stream))["total_current_A"]))
-    table = done.case.table
-    k = np.flatnonzero((table["supply_voltage_V"] == 33) & (table["slope_deg"] == 0) & (table["payload_kg"] == 0))[0]
-    wrong = np.abs(np.array(shown) - table["total_current_A"][k])
-    assert wrong[1] < 0.06 < wrong[0]
 
 
 def test_report_tells_the_story_in_order(done):

@@ -9,6 +9,7 @@ from calibration.data import robot_file
 from calibration.data import runs as records
 from calibration.inference.lost_motion import lost_motion_notes
 from mmrjax.model.quantities import RPM
+from sweeps.commands.rig_check import check_rig_file
 
 RIG = """base = "none"
 channels = [{channels}]
@@ -90,8 +91,7 @@ def test_stated_backlash_needs_no_note(tmp_path):
     assert lost_motion_notes(*read(tmp_path, servo(play=1.0, seconds=8.0), backlash='backlash = "0.01 ± 30 %"')) == []
 
 
-def test_check_of_a_log_reports_lost_motion(tmp_path):
-    from calibration.inference.preparation import prepare
-
-    runs, robot = read(tmp_path, servo(play=1.0))
-    assert "lost_motion" in [getattr(note, "code", "") for note in prepare(runs, robot).checked]
+def test_check_of_a_log_reports_lost_motion(tmp_path, capsys):
+    read(tmp_path, servo(play=1.0))
+    assert check_rig_file(tmp_path / "rig.toml", str(tmp_path / "log.csv"), (), False) == 0
+    assert "reversals loses about" in " ".join(capsys.readouterr().out.split())

@@ -1,4 +1,4 @@
-"""Missions: against SciPy, closed forms, and themselves; energy, derivatives, standing still, limits."""
+"""Missions: against SciPy, closed forms, and themselves. Energy, derivatives, standing still, limits."""
 
 import dataclasses
 
@@ -24,7 +24,7 @@ _run = eqx.filter_jit(mission)
 
 
 def run(robot, conditions, profile, start=None, tolerance=TOLERANCE):
-    """A mission with its course; all that is stated here is a number of the program, so that most tests share one."""
+    """A mission with its course. All that is stated here is a number of the program, so that most tests share one."""
     ambient = robot.motor.temperature_ambient
     start = start or Start(temperature_winding=ambient, temperature_housing=ambient)
     start = jax.tree.map(lambda x: jnp.asarray(x, float), start)
@@ -99,19 +99,6 @@ def expected(voltages, times, slope, tolerance=1e-10):
     return np.array(ends)
 
 
-@pytest.mark.slow
-def test_mission_matches_scipy_through_a_reversal(robot):
-    """No stop on the way: the voltage is turned round while the robot travels."""
-    found = expected([24.0, -15.0, 20.0], [0.0, 1.0, 2.5, 4.0], 3.0)
-    p = rows([0, 1, 2.5, 4], voltage=[24, -15, 20, 20], slope_deg=3.0)
-    p = dataclasses.replace(p, voltage=p.voltage.at[3:].set(20.0))
-    got = run(robot, asked(), p, tolerance=1e-8)
-    distance = np.cumsum(np.asarray(got.segments.of["distance"][0, :3]))
-    assert_allclose(distance, found[:, 3], rtol=2e-4, atol=2e-5)  # it begins by standing, SciPy's by creeping
-    taken = np.cumsum(np.asarray(got.segments.energy[0, :3]))
-    assert_allclose(taken, found[:, 7], rtol=1e-4)
-
-
 #: Driven, braked to rest, driven backward and to the other side again, the current limited at each start.
 DUTIES, TIMES, LIMIT = [1.0, 0.0, -1.0, 0.8], [0.0, 1.0, 2.0, 3.0, 4.5], 6.0
 EXPLORED = ("6T2A.mass", "motor.torque_constant", "driver.current_limit")
@@ -150,7 +137,7 @@ def test_mission_through_rest_at_the_current_limit_is_that_of_scipy(robot):
 @pytest.mark.parametrize("configuration", [0, 1])
 @pytest.mark.parametrize("battery", [0.0, 1.0])
 def test_energy_in_is_where_it_went_and_what_is_stored(robot, configuration, battery):
-    """Through starts, stops, reversals and a descent; stored energy from the states, not from the integrals."""
+    """Through starts, stops, reversals and a descent. Stored energy from the states, not from the integrals."""
     time, mode, values = MANY
     p = rows(time, mode, **{**values, "slope_deg": [0, 0, 0, 5, 0, -20, -20, 0]})
     found = run(robot, asked(configuration, battery=battery, adhesion=2.0), p, tolerance=2e-6)
@@ -182,15 +169,6 @@ def test_a_supply_that_takes_nothing_back_lets_the_motors_coast(robot):
     assert float(found.total.of["returned"]) < 1e-3 * float(both.total.of["returned"])
     assert float(found.peaks["speed"]) > 1.5 * float(both.peaks["speed"])
     assert abs(float(found.total.unaccounted)) < 1e-4 * float(found.total.of["drawn"] + abs(found.total.of["lift"]))
-
-
-@pytest.mark.slow
-def test_theory_of_the_mesh_gives_less_back(robot):
-    mesh = dataclasses.replace(robot, gearbox=dataclasses.replace(robot.gearbox, mesh_theory=True))
-    assert float(mesh.gearbox.efficiency_backward) == pytest.approx(2 - 1 / 0.74)
-    p = rows([0, 5], slope_deg=-20.0, payload=8.0)
-    equal, less = (run(r, asked(1, adhesion=2.3), p).total.of["returned"] for r in (robot, mesh))
-    assert 0 < float(less) < 0.95 * float(equal)
 
 
 # --- standing ---------------------------------------------------------------------------------------
@@ -304,45 +282,11 @@ def test_a_demand_that_cannot_be_met_is_followed_as_far_as_possible_and_flagged(
 
 # --- derivatives ------------------------------------------------------------------------------------
 
-BY = ("motor.resistance", "gearbox.efficiency_load", "6T2A.track.loss_coulomb", "6T2A.mass", "motor.torque_constant")
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-def test_derivatives_through_stops_and_reversals_match_differences(robot):
-    """Of energy, path, Wh/m and temperature, by parameters and by times and values of rows, to 1e-4."""
-    time, mode, values = MANY
-    start = rows(time, mode, **values)
-    base = {p.name: float(p.value) for p in params.walk_parameters(robot)}
-
-    def outputs(x):
-        changed = params.replace(robot, {name: base[name] * x[k] for k, name in enumerate(BY)})
-        p = dataclasses.replace(
-            start,
-            time=start.time.at[3].add(x[5] - 1).at[5].add(x[6] - 1),
-            voltage=start.voltage.at[0].multiply(x[7]).at[3].multiply(x[8]),
-            demand=start.demand.at[5].multiply(x[9]),
-        )
-        found = mission(changed, asked(), p, tolerance=1e-7)
-        total = found.total
-        per_metre = total.energy / total.of["path"]
-        return jnp.stack([total.energy, total.of["path"], per_metre, found.peaks["temperature"]])
-
-    x = jnp.ones(len(BY) + 5)
-    exact = eqx.filter_jit(jax.jacfwd(outputs))(x)
-    step, compiled = 1e-3, eqx.filter_jit(outputs)
-    value = compiled(x)
-    for k in range(len(x)):
-        apart = np.asarray(compiled(x.at[k].add(step))) - np.asarray(compiled(x.at[k].add(-step)))
-        # Two parts in 10^4 of a derivative, or of the output where that hardly changes.
-        allowed = 1e-4 * np.abs(apart / (2 * step)) + 1e-5 * np.abs(np.asarray(value))
-        assert (np.abs(np.asarray(exact[:, k]) - apart / (2 * step)) < allowed).all(), k
-
 
 @pytest.mark.nightly
 @pytest.mark.slow
 def test_derivatives_by_every_parameter_and_row_match_differences(robot):
-    """Of Wh/m and peak temperature of a mission, in one Jacobian; endurance has its closed form below."""
+    """Of Wh/m and peak temperature of a mission, in one Jacobian. Endurance has its closed form below."""
     time, mode, values = MANY
     start = rows(time, mode, **values)
     fixed = ("battery.", "6T2A", "running_gear.")  # on a supply, on wheels, with contacts lumped: not read
@@ -408,21 +352,6 @@ def test_endurance_has_the_derivative_of_its_closed_form(robot):
     assert float(jax.jacfwd(endurance)(jnp.asarray(7920.0))) == pytest.approx(1 / 1.5, rel=1e-9)
 
 
-@pytest.mark.slow
-def test_vmap_is_a_loop(robot):
-    time, mode, values = MANY
-    p = rows(time, mode, **values)
-    payload = np.array([0.0, 4.0, 8.0])
-    p = dataclasses.replace(p, payload=None)
-    batch = jax.jit(jax.vmap(lambda m: mission(robot, asked(payload=m), p)))(payload)
-    alone = jax.jit(lambda m: mission(robot, asked(payload=m), p))
-    for k, m in enumerate(payload):
-        one = alone(m)
-        # Rounding may make another step of a batch be rejected: then they agree as well as the steps are accurate.
-        assert float(batch.total.energy[k]) == pytest.approx(float(one.total.energy), rel=1e-6)
-        assert abs(int(batch.steps[k]) - int(one.steps)) < 20
-
-
 def test_course_is_the_mission_over_time(robot):
     time, mode, values = MANY
     found = run(robot, asked(), rows(time, mode, **values))
@@ -433,16 +362,6 @@ def test_course_is_the_mission_over_time(robot):
     assert float(found.course.time[kept - 1]) == pytest.approx(float(found.total.time), rel=1e-12)
     current = 2 * np.abs(np.asarray(found.course.signals.current)[:kept]).max()
     assert current <= float(found.peaks["current"]) * (1 + 1e-12) and current > 0.99 * float(found.peaks["current"])
-
-
-@pytest.mark.slow
-def test_linear_rows_ramp(robot):
-    ramp = profile([0, 2, 4], "voltage", voltage=[0.0, 24.0, 24.0], linear=True)
-    found = run(robot, asked(), ramp, tolerance=1e-6)
-    t, source = np.asarray(found.course.time), np.asarray(found.course.signals.voltage_source)
-    there = np.isfinite(t) & (t < 2)
-    assert_allclose(source[there], 12 * t[there], rtol=1e-9, atol=1e-9)
-    assert float(found.peaks["current"]) < 10.0  # no inrush
 
 
 # --- what is wrong ----------------------------------------------------------------------------------

@@ -260,7 +260,7 @@ def test_words_and_files_say_cut_off_and_the_charge_that_is_left(run_folder):
 @pytest.mark.slow
 def test_names_shared_by_a_run_and_a_mission_are_the_same_quantities(folder, capsys, monkeypatch):
     """The same three seconds by both, at a current limit, so that current of motors and of the supply differ, and
-    backward, so that the two distances do; a mission heats up by some degrees, of which 2 % are allowed for."""
+    backward, so that the two distances do. A mission heats up by some degrees, of which 2 % are allowed for."""
     (folder / "three.csv").write_text("time_s,supply_voltage_V\n0,-24\n3,-24\n")
     asked = ("simulate", "--configuration", "4W2T", "--set", "driver.current_limit=1.5", "--no-report")
     by_run = ("--model", "drive", "--voltage", "-24", "--duration", "3", "--out", "run")

@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import zarr
 from numpy.testing import assert_allclose
 
 import mmrjax as mm
@@ -18,7 +17,6 @@ from mmrjax.missions.mission_batch import simulate_batch
 from mmrjax.missions.mission_steps import BREAKS_AWAY, event_functions
 from mmrjax.missions.profile import profile
 from mmrjax.model import params
-from tests.commands import ends
 
 ROWS = [0.0, 1.0, 4.0, 5.0, 6.0]
 RAMP = dict(demand=[0, 0.3, 0.3, 0, 0], linear=True)
@@ -115,18 +113,6 @@ def test_equal_sides_are_a_mission_of_straight_travel(robot, demanded):
         assert abs(demanded.total.of[name][0]) < 1e-12
 
 
-@pytest.mark.nightly
-@pytest.mark.slow
-def test_sides_exchanged_mirror(driven, demanded):
-    for found, one, other in ((driven, 0, 1), (demanded, 1, 2)):
-        for name, values in found.total.of.items():
-            sign = -1.0 if name in ("place_y", "turned") else 1.0
-            swapped = name.replace("_left", "_x").replace("_right", "_left").replace("_x", "_right")
-            swapped = swapped if swapped in found.total.of else name
-            assert_allclose(found.total.of[swapped][other], sign * values[one], rtol=1e-8, atol=1e-9)
-        assert found.total.of["turned"][one] > 0.3
-
-
 @pytest.mark.slow
 def test_energy_adds_up_with_both_sides(driven, demanded):
     for found in (driven, demanded):
@@ -199,23 +185,3 @@ def test_derivatives_of_a_turn_match_differences(robot):
             exact[:, k],
             apart,
         )
-
-
-@pytest.mark.slow
-def test_sweep_of_missions_has_the_numbers_of_both_sides(robot, mmrjax, tmp_path):
-    (tmp_path / "turn.csv").write_text(
-        '# between_rows = "linear"\ntime_s,speed_mm_s,yaw_rate_rad_s\n0,0,0\n0.2,300,0.8\n0.4,300,0.8\n0.5,300,0\n0.6,0,0\n'
-    )
-    (tmp_path / "plan.toml").write_text(
-        'profile = "turn.csv"\nmodel = "drive"\nreport = false\noutputs = ["energy_Wh", "turned_deg"]\n'
-        "[conditions]\nvoltage = 24\n[axes]\npayload = [0, 4, 8]\n"
-    )
-    ends(mmrjax("sweep plan.toml --out run"), code=0)
-    store = zarr.open_group(tmp_path / "run" / "results.zarr", mode="r")
-    of = dict(demand=[0.0, 0.3, 0.3, 0.3, 0.0], yaw_rate=[0.0, 0.8, 0.8, 0.0, 0.0], linear=True)
-    asks = profile([0.0, 0.2, 0.4, 0.5, 0.6], "speed", **of)
-    own = conditions(3, configuration=np.zeros(3, int), payload=np.array([0.0, 4.0, 8.0])).resolved(robot)
-    found = missions.numbers_by_column(missions.mission_numbers(robot, own, demanding(robot, own, *[asks] * 3)))
-    for name in ("energy_Wh", "turned_deg"):
-        assert_allclose(store[name][:], found[name], rtol=1e-9)
-    assert store["turned_deg"][0] > 1

@@ -40,7 +40,7 @@ def named(of, name):
 @pytest.mark.slow
 @pytest.mark.parametrize("k", [0, 1])
 def test_bounce_on_wheels_is_that_of_a_mass_on_two_springs(robot, wheeled, k):
-    """k = 1.5 c δ^0.5 at the load F = c δ^1.5 of each wheel; f = sqrt(2 k / m) / 2π."""
+    """k = 1.5 c δ^0.5 at the load F = c δ^1.5 of each wheel. f = sqrt(2 k / m) / 2π."""
     mass = (float(robot.chassis(1).mass) + PAYLOADS[k]) / 2
     depth = (mass * GRAVITY / 2 / 3e7) ** (2 / 3)
     expected = np.sqrt(2 * 1.5 * 3e7 * depth**0.5 / mass) / (2 * np.pi)
@@ -49,7 +49,7 @@ def test_bounce_on_wheels_is_that_of_a_mass_on_two_springs(robot, wheeled, k):
 
 @pytest.mark.slow
 def test_bounce_on_tracks_is_that_of_a_mass_on_its_grousers(robot):
-    """Nine grousers half a pitch from the arcs; towards the ends the belt yields as a string of 100 N."""
+    """Nine grousers half a pitch from the arcs. Towards the ends the belt yields as a string of 100 N."""
     rates, masses = jax.device_get(
         _linearised(params.without_weak_types(robot), conditions(robot, "6T2A"), POSITIONS)
     )
@@ -76,7 +76,7 @@ def test_bounce_on_tracks_is_that_of_a_mass_on_its_grousers(robot):
 
 @pytest.mark.slow
 def test_a_small_vibration_rings_at_the_damped_frequency(robot, wheeled):
-    """4W2T rolls; 2 µm up, and its height against that of the same run undisturbed."""
+    """4W2T rolls, 2 µm up, and its height against that of the same run undisturbed."""
     run = half_robot_system(robot, jax.tree.map(lambda x: x[0], conditions(robot, "4W2T")), 1e-4)
     start = roll(run)
     lifted = dataclasses.replace(start, q=start.q.at[1].add(2e-6))
@@ -101,7 +101,7 @@ def test_a_small_vibration_rings_at_the_damped_frequency(robot, wheeled):
 
 @pytest.mark.slow
 def test_modes_of_the_tracked_robot_have_names_and_bands(tracked):
-    """Heavier: bounce falls towards pitch; each holds most of its energy in its own coordinate; the drive is too damped."""
+    """Heavier: bounce falls towards pitch. Each holds most of its energy in its own coordinate. The drive is too damped."""
     light, heavy = tracked
     assert [m.name for m in light] == ["pitch", "drive", "bounce"]
     assert named(light, "pitch").frequency == pytest.approx(66, abs=2)
@@ -125,7 +125,7 @@ def test_mode_over_an_octave_is_no_frequency_to_meet():
 @pytest.mark.slow
 @pytest.mark.parametrize("recess", [3.5e-4, *(pytest.param(x, marks=pytest.mark.slow) for x in (0.0, 3e-3))])
 def test_standing_robot_is_in_balance_wherever_its_belt_stands(robot, recess):
-    """Normal force to the weight; with a recess some grousers bear alone."""
+    """Normal force to the weight. With a recess some grousers bear alone."""
     gear = params.replace(robot, {"running_gear.guide_recess": jnp.asarray(recess)})
     run = half_robot_system(gear, jax.tree.map(lambda x: x[1], conditions(gear, "6T2A")), 1e-4)
     weight = centre_of_mass(run)[2] * GRAVITY

@@ -22,7 +22,7 @@ def signals_of(path):
 
 
 def wpilog(*records):
-    """Bytes of a log: (entry, stamp [µs], payload); a payload of text starts an entry, (name, type)."""
+    """Bytes of a log: (entry, stamp [µs], payload). A payload of text starts an entry, (name, type)."""
     content = b"WPILOG" + struct.pack("<HI", 0x100, 3) + b"abc"
     for entry, stamp, payload in records:
         if isinstance(payload, tuple):

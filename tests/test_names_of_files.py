@@ -126,7 +126,7 @@ FOREIGN = {"parameters", "set", "versions", "hashes", "prior", "blocks", "status
 
 
 def registries() -> dict[str, list[tuple[str, str]]]:
-    """Unit and meaning of every name of the tables that writers use; of each table in which it is."""
+    """Unit and meaning of every name of the tables that writers use. Of each table in which it is."""
     found: dict[str, list[tuple[str, str]]] = {}
     for row in (*outputs.output_table(channels.EVERY), *mission_batch.OUTPUTS, *derived.TABLE):
         found.setdefault(row.column, []).append((row.unit_shown, row.label))
@@ -206,7 +206,7 @@ def unknown(folder: Path) -> dict[str, str]:
 
 
 def numbers(found: dict[str, list[str]]) -> dict[str, np.ndarray]:
-    """Columns of numbers; an empty cell is NaN."""
+    """Columns of numbers. An empty cell is NaN."""
     kept = {}
     for name, cells in found.items():
         with contextlib.suppress(ValueError):
@@ -262,7 +262,7 @@ def sound(folder: Path) -> None:
 
 
 def same(one: dict[str, np.ndarray], other: dict[str, np.ndarray], *, but: tuple[str, ...] = ()) -> set[str]:
-    """Names that two tables of the same rows share; their numbers are the same."""
+    """Names that two tables of the same rows share. Their numbers are the same."""
     shared = (set(one) & set(other)) - set(but)
     for name in sorted(shared):
         assert_allclose(one[name], other[name], rtol=1e-6, atol=1e-12, err_msg=name)
@@ -290,7 +290,7 @@ def test_a_meaning_has_one_name():
 
 
 def test_the_end_of_a_name_is_its_unit():
-    """C is a degree, never a coulomb; energy per metre alone leaves its metre to the words before its unit."""
+    """C is a degree, never a coulomb. Energy per metre alone leaves its metre to the words before its unit."""
     for name, said in registries().items():
         end = END.search(name)
         for unit, _ in said:
@@ -372,7 +372,7 @@ def test_files_of_a_sweep_and_of_its_runs_simulated_hold_the_same_numbers(made, 
 
 @pytest.mark.slow
 def test_an_export_has_conditions_in_the_units_of_their_columns(folder):
-    """A discharge of 1800 C is 500 mAh; it was a column discharge_C, whose end is that of a temperature."""
+    """A discharge of 1800 C is 500 mAh. It was a column discharge_C, whose end is that of a temperature."""
     (folder / "charge.toml").write_text(
         '[conditions]\nbattery = 1\nconfiguration = "6T2A"\n[axes]\ndischarge = [0, 1800]\n'
     )

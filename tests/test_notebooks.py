@@ -1,4 +1,4 @@
-"""The notebooks run and their asserts hold; what is committed with outputs is what the paired script says."""
+"""The notebooks run and their asserts hold. What is committed with outputs is what the paired script says."""
 
 from __future__ import annotations
 

@@ -155,7 +155,7 @@ def test_configuration_of_one_command_names_what_another_lacks(tmp_path, monkeyp
 
 def test_no_message_of_what_was_stated_by_options_names_a_field(tmp_path):
     """Every message of a configuration's own rules has its fields between backticks, and those that differ from their
-    option are called by it; from a file by their key."""
+    option are called by it. From a file by their key."""
     source = Path(config.__file__).read_text(encoding="utf-8")
     rules = [m for m in re.findall(r'"idle",\s*(f?"(?:[^"]|"\s*f?")*")', source)]
     fields = {n for kinds in KINDS.values() for k in kinds for n in options.options_of_fields(k) if "_" in n}

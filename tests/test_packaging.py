@@ -67,7 +67,7 @@ def copied(target):
 
 @pytest.mark.slow
 def test_wheel_and_sdist_install_in_a_clean_environment(tmp_path):
-    """With templates, tables, rigs, parts and profiles; libraries come from this environment, no network is needed."""
+    """With templates, tables, rigs, parts and profiles. Libraries come from this environment, no network is needed."""
 
     def run(*words, **options):
         done = subprocess.run(words, capture_output=True, text=True, timeout=600, check=False, **options)

@@ -47,7 +47,7 @@ def given(sheet) -> dict[str, float]:
 
 
 def inconsistency(sheet: parts.MotorSheet) -> dict[str, float]:
-    """Relative departures of a sheet's values from each other; NaN where it does not state them."""
+    """Relative departures of a sheet's values from each other, NaN where it does not state them."""
     s = sheet
     return {
         "no load": s.speed_no_load * s.torque_constant / (s.voltage_nominal - s.current_no_load * s.resistance) - 1,
@@ -92,7 +92,7 @@ def test_parts_motor_sheet_is_consistent(motor):
 
 
 def test_parts_winding_stays_cool_at_the_nominal_current():
-    """In still air at 25 °C with hot copper, where the sheet states a limit; no sheet rates itself beyond it."""
+    """In still air at 25 °C with hot copper, where the sheet states a limit. No sheet rates itself beyond it."""
     for m in parts.packaged_motors():
         if math.isnan(m.temperature_winding_max):
             continue

@@ -237,7 +237,7 @@ def test_regression_over_members_is_the_derivative_of_a_smooth_model(posed, foun
 
 @pytest.mark.slow
 def test_parameter_across_whose_threshold_differences_lead_is_named(posed, found):
-    """The derivative by the resistance says nothing of the jump; that by the other parameters is right."""
+    """The derivative by the resistance says nothing of the jump. That by the other parameters is right."""
     stepped = eqx.tree_at(
         lambda p: p.observe, posed, Stepped(posed.observe.conditions, "steady"), is_leaf=lambda x: x is posed.observe
     )
@@ -337,7 +337,7 @@ def test_options_of_a_population_that_cannot_be_are_refused(options, says):
 @pytest.mark.nightly
 @pytest.mark.slow
 def test_running_gear_is_found_through_the_track_model(tmp_path):
-    """Readings of a shaking gear; the population comes near its slip, which the flush gear does not."""
+    """Readings of a shaking gear. The population comes near its slip, which the flush gear does not."""
     table = records.read_runs("measured")
     table = table.where(
         (table["configuration"] == "6T2A") & (table["supply_voltage_V"] == 15) & (table["slope_deg"] % 10 == 0)

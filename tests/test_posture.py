@@ -164,7 +164,7 @@ def test_derivatives_of_posture_and_step_are_those_of_differences(robot):
 @pytest.mark.quick("angles0")
 @pytest.mark.parametrize("angles", [(-120.0, -40.0), (180.0, 50.0)])
 def test_derivative_where_two_parts_decide_the_step(robot, angles):
-    """Front levers that reach the step beside the belt over its edge; and a smooth highest point."""
+    """Front levers that reach the step beside the belt over its edge, and a smooth highest point."""
 
     @jax.jit
     def height(angles):
@@ -179,7 +179,7 @@ def test_derivative_where_two_parts_decide_the_step(robot, angles):
 @pytest.mark.quick("-180.0")
 @pytest.mark.parametrize("least", [-180.0, -30.0])
 def test_no_posture_stands_on_a_higher_step_than_the_best(robot, least):
-    """Of all within the range, near the best and far from it; and near it some stand about as high."""
+    """Of all within the range, near the best and far from it, and near it some stand about as high."""
     of = params.replace(
         robot,
         {

@@ -28,21 +28,6 @@ def flush(robot):
 
 
 @pytest.mark.slow
-def test_posture_of_a_run(flush):
-    table = flush.table
-    assert table["levers_rear_deg"] == [-8.5] and table["bears"] == ["all along"]
-    assert table["highest_step_mm"][0] == pytest.approx(231.6, abs=0.2)
-    assert table["contact_mm"][0] == pytest.approx(503, abs=1)
-    assert table["pitch_deg"][0] == pytest.approx(-0.0119, abs=1e-4)  # the tail 0.1 mm up
-    assert flush.over.step_mm.max() == pytest.approx(270, abs=0.5) and flush.over.step_mm.shape == (61, 61)
-    k = np.argmin(abs(posture_words.ANGLES - 180)), np.argmin(abs(posture_words.ANGLES + 6))
-    assert flush.over.step_mm[k] < table["highest_step_mm"][0] + 5
-    assert (
-        "steps up to 232 mm" in posture_words.posture_sentences(flush) and posture_words.tipping_remarks(flush) == []
-    )
-
-
-@pytest.mark.slow
 def test_a_run_that_would_tip_is_said_to(flush):
     tipping = posture_words.Postures(
         {**flush.table, "margin_mm": np.array([-3.0])}, flush.rest, flush.step, flush.over

@@ -47,7 +47,7 @@ def test_an_error_that_falls_or_stays_is_not_said():
 
 
 def test_errors_are_of_the_rows_that_both_predict():
-    """A fit that predicts two hard rows more is not worse for them; one that predicts fewer is said to."""
+    """A fit that predicts two hard rows more is not worse for them. One that predicts fewer is said to."""
     readings = held_out(4.0, 4.0)
     before, after = readings["voltage"]
     before[:2], after[:2] = np.nan, 40.0

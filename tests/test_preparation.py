@@ -23,7 +23,7 @@ ALL = {
 
 @pytest.mark.parametrize("who", ALL)
 def test_a_table_whose_masses_have_another_unit_is_refused_by_all(who):
-    """`calibrate` took the table's mass for the robot's own before it compared the two, and fitted a robot of 79 kg;
+    """`calibrate` took the table's mass for the robot's own before it compared the two, and fitted a robot of 79 kg.
     `rig check` compared nothing."""
     runs = records.read_runs("measured")
     runs = Runs("runs.csv", {**runs.columns, "total_mass_kg": 6 * runs["total_mass_kg"]})

@@ -1,4 +1,4 @@
-"""Profiles from files: columns, units, modes and settings; everything wrong is said in one sentence."""
+"""Profiles from files: columns, units, modes and settings. Everything wrong is said in one sentence."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ MATRIX = np.array([[4.0, 1.0], [1.0, 3.0]])
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """An empty one in which programs are kept; JAX's own cache, which other tests fill, is not asked."""
+    """An empty one in which programs are kept. JAX's own cache, which other tests fill, is not asked."""
     monkeypatch.setenv(programs.VARIABLE, str(tmp_path))
     monkeypatch.setattr(jax, "device_count", lambda: 1)
     jax.config.update("jax_enable_compilation_cache", False)
@@ -108,6 +108,12 @@ def test_another_function_class_or_curve_has_another_program():
     some = [effects.BY_NAME["churning"](), effects.BY_NAME["windage"](), *(curve() for curve in UNNAMED.values())]
     names = {named(sine, dataclasses.replace(robot, effects=(e,))) for e in some}
     assert len(names) == len(some)
+
+
+def test_the_source_is_hashed_at_the_folder_of_the_packages():
+    """A module that moved a folder down hashed no file, and old programs were run after an edit."""
+    (root,) = programs.source_hash.__wrapped__.__defaults__
+    assert all((root / package / "__init__.py").is_file() for package in programs.OWN)
 
 
 def test_settings_and_source_are_part_of_a_name(monkeypatch, tmp_path):

@@ -1,4 +1,4 @@
-"""What every command leaves is what `tests/record/commands` has of it (benchmarks/record.py); a difference is seen."""
+"""What every command leaves is what `tests/record/commands` has of it (benchmarks/record.py). A difference is seen."""
 
 from __future__ import annotations
 

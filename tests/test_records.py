@@ -54,7 +54,7 @@ OWN = {"output_speed_rpm": "output_speed_rpm"}
 
 
 def table(step, late):
-    """Nine settings, three to a step; readings follow the setting of their row, or of the row before (`late`)."""
+    """Nine settings, three to a step. Readings follow the setting of their row, or of the row before (`late`)."""
     volts = np.array([6.0, 11.0, 8.0, 14.0, 7.0, 12.0, 9.0, 13.0, 10.0])
     shown = np.roll(volts, late)
     return {"time_s": step * np.arange(9.0), "supply_voltage_V": volts, "output_speed_rpm": 90 * shown - 100}
@@ -101,4 +101,5 @@ def test_a_record_is_checked_and_calibrated(name, tmp_path, capsys, monkeypatch)
     assert command(["rig", "check", file, data]) == 0
     assert "These data determine" in capsys.readouterr().out
     assert command(["calibrate", data, "--robot", file, "--out", "fit"]) == 0
-    assert json.loads((tmp_path / "fit" / "result.json").read_text("utf-8"))["converged"]
+    found = json.loads((tmp_path / "fit" / "result.json").read_text("utf-8"))
+    assert found["optimizer"]["status"] == "converged"

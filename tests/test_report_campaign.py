@@ -85,7 +85,7 @@ def test_few_points_fill_few_bins():
 
 
 def test_a_share_by_few_points_is_said_only_above_its_chance_level():
-    """Of inputs without effect one in 100 has more; 16 points, each a value of its own, fill 6 bins."""
+    """Of inputs without effect one in 100 has more, 16 points, each a value of its own, fill 6 bins."""
     rng = np.random.default_rng(0)
     x = rng.random((2000, 16))
     found = [campaign_figures.variance_share(row, rng.standard_normal(16)) for row in x]

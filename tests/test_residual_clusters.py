@@ -233,7 +233,7 @@ def test_histories_are_compared_by_the_means_of_their_runs():
 
 
 def measured_table(seed, shift):
-    """Sixty runs of the packaged robot up to 10°, with noise, and two columns without a role; the speed is shown
+    """Sixty runs of the packaged robot up to 10°, with noise, and two columns without a role. The speed is shown
     `shift` mm/s too high where wheel 1 idles, and half of it too low elsewhere."""
     rng, robot = np.random.default_rng(seed), paper_robots.nominal()
     volts, slope, load, name = np.meshgrid([15.0, 18.0, 24.0], [0.0, 5.0, 10.0], [0.0, 3.0, 8.0], ["6T2A", "4W2T"])
@@ -297,7 +297,7 @@ def clustered():
 
 
 def test_the_loop_gives_its_document_what_its_last_fit_leaves_clustered():
-    """A clean column without a role is not told; one by which residuals cluster is in the document."""
+    """A clean column without a role is not told. One by which residuals cluster is in the document."""
     plain, found = commanded().found, clustered()
     assert plain.residual_clusters == () and plain.to_json()["residual_clusters"] == []
     document = dataclasses.replace(plain, residual_clusters=(found,)).to_json()

@@ -63,7 +63,7 @@ def test_histories_are_refused():
 
 
 def test_what_the_track_model_has_by_itself_is_left_out_of_the_robot(monkeypatch):
-    """Both fits are of the rows on tracks, with the same noise; what was found in slip, and what it resolves, is gone."""
+    """Both fits are of the rows on tracks, with the same noise. What was found in slip, and what it resolves, is gone."""
     asked = found(effects=("nonlinear_slip",))
     held = ("vibration_slip", "nonlinear_slip", "series_resistance")
     asked.robot = dataclasses.replace(asked.robot, effects=tuple(BY_NAME[n]() for n in held))

@@ -47,8 +47,8 @@ def linear(robot, conditions):
 
 
 def waves(robot, conditions, duration, step, **_):
-    """Runs in closed form instead of the track model's: travel at U · 29 mm/s per V; on tracks a harmonic of what passes
-    drives each oscillator, and the signal that shows it swings by 2 % times its amplification; on wheels by 0.5 %."""
+    """Runs in closed form instead of the track model's: travel at U · 29 mm/s per V. On tracks a harmonic of what passes
+    drives each oscillator, and the signal that shows it swings by 2 % times its amplification. On wheels by 0.5 %."""
     time = 1e-3 * np.arange(1, round(1e3 * duration) + 1)
     speed = 0.029 * np.asarray(conditions.voltage)
     still = {
@@ -103,7 +103,7 @@ def tracked(request, tmp_path_factory):
 
 
 def test_ripple_peaks_where_harmonics_meet_natural_frequencies(tracked):
-    """Reaction, and current with 8 kg, where the third harmonic of the grousers meets bounce; current without payload
+    """Reaction, and current with 8 kg, where the third harmonic of the grousers meets bounce. Current without payload
     where the second meets pitch, whose frequency changes most over the belt's position."""
     found = tracked[1]
     for payload, of in found.modes.items():

@@ -33,7 +33,7 @@ TEXTS = (".html", ".toml", ".json", ".csv", ".svg", ".txt")
 
 
 def words_of_others(*texts):
-    """Forbidden words in texts, each with what stands around it; pictures within a page lie beside it too."""
+    """Forbidden words in texts, each with what stands around it. Pictures within a page lie beside it too."""
     found = []
     for text in texts:
         bare = re.sub(r"data:image/[^\"]*", "", text)
@@ -64,7 +64,7 @@ def of_kind(tmp_path, kind, speed=False):
 
 
 def table_of(rig, changed, levels, slopes=None, sd=0.01, seed=5):
-    """A table of settled runs of a rig with changed parameters, beside its file; every reading with its sd."""
+    """A table of settled runs of a rig with changed parameters, beside its file. Every reading with its sd."""
     robot = robot_file.read_robot(rig)
     layout = Layout.of(robot)
     levels = np.asarray(levels, float)
@@ -94,14 +94,14 @@ BOTH_WAYS = [800, 1600, 2400, 3200, 4000, 4800, -800, -1600, -2400, -3200, -4000
 
 @pytest.fixture
 def bench(tmp_path):
-    """A motor on a bench, its speed imposed, its current alone read, both ways; and its table."""
+    """A motor on a bench, its speed imposed, its current alone read, both ways, and its table."""
     rig = of_kind(tmp_path, "bench", speed=True)
     return rig, table_of(rig, {"bench.loss_coulomb": 0.07}, BOTH_WAYS)
 
 
 @pytest.fixture
 def rover(tmp_path):
-    """A wheeled robot whose motors' speed is imposed, on slopes; and its table."""
+    """A wheeled robot whose motors' speed is imposed, on slopes, and its table."""
     rig = of_kind(tmp_path, "wheeled", speed=True)
     speeds, slopes = np.repeat([1000.0, 2000.0, 3000.0], 3), np.tile([0.0, 5.0, 10.0], 3)
     return rig, table_of(rig, {"rover.ground.rolling_resistance": 0.03}, speeds, slopes)
@@ -392,7 +392,7 @@ motor_speed_rpm = "Drehzahl [1/min]"
 
 def precise_table(path):
     """Settled runs of a motor with a brake of air, 6 nN·m·s², read to a thousandth, as a logger far from here writes
-    them; from the laws in NumPy."""
+    them. From the laws in NumPy."""
     volts = np.array([5, 6.5, 8, 9.5, 11, 12.5, 14, 15.5, 17, 18.5, 20, 22, 24, -7, -11, -15, -19, -23])
     r, k, dry, viscous, air = 2.3, 0.021, 0.0022, 1.1e-6, 6e-9
     # k (u - k w) / r = dry + viscous w + air w², of magnitudes
@@ -438,27 +438,6 @@ def test_compare_shows_a_vehicles_conditions(mmrjax, tmp_path, rover):
     _, out, err = ends(mmrjax("compare", data, "--robot", rig, "--out", "compared"), code=0)
     shown = (tmp_path / "compared" / "figures" / "errors.svg").read_text()
     assert "motor speed [rpm]" in shown and "slope" in shown and "supply voltage" not in shown
-    assert words_of_others(out, err, *left_in(tmp_path / "compared")) == []
-
-
-@pytest.mark.slow
-def test_calibrate_shows_a_vehicles_conditions(mmrjax, tmp_path, rover):
-    rig, data = rover
-    _, said, err = ends(
-        mmrjax("calibrate", data, "--robot", rig, "--starts", "2", "--no-profiles", "--out", "fitted"), code=0
-    )
-    priors = json.loads((tmp_path / "fitted" / "result.json").read_text())["parameters"]
-    assert {p["prior"]["source"] for p in priors.values()} <= {params.STATED, params.DEFAULT}
-    assert words_of_others(said, err, *left_in(tmp_path / "fitted")) == []
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["linear", pytest.param("tracked", marks=pytest.mark.slow)])
-def test_compare_takes_a_table_by_voltage(mmrjax, tmp_path, kind):
-    rig = of_kind(tmp_path, kind)
-    levels = [8, 12, 18, 24, 8, 12, 18, 24]
-    data = table_of(rig, {}, levels, np.tile([0.0, 5.0], 4) if kind == "tracked" else None)
-    _, out, err = ends(mmrjax("compare", data, "--robot", rig, "--out", "compared"), code=0)
     assert words_of_others(out, err, *left_in(tmp_path / "compared")) == []
 
 

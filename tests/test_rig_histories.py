@@ -184,7 +184,7 @@ def test_the_beginning_of_an_arm_in_motion_is_found(tmp_path):
 
 
 def test_beginnings_are_measured_by_the_first_samples(tmp_path):
-    """A line through five samples, whatever channel shows the speed; only free ones are free."""
+    """A line through five samples, whatever channel shows the speed. Only free ones are free."""
     path = tmp_path / "rig.toml"
     for start in ("measured", "free"):
         path.write_text(DRIVE.format(imposed="voltage", channels='"output_speed", "output_angle"', start=start) + ARM)
@@ -221,7 +221,7 @@ def test_what_is_imposed_acts_later_by_the_delay():
 
 
 def test_a_delay_reads_the_run_of_each_row_and_takes_memory_by_rows():
-    """Two runs, the rows in no order; a run of 3000 rows takes less than each row's own copy of the run."""
+    """Two runs, the rows in no order. A run of 3000 rows takes less than each row's own copy of the run."""
     times = np.array([[0.0, 0.5, 1.0], [0.0, 0.25, 0.5]])
     every = np.stack([10 * times, -times], -1)
     order = [1, 0, 1, 0, 0], [2, 1, 1, 2, 0], [[4, 1, 3], [2, 0, -1]]
@@ -313,7 +313,7 @@ def test_an_imposed_speed_changes_within_each_run_and_nothing_else_does(tmp_path
 
 
 def test_every_row_of_an_imposed_speed_has_the_acceleration_of_its_line(tmp_path):
-    """That of the line which begins at the row; the last row of each run ends one, and a run of one row has none."""
+    """That of the line which begins at the row. The last row of each run ends one, and a run of one row has none."""
     robot, _ = imposed_speed(tmp_path, 1)
     ramps = {"a": [100.0, 120.0, 160.0, 160.0, 150.0], "b": [0.0, -30.0, -60.0], "c": [7.0]}
     columns = {
@@ -397,7 +397,7 @@ def test_a_log_of_an_imposed_speed_soon_has_even_steps(tmp_path, faster, step):
 
 @pytest.mark.parametrize("imposed", ["voltage", "motor_current"])
 def test_steps_are_short_where_a_drive_passes_through_rest(tmp_path, imposed):
-    """Of a current from a higher speed on and earlier; by the rates of an angle where no speed is shown, all along where
+    """Of a current from a higher speed on and earlier. By the rates of an angle where no speed is shown, all along where
     neither is. Without a backlash the moment of rest is found within a step, which may be as long as elsewhere."""
     text = DRIVE.format(imposed=imposed, channels='"motor_speed", "output_angle"', start="rest") + BENCH
     text = text.replace('delay = "0 ± 0.05"', "delay = 0.02")
@@ -430,7 +430,7 @@ def test_steps_are_short_where_a_drive_passes_through_rest(tmp_path, imposed):
 
 
 def test_a_voltage_on_lines_is_the_mean_of_each_step_and_no_jump(tmp_path):
-    """The means of all steps make up the integral of the broken line; nothing else than what is imposed is on lines."""
+    """The means of all steps make up the integral of the broken line. Nothing else than what is imposed is on lines."""
     text = DRIVE.format(imposed="voltage", channels='"motor_speed"', start="rest") + BENCH
     (tmp_path / "rig.toml").write_text(text.replace('start = "rest"', 'start = "rest"\nbetween_rows = "linear"'))
     robot = robot_file.load_robot(str(tmp_path / "rig.toml"))
@@ -455,7 +455,7 @@ def test_a_voltage_on_lines_is_the_mean_of_each_step_and_no_jump(tmp_path):
 
 @pytest.mark.slow
 def test_what_is_imposed_is_held_or_goes_on_lines_between_rows(tmp_path):
-    """A ramp of 50 rows a second: on lines it is a ramp of finer rows; held it is late by half a row."""
+    """A ramp of 50 rows a second: on lines it is a ramp of finer rows. Held it is late by half a row."""
     text = DRIVE.format(imposed="voltage", channels='"motor_speed"', start="rest") + BENCH.replace(
         '"0 ± 0.05"', '"0 ± 0"'
     )

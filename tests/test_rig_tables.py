@@ -27,7 +27,6 @@ from mmrjax.model.signals import STALLED
 from mmrjax.model.track_friction import Track
 from sweeps import config as configuration
 from sweeps.points import run
-from tests.commands import ends
 
 DRIVE = {
     "motor.resistance": 2.0,
@@ -243,7 +242,7 @@ def test_times_of_day_count_from_the_first_of_each_run(tmp_path, column, cells):
 
 
 def test_a_run_begins_at_its_first_row_whatever_its_clock_shows(tmp_path):
-    """Each run by its own first row, wherever that stands in the file; in any unit; a row without readings too."""
+    """Each run by its own first row, wherever that stands in the file, in any unit. A row without readings too."""
     rows = "b,0,0.4\na,3600.25,\nb,0.5,0.4\na,3600.5,0.4\nc,12,0.4\n"
     rows = "".join(f"{run},{cell},12,{amps}\n" for run, cell, amps in (r.split(",") for r in rows.split()))
     runs = read(tmp_path, f"run_id,time_s,supply_voltage_V,total_current_A\n{rows}", bench("voltage"))
@@ -258,7 +257,7 @@ def test_a_run_begins_at_its_first_row_whatever_its_clock_shows(tmp_path):
 
 
 def test_a_load_that_drives_its_motors_takes_voltage_from_their_back_emf(tmp_path):
-    """E is 4.71 V: a motor that brakes with 1.3 A of 2 ohm has 2.11 V left; one that takes -0.4 A has not."""
+    """E is 4.71 V: a motor that brakes with 1.3 A of 2 ohm has 2.11 V left. One that takes -0.4 A has not."""
     winch = {"torque_constant": 0.5}
     robot = bench(shown=("motor_current", "motor_voltage"), load=winch)
     header = "motor_speed_rpm,motor_voltage_V,motor_current_A\n"
@@ -551,18 +550,6 @@ def test_curves_of_runs_both_ways_count_along_the_travel(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_bench_with_imposed_speed_and_current_alone_is_calibrated(tmp_path):
-    robot, speed = bench(), np.repeat(np.linspace(500, 4000, 6), 3)
-    true = {"rig.loss_coulomb": 0.07, "rig.loss_viscous": 0.006}
-    conditions = Conditions(np.zeros(len(speed), int), motor_speed=speed * np.pi / 30)
-    runs = measured(tmp_path, robot, conditions, {"motor_speed_rpm": speed}, true)
-    found = calibrate(runs, robot, noise="current=1%", **QUICK)
-    assert found.converged and found.adequacy.adequate
-    assert set(found.parameters) == set(true) and max(inside(found, true).values()) < 3
-    assert list(found.held_out) == ["speed"] and "supply_voltage_V" not in found.rows()
-
-
-@pytest.mark.slow
 def test_three_motors_forward_and_reverse_are_calibrated(tmp_path):
     robot = bench("voltage", ("total_current", "motor_speed"), sides=3.0)
     volts = np.array([-24.0, -18, -12, -6, 6, 12, 18, 24] * 2)
@@ -597,39 +584,6 @@ def test_a_vehicle_on_two_surfaces_is_calibrated(tmp_path):
     assert set(found.parameters) == set(named) and max(inside(found, named).values()) < 3
 
 
-RIG = """
-schema = "mmrjax.robot/2"
-base = "none"
-sides = 1
-imposed = "motor_speed"
-channels = ["total_current"]
-[motor]
-torque_constant = 0.05
-friction_coulomb = 0.004
-[gearbox]
-ratio = 16
-efficiency_load = 0.8
-[bench]
-load = "shaft"
-inertia = 1e-3
-loss_coulomb = "0.05 ± 50 %"
-loss_viscous = 0.004
-"""
-
-
-@pytest.mark.slow
-def test_a_bench_is_compared_and_calibrated_from_two_files(mmrjax, tmp_path):
-    (tmp_path / "rig.toml").write_text(RIG, encoding="utf-8")
-    rows = "".join(f"{n},{0.16 + n * 2.4e-5 + 1e-3 * (k % 3)}\n" for k, n in enumerate(range(500, 4500, 500)))
-    (tmp_path / "runs.csv").write_text(BENCH + rows, encoding="utf-8")
-    both = ("runs.csv", "--robot", "rig.toml", "--out")
-    ends(mmrjax("compare", *both, "a"), code=0)
-    ends(mmrjax("calibrate", *both, "b", "--starts", "2", "--no-profiles", "--noise", "current=2%"), code=0)
-    for page in (tmp_path / "a" / "report.html", tmp_path / "b" / "report.html"):
-        text = page.read_text(encoding="utf-8")
-        assert "n [rpm]" in text and "slope [°]" not in text and "6T2A" not in text
-
-
 # --- instruments of which the table tells --------------------------------------------------------------
 
 
@@ -650,7 +604,7 @@ def test_step_of_readings_is_their_common_divisor(readings, step):
 
 
 def test_an_instrument_left_free_is_what_its_table_shows(tmp_path):
-    """Both ways, magnitudes in steps of 0.03 A: as if the file had stated that; the noise grows by the step."""
+    """Both ways, magnitudes in steps of 0.03 A: as if the file had stated that. The noise grows by the step."""
     path = tmp_path / "t.csv"
     speeds = [-3000, -2500, -2000, -1000, 1000, 1500, 2000, 3000]
     shown = [0.51, 0.48, 0.42, 0.33, 0.36, 0.39, 0.45, 0.54]

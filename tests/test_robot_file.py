@@ -239,7 +239,7 @@ def test_robot_file_knows_what_it_states(tmp_path):
 
 
 def test_a_stated_curve_is_that_of_the_capacity_beside_it(tmp_path):
-    """So what a file with a capacity and a curve of its own means is eq. (13); a capacity alone keeps the paper's."""
+    """So what a file with a capacity and a curve of its own means is eq. (13). A capacity alone keeps the paper's."""
     path, again = tmp_path / "mine.toml", tmp_path / "again.toml"
     for text, of in (
         ("capacity = 18000.0\ncurvature = 1e-9\nslope = -4e-5", 18_000.0),

@@ -439,7 +439,7 @@ def test_a_command_says_it_on_stderr_before_it_fits(mmrjax, tmp_path, monkeypatc
 
 @pytest.mark.parametrize("named", [True, False])
 def test_pages_order_the_rows_of_a_run_as_the_table_does(named):
-    """Rows of two runs, mixed and backwards in time; of one run, where there is no `run_id`."""
+    """Rows of two runs, mixed and backwards in time. Of one run, where there is no `run_id`."""
     time = np.array([3.0, 2.0, 1.0, 0.0, 5.0, 4.0])
     columns = {"run_id": np.array(["a", "b", "a", "b", "a", "b"])} if named else {}
     columns |= {"time_s": time, "total_current_A": time}

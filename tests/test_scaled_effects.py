@@ -275,18 +275,9 @@ def test_the_loop_looks_for_an_error_of_every_instrument(tmp_path):
 
 @pytest.mark.nightly
 @pytest.mark.slow
-def test_a_torque_meters_gain_is_named(tmp_path):
-    runs, robot = metered(tmp_path, 0.05)
-    found = mm.discover(runs, robot)
-    assert found.verdict == "named" and [e.name for e in found.effects] == ["output_torque_gain"]
-    assert found.effects[0].parameters["amplitude"].value == pytest.approx(0.05, abs=0.015)
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
 @pytest.mark.parametrize("signed", [True, False])
 def test_a_current_sensors_offset_is_named(tmp_path, signed):
-    """Of a bench driven both ways; where the sensor shows magnitudes a friction may look alike."""
+    """Of a bench driven both ways. Where the sensor shows magnitudes a friction may look alike."""
     shown = f"[instruments.motor_current]\nsigned = {str(signed).lower()}\n"
     (tmp_path / "rig.toml").write_text(METERED.replace(', "output_torque"', ', "motor_current"') + shown)
     robot = robot_file.read_robot(tmp_path / "rig.toml")

@@ -97,7 +97,7 @@ def test_a_scan_is_as_fine_as_the_rise_of_a_current(coarse):
 
 
 def test_the_interval_of_a_scan_holds_every_basin_that_may_be():
-    """Two basins that differ by 1 σ² and a wall between them; a third one, 6 σ² higher, is out."""
+    """Two basins that differ by 1 σ² and a wall between them. A third one, 6 σ² higher, is out."""
     at = np.linspace(-4, 4, 801)
     rise = np.minimum(np.minimum(((at - 1) / 0.1) ** 2, ((at + 1) / 0.1) ** 2 + 1), ((at - 3) / 0.1) ** 2 + 6)
     seen = Scan(at, 0.5 * rise, at[:, None])

@@ -31,7 +31,7 @@ ANALYST = Analyst(dataclasses.replace(settings_for(Histories, 300), slots=2), {n
 
 @pytest.fixture(scope="module")
 def space():
-    """What can be fitted to two starts; nothing is."""
+    """What can be fitted to two starts. Nothing is."""
     runs = table(histories.narrow((), 0.0, 1, duration=0.4, every=0.02))
     return ANALYST.space(runs.where(np.isin(runs["run_id"], ["start0", "start3"])))
 
@@ -54,7 +54,7 @@ def test_the_program_of_a_log_has_the_effects_that_are_asked_for_and_those_of_it
 
 
 def test_the_base_of_a_log_is_fitted_in_the_program_of_its_room(space, monkeypatch):
-    """One program serves fits with and without effects; scans are those of the base's coordinates."""
+    """One program serves fits with and without effects. Scans are those of the base's coordinates."""
     asked = []
 
     def search(self, problem, starts, weights, active=None, **options):
@@ -180,7 +180,7 @@ def test_a_set_that_needs_another_program_has_to_promise_more(space, monkeypatch
 
 
 def test_fits_with_other_sds_are_few_steps_from_those_that_are_known(space, monkeypatch):
-    """Such a fit begins where it ended with the other sds; one that is not known takes as many steps as it needs."""
+    """Such a fit begins where it ended with the other sds. One that is not known takes as many steps as it needs."""
     known, other, new = fill_slots(["churning"], ANALYST.settings), fill_slots(["brush_drop"], ANALYST.settings), []
     size, at = len(space.coordinates), np.full(len(space.coordinates), 0.3)
 

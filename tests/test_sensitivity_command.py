@@ -139,17 +139,6 @@ def test_inputs_of_a_posterior_that_do_nothing_are_found_whatever_their_variance
     assert_array_equal(inert_inputs(one, local_derivatives(one), 0), [False, True])
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("method", ["sobol", "morris", "derivative"])
-def test_evaluations_are_those_whose_statuses_are_counted(robot, study, method):
-    inputs = room.inputs_from_priors(robot, (*NAMES[:3], "6T2A.ground.friction.static"), {})  # a size of design each
-    points = Points(*(x[:2] for x in study.points.columns().values()))
-    found = analyse_sensitivity(Study(robot, inputs, points, chosen_outputs(("speed",), robot)), method, 3000)
-    assert sum(found.sampled["steady"].values()) == found.evaluations > 0
-    if method == "sobol":
-        assert found.outputs["speed"].convergence[-1][0] == found.evaluations
-
-
 # --- the command ------------------------------------------------------------------------------------------------
 
 

@@ -1,4 +1,4 @@
-"""Settled runs out of logs: they are those of the levels that were held, with sds that hold; what cannot be is said."""
+"""Settled runs out of logs: they are those of the levels that were held, with sds that hold. What cannot be is said."""
 
 from __future__ import annotations
 
@@ -359,7 +359,7 @@ def test_time_in_milliseconds_is_doubted_where_a_start_shows_it(tmp_path):
 
 @pytest.mark.parametrize("moves", [[8.50, 0.42, -0.1743, -9.796, -11.76, -17.17], [0, 190, 400, 620, 830, 1030]])
 def test_a_shaft_that_stands_for_long_may_be_quick_for_a_while(moves):
-    """Through zero from a small angle to a large one; and by more than half a turn a sample."""
+    """Through zero from a small angle to a large one, and by more than half a turn a sample."""
     angle = np.concatenate([np.full(50, float(moves[0])), moves, np.full(50, float(moves[-1]))])
     columns = {"output_angle_deg": angle, "time_s": 0.01 * np.arange(len(angle)), "run_id": np.full(len(angle), "a")}
     contradictions._angle(records.Runs("log.csv", columns))
@@ -448,7 +448,7 @@ def test_glitches_leave_means_where_they_are_or_a_level_out(tmp_path, case):
 
 
 def test_the_readings_of_a_start_are_no_glitches():
-    """A delayed start of a current: the old level, then a peak that decays; a single reading later is a glitch."""
+    """A delayed start of a current: the old level, then a peak that decays. A single reading later is a glitch."""
     rng, k = np.random.default_rng(0), np.arange(200)
     shown = np.where(k < 4, 2.0, 1.0 + 8.0 * np.exp(-(k - 4) / 4)) + 0.01 * rng.standard_normal(200)
     shown[150] = 5.0
@@ -579,7 +579,7 @@ def test_a_log_with_few_settled_runs_is_given_to_the_loop_itself(tmp_path):
 
 
 def turning(tmp_path):
-    """A log of a robot whose wheels are held at nine pairs of speeds; the yaw rate is that of their difference."""
+    """A log of a robot whose wheels are held at nine pairs of speeds. The yaw rate is that of their difference."""
     pairs = np.array([(1, 1), (1, 0.5), (1, -0.5), (0.5, 1), (-1, 1), (-1, -1), (0.5, 0.5), (-0.5, -1), (1, 0.5)])
     left, right = np.repeat(pairs, 40, 0).T
     noise = np.random.default_rng(4).standard_normal((3, len(left)))

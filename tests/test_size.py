@@ -72,7 +72,7 @@ def space(robot, asked, found):
 
 
 def meets(f, asked):
-    """Whether a design meets every requirement; each is a structure of its own to compile."""
+    """Whether a design meets every requirement. Each is a structure of its own to compile."""
     outcomes = sheet.check_requirements(f.robot, asked, changes=False)
     assert all(o.met for o in outcomes), (f.to_json(), outcomes)
     assert float(f.robot.chassis(0).mass) == pytest.approx(f.objectives["mass"])
@@ -94,7 +94,7 @@ def test_alternatives_meet_every_requirement(asked, found):
 
 @pytest.mark.slow
 def test_best_is_of_the_sheets(found):
-    """A ratio that is made, with a gearbox that its source combines with the motor; whole cells."""
+    """A ratio that is made, with a gearbox that its source combines with the motor, whole cells."""
     for f in (found.best, *found.alternatives):
         made = [
             g.ratio * BELT_STAGE
@@ -164,7 +164,7 @@ def test_margins_are_differentiable(robot, asked, found):
 
 
 def test_paper_parts_make_the_papers_robot(robot, asked):
-    """Its own motor, gearbox, ratio, radius and cells give back its numbers; the sheet's where the paper's are others."""
+    """Its own motor, gearbox, ratio, radius and cells give back its numbers. The sheet's where the paper's are others."""
     chosen = options_for_robot(robot)
     of = sizing_task(robot, asked, chosen)
     choice = design_search.choice_space(robot, of, chosen)
@@ -212,7 +212,7 @@ def test_command_leaves_what_its_schema_says(folder):
 
 @pytest.mark.slow
 def test_chart_has_the_limits_of_the_robot(robot, asked):
-    """On the bench's surface adhesion ends at 14.6°; the required speed counts within its envelope alone."""
+    """On the bench's surface adhesion ends at 14.6°. The required speed counts within its envelope alone."""
     of = chart.margin_chart(robot, requirements_file.parse_requirements("speed_m_s = 0.1", "r.toml"), (8.0, 30.0))
     steep = of.slope > 14.6
     assert np.all(of.margin[steep] < 0) and chart.LIMITS[of.nearest[-1, 0]] in ("adhesion", "gearbox input speed")

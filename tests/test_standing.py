@@ -1,4 +1,4 @@
-"""Names stand where they explain better than a curve would; evidence against marginal likelihoods written out."""
+"""Names stand where they explain better than a curve would. Evidence against marginal likelihoods written out."""
 
 import dataclasses
 import itertools
@@ -46,7 +46,7 @@ from mmrjax.model import channels
 
 @pytest.fixture(scope="module")
 def toy():
-    """Twenty rows, four coordinates with standard normal priors, defects of every balance; what is missing is a
+    """Twenty rows, four coordinates with standard normal priors, defects of every balance. What is missing is a
     wave over the speed in the balance `track`."""
     rng = np.random.default_rng(11)
     rows, p = 20, 4
@@ -208,7 +208,7 @@ def names_of(posterior, free):
 
 @pytest.mark.parametrize("scale", [1.0, 30.0], ids=["of the prior's size", "far smaller"])
 def test_evidence_of_a_name_is_its_marginal_likelihood_less_what_was_searched(toy, scale):
-    """Of one effect among a library of twelve; the prior of its amplitude is standard normal, or where the data have
+    """Of one effect among a library of twelve. The prior of its amplitude is standard normal, or where the data have
     it far smaller, of the size that they find most likely."""
     over = np.sin(toy.linear.variable("speed_motor") / 120)[:, None]
     column = scale * bases.place_signature(toy.linear, "track", over)
@@ -393,8 +393,8 @@ def test_what_is_left_lies_where_its_curve_and_where_its_strongest_effect_would(
 
 
 def test_effect_has_to_be_the_strongest_again_without_blocks_that_leave_half_of_it(toy):
-    """`a` is in two thirds of the rows, `b` in the last four: without a third of the rows of `a` it is still chosen;
-    where only `b` is left, `a` is not asked."""
+    """`a` is in two thirds of the rows, `b` in the last four: without a third of the rows of `a` it is still chosen.
+    Where only `b` is left, `a` is not asked."""
     readings, rows = len(toy.readings), np.arange(toy.rows)
     at = np.repeat(rows, 3)
     a, b = (np.where(mine, 1.0, 0.0)[:, None] for mine in (at < 12, at >= 16))
@@ -572,7 +572,7 @@ def test_true_pairs_of_one_balance_keep_their_names(pair):
 @pytest.mark.nightly
 @pytest.mark.slow
 def test_supply_that_sags_over_time_gets_no_name(monkeypatch):
-    """By one volt in 0.8 s, in six starts; it was called a brush drop and an eccentric pulley."""
+    """By one volt in 0.8 s, in six starts. It was called a brush drop and an eccentric pulley."""
     sag = laws.Law("", "supply", lambda s, q: np.full_like(s.w, s.time / 0.8), 1.0 / histories.LARGEST)
     monkeypatch.setitem(histories.EVERY, "sag_over_time", sag)
     made = histories.narrow(["sag_over_time"], 1e6, 1, duration=0.8)

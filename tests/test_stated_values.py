@@ -23,7 +23,7 @@ NEEDED = 25.0
 
 @pytest.fixture(scope="module")
 def toy():
-    """Thirty readings and five coordinates, the last of which no reading shows, at their optimum; the prior of the
+    """Thirty readings and five coordinates, the last of which no reading shows, at their optimum. The prior of the
     first is off by eight of its sds."""
     rng = np.random.default_rng(3)
     readings, p = 30, 5
@@ -76,7 +76,7 @@ LOOKS = {"few": (FEW, small), "many": (SETTLED, settled.table8)}
 
 @functools.cache
 def traced(looks):
-    """The stages of the loop on runs of a robot with leads, and those runs; made once for all files."""
+    """The stages of the loop on runs of a robot with leads, and those runs. Made once for all files."""
     analyst, grid = LOOKS[looks]
     runs = made(lead=0.8, grid=grid)
     return analyst.trace(runs), runs
@@ -117,7 +117,7 @@ def test_nothing_is_shifted_where_the_sheet_is_right(looks):
 
 
 def test_verdict_lists_the_resistance_that_may_be_wrong(looks):
-    """Beside the leads, so that no single name is given; its prior is one fifteenth of the shift."""
+    """Beside the leads, so that no single name is given. Its prior is one fifteenth of the shift."""
     found, _ = traced("few" if looks is LOOKS["few"] else "many")
     assert found.verdict == "class"
     (members,), (stated,) = found.alike.members, found.alike.stated

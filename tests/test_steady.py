@@ -168,16 +168,6 @@ def test_steady_flags(robot, conditions, flags):
 # --- batches ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
-def test_steady_batch_equals_loop(robot, table8, steady_table8):
-    single = jax.jit(steady)
-    for k in (0, 37, 64, 90, 131, 179):
-        alone = single(robot, jax.tree.map(lambda x, k=k: x[k], table8))
-        member = jax.tree.map(lambda x, k=k: x[k], steady_table8)
-        for a, b in zip(jax.tree.leaves(alone), jax.tree.leaves(member), strict=True):
-            assert_allclose(a, b, rtol=1e-12, atol=1e-12)
-
-
 def test_steady_compiles_once_for_other_numbers(robot, table8, compilations):
     jax.block_until_ready(steady_batch(robot, table8))
     other = params.replace(robot, {"motor.resistance": 0.9, "6T2A.mass": 14})

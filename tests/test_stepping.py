@@ -86,7 +86,7 @@ def test_starts_are_as_accurate_as_stated(dt, robot, in_steps):
 
 @pytest.fixture(scope="module")
 def in_steps(robot):
-    """Speeds of a start in steps of one length, over half a second; one program for all."""
+    """Speeds of a start in steps of one length, over half a second. One program for all."""
     step = jax.jit(lambda state, dt, conditions: mm.step(robot, state, None, dt, conditions))
 
     def speeds(conditions, dt):

@@ -1,4 +1,4 @@
-"""How the code hangs together, read from the code with `ast`; every rule is shown to be able to fail."""
+"""How the code hangs together, read from the code with `ast`. Every rule is shown to be able to fail."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ NAMED = {DOOR, ("mmrjax/compile/programs.py", "OWN")}
 
 
 def physics_names_no_layer_above(path: PurePosixPath, tree: ast.Module) -> Iterator[Breach]:
-    """By a string, as `importlib` takes it; of statements Ruff sees to that (ruff.toml of each layer)."""
+    """By a string, as `importlib` takes it. Of statements Ruff sees to that (ruff.toml of each layer)."""
     place = places(tree)
     for node in walked(tree) if path.parts[0] == LAYERS[0] else ():
         text = node.value if isinstance(node, ast.Constant) and isinstance(node.value, str) else ""
@@ -152,7 +152,7 @@ def _conditions(tree: ast.Module) -> Iterator[ast.expr]:
 
 
 def observers_alone_know_the_kind_of_data(path: PurePosixPath, tree: ast.Module) -> Iterator[Breach]:
-    """No other room asks whether a table holds settled runs or histories; it calls a method of the observer."""
+    """No other room asks whether a table holds settled runs or histories. It calls a method of the observer."""
     if path.parts[:3] == ("calibration", "inference", "observers"):
         return
     for node in walked(tree):
@@ -678,7 +678,7 @@ def test_one_preparation_serves_all():
 
 
 def circle(root: Path) -> list[str]:
-    """Modules that import one another in a circle, inside of functions too, as `graphlib` lists them; empty: none.
+    """Modules that import one another in a circle, inside of functions too, as `graphlib` lists them. Empty: none.
 
     Imports for annotations alone (under `TYPE_CHECKING`) are no part of it.
     """
@@ -752,7 +752,7 @@ def test_few_modules_import_for_annotations_alone(tmp_path):
 
 
 def test_nobody_asks_what_a_load_is():
-    """What a load can do it states; which it is ask its balances, and what reads, writes and describes its file."""
+    """What a load can do it states. Which it is ask its balances, and what reads, writes and describes its file."""
     found = {
         path.relative_to(ROOT).as_posix()
         for layer in LAYERS

@@ -3,8 +3,6 @@
 import json
 import time
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import zarr
@@ -12,10 +10,8 @@ from pages import Tables, drawn
 from pydantic import ValidationError
 
 from calibration.data.input_errors import BadConfiguration
-from mmrjax.climbing import terrain
-from mmrjax.climbing.climb_simulation import NAMES, OVER, SLIDES, TIPS, climb_batch, constant_angles
+from mmrjax.climbing.climb_simulation import NAMES, OVER, SLIDES, TIPS
 from mmrjax.fidelities.variation import STATUS, Variation
-from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.paper_robots import nominal
 from sweeps.config_campaign import Campaign, Obstacle
@@ -107,27 +103,6 @@ def test_each_point_has_its_own_robot_levers_and_obstacle(monkeypatch):
     assert np.asarray(asked["sequence"].supply) == pytest.approx([8.0, 8.0])
     assert np.asarray(asked["ground"].points)[:, 2] == pytest.approx(np.array([[0.0, 0.06], [0.0, 0.09]]))
     assert np.asarray(asked["ground"].finish) == pytest.approx([0.3, 0.3])
-
-
-@pytest.mark.slow
-def test_points_of_which_the_robot_varies_are_single_climbs():
-    of = Obstacle(kind="step", duration_s=0.5, time_step_s=2e-4)
-    variation = Variation(ROBOT, ("levers_front_deg", "motor.resistance", "payload"))
-    values = np.array([[30.0, 0.6, 0.0], [50.0, 1.5, 4.0], [50.0, 0.6, 0.0]])
-    conditions = Conditions(np.zeros(3, int), voltage=np.full(3, 24.0)).resolved(ROBOT)
-    found = climbs.compute_climbs(of, variation, conditions, values, np.array([60.0, 90.0, 90.0]), lambda share: None)
-    robot = params.replace(ROBOT, {"motor.resistance": 1.5})
-    one = climb_batch(
-        robot, Conditions(np.zeros(1, int), voltage=24.0, payload=4.0).resolved(robot),
-        jax.tree.map(lambda x: jnp.asarray(x)[None], terrain.single_step(0.09)),
-        jax.tree.map(lambda x: x[None], constant_angles(np.radians(50.0), 0.0 + np.pi - robot.running_gear.lever_rear)),
-        duration=0.5, step=2e-4, sample=climbs.SAMPLE,
-    )  # fmt: skip
-    alone = climbs._numbers(one)
-    for name, value in alone.items():
-        assert float(found[name][1]) == pytest.approx(float(value[0]), rel=1e-6), name
-    assert found["furthest_mm"][2] > found["furthest_mm"][1] + 1  # with less resistance and payload
-    assert found[STATUS].tolist() == [3, 3, 3]  # not settled: the time was over
 
 
 def test_map_of_verdicts_has_each_point_in_its_colour():

@@ -1,4 +1,4 @@
-"""Sweeps on dask workers: the same store as without, also when a worker is killed; schedulers that do not answer."""
+"""Sweeps on dask workers: the same store as without, also when a worker is killed. Schedulers that do not answer."""
 
 import importlib.util
 import os
@@ -91,7 +91,7 @@ def test_sweep_on_two_workers_leaves_the_same_store(tmp_path, two_workers):
 
 @pytest.mark.slow
 def test_worker_killed_in_the_middle_changes_nothing(tmp_path, two_workers):
-    """Of two workers one is killed when a third of the chunks is there; the other does the rest."""
+    """Of two workers one is killed when a third of the chunks is there. The other does the rest."""
     config = CONFIG.replace("chunk = 40", "chunk = 10").replace("number = 50", "number = 500")
     (tmp_path / "plan.toml").write_text(config)
     killed = []
@@ -241,7 +241,7 @@ class Completed(list):
 
 @pytest.mark.slow
 def test_chunks_that_workers_compute_are_those_of_this_process(job, monkeypatch):
-    """What travels, computed where it arrives, in a process that has not yet seen the job; here this one."""
+    """What travels, computed where it arrives, in a process that has not yet seen the job, here this one."""
     import distributed
 
     class Client:

@@ -1,4 +1,4 @@
-"""Designs of sweeps: each point is known from its number, whatever the chunk; distributions are what they state."""
+"""Designs of sweeps: each point is known from its number, whatever the chunk. Distributions are what they state."""
 
 import itertools
 

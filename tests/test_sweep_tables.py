@@ -27,7 +27,7 @@ def robot():
 
 @pytest.fixture(scope="module")
 def runs(robot):
-    """Of both configurations; the last one slides."""
+    """Of both configurations. The last one slides."""
     columns = {
         "configuration": np.array(["6T2A", "4W2T", "6T2A", "6T2A"]), "supply_voltage_V": np.array([24.0, 33.0, 15.0, 24.0]),
         "payload_kg": np.array([0.0, 3.0, 8.0, 0.0]), "slope_deg": np.array([0.0, 5.0, 5.0, 20.0]),
@@ -93,7 +93,7 @@ def test_draws_have_the_intervals_of_robots_simulated_one_by_one(robot, runs, po
 
 @pytest.mark.slow
 def test_chunks_of_draws_change_no_interval(robot, runs, posterior):
-    """Of a run all draws in one chunk, some runs in each; and a run's draws in three."""
+    """Of a run all draws in one chunk, some runs in each, and a run's draws in three."""
     whole = uncertainty.simulate_draws(robot, posterior, runs, chunked(2 * DRAWS), DRAWS)
     parted = uncertainty.simulate_draws(robot, posterior, runs, chunked(4), DRAWS)
     same(whole.columns, parted.columns, rtol=1e-9)
@@ -146,7 +146,7 @@ def test_what_takes_long_runs_in_parts_and_says_how_far_it_is(robot, runs, monke
 
 
 def test_chunks_are_filled_up_to_share_programs(robot, runs):
-    """Of settled points those of few too; what runs over time takes longer than its program does to compile."""
+    """Of settled points those of few too. What runs over time takes longer than its program does to compile."""
     many = dataclasses.replace(runs, columns={k: np.tile(v, 4200) for k, v in runs.columns.items()})
     sizes = [scale.Compiled(run.job_of(robot, r, chunked(None))).size for r in (runs, many)]
     assert sizes == [fidelities.FEW, 2 * scale.SHARED]

@@ -15,7 +15,7 @@ SPEED, CURRENT = channels.find_channel("motor_speed"), channels.find_channel("mo
 
 
 def overlay(rows=200, offset=(1.0, 5.0)):
-    """Two recordings, their rows shuffled; the simulated speed is off by a constant of each, a current is missing."""
+    """Two recordings, their rows shuffled. The simulated speed is off by a constant of each, a current is missing."""
     time = np.tile(np.linspace(0.0, 10.0, rows), 2)
     run = np.repeat(["a", "b"], rows)
     measured = 100 * np.sin(time)

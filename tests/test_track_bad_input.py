@@ -90,7 +90,7 @@ def test_lever_is_measured_from_the_tracks_axle_whoever_comes_first(robot):
 
 @pytest.mark.parametrize("limit", [2.6e-4, 1.0999e-4, 1e-4, 3.7e-6, 0.5])
 def test_step_that_is_proposed_can_be_typed_in(limit):
-    """It is not above the limit, divides the sample, and survives being printed; and it is not far below."""
+    """It is not above the limit, divides the sample, and survives being printed, and it is not far below."""
     proposed = _whole(1e-3, limit)
     typed = float(f"{proposed:g}")
     assert 0.5 * min(limit, 1e-3) < typed <= limit * (1 + 1e-12)
@@ -118,7 +118,7 @@ def test_posture_that_cannot_stand_has_a_negative_margin(robot):
 
 
 def test_standing_robot_is_in_balance(robot):
-    """Weight and moment to 1e-9, on a slope with a payload off centre; then no force is left over."""
+    """Weight and moment to 1e-9, on a slope with a payload off centre. Then no force is left over."""
     from mmrjax.undercarriage.half_robot import instant
 
     loaded = params.replace(robot, {"running_gear.payload_offset": jnp.asarray(0.05)})
@@ -186,7 +186,7 @@ def changed(robot, values):
 
 @pytest.mark.slow
 def test_gear_that_throws_the_robot_off_the_ground_is_flagged(robot):
-    """Set S at 33 V on 15 deg leaves the ground for a twentieth of the time; at 15 V it shakes and stays on it."""
+    """Set S at 33 V on 15 deg leaves the ground for a twentieth of the time. At 15 V it shakes and stays on it."""
     runs = Conditions(
         voltage=jnp.asarray([15.0, 33.0]), slope_deg=jnp.asarray([10.0, 15.0]), payload=jnp.asarray([0.0, 8.0])
     )
@@ -200,7 +200,7 @@ def test_gear_that_throws_the_robot_off_the_ground_is_flagged(robot):
 
 @pytest.mark.slow
 def test_robot_thrown_over_by_its_own_motion_tips_and_harms_no_other(robot):
-    """A payload 0.66 m up: gravity alone would not turn it over on 20 deg, its start does; at 15 V it climbs."""
+    """A payload 0.66 m up: gravity alone would not turn it over on 20 deg, its start does. At 15 V it climbs."""
     high = {
         "running_gear.payload_height": 0.66,
         "6T2A.ground.friction.static": 1.2,

@@ -1,7 +1,7 @@
 """Derivatives of the track model's averages, forward and reverse, against central differences.
 
 Eight operating points in both configurations, rolling, averaged over whole grouser periods of the settled
-orbit; every parameter by its relative change. To 1 %, no floor but for what is zero.
+orbit. Every parameter by its relative change. To 1 %, no floor but for what is zero.
 """
 
 import jax

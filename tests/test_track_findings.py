@@ -194,7 +194,7 @@ def test_guides_carry_nearly_all_of_the_weight_when_flush(runs):
 
 
 def test_belt_is_tight_above_and_slack_below(runs):
-    """The front pulley pulls the upper run; traction enters along the lower one (4W2T: at the rear wheel)."""
+    """The front pulley pulls the upper run. Traction enters along the lower one (4W2T: at the rear wheel)."""
     for k in (*TRACKED, *WHEELED):
         tension = runs.reactions.tension[k, TAIL].mean(axis=0)
         lower, upper = tension[:8], tension[13:20]

@@ -1,4 +1,4 @@
-"""The MJCF in C MuJoCo, stepped with the same forces, against MJX; and the mass constants of a member."""
+"""The MJCF in C MuJoCo, stepped with the same forces, against MJX, and the mass constants of a member."""
 
 import jax
 import jax.numpy as jnp
@@ -65,7 +65,7 @@ def step_both(robot):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(RUNS))
 def test_c_mujoco_agrees_over_a_second(robot, step_both, name):
-    """10 000 steps, each engine on its own trajectory; to 1e-6 of every coordinate's and rate's size.
+    """10 000 steps, each engine on its own trajectory. To 1e-6 of every coordinate's and rate's size.
 
     What C MuJoCo gives to a step are its mass matrix and its acceleration.
     """
@@ -99,7 +99,7 @@ def test_c_mujoco_agrees_over_a_second(robot, step_both, name):
 
 @pytest.mark.slow
 def test_c_mujoco_shakes_alike():
-    """Set S at 33 V, 5 deg, 8 kg: 12 000 steps in which contacts open and close; goal a fifth, found 1e-13."""
+    """Set S at 33 V, 5 deg, 8 kg: 12 000 steps in which contacts open and close. Goal a fifth, found 1e-13."""
     import shaking
 
     found = shaking.native(33.0, 5.0, 8.0)

@@ -24,7 +24,7 @@ def _member(runs, k):
 
 
 def rolling():
-    """Runs in closed form, in the shapes of the track model's: 0.9 m/s with equal loads; the last has no numbers."""
+    """Runs in closed form, in the shapes of the track model's: 0.9 m/s with equal loads. The last has no numbers."""
     time = np.tile(1e-3 * np.arange(1, 41), (3, 1))
     way, wheel = 0.9 * time, 0.9 * time / 0.05
     q = np.stack([way, 0.05 + 0 * time, 0 * time, wheel, wheel], -1)

@@ -32,7 +32,7 @@ MIRRORED, ALIKE = (0, 1), 4
 
 
 def _power(run, motion):
-    """A step, and where its power goes [W], of the whole robot; what is stored after it [J]."""
+    """A step, and where its power goes [W], of the whole robot. What is stored after it [J]."""
     robot, b = run.robot, both_sides
     sides, plane = b._contacts(run, motion), b.plane_motion(run, motion)
     signals, pulled = b._resolved(run, plane, sides)
@@ -144,7 +144,7 @@ def test_sides_swapped_mirror(runs):
 
 @pytest.mark.slow
 def test_sides_alike_are_the_half_robot(robot, runs):
-    """To 1e-6 of every coordinate's and rate's size, and of the current; nothing to the side."""
+    """To 1e-6 of every coordinate's and rate's size, and of the current. Nothing to the side."""
     straight = jax.tree.map(lambda x: x[ALIKE], RUNS).straight()
     run = half_robot_system(robot, straight, STEP)
 
@@ -164,7 +164,7 @@ def test_sides_alike_are_the_half_robot(robot, runs):
 
 
 def test_forces_do_the_work_of_contacts_and_friction_takes_it(robot):
-    """Generalized forces on any velocities, against the sum over contacts; lateral friction is λ of that along."""
+    """Generalized forces on any velocities, against the sum over contacts. Lateral friction is λ of that along."""
     conditions = Conditions(0, voltage=24.0, duty_left=1.0, duty_right=0.3, adhesion_lateral=0.6).resolved(robot)
     b, v = both_sides, 1e-3 * np.array([3.0, 2.0, 0.4, 20.0, 0.7, 1.5, 90.0, 95.0, 60.0, 70.0])
     q = np.zeros(10)
@@ -198,7 +198,7 @@ def test_forces_do_the_work_of_contacts_and_friction_takes_it(robot):
 
 @pytest.mark.parametrize("configuration", [0, 1])
 def test_bodies_are_the_robot_that_mujoco_compiles(robot, configuration):
-    """Mass, and the moment of inertia in yaw about the centre, of all; and of half a robot twice the planar ones."""
+    """Mass, and the moment of inertia in yaw about the centre, of all, and of half a robot twice the planar ones."""
     run = Conditions(configuration, payload=3.0, heading_deg=0.0)
     zero = jnp.asarray(0.0)
     total = balances.begin_signals(robot, run, State(zero, zero, zero, zero)).mass
@@ -246,7 +246,7 @@ def test_friction_rises_as_differences_say_and_never_falls_along_its_sliding(rob
 
 @pytest.mark.parametrize("contacts", [24, 2])
 def test_a_turn_is_seen_from_above(contacts):
-    """What bears is drawn on its side, as wide as its load; what slides, with an arrow the way it slides."""
+    """What bears is drawn on its side, as wide as its load. What slides, with an arrow the way it slides."""
     load = np.zeros((2, 2, contacts))
     load[:, 0, :2], load[:, 1, 0] = (10.0, 20.0), 5.0
     q, v = np.zeros((2, 10)), np.zeros((2, 10))
@@ -268,7 +268,7 @@ def test_a_turn_is_seen_from_above(contacts):
 
 @pytest.mark.slow
 def test_wheels_turn_as_the_steady_fidelity_says_and_tracks_faster(robot):
-    """On the spot; the track does not bear along all of its wheelbase (docs/explanation/turning.md)."""
+    """On the spot. The track does not bear along all of its wheelbase (docs/explanation/turning.md)."""
     turns = Conditions(["6T2A", "4W2T"], voltage=[15.0, 24.0], duty_left=-1.0, duty_right=1.0).resolved(robot)
     found = track_batch(robot, turns, duration=0.6, rolling=True)
     settled = steady_batch(robot, turns)

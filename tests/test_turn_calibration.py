@@ -1,7 +1,6 @@
 """Calibration of a robot whose sides are driven apart: tables of settled turns whose truth is known."""
 
 import dataclasses
-import json
 
 import jax
 import jax.numpy as jnp
@@ -17,8 +16,7 @@ from calibration.inference import blocks, identifiability, observers, priors
 from calibration.inference import optimizers as fit
 from calibration.inference.calibration import calibrate
 from calibration.inference.observers.turns import SettledTurns
-from mmrjax.model import balances, channels, paper_robots, params
-from tests.commands import ends
+from mmrjax.model import balances, channels
 
 CURRENTS = ("motor_current_left", "motor_current_right")
 MOTION = ("motor_speed_left", "motor_speed_right", "yaw_rate")
@@ -169,27 +167,6 @@ def test_truth_of_a_second_implementation_is_found(robot, of_world):
     held = found.held_out["turn"].errors
     assert all(0 < held[name].rms_sigma < 2 for name in SHOWN)
     assert held["yaw_rate"].rms_percent < 2 < found.errors_before["yaw_rate"].rms_percent
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-def test_truth_of_a_simulated_table_is_found_from_the_command_line(tmp_path, mmrjax):
-    friction = {f"4W2T.ground.friction.{k}": v for k, v in (("static", 0.45), ("dynamic", 0.36))}
-    true = params.replace(paper_robots.nominal(), {f"4W2T.{LATERAL}": 0.9, **friction})
-    duties = dict(zip(("duty_left", "duty_right"), np.array(DUTIES).T, strict=True))
-    runs = mm.Conditions(["4W2T"] * len(DUTIES), voltage=33.0, **duties)
-    seen = mm.simulate(true, runs).reading
-    mass = float(true.configurations["4W2T"].mass)
-    table = written(tmp_path / "turns.csv", "4W2T", mass, {name: seen[name] for name in SHOWN})
-    (tmp_path / "robot.toml").write_text(f'base = "nominal"\nchannels = [{", ".join(map(repr, SHOWN))}]\n')
-    free = ",".join(f"4W2T.{n}" for n in (LATERAL, WIDTH, "ground.friction.static"))
-    told = ("--robot", str(tmp_path / "robot.toml"), "--free", free, "--noise", NOISE)
-    _, out, _ = ends(mmrjax("calibrate", str(table), *told, "--out", str(tmp_path / "run")), code=0)
-    assert "held out" in out
-    held = json.loads((tmp_path / "run" / "result.json").read_text())["held_out_by"]["turn"]
-    assert held["all"]["yaw_rate"]["rows"] == len(DUTIES)
-    fitted = mm.read_robot(str(tmp_path / "run" / "robot.toml"))
-    assert float(fitted.configurations["4W2T"].turning.lateral) == pytest.approx(0.9, rel=0.03)
 
 
 @pytest.mark.slow

@@ -258,7 +258,7 @@ def test_a_robot_that_cannot_turn_is_refused_wherever_it_is_asked_to(tmp_path, m
 
 
 def test_results_of_turns_show_both_sides():
-    """Nothing is computed before it is asked for; who travels straight has the columns of before."""
+    """Nothing is computed before it is asked for. Who travels straight has the columns of before."""
     robot, sides = paper_robots.nominal(), {"duty_left": 1.0, "duty_right": [0.5, -1.0]}
     turns, straight = (mm.simulate(robot, mm.Conditions("6T2A", voltage=33.0, **x)) for x in (sides, {}))
     assert {"yaw_rate", "motor_current_left", "motor_current_right"} <= {c.name for c in turns.channels}

@@ -54,7 +54,7 @@ CURVES = ("curve_track_side", "curve_yaw_yaw_rate", "curve_slip_yaw_rate")
 @pytest.fixture(scope="module")
 def shown(posed):
     """Change of the whitened readings as an effect of a robot goes from nothing to an amplitude, by central
-    difference; the others that are asked for here stand beside it without amplitude, so that one program serves."""
+    difference. The others that are asked for here stand beside it without amplitude, so that one program serves."""
     problem, space = posed
     robot = problem.robot(jnp.zeros(space.free))
     kinds = [(effects.BY_NAME | effects.BESIDE)[name] for name in (*SCORED, *CURVES)]

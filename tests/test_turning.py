@@ -41,7 +41,7 @@ def robot():
 
 @pytest.fixture(scope="module")
 def turns(robot):
-    """Settled turns at 33 V: as `DUTIES` say, mirrored, backward, and straight; of either configuration."""
+    """Settled turns at 33 V: as `DUTIES` say, mirrored, backward, and straight, of either configuration."""
     left = [a for a, _ in DUTIES] + [b for _, b in DUTIES] + [-a for a, _ in DUTIES] + [0.7]
     right = [b for _, b in DUTIES] + [a for a, _ in DUTIES] + [-b for _, b in DUTIES] + [0.7]
     which = np.repeat(CONFIGURATIONS, len(left))

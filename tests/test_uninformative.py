@@ -4,13 +4,14 @@ import dataclasses
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from calibration.data import robot_file
 from calibration.data import runs as records
 from calibration.data.input_errors import BadData
 from calibration.described import describe
 from calibration.discovery import discover
-from calibration.inference import noise, observers, preparation, ranges, uninformative
+from calibration.inference import noise, observers, ranges, uninformative
 
 RIG = """
 base = "none"
@@ -73,13 +74,12 @@ def test_independent_readings_are_no_copies(tmp_path, robot):
 @pytest.mark.parametrize(
     ("copy", "column", "said"),
     [
-        (
-            {"torque": 0.64 * CURRENT},
-            "output_torque_Nm",
-            "0.64 times motor_current_A, to the last digit: it is computed",
-        ),
         ({"torque": 3 - 2 * CURRENT}, "output_torque_Nm", "3 - 2 times motor_current_A"),
-        ({"torque": np.round(0.64 * CURRENT, 4)}, "output_torque_Nm", "0.64 times motor_current_A"),
+        (
+            {"torque": 1 - 0.64 * np.round(CURRENT, 4)},
+            "output_torque_Nm",
+            "1 - 0.64 times motor_current_A, to the last digit: it is computed",
+        ),
     ],
 )
 def test_a_channel_that_is_a_line_of_another_is_refused_by_the_loop(tmp_path, robot, foreseen, copy, column, said):
@@ -98,24 +98,41 @@ def test_what_follows_another_within_noise_or_a_display_or_on_a_curve_is_no_copy
     assert uninformative.copied_channels(table(tmp_path, robot, torque=torque), robot) == []
 
 
-def test_a_load_that_is_a_multiple_of_a_current_is_computed(tmp_path, robot, foreseen):
-    """No command fits it; friction, a coarse display and a meter's noise leave no multiple."""
+@pytest.mark.parametrize("torque", [0.64 * CURRENT, np.round(0.64 * CURRENT, 4)])
+def test_a_measured_torque_that_is_a_multiple_of_a_current_is_left_out(tmp_path, robot, torque):
+    runs = table(tmp_path, robot, torque=torque)
+    assert not runs.has("output_torque_Nm") and runs.has("motor_current_A")
+    assert any("output_torque_Nm: in every row 0.64" in note and "it is left out" in note for note in runs.notes)
+
+
+def test_a_load_that_is_a_multiple_of_a_current_is_left_out(tmp_path, robot):
+    """The load is what leaves the gearbox at the current. Friction, a display and a meter's noise leave no multiple."""
     current = np.round(CURRENT, 5)
     runs = table(tmp_path, robot, current, load_torque_Nm=np.round(0.64 * current, 4))
-    foreseen(shown(runs))
-    with pytest.raises(
-        BadData, match=r"load_torque_Nm: in every row 0\.64\d* times motor_current_A.* never measured"
-    ):
-        preparation.prepare(runs, robot)
+    (note,) = (note for note in runs.notes if "load_torque_Nm: in every row 0.64" in note)
+    assert "this current is no reading either" in note and not runs.has("motor_current_A")
+    output = 20 * 0.8 * (0.04 * current - 0.002) - 0.3
+    assert_allclose(runs["load_torque_Nm"], output, rtol=1e-3)
     noisy = 0.64 * current + 2e-4 * RNG.standard_normal(12)
-    for torque in (0.64 * current - 0.03, np.round(0.64 * current, 2), noisy):
-        assert uninformative.computed_load(table(tmp_path, robot, current, load_torque_Nm=torque)) is None
     few = np.round(current, 1)
-    assert uninformative.computed_load(table(tmp_path, robot, few, load_torque_Nm=0.64 * few)) is None
+    for drawn, torque in (
+        (current, 0.64 * current - 0.03), (current, np.round(0.64 * current, 2)), (current, noisy), (few, 0.64 * few),
+    ):  # fmt: skip
+        kept = table(tmp_path, robot, drawn, load_torque_Nm=torque)
+        assert kept.has("motor_current_A") and not [note for note in kept.notes if "computed" in note]
+
+
+def test_a_computed_load_is_refused_where_the_current_is_imposed(tmp_path, robot):
+    rig = dataclasses.replace(robot.rig, imposed="motor_current", channels=("output_speed", "motor_voltage"))
+    driven = dataclasses.replace(robot, rig=rig)
+    with pytest.raises(
+        BadData, match=r"load_torque_Nm: in every row 0\.64 times motor_current_A.* keep rows without"
+    ):
+        table(tmp_path, driven, load_torque_Nm=0.64 * CURRENT)
 
 
 def test_readings_that_a_rigid_gear_ties_are_said_and_not_refused(tmp_path, robot):
-    """The imposed speed is no channel; with the motor's as one, the output's may be of the same instrument."""
+    """The imposed speed is no channel. With the motor's as one, the output's may be of the same instrument."""
     rig = dataclasses.replace(robot.rig, channels=("motor_speed", "output_speed"), imposed="voltage")
     driven = dataclasses.replace(robot, rig=rig)
     columns = {"supply_voltage_V": SPEED / 200, "motor_speed_rpm": SPEED, "output_speed_rpm": SPEED / 20}
@@ -150,7 +167,7 @@ def test_runs_of_one_condition_are_refused_by_the_loop(tmp_path, robot, foreseen
 
 @pytest.mark.parametrize(("factor", "unit"), [(1000.0, "mNm"), (10.0, "")])
 def test_a_torque_in_another_unit_is_refused_where_its_friction_is_not_known(tmp_path, robot, foreseen, factor, unit):
-    """Friction that nobody knows may be ten times another; a thousand times is a matter of units."""
+    """Friction that nobody knows may be ten times another. A thousand times is a matter of units."""
     runs = table(tmp_path, robot)
     foreseen(shown(runs))
     off = table(tmp_path, robot, torque=factor * TORQUE)

@@ -1,4 +1,4 @@
-"""Columns that vary and are no conditions: found, with what each may be; a torque at the output that a brake sets."""
+"""Columns that vary and are no conditions: found, with what each may be. A torque at the output that a brake sets."""
 
 import numpy as np
 import pytest
@@ -78,7 +78,7 @@ def test_a_torque_that_no_load_gives_may_be_a_brakes(tmp_path):
 
 
 def test_readings_that_a_brake_explains_are_no_contradiction(tmp_path):
-    """As a condition it tells rows apart; without it the message says how it becomes one."""
+    """As a condition it tells rows apart, without it the message says how it becomes one."""
 
     def checked(runs):
         return SettledRuns.check(runs, noise.infer_noise(runs, SettledRuns.sizes(runs), None))

@@ -179,7 +179,7 @@ def test_constant_values_at_every_instant_are_those_of_a_constant_run():
 
 @pytest.mark.slow
 def test_runs_are_those_of_missions(simulated):
-    """Of an engine with steps, events and friction at rest of its own; its noise is all that remains."""
+    """Of an engine with steps, events and friction at rest of its own. Its noise is all that remains."""
     runs, observer = simulated, Histories.of(simulated, paper_robots.nominal())
     truth = params.replace(paper_robots.nominal(), {k: jnp.asarray(v) for k, v in TRUTH.items()})
     seen = np.asarray(eqx.filter_jit(observer)(truth).reading)
@@ -220,18 +220,6 @@ def test_derivatives_of_a_varying_run_are_differences(of_values, solved):
         assert (scale > 0).all(), name
         error = np.abs(slopes[..., k] - expected).max(0) / scale
         assert (error < DERIVATIVES).all(), (name, error)
-
-
-@pytest.mark.slow
-def test_derivative_of_a_varying_run_along_one_direction_is_a_difference(of_values, solved):
-    """All of these parameters at once, by shares drawn at random."""
-    names, theta, readings, several = of_values
-    along = theta * np.random.default_rng(6).uniform(0.3, 1.0, len(names)) * np.array([1, -1, 1, -1, 1, 1])
-    slope = np.asarray(jax.jit(lambda x: jax.jvp(readings, (x,), (along,))[1])(theta))
-    ends = jnp.resize(theta + DIFFERENCE * along * np.array([[1.0], [-1.0]]), (len(names), len(names)))
-    up, down, *_ = np.asarray(several(ends))  # as many as the differences above have, whose program it is
-    expected = (up - down) / (2 * DIFFERENCE)
-    assert (np.abs(slope - expected).max(0) < DERIVATIVES * np.abs(expected).max(0)).all() and slope.any(0).all()
 
 
 # --- what inference makes of it
@@ -421,7 +409,7 @@ def test_speeds_without_a_sign_are_refused_where_a_run_is_driven_backward(runs):
 
 
 def test_a_rig_may_turn_on_forward_while_it_is_driven_backward(runs):
-    """Its inertia carries it through one stretch; another shows that its speeds have a sign."""
+    """Its inertia carries it through one stretch. Another shows that its speeds have a sign."""
     nothing = Noise(*(None for _ in dataclasses.fields(Noise)))
     back = np.flatnonzero(runs["supply_voltage_V"] * (runs["mode"] == "voltage") < 0)
     speed = runs["motor_speed_rpm"].copy()

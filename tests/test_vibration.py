@@ -103,7 +103,7 @@ GEARS = {
 
 @pytest.fixture(scope="module")
 def shaken():
-    """Slip [%] of runs, and what follows from their ripple; gears that the law was not derived from."""
+    """Slip [%] of runs, and what follows from their ripple. Gears that the law was not derived from."""
 
     rows = (jnp.repeat(jnp.asarray([15.0, 33.0]), 3), jnp.tile(jnp.asarray([0.0, 6.0, 12.0]), 2), jnp.zeros(6))
     found = {}
@@ -138,7 +138,7 @@ def test_fig_7_alone_misses_the_slip_of_the_gear_that_shakes(shaken):
 @pytest.mark.nightly
 @pytest.mark.slow
 def test_loop_finds_the_effect_in_what_the_track_model_made():
-    """Seventy rows of a gear that shakes (set S of 2026-11-22), with noise; nobody tells the loop of it."""
+    """Seventy rows of a gear that shakes (set S of 2026-11-22), with noise. Nobody tells the loop of it."""
     gear = {
         "guide_recess": 3.327e-4, "guide_gap": 10.29e-3, "contact_stiffness": 4.261e7, "contact_damping": 806.9,
         "centre_offset": -1.54e-3, "payload_height": 67.5e-3,

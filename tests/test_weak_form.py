@@ -1,4 +1,4 @@
-"""Regression of a log's equations in weak form, on logs from plain NumPy laws; no window holds a jump."""
+"""Regression of a log's equations in weak form, on logs from plain NumPy laws. No window holds a jump."""
 
 from __future__ import annotations
 
@@ -205,7 +205,7 @@ def test_windows_across_a_jump_are_wrong(space, before, monkeypatch):
 @pytest.mark.parametrize("imposed, channel", [("motor_current", "motor_speed"), ("motor_speed", "motor_current")])
 def test_a_current_or_a_speed_may_be_imposed(tmp_path, imposed, channel):
     """Torques alone are shown then: inertia over the torque constant, and the effect where rows follow a speed that
-    turns between them; lines between rows of an imposed one differ from it by more than the effect."""
+    turns between them. Lines between rows of an imposed one differ from it by more than the effect."""
     text = RIG.replace('imposed = "voltage"', f'imposed = "{imposed}"')
     if imposed == "motor_current":  # samples of a current that changes between them, half a row earlier than if held
         text += f'[rig]\ndelay = "{-EVERY / 2} ± 0"\n'

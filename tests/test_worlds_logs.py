@@ -23,7 +23,7 @@ ERROR = 0.3
 
 def shown(tmp_path, case, terms=()):
     """Readings of the simulator with the truth of a case, in sds as the generator's: without effects, then with each of
-    `terms` alone; each of shape (runs, readings)."""
+    `terms` alone, each of shape (runs, readings)."""
     case.write(tmp_path)
     robot = robot_file.read_robot(tmp_path / "rig.toml")
     runs = records.read_runs(tmp_path / "table.csv", robot=robot)

@@ -12,7 +12,7 @@ from worlds.turning import LENGTH, REACH, STATES, SURFACES, WIDTH, Inputs, circl
 
 
 def ideal(wheeled=False, surface="wood", coulomb=False, **changes):
-    """The paper's robot without rolling resistance; `coulomb`: friction without creep and without fall."""
+    """The paper's robot without rolling resistance. `coulomb`: friction without creep and without fall."""
     role = "4W2T" if wheeled else "6T2A"
     own = {f"{role}.ground.rolling_resistance": 0.0}
     robot = paper_robot(wheeled, surface, left=own, right=own, **changes)

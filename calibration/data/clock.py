@@ -26,13 +26,14 @@ SHARED, ODD = 0.1, 0.1
 
 
 def unwrap_counter(count: np.ndarray, run: np.ndarray) -> tuple[np.ndarray, float]:
-    """Returns a counter that goes on past its end, and its period; 0 where it does not.
+    """Returns a counter that goes on past its end, and its period, 0 where it does not.
 
     A counter wraps where it falls from its last numbers to its first ones, within `LACKING` usual steps, and never
     goes back otherwise.
 
     Args:
-        count: as logged, shape (rows,); run: index of the recording of each row, shape (rows,).
+        count: as logged, shape (rows,).
+        run: index of the recording of each row, shape (rows,).
     """
     same = np.diff(run) == 0
     step = np.where(same, np.diff(count), 0.0)
@@ -66,7 +67,8 @@ def spread_shared_stamps(time: np.ndarray, run: np.ndarray) -> tuple[np.ndarray,
     The number of rows is 0 where nothing is changed.
 
     Args:
-        time: of rows in order, shape (rows,); run: index of the recording of each row, shape (rows,).
+        time: of rows in order, shape (rows,).
+        run: index of the recording of each row, shape (rows,).
     """
     if len(time) < 3:
         return time, 0.0
@@ -136,7 +138,9 @@ def from_the_first(name: str, meaning: Column, raw: Raw, runs: Sequence[str] | N
     and the reader refuses that cell.
 
     Args:
-        name: of the source; meaning: of the column; runs: `run_id` of each cell; None: all are of one run.
+        name: of the source.
+        meaning: of the column.
+        runs: `run_id` of each cell. None: all are of one run.
     """
     factor = meaning.value(1.0)
     clock = (

@@ -29,7 +29,7 @@ _WITH_UNIT = re.compile(r"([+-]?\d*\.?\d+(?:[eE][+-]?\d+)?)\s*([^\d\s.,].*)")
 def convert_column(meaning: Column, raw: Raw, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
     """Returns a column's values in its unit, NaN where there is no reading, and True for each cell to be refused.
 
-    All cells are read at once, since a log may have a million rows; `refused_cell_sentence` makes the sentence about
+    All cells are read at once, since a log may have a million rows. `refused_cell_sentence` makes the sentence about
     one of them.
     """
     if meaning.column in WORDS:
@@ -40,7 +40,11 @@ def convert_column(meaning: Column, raw: Raw, layout: Layout) -> tuple[np.ndarra
     beyond = ROUNDED_FACTOR if meaning.factor != 1.0 else ROUNDED
     above = found > low if meaning.column in layout.deviation_columns else found >= low - beyond * abs(low)
     refused = ~(above & (found <= high + beyond * abs(high)))
-    if _may_be_empty(meaning.column, layout):
+    if meaning.column != layout.imposed_column and meaning.column in (
+        *layout.measured_columns,
+        *layout.deviation_columns,
+        *DUTY,
+    ):
         refused[refused] = ~missing_readings(raw, np.flatnonzero(refused))
     np.clip(found, low, high, out=found)
     return found if meaning.as_named else _in_its_unit(meaning, found), refused
@@ -53,15 +57,8 @@ def _in_its_unit(meaning: Column, written: np.ndarray) -> np.ndarray:
     return written * meaning.factor * meaning.quantity.units[meaning.unit]
 
 
-def _may_be_empty(column: str, layout: Layout) -> bool:
-    """True for a column whose cells may have no reading."""
-    return column != layout.imposed_column and column in (
-        *layout.measured_columns, *layout.deviation_columns, *DUTY,
-    )  # fmt: skip
-
-
 def _allowed_words(column: str, word: str, layout: Layout) -> str:
-    """Allowed words for the message about a word; empty if the word is allowed itself."""
+    """Allowed words for the message about a word, empty if the word is allowed itself."""
     if column == "surface":
         return surfaces.allowed_labels(word, layout)
     if column == "mode" and word not in DRIVEN:
@@ -75,7 +72,8 @@ def refused_cell_sentence(where: str, meaning: Column, cell: str, layout: Layout
     """Returns the sentence about a cell that `convert_column` refuses.
 
     Args:
-        where: opens it; hints: True to guess the unit that was meant.
+        where: opens it.
+        hints: True to guess the unit that was meant.
     """
     column, hint = meaning.column, ""
     if column in WORDS:
@@ -93,7 +91,7 @@ def refused_cell_sentence(where: str, meaning: Column, cell: str, layout: Layout
 
 
 def _hint(meaning: Column, cell: str, units: bool, readings: Names) -> str:
-    """Guess at the meaning of a refused cell, with a semicolon at its end; empty without a guess."""
+    """Guess at the meaning of a refused cell, with a semicolon at its end, empty without a guess."""
     if cell.lower() in NOTHING:
         return "leave the cell empty where there is no reading; " if meaning.column in readings else ""
     quantity, mine = meaning.quantity, meaning.unit
@@ -116,7 +114,7 @@ def _hint(meaning: Column, cell: str, units: bool, readings: Names) -> str:
 
 
 def _unit_hint(value: str, written: str, mine: str, named: Mapping[str, str]) -> str:
-    """Advice on a unit next to a number; `mine`: the column's own unit, `named`: columns by their units."""
+    """Advice on a unit next to a number. `mine`: the column's own unit. `named`: columns by their units."""
     unit = quantities.unit_in_column(written)
     if unit == mine:
         return f"write {value}, as the column's name has the unit; "
@@ -233,7 +231,7 @@ def check_time(name: str, header: list[str], meanings: list[Column | None], layo
 
 
 def _other_names(strange: list[str], column: str) -> str:
-    """Advice on columns with unknown names, for a message; empty without such columns."""
+    """Advice on columns with unknown names, for a message, empty without such columns."""
     if not strange:
         return ""
     unit = column.rpartition("_")[2]

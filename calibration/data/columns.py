@@ -70,7 +70,9 @@ class Column:
     """A quantity in a column of a file.
 
     Attributes:
-        shown: name of the column in the file; unit: that it states; factor: from its cells to that unit.
+        shown: name of the column in the file.
+        unit: that it states.
+        factor: from its cells to that unit.
     """
 
     quantity: Quantity
@@ -124,7 +126,7 @@ class Layout:
 
     @classmethod
     def of(cls, robot: Robot | None) -> Layout:
-        """Returns the layout of a robot; None: of the packaged robot."""
+        """Returns the layout of a robot. None: of the packaged robot."""
         if robot is None:
             return cls()
         rig = robot.rig
@@ -142,7 +144,7 @@ class Layout:
 
     @property
     def complete(self) -> bool:
-        """True if tables have to state every condition; otherwise a missing condition has its usual value."""
+        """True if tables have to state every condition, otherwise a missing condition has its usual value."""
         return self.table8
 
     @property
@@ -162,7 +164,7 @@ class Layout:
 
     @property
     def sides(self) -> Names:
-        """Columns of the drive of the left and the right side; none for a robot that cannot turn."""
+        """Columns of the drive of the left and the right side. None for a robot that cannot turn."""
         imposed = {"voltage": tuple(SIDES), "motor_speed": SPEEDS}.get(self.imposed, ())
         return imposed if self.has_ground else ()
 
@@ -213,7 +215,7 @@ class Layout:
         return {q.column: q for q in rows if q.column in known}
 
     def meanings(self, source: str, header: list[str]) -> list[Column | None]:
-        """Returns the quantity of each column of a file, None for an unknown column; names may state another unit.
+        """Returns the quantity of each column of a file, None for an unknown column. Names may state another unit.
 
         Raises:
             BadData: two columns of one quantity.
@@ -226,7 +228,9 @@ class Layout:
             if column in theirs:
                 mine, factor = theirs[column]
                 meant = by_name.get(mine)
-                if meant is None and mine in _of_every_channel():  # a channel that is not read
+                if meant is None and mine in {
+                    name for channel in channels.EVERY for q in _of_channel(channel) for name in q.columns()
+                }:  # a channel that is not read
                     found.append(None)
                     continue
                 if meant is None:
@@ -256,7 +260,7 @@ class Layout:
     def nearest(self, name: str, stated: Collection[str]) -> str:
         """Returns the column, in the unit of `name`, that a column without a role is most similar to.
 
-        It is the column with a similar name, else the only condition in its unit; empty if there is neither.
+        It is the column with a similar name, else the only condition in its unit, empty if there is neither.
 
         Args:
             stated: columns that the table has, which are left out.
@@ -276,11 +280,6 @@ class Layout:
         """Returns the column, with its source column if the robot's file states one."""
         theirs = next((their for mine, their, _ in self.mapped if _standard(self._by_name(), mine) == column), None)
         return column if theirs is None else f"{column} (in the robot's file: {theirs})"
-
-
-def _of_every_channel() -> set[str]:
-    """Names of columns of every channel, in any unit."""
-    return {name for channel in channels.EVERY for q in _of_channel(channel) for name in q.columns()}
 
 
 def _standard(by_name: Mapping[str, Column], name: str) -> str:

@@ -35,7 +35,8 @@ class Loads:
     """The loads of a robot file, before the parameters that it states.
 
     Attributes:
-        by_name: in order; travels: true if they travel, as vehicles and linear units do.
+        by_name: in order.
+        travels: true if they travel, as vehicles and linear units do.
         linear: names of linear units.
         missing: parameters without default that the file does not state.
     """
@@ -50,17 +51,18 @@ def loads_from_tables(base: Robot | None, content: Json, sds: dict[str, float], 
     """Returns the loads that the file's content states, in its order.
 
     Takes `configurations` and every configuration's `load`, `like` and `movers` out of `content`, and replaces linear
-    units by shafts; the remaining keys are parameters. Without `configurations` a robot keeps the configurations of
-    its base; without a base, each table is a configuration.
+    units by shafts. The remaining keys are parameters. Without `configurations` a robot keeps the configurations of
+    its base. Without a base, each table is a configuration.
 
     Args:
-        base: None starts from nothing; else `like` names one of its configurations.
-        sds: stated ±, by dotted name; where: opens the message of an error.
+        base: None starts from nothing, else `like` names one of its configurations.
+        sds: stated ±, by dotted name.
+        where: opens the message of an error.
 
     Raises:
-        BadConfiguration: `configurations` is no list of names, or has a repeated or reserved name; a table belongs to
-            no configuration; `load`, `like` or `movers` is unknown, contradicts another one, or all are missing;
-            a file has both shafts and vehicles; a robot with a base lacks a parameter without default.
+        BadConfiguration: `configurations` is no list of names, or has a repeated or reserved name. A table belongs to
+            no configuration. `load`, `like` or `movers` is unknown, contradicts another one, or all are missing.
+            A file has both shafts and vehicles. A robot with a base lacks a parameter without default.
     """
     found = [n for n, table in content.items() if n not in TAKEN and isinstance(table, dict)]
     usual = found if base is None else list(base.configurations)
@@ -122,7 +124,7 @@ def resolved_likes(content: Json, where: str) -> None:
 
 
 def _over(below: Mapping[str, Any], above: Mapping[str, Any]) -> Json:
-    """Two tables as one; `above` wins."""
+    """Two tables as one, in which `above` wins."""
     both = {
         key: value for key, value in below.items() if isinstance(value, dict) and isinstance(above.get(key), dict)
     }
@@ -130,7 +132,7 @@ def _over(below: Mapping[str, Any], above: Mapping[str, Any]) -> Json:
 
 
 def _kind(table: Json, where: str) -> str:
-    """Load that a table states; by default a vehicle."""
+    """Load that a table states. A vehicle by default."""
     if "load" not in table:
         return "vehicle"
     load = table.pop("load")
@@ -145,7 +147,7 @@ def _kind(table: Json, where: str) -> str:
 
 
 def _sides(content: Mapping[str, Any], base: Robot | None) -> float:
-    """Drives of a file; a value that is no count is refused later."""
+    """Drives of a file. A value that is no count is refused later."""
     sides = content.get("sides", 1.0 if base is None else float(base.sides))
     return float(sides) if isinstance(sides, int | float) and sides >= 1 else 1.0
 
@@ -228,7 +230,7 @@ def _chassis(robot: Robot, name: str, table: Json, where: str) -> Chassis:
 
 
 def _blank(pattern: Chassis, on_tracks: float, table: Mapping[str, Any], where: str) -> Chassis:
-    """A chassis with defaults where its fields have them; the table has to state all others."""
+    """A chassis with defaults where its fields have them. The table has to state all others."""
     defaults = dict(_defaults(pattern))
     missing = [name for name, default in defaults.items() if default is None and not _states(table, name)]
     if missing:

@@ -30,11 +30,16 @@ class SignalFacts:
     """Facts about a signal of a file.
 
     Attributes:
-        path: of it; unit: that the file states; samples: number of them; refused: why it cannot be read.
+        path: of it.
+        unit: that the file states.
+        samples: number of them.
+        refused: why it cannot be read.
         rate: of its clock [Hz], NaN where it has none.
         gaps: number of steps of more than `GAP` usual ones, NaN without a clock.
-        least, greatest: of its numbers, NaN where it has none; missing: samples without a number.
-        words: some of its words, of a signal of words; clock: name of its clock.
+        least, greatest: of its numbers, NaN where it has none.
+        missing: samples without a number.
+        words: some of its words, of a signal of words.
+        clock: name of its clock.
     """
 
     path: str
@@ -55,8 +60,10 @@ class Contents:
     """Contents of a file.
 
     Attributes:
-        name, kind: of the file; signals: of it; notes: on how it was read.
-        preset: name of the packaged preset that its columns are of; empty: none.
+        name, kind: of the file.
+        signals: of it.
+        notes: on how it was read.
+        preset: name of the packaged preset that its columns are of. Empty: none.
         proposed: lines of a table `[columns]`, for a person to check.
     """
 
@@ -145,7 +152,7 @@ def _clock(signal: Signal | None) -> Clock | None:
 
 
 def _unit_of_time(name: str) -> str | None:
-    """Unit of a clock by its name, also by names of loggers; None if it is not a clock."""
+    """Unit of a clock by its name, also by names of loggers, None if it is not a clock."""
     bare = name.casefold().replace("time (", "time_").rstrip(")")
     return "ms" if bare == "ms_today" else unit_of_clock(bare)
 

@@ -35,8 +35,8 @@ def check_contradictions(runs: Runs, robot: Robot) -> None:
     """Refuse a table that contradicts itself or its robot.
 
     Raises:
-        BadData: a vehicle has no mass; a robot turns that cannot turn, or its sides are exchanged; the stated voltage
-            cannot turn the motors at the imposed speed; an angle wraps or changes its unit; time sometimes goes back.
+        BadData: a vehicle has no mass. A robot turns that cannot turn, or its sides are exchanged. The stated voltage
+            cannot turn the motors at the imposed speed. An angle wraps or changes its unit. Time sometimes goes back.
     """
     _mass(runs, robot)
     if runs.turns and (why := turn_error(robot, sorted({str(n) for n in runs.configurations_named(robot)}))):
@@ -56,7 +56,7 @@ def check_contradictions(runs: Runs, robot: Robot) -> None:
 
 
 def cannot_stand(robot: Robot) -> str | None:
-    """Reason why the stance of a robot is unknown; None if it is known."""
+    """Reason why the stance of a robot is unknown, None if it is known."""
     if not robot.has_ground:
         return "the robot's load is a shaft, which stands on no ground"
     if not any(robot.knows([f"running_gear.{p.name}"]) for p in params.walk_parameters(robot.running_gear)):
@@ -65,14 +65,14 @@ def cannot_stand(robot: Robot) -> str | None:
 
 
 def without_levers(robot: Robot, configuration: str) -> str:
-    """Reason why a configuration has no levers; empty if it has levers."""
+    """Reason why a configuration has no levers, empty if it has levers."""
     have = [name for name, c in robot.configurations.items() if float(c.on_tracks) > 0.5]
     others = f"those that have: {', '.join(have)}" if have else "no configuration of the robot has"
     return "" if configuration in have else f"{configuration} has no levers; {others}"
 
 
 def misplaced_levers(runs: Runs, robot: Robot) -> tuple[int, str, str] | None:
-    """Row and column of an impossible lever angle, and the reason; None if there is no such row.
+    """Row and column of an impossible lever angle, and the reason, None if there is no such row.
 
     The reason is a configuration without levers, or an angle beyond their range.
     """

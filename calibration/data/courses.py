@@ -38,7 +38,7 @@ class Stretch:
         return self.end - self.begin
 
     def after(self, time: np.ndarray, share: float) -> np.ndarray:
-        """Rows later than a share of its time; `time` is of every row of the table [s]."""
+        """Rows later than a share of its time. `time` is of every row of the table [s]."""
         return self.rows[time[self.rows] >= self.begin + share * (self.end - self.begin)]
 
 
@@ -48,7 +48,7 @@ def changing_columns(runs: Runs) -> Names:
 
 
 def applied_drive(runs: Runs) -> np.ndarray:
-    """Voltage of the motors in every row, or the imposed speed or current; shape (rows,) [V], [rpm] or [A].
+    """Voltage of the motors in every row, or the imposed speed or current, shape (rows,) [V], [rpm] or [A].
 
     The voltage is 0 where the driver brakes or coasts. In turns it is the magnitude of the larger of both sides'.
     """
@@ -61,7 +61,7 @@ def applied_drive(runs: Runs) -> np.ndarray:
 
 
 def rows_of_varying_runs(runs: Runs, columns: Names | None = None) -> np.ndarray:
-    """True for rows in whose run one of these columns changes, shape (rows,); by default the columns that may."""
+    """True for rows in whose run one of these columns changes, shape (rows,). By default the columns that may."""
     columns = changing_columns(runs) if columns is None else columns
     found = np.zeros(len(runs), bool)
     if not runs.sampled:
@@ -88,7 +88,8 @@ def divide_run(
     """The stretches of one run.
 
     Args:
-        rows: of the run, in the order of time; time [s], conditions, applied [V]: of every row of the table.
+        rows: of the run, in the order of time.
+        time, conditions, applied: of every row of the table [s], [V].
     """
     cuts = [0, *np.flatnonzero(differs_from_row_before(rows, conditions)).tolist(), len(rows)]
     begins = [0.0, *(float(time[rows[k]]) for k in cuts[1:-1]), float(time[rows[-1]])]
@@ -109,7 +110,7 @@ def course_stretches(runs: Runs) -> list[list[Stretch]]:
 
 
 def course_of_each_row(runs: Runs) -> np.ndarray:
-    """For every row the course of its run's conditions, empty where they do not change; shape (rows,)."""
+    """For every row the course of its run's conditions, empty where they do not change, shape (rows,)."""
     found = np.full(len(runs), "", dtype=object)
     if rows_of_varying_runs(runs).any():
         columns = changing_columns(runs)

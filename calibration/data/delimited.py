@@ -76,7 +76,7 @@ def read_csv_columns(path: Path, name: str) -> NamedArrays:
 
 
 def _plain(name: str, content: bytes) -> NamedArrays | None:
-    """Columns of a plain table, numbers as arrays; None for any other table, which `split_cells` reads and checks.
+    """Columns of a plain table, numbers as arrays, None for any other table, which `split_cells` reads and checks.
 
     A plain table is in UTF-8 with commas, without comments, quotes and units.
     """
@@ -122,7 +122,7 @@ def _plain(name: str, content: bytes) -> NamedArrays | None:
 
 
 def row_of_units(header: Sequence[str], first: Sequence[str]) -> Names:
-    """Returns the units that the first row below a header states, empty where it states none; () if it is a run: a
+    """Returns the units that the first row below a header states, empty if it states none, () if it is a run: a
     cell of it is a number, or no cell of a column of numbers is a unit."""
     if len(first) != len(header) or any(math.isfinite(cell_number(cell)) for cell in first):
         return ()
@@ -133,7 +133,7 @@ def row_of_units(header: Sequence[str], first: Sequence[str]) -> Names:
 
 
 def decode_text(name: str, content: bytes) -> tuple[str, Names]:
-    """Returns the text of a file in UTF-8, in UTF-16 that begins with its mark, or in Windows-1252; and a note if it
+    """Returns the text of a file in UTF-8, in UTF-16 that begins with its mark, or in Windows-1252, and a note if it
     is not in UTF-8.
 
     Raises:
@@ -156,7 +156,7 @@ def decode_text(name: str, content: bytes) -> tuple[str, Names]:
 def below_comments(lines: Sequence[str]) -> list[str]:
     """Returns the lines of a table, its header first, without comments above, which begin with # or %.
 
-    If numbers follow the comments, the last comment with as many cells is the header; it may have units below it.
+    If numbers follow the comments, the last comment with as many cells is the header. It may have units below it.
     """
     first = next((k for k, line in enumerate(lines) if not line.startswith(COMMENTS)), len(lines))
     below = list(lines[first:])
@@ -175,12 +175,13 @@ def below_comments(lines: Sequence[str]) -> list[str]:
 
 
 def split_cells(name: str, lines: Sequence[str]) -> tuple[list[list[str]], Names]:
-    """Returns rows of cells without blanks around them, numbers with points; and notes on separators and marks.
+    """Returns rows of cells without blanks around them, numbers with points, and notes on separators and marks.
 
-    Semicolons or tabs separate cells where the header has no comma; numbers may have decimal commas then.
+    Semicolons or tabs separate cells where the header has no comma. Numbers may have decimal commas then.
 
     Args:
-        name: of the file, for messages; lines: of the file, its header first.
+        name: of the file, for messages.
+        lines: of the file, its header first.
 
     Raises:
         BadData: text that is no CSV, a column that has decimal commas and points, or marks that may stand between

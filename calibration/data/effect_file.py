@@ -49,10 +49,10 @@ def _witness(place: str, whose: str, seen: list[Signals]) -> Effect:
 def readable_signals(
     robot: Robot, conditions: Conditions, state: State, balance: str, channel: str = "", *, settled: bool = False
 ) -> Signals:
-    """The signals that an effect of this balance may read: those computed before it; the others are `UNSET`.
+    """The signals that an effect of this balance may read: those computed before it. The others are `UNSET`.
 
     Args:
-        conditions, state: one run at one instant, scalars; not traced.
+        conditions, state: one run at one instant, scalars, not traced.
         settled: in steady forward travel (`balances.settled_signals`), else in motion (`balances.moving_signals`).
     """
     seen: list[Signals] = []
@@ -100,7 +100,7 @@ def effect_library(paths: Sequence[Path | str] = ()) -> Library:
     """Returns the packaged effects and the effects of the files, by name.
 
     Raises:
-        BadConfiguration: as `read_effect_file`; a repeated name; an effect that settles to an unknown effect.
+        BadConfiguration: as `read_effect_file`. A repeated name. An effect that settles to an unknown effect.
     """
     known = dict(effects.BY_NAME)
     own = [(path, effect) for path in map(Path, paths) for effect in read_effect_file(path)]
@@ -119,7 +119,7 @@ def effect_library(paths: Sequence[Path | str] = ()) -> Library:
 
 
 class _FromSource(importlib.machinery.SourceFileLoader):
-    """Runs the file itself. Compiled bytes next to it may differ from its text; they are not read and not written."""
+    """Runs the file itself. Compiled bytes next to it may differ from its text. They are not read and not written."""
 
     def get_code(self, fullname: str) -> types.CodeType:
         return self.source_to_code(self.get_data(self.path), self.path)

@@ -1,4 +1,4 @@
-"""Errors of input from outside, files and arguments; each has its exit code."""
+"""Errors of input from outside, files and arguments. Each has its exit code."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SEEDS = 2**32 - 1
 
 
 class InputError(Exception):
-    """Error of input from outside; the message is one sentence for a person."""
+    """Error of input from outside. The message is one sentence for a person."""
 
     def __init__(self, message: str) -> None:
         """Keeps the message, `shorten` and `printable`."""
@@ -50,7 +50,7 @@ def parse_number(text: str) -> float:
 def rows_text(rows: Sequence[int], most: int, rest: str = ", ...") -> str:
     """`row 4`, or `rows 4, 5` and so on, from indices that begin at 0.
 
-    `rest` stands for rows after the first `most`; `{}` in it is their number.
+    `rest` stands for rows after the first `most`. `{}` in it is their number.
     """
     shown = ", ".join(str(k + 1) for k in rows[:most]) + rest.format(len(rows) - most) * (len(rows) > most)
     return f"row{'s' * (len(rows) > 1)} {shown}"
@@ -67,7 +67,7 @@ def three_digits(value: float) -> str:
 
 
 def is_number(value: Any) -> bool:
-    """True if a value of a TOML file or of Python is a number; true and false are not."""
+    """True if a value of a TOML file or of Python is a number. True and false are not."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
@@ -88,7 +88,8 @@ def stated_number(
     """A number of a TOML file.
 
     Args:
-        low, high: bounds; unit: of the number, empty or `-` for none; None: unknown, the message leaves it out.
+        low, high: bounds.
+        unit: of the number, empty or `-` for none. None: unknown, the message leaves it out.
 
     Raises:
         BadConfiguration: no number, or a number that is not finite or out of bounds.

@@ -44,7 +44,9 @@ def file_bytes(path: Path, where: str | Path, kind: type[InputError] = BadData, 
     """Returns the bytes of a regular file.
 
     Args:
-        where: opens the message of an error; kind: of the error; largest: number of bytes.
+        where: opens the message of an error.
+        kind: of the error.
+        largest: number of bytes.
 
     Raises:
         InputError: a folder, a pipe, a device, a file larger than `largest`, or a file that the system does not open.
@@ -57,7 +59,8 @@ def first_bytes(path: Path, where: str | Path, kind: type[InputError] = BadData,
     """Returns the first bytes of a regular file of any size.
 
     Args:
-        where: opens the message of an error; kind: of the error.
+        where: opens the message of an error.
+        kind: of the error.
 
     Raises:
         InputError: as `file_bytes`.
@@ -87,8 +90,10 @@ def check_declared(where: str | Path, columns: int, size: float = 0.0, held: flo
     """Refuses sizes that a source declares, before its values are read.
 
     Args:
-        where: opens the message of an error; columns: number of signals or columns.
-        size: of all values [bytes]; held: size of the file that has them [bytes].
+        where: opens the message of an error.
+        columns: number of signals or columns.
+        size: of all values [bytes].
+        held: size of the file that has them [bytes].
 
     Raises:
         BadData: more than `COLUMNS` columns, or more values than a file of this size can hold.
@@ -106,7 +111,8 @@ def check_memory(where: str | Path, size: float) -> None:
     """Refuses values that need more than `SHARE` of the free memory, before they are read.
 
     Args:
-        where: opens the message of an error; size: of the values [bytes].
+        where: opens the message of an error.
+        size: of the values [bytes].
 
     Raises:
         BadData: they do.
@@ -176,7 +182,8 @@ def toml_content(text: str, where: str | Path, kind: type[InputError] = BadConfi
     """Returns the keys and tables of a TOML text.
 
     Args:
-        where: opens the message of an error; kind: of the error.
+        where: opens the message of an error.
+        kind: of the error.
 
     Raises:
         InputError: it is no TOML, has more than `KEYS` keys or `DEEPEST` tables within one another, or a whole number

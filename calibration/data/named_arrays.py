@@ -26,10 +26,10 @@ class NamedArrays:
         name: of the source, which opens every message.
         header: names of the columns, as the source states them.
         values: one for each column, all of one length.
-        units: one for each column, spelled by `quantities.unit_in_column`, empty if unknown; or no units at all.
+        units: one for each column, spelled by `quantities.unit_in_column`, empty if unknown, or no units at all.
         units_from: place where the source states them, for messages.
         notes: sentences on reading.
-        digest: SHA-256 of the source's bytes; empty if it has none.
+        digest: SHA-256 of the source's bytes, empty if it has none.
     """
 
     name: str

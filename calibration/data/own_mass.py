@@ -45,7 +45,7 @@ class StatedMass:
 
 
 def stated_masses(robot: Robot, runs: Runs) -> dict[str, StatedMass]:
-    """Returns the masses that a table states of its configurations; none if it has no `total_mass_kg`.
+    """Returns the masses that a table states of its configurations. None if it has no `total_mass_kg`.
 
     Raises:
         BadData: a mass beyond the bounds of the robot's, or a configuration that the robot does not have.

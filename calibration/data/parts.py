@@ -1,6 +1,6 @@
 """Packaged sheets of parts for sizing: motors, gearboxes and cells, each value from a sheet that its row names.
 
-The tables are in `parts/*.csv` in the units of the sheets; the reader gives SI. Values missing in a sheet are NaN.
+The tables are in `parts/*.csv` in the units of the sheets. The reader gives SI. Values missing in a sheet are NaN.
 `docs/reference/parts.md` has the origin of the sheets, and checks of their consistency.
 """
 
@@ -25,7 +25,7 @@ COULOMB_PER_MAH = 3.6
 
 
 def _column(name: str, factor: float = 1.0) -> Any:
-    """A number of the table in the unit of the column's name; times `factor` it is in SI; NaN for an empty cell."""
+    """A number of the table in the unit of the column's name. Times `factor` it is in SI, NaN for an empty cell."""
     return dataclasses.field(metadata={"column": name, "factor": factor})
 
 
@@ -40,7 +40,7 @@ def _texts(name: str) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class MotorSheet:
-    """A brushed DC motor as its maker's sheet states it, at 25 °C; NaN where the sheet is silent.
+    """A brushed DC motor as its maker's sheet states it, at 25 °C, NaN where the sheet is silent.
 
     Attributes:
         name, maker, order_number: of the winding.
@@ -94,7 +94,7 @@ class MotorSheet:
 
 @dataclasses.dataclass(frozen=True)
 class GearboxSheet:
-    """A planetary gearbox as its maker's sheet states it; NaN where the sheet is silent.
+    """A planetary gearbox as its maker's sheet states it, NaN where the sheet is silent.
 
     Attributes:
         name, maker, order_number, family: one row a ratio of a family.
@@ -130,7 +130,7 @@ class GearboxSheet:
 
 @dataclasses.dataclass(frozen=True)
 class CellSheet:
-    """A battery cell, or a pack of `cells` in series, as its sheet states it; NaN where the sheet is silent.
+    """A battery cell, or a pack of `cells` in series, as its sheet states it, NaN where the sheet is silent.
 
     Attributes:
         name, maker, chemistry: of the cell.
@@ -139,7 +139,7 @@ class CellSheet:
         voltage_full, voltage_cut_off: of one cell [V].
         current_max, current_charge_max: largest continuous currents [A].
         resistance: of one cell to direct current [ohm].
-        impedance: of one cell at 1 kHz [ohm]; smaller than the resistance.
+        impedance: of one cell at 1 kHz [ohm]. Smaller than the resistance.
         mass: of all cells [kg].
         source, note: as of `MotorSheet`.
     """
@@ -209,5 +209,5 @@ def packaged_gearboxes() -> tuple[GearboxSheet, ...]:
 
 @functools.cache
 def packaged_cells() -> tuple[CellSheet, ...]:
-    """The packaged cells; the first is the paper's, whose mass no sheet that was found states."""
+    """The packaged cells. The first is the paper's, whose mass no sheet that was found states."""
     return tuple(_rows(CellSheet, "cells.csv"))

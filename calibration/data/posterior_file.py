@@ -31,9 +31,11 @@ class Posterior:
     `calibration.inference.priors.Coordinates`; 0 cuts), and θ = u, exp u, or u within half a turn.
 
     Attributes:
-        coordinates: names of the parameters that have a coordinate each; units: of them.
+        coordinates: names of the parameters that have a coordinate each.
+        units: of them.
         mean, covariance: of z, shape (coordinates,) and (coordinates, coordinates).
-        location, spread, low, high: of u, in the parameter's unit or its logarithm; softness: [-].
+        location, spread, low, high: of u, in the parameter's unit or its logarithm.
+        softness: [-].
         kinds: `NORMAL`, `LOG` or `ANGLE`, of each.
         tied: (follower, index of the coordinate that it follows, ratio).
     """
@@ -68,7 +70,7 @@ class Posterior:
     def at(self, z: Any) -> Any:
         """Parameters [SI] in the order of `names` at coordinates z, shape (..., coordinates).
 
-        For a NumPy array it computes in NumPy, without compilation; otherwise it is traceable.
+        For a NumPy array it computes in NumPy, without compilation, otherwise it is traceable.
         """
         import jax.numpy as jnp
 
@@ -240,7 +242,7 @@ def _of(data: Any) -> Posterior:
 
 
 def join_posteriors(parts: Sequence[Posterior], covariance: np.ndarray) -> Posterior:
-    """Joins sets of coordinates into one; `covariance` is the covariance of all of them."""
+    """Joins sets of coordinates into one. `covariance` is the covariance of all of them."""
     fields = {
         f: np.concatenate([getattr(p, f) for p in parts])
         for f in ("mean", "location", "spread", "low", "high", "softness")

@@ -35,11 +35,12 @@ class PresetColumn:
     """A column of this program, and its source in a logger's file.
 
     Attributes:
-        mine: name of the column; theirs: names that it may have in the file, `*` for any text; the first that the
-            file has is read.
-        factor: from its unit to the unit of `mine`; note: its meaning, for a note.
-        needs: column of this program without which it is not what drives the motor; empty: none.
-        across: column of the file with the current along d, zero where the field is not weakened; empty: none.
+        mine: name of the column.
+        theirs: names that it may have in the file, `*` for any text. The first that the file has is read.
+        factor: from its unit to the unit of `mine`.
+        note: its meaning, for a note.
+        needs: column of this program without which it is not what drives the motor. Empty: none.
+        across: column of the file with the current along d, zero where the field is not weakened. Empty: none.
     """
 
     mine: str
@@ -55,8 +56,9 @@ class Preset:
     """Columns of a logger's files.
 
     Attributes:
-        name: of the preset or its file; columns: in its order.
-        header: names of the columns of a file without a header; empty: every file has one.
+        name: of the preset or its file.
+        columns: in its order.
+        header: names of the columns of a file without a header. Empty: every file has one.
     """
 
     name: str
@@ -69,7 +71,7 @@ class Preset:
         """Returns columns of a source in the form of `Layout.mapped`, and notes on their meaning.
 
         Args:
-            found: name of the source's column that a name means; None: it has none.
+            found: name of the source's column that a name means. None: it has none.
             has_readings: False for a column of the source that is empty.
         """
         mapped, notes = [], []
@@ -89,7 +91,9 @@ class Preset:
         """Refuses a source whose imposed column means nothing without another one that the source lacks.
 
         Args:
-            mapped: columns of the source; imposed: the column that drives the motor; name: of the source.
+            mapped: columns of the source.
+            imposed: the column that drives the motor.
+            name: of the source.
 
         Raises:
             BadData: it lacks that column.
@@ -116,7 +120,7 @@ def of_columns(columns: Mapping[str, Any], where: str = "the stated table") -> P
 
 
 def find_preset(stated: str | Path) -> Preset:
-    """Returns a packaged preset by its name, or the preset of a file; numbers that it asks for may follow.
+    """Returns a packaged preset by its name, or the preset of a file. Numbers that it asks for may follow.
 
     Args:
         stated: `vesc,pole_pairs=7`, `mine.toml`.
@@ -146,7 +150,7 @@ def find_preset(stated: str | Path) -> Preset:
 
 
 def recognise_preset(names: Sequence[str]) -> str:
-    """Returns the packaged preset with most columns in a source, at least `OF_A_PRESET`; empty if no preset has.
+    """Returns the packaged preset with most columns in a source, at least `OF_A_PRESET`, empty if no preset has.
 
     Args:
         names: of the source's columns, or paths of its signals.
@@ -179,7 +183,8 @@ def parse_preset(text: str, where: str, given: Mapping[str, float]) -> Preset:
     """Returns the preset that a TOML text states.
 
     Args:
-        where: opens the message of an error; given: numbers that it asks for, by name.
+        where: opens the message of an error.
+        given: numbers that it asks for, by name.
 
     Raises:
         BadConfiguration: no TOML, an unknown key, a column that this program does not have, or a number that it asks
@@ -291,7 +296,7 @@ def _texts(stated: Any, where: str, form: str = "expected a list of names") -> N
 def merge_columns(
     first: Iterable[tuple[str, str, float]], others: Iterable[tuple[str, str, float]]
 ) -> tuple[tuple[str, str, float], ...]:
-    """Columns of two tables; `first` wins where both have a column, or read the same source column."""
+    """Columns of two tables. `first` wins where both have a column, or read the same source column."""
     first = tuple(first)
     taken = {_bare(mine) for mine, _, _ in first} | {theirs for _, theirs, _ in first}
     return (*first, *(c for c in others if _bare(c[0]) not in taken and c[1] not in taken))

@@ -80,13 +80,14 @@ class ProfileTable:
 
     Attributes:
         source: name of the file or of the packaged profile, for messages.
-        time: of the rows [s]; modes: of `MODES`, one a row.
+        time: of the rows [s].
+        modes: of `MODES`, one a row.
         demand: motor speed [rad/s] or speed [m/s], shape (rows,).
         values: fields of `mmrjax.missions.profile.Profile` that it states, by name, shape (rows,).
-        surface: of Table 5, one a row; None where it states none.
+        surface: of Table 5, one a row, None where it states none.
         linear, cycles: as of `mmrjax.missions.profile.Profile`.
         digest: SHA-256 of the file.
-        begins: fields of `Start` that it states [SI, °C]; rolling speed, temperatures of winding and housing.
+        begins: fields of `Start` that it states [SI, °C]. Rolling speed, temperatures of winding and housing.
         notes: sentences on how the file was read.
     """
 
@@ -104,7 +105,7 @@ class ProfileTable:
 
     @property
     def start(self) -> Start | None:
-        """The state that the mission begins in; None: at rest at ambient temperature."""
+        """The state that the mission begins in. None: at rest at ambient temperature."""
         return Start(**self.begins) if self.begins else None
 
     @property
@@ -132,10 +133,11 @@ class ProfileTable:
         )
 
     def demanded(self, segment: np.ndarray, elapsed: np.ndarray, per_speed: float) -> np.ndarray:
-        """Demanded ground speed [m/s], also from a demanded motor speed; NaN without a demand.
+        """Demanded ground speed [m/s], also from a demanded motor speed, NaN without a demand.
 
         Args:
-            segment: of one cycle, from 0; elapsed: since it began [s]; both of one shape.
+            segment: of one cycle, from 0.
+            elapsed: since it began [s]. Both of one shape.
             per_speed: motor speed over ground speed [rad/m].
         """
         before, after = self.demand[segment], self.demand[segment + 1]
@@ -165,10 +167,11 @@ class ProfileTable:
         """The profile that a simulation takes, for a batch of runs.
 
         Args:
-            robot: that follows it; conditions: of shape (runs,), configurations as indices.
+            robot: that follows it.
+            conditions: of shape (runs,), configurations as indices.
 
         Returns:
-            Fields of shape (rows,); where surfaces are stated, `adhesion` of shape (runs, rows).
+            Fields of shape (rows,). Where surfaces are stated, `adhesion` of shape (runs, rows).
         """
         made = profile(
             self.time,
@@ -195,9 +198,9 @@ def read_profile(source: str | Path) -> ProfileTable:
     """Returns a packaged profile, by its name, or the profile of a file in any format of a table.
 
     Raises:
-        BadData: no such file; fewer than two rows; an unknown, misspelt or repeated column or unit; a time that does
-            not increase; a cell that is no number, not finite or out of range; an empty cell of a required column;
-            two demands in a row or none; an unknown mode, surface or setting. The message has file, row (counted
+        BadData: no such file. Fewer than two rows. An unknown, misspelt or repeated column or unit. A time that does
+            not increase. A cell that is no number, not finite or out of range. An empty cell of a required column.
+            Two demands in a row or none. An unknown mode, surface or setting. The message has file, row (counted
             from 1 below the header), column, value and the allowed values.
     """
     if str(source) in PACKAGED:
@@ -252,7 +255,7 @@ def _parsed(name: str, settings: Json, rows: list[list[str]], digest: str, notes
 
 
 def _settings(name: str, comments: list[str]) -> Json:
-    """Settings in the comment lines at the top: `cycles = 40`, `between_rows = "linear"`; other lines are remarks."""
+    """Settings in the comment lines at the top: `cycles = 40`, `between_rows = "linear"`. Other lines are remarks."""
     stated: Json = {}
     for line in comments:
         text = line.lstrip("#").strip()
@@ -347,7 +350,7 @@ class _Cells:
         return self.columns[field][0] if self.has(field) else next(iter(QUANTITIES[field].columns()))
 
     def text(self, field: str, row: int) -> str:
-        """The cell of a field; empty where the file has no such column."""
+        """The cell of a field, empty if the file has no such column."""
         return self.cells[self.columns[field][0]][row] if self.has(field) else ""
 
     def refuse(self, field: str, row: int, allowed: str) -> NoReturn:
@@ -369,7 +372,7 @@ class _Cells:
         return value * quantity.factor if isinstance(quantity, Channel) else value
 
     def held(self, field: str) -> np.ndarray:
-        """A column that every row needs; the last row of a profile whose values are held needs none."""
+        """A column that every row needs. The last row of a profile whose values are held needs none."""
         last = len(self) - 1
         found: list[float] = []
         for row in range(len(self)):
@@ -402,7 +405,7 @@ def _driven(cells: _Cells) -> tuple[Names, Columns]:
     """Mode of each row, and by field of `Profile` its demand, and the duties, voltages and yaw rates that are stated.
 
     A cell of a demand column in a row of another mode ends the ramp that leads to this row, where values are linear
-    between rows; else it is a second demand.
+    between rows, else it is a second demand.
     """
     modes: list[str] = []
     shares = [field for field in DEMANDS if DEMANDS[field] == MODES[VOLTAGE] and cells.has(field)]
@@ -424,25 +427,20 @@ def _driven(cells: _Cells) -> tuple[Names, Columns]:
                 found[name][row] = full[name] if mode == MODES[VOLTAGE] else found[name][row - 1]
         for field in (*(f for f in ends if f not in own), *own):
             found["demand" if field in CONTROLLED else field][row] = cells.value(field, row)
-        if _demands_yaw(cells, row, before, mode):
+        speed, stated = MODES[SPEED], bool(cells.text(YAW_RATE, row))
+        if stated and mode != speed and not (cells.linear and before == speed):
+            cells.refuse(
+                YAW_RATE, row, f"an empty cell: a yaw rate goes with a demanded speed, and this row has mode {mode}"
+            )
+        if cells.has(YAW_RATE) and not stated and mode == speed and (cells.linear or row < len(cells) - 1):
+            cells.refuse(YAW_RATE, row, "the demanded yaw rate, 0 for straight travel")
+        if stated:
             found[YAW_RATE][row] = cells.value(YAW_RATE, row)
     return tuple(modes), found
 
 
-def _demands_yaw(cells: _Cells, row: int, before: str, mode: str) -> bool:
-    """True if a row states a yaw rate, which only a row with a demanded speed may."""
-    speed, stated = MODES[SPEED], bool(cells.text(YAW_RATE, row))
-    if stated and mode != speed and not (cells.linear and before == speed):
-        cells.refuse(
-            YAW_RATE, row, f"an empty cell: a yaw rate goes with a demanded speed, and this row has mode {mode}"
-        )
-    if cells.has(YAW_RATE) and not stated and mode == speed and (cells.linear or row < len(cells) - 1):
-        cells.refuse(YAW_RATE, row, "the demanded yaw rate, 0 for straight travel")
-    return stated
-
-
 def _mode(cells: _Cells, row: int, before: str, filled: list[str]) -> str:
-    """The mode that a row states, or that its demand means; without either voltage, if no row has a demand."""
+    """The mode that a row states, or that its demand means, without either voltage, if no row has a demand."""
     stated = cells.text(MODE, row)
     if stated and stated not in MODES:
         cells.refuse(MODE, row, f"one of these; {allowed_words(stated, MODES)}")

@@ -81,7 +81,8 @@ class Candidate:
     """A signal and the quantity that it may show.
 
     Attributes:
-        column: name of the column with the signal's unit; question: empty, or what a person has to check.
+        column: name of the column with the signal's unit.
+        question: empty, or what a person has to check.
         factor: from the signal's unit, if no column has it.
     """
 
@@ -104,7 +105,9 @@ def propose_columns(
     """Paths of signals that may be columns, each with its line of a table `[columns]`.
 
     Args:
-        signals: those that change first; spelled: names that already are columns; seconds: times of a signal [s].
+        signals: those that change first.
+        spelled: names that already are columns.
+        seconds: times of a signal [s].
     """
     columns = {q.stem or q.name: q.columns() for q in Layout(channels=channels.EVERY).quantities().values()}
     taken = {signal.name.rpartition("_")[0] for signal in signals if signal.name in spelled}
@@ -136,7 +139,7 @@ def propose_columns(
 
 
 def _joint(signal: Signal, signals: Sequence[Signal]) -> str:
-    """Name of the joint that an element of a message of joints belongs to; empty if there is none."""
+    """Name of the joint that an element of a message of joints belongs to, empty if there is none."""
     element = re.search(r"\w+(\[\d+\])$", signal.path)
     if element is None:
         return ""
@@ -148,10 +151,10 @@ def _joint(signal: Signal, signals: Sequence[Signal]) -> str:
 def _candidate(
     signal: Signal, unit: str | None, alone: bool, columns: Mapping[str, Mapping[str, str]]
 ) -> Candidate | None:
-    """Quantity that a signal may show; None if its unit, its behaviour or its name excludes every one.
+    """Quantity that a signal may show, None if its unit, its behaviour or its name excludes every one.
 
     Args:
-        unit: that it states, a column's; None: it states none. alone: True if no other signal states it.
+        unit: that it states, a column's. None: it states none. alone: True if no other signal states it.
         columns: names of the columns of each quantity, and their units.
     """
     if signal.refused:
@@ -203,7 +206,7 @@ def _words(path: str) -> str:
 
 
 def _unit(signal: Signal, known: set[str]) -> str | None:
-    """Unit that a signal's metadata or its name states; None if it states none."""
+    """Unit that a signal's metadata or its name states, None if it states none."""
     if signal.unit:
         return quantities.unit_in_column(signal.unit.strip("[]()"))
     if brackets := re.search(r"[\[(]([^\])]*[^\])\d][^\])]*)[\])]\s*$", signal.path):
@@ -222,7 +225,7 @@ def _is_reading(values: np.ndarray) -> bool:
 
 
 def seconds_of_a_count(signals: Sequence[Signal], count: np.ndarray) -> float:
-    """Seconds between numbers of a clock, from a place and its rate that state their units; NaN without such two.
+    """Seconds between numbers of a clock, from a place and its rate that state their units, NaN without such two.
 
     Args:
         count: numbers of the clock, shape (rows,).
@@ -245,10 +248,11 @@ def _by_rate(
     columns: Mapping[str, Mapping[str, str]],
     seconds: Callable[[Signal], np.ndarray | None],
 ) -> Iterator[Candidate]:
-    """Candidates; a place and its rate have units that agree with each other.
+    """Candidates. A place and its rate have units that agree with each other.
 
     Args:
-        stated: unit of each signal, by its path; columns: as of `_candidate`.
+        stated: unit of each signal, by its path.
+        columns: as of `_candidate`.
     """
     agreed: dict[str, Candidate] = {}
     for place, rate in itertools.product(pool, pool):
@@ -278,10 +282,11 @@ def _by_rate(
 def _units_of_place_and_rate(
     time: np.ndarray, place: Signal, rate: Signal, stated: Sequence[str | None]
 ) -> list[tuple[str, str]]:
-    """Units in which a place is the integral of its rate; empty if it is not.
+    """Units in which a place is the integral of its rate, empty if it is not.
 
     Args:
-        time: of both [s]; stated: unit of each, None if it states none.
+        time: of both [s].
+        stated: unit of each, None if it states none.
     """
     turned = np.asarray(rate.load(), float)
     factor = _integral_factor(time, np.asarray(place.load(), float), turned)
@@ -298,7 +303,7 @@ def _units_of_place_and_rate(
 
 
 def _integral_factor(time: np.ndarray, place: np.ndarray, rate: np.ndarray) -> float:
-    """Factor from the integral of a rate to its place; NaN if the place is not that integral."""
+    """Factor from the integral of a rate to its place, NaN if the place is not that integral."""
     step = np.diff(time)
     sound = np.isfinite(step) & (step > 0) & np.isfinite(np.diff(place)) & np.isfinite(rate[1:] + rate[:-1])
     if sound.sum() < 3:
@@ -314,7 +319,7 @@ def _integral_factor(time: np.ndarray, place: np.ndarray, rate: np.ndarray) -> f
 
 
 def _by_power(pool: Iterable[Candidate]) -> Iterator[Candidate]:
-    """Candidates; of two currents next to a duty, that of the supply is the motor's times the duty."""
+    """Candidates. Of two currents next to a duty, that of the supply is the motor's times the duty."""
     pool = [*pool]
     duty = next((c for c in pool if c.quantity == "duty"), None)
     currents = [c for c in pool if c.quantity in ("total_current", "motor_current")]

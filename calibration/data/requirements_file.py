@@ -48,8 +48,8 @@ class Envelope:
     """Conditions under which a requirement has to be met: ranges, each from its least to its greatest value.
 
     Attributes:
-        configuration: of the robot, by name; empty: its first.
-        surface: of Table 5. battery: on the battery; else on the external supply.
+        configuration: of the robot, by name. Empty: its first.
+        surface: of Table 5. battery: on the battery, else on the external supply.
         payload_kg, slope_deg, state_of_charge, supply_voltage_V: as named.
         ambient_C: None: the robot's own ambient temperature.
     """
@@ -87,10 +87,11 @@ class Requirement:
     """One requirement.
 
     Attributes:
-        name: of `QUANTITIES`; limit: in the unit of the name, None: as the part is rated; least: true if the quantity
-            has to be at least the limit, false if at most.
+        name: of `QUANTITIES`.
+        limit: in the unit of the name, None: as the part is rated.
+        least: true if the quantity has to be at least the limit, false if at most.
         envelope: conditions under which it has to be met.
-        share: of the time that the robot drives, for the endurance; 0: it stands.
+        share: of the time that the robot drives, for the endurance. 0: it stands.
         tread_mm: of stairs, for their rise.
         source: where the requirement comes from.
     """
@@ -119,7 +120,10 @@ class Requirements:
     """A file of requirements.
 
     Attributes:
-        source: its name; envelope: that it states; each: its requirements, in order; text: of the file.
+        source: its name.
+        envelope: that it states.
+        each: its requirements, in order.
+        text: of the file.
     """
 
     source: str
@@ -156,8 +160,8 @@ def parse_requirements(text: str, where: str) -> Requirements:
     (a number or [least, greatest]), surface, configuration, and battery.
 
     Raises:
-        BadConfiguration: not TOML; no requirement; an unknown key, or one without its unit; no finite number; an
-            empty range; requirements that contradict one another or the envelope.
+        BadConfiguration: not TOML, no requirement. An unknown key, or one without its unit, no finite number, an
+            empty range. Requirements that contradict one another or the envelope.
     """
     content = toml_content(text, where)
     schema = content.pop("schema", SCHEMA)

@@ -35,7 +35,9 @@ class Fact:
     """Returns facts that follow from a rig's numbers.
 
     Attributes:
-        what: in words; value: with its unit; odd: reason to check its numbers again, else empty.
+        what: in words.
+        value: with its unit.
+        odd: reason to check its numbers again, else empty.
     """
 
     what: str
@@ -186,7 +188,7 @@ def _vehicle(robot: Robot, name: str) -> Iterator[Fact]:
 
 
 def doubtful_time(runs: Runs, robot: Robot) -> str:
-    """Reason to read a log's time as milliseconds; empty without evidence.
+    """Reason to read a log's time as milliseconds, empty without evidence.
 
     At a constant voltage, the speed then changes over far longer than the motors take with their load.
     """
@@ -221,7 +223,7 @@ LEAST, MOST = 0.1, 100.0
 
 
 def doubtful_current(runs: Runs, robot: Robot) -> str:
-    """Reason to doubt the unit of an imposed current or torque; empty without evidence.
+    """Reason to doubt the unit of an imposed current or torque, empty without evidence.
 
     Such a current is far from the current that turns the loads of the table slowly.
     """
@@ -256,7 +258,7 @@ def _times_between(runs: Runs) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
 
 
 def gap_sentence(runs: Runs) -> str:
-    """Sentence on the longest time between two rows of a run, if rows may be missing there; empty otherwise."""
+    """Sentence on the longest time between two rows of a run, if rows may be missing there, empty otherwise."""
     worst, told = 0.0, ""
     for _, rows, steps in _times_between(runs):
         usual = float(np.median(steps)) if len(steps) else 0.0
@@ -279,7 +281,7 @@ UNEVEN, TURNS_BACK, ROWS_OF_CLOCK = 0.1, -0.3, 50
 
 
 def jitter_sentence(runs: Runs) -> str:
-    """Sentence on a clock that jitters about even rows; empty otherwise.
+    """Sentence on a clock that jitters about even rows, empty otherwise.
 
     If rows are even and the clock's errors independent, the times between rows correlate with the next by -1/2. If
     the rows themselves are uneven, these times are independent and correlate by 0.
@@ -301,7 +303,7 @@ def jitter_sentence(runs: Runs) -> str:
 
 
 def one_level(runs: Runs) -> str:
-    """Sentence on a log without any condition that changes; empty for others."""
+    """Sentence on a log without any condition that changes, empty for others."""
     conditions = (*changing_columns(runs), *(c for c in runs.layout.sides if runs.has(c)))
     column = runs.layout.imposed_column
     if not (runs.sampled and runs.has(column) and np.isfinite(runs[column]).all()):
@@ -321,7 +323,7 @@ INNER, ROWS_INNER, FITS, REACHES = 0.25, 30, 0.2, 0.8
 
 
 def saturation_sentence(runs: Runs) -> str:
-    """Sentence on a voltage in a log that the driver does not reach; empty without evidence.
+    """Sentence on a voltage in a log that the driver does not reach, empty without evidence.
 
     Rows of small voltage give U = R I + k ω by least squares. In rows of a larger voltage, current and speed show one
     voltage all the time if the driver limits it.
@@ -362,7 +364,7 @@ OTHER_UNIT = 3.0
 
 
 def doubtful_speed(runs: Runs, robot: Robot) -> str:
-    """Reason to doubt the unit of an imposed voltage or of the speed; empty without evidence.
+    """Reason to doubt the unit of an imposed voltage or of the speed, empty without evidence.
 
     The speed is far above that at which the motors' back-EMF equals the voltage. A load keeps it below, so only rows
     without current or without a brake's torque show a speed that is far too small.
@@ -394,7 +396,7 @@ BEYOND = 3.0
 
 
 def doubtful_torque(runs: Runs, robot: Robot) -> str:
-    """Reason to doubt the unit of a brake's torque; empty without evidence, or if the speed is imposed.
+    """Reason to doubt the unit of a brake's torque, empty without evidence, or if the speed is imposed.
 
     Most rows of such a torque are far above the torque that stalls the motors.
     """
@@ -421,7 +423,7 @@ MOVES, HELD, SWAPPED = 0.05, 0.1, 0.3
 
 
 def still_sentence(runs: Runs) -> str:
-    """Sentence on a log in which nothing moves; empty for others."""
+    """Sentence on a log in which nothing moves, empty for others."""
     moving = [k for k, c in enumerate(runs.channels) if c.zero_at_rest]
     measured = runs.measured()[:, moving]
     if not (runs.sampled and moving and np.isfinite(measured).any()) or np.nanmax(np.ptp(measured, axis=0)) > 0:
@@ -434,7 +436,7 @@ def still_sentence(runs: Runs) -> str:
 
 
 def held_sentence(runs: Runs) -> str:
-    """Sentence on readings that repeat the last value while what is imposed changes; empty for others."""
+    """Sentence on readings that repeat the last value while what is imposed changes, empty for others."""
     imposed = runs.layout.imposed_column
     if not (runs.sampled and runs.has(imposed)):
         return ""
@@ -456,7 +458,7 @@ def held_sentence(runs: Runs) -> str:
 
 
 def swapped_sentence(runs: Runs) -> str:
-    """Sentence on a speed whose sign swaps within a log, by the power of the drive; empty for others."""
+    """Sentence on a speed whose sign swaps within a log, by the power of the drive, empty for others."""
     imposed = runs.layout.imposed_column
     if not (runs.sampled and runs.has(imposed) and np.nanmin(runs[imposed]) < 0 < np.nanmax(runs[imposed])):
         return ""  # what never changes its sign may lack one, which other checks report
@@ -500,7 +502,8 @@ class Origin:
     """Origin of a number of a robot.
 
     Attributes:
-        name: of the parameter; value [unit]; sd: as stated, None if the file states none.
+        name: of the parameter, value [unit].
+        sd: as stated, None if the file states none.
         why: in words.
     """
 
@@ -512,7 +515,7 @@ class Origin:
 
 
 def number_origins(file: RobotFile) -> list[Origin]:
-    """Returns the origin of each number of a robot; in each part, numbers that no file states come last."""
+    """Returns the origin of each number of a robot. In each part, numbers that no file states come last."""
     robot, stated = file.robot, file.stated
     priors = {name: sd for name, _, sd in robot.rig.priors}
     found = []

@@ -85,13 +85,15 @@ def linear_to_shaft(table: Json, name: str, where: str, sds: dict[str, float], s
 
     Travel r per radian is lead / 2π or the drum's radius. With n drives, each drive has
 
-        J = J_0 + m r² / n,  M_0 = F_0 r / n;  K = b r² / n,  M_c = (F_c + m g sin α) r / n.
+        J = J_0 + m r² / n,  M_0 = F_0 r / n.  K = b r² / n,  M_c = (F_c + m g sin α) r / n.
 
-    The sds are first order for independent inputs; exact inputs give exact values.
+    The sds are first order for independent inputs. Exact inputs give exact values.
 
     Args:
-        table: of the configuration `name`, without `load`; where: opens the message of an error.
-        sds: stated, by dotted name; sides: drives that move it together.
+        table: of the configuration `name`, without `load`.
+        where: opens the message of an error.
+        sds: stated, by dotted name.
+        sides: drives that move it together.
 
     Raises:
         BadConfiguration: an unknown key, a value that is no number, no mass, not exactly one travel, or a mass or
@@ -151,7 +153,8 @@ def vehicle_defaults(on_tracks: bool, table: Mapping[str, Any], sides: float) ->
     """Returns default values of a vehicle that starts from nothing.
 
     Args:
-        table: that its file states of it; sides: drives that move it together.
+        table: that its file states of it.
+        sides: drives that move it together.
     """
 
     def stated(*keys: str) -> float:
@@ -166,10 +169,11 @@ def vehicle_defaults(on_tracks: bool, table: Mapping[str, Any], sides: float) ->
 
 
 def parse_rig(content: Json, where: str, loads: Sequence[str], *, travels: bool, inherits: bool) -> Rig:
-    """The rig that a file's content states; takes the `KEYS` out of it.
+    """The rig that a file's content states. Takes the `KEYS` out of it.
 
     Args:
-        loads: names of the configurations; travels: true if their travel can be measured.
+        loads: names of the configurations.
+        travels: true if their travel can be measured.
         inherits: true if the robot has a base.
 
     Raises:
@@ -315,8 +319,9 @@ def refuse_missing(
     """Refuse a robot that starts from nothing and does not state all required parameters.
 
     Args:
-        missing: names of parameters; known: every parameter of the robot.
-        given: names that the file states; one of them may be misspelt.
+        missing: names of parameters.
+        known: every parameter of the robot.
+        given: names that the file states. One of them may be misspelt.
 
     Raises:
         BadConfiguration: one sentence that lists all of them.

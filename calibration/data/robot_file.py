@@ -68,9 +68,10 @@ class RobotFile:
 
     Attributes:
         robot: including changes from elsewhere, such as the command line.
-        source: path of its file, or name of a packaged robot; a packaged robot states no parameters.
-        stated: names of the parameters that the file states; a linear unit's keys become parameters of its shaft.
-        linear: configurations that it states as linear units; text: of the file.
+        source: path of its file, or name of a packaged robot. A packaged robot states no parameters.
+        stated: names of the parameters that the file states. A linear unit's keys become parameters of its shaft.
+        linear: configurations that it states as linear units.
+        text: of the file.
         remarks: sentences on the robot, for readers of its numbers.
     """
 
@@ -93,7 +94,8 @@ def load_robot(name_or_path: str, library: Library = effects.BY_NAME, notes: lis
 
     Args:
         name_or_path: `nominal`, `sm1`, `sm2`, or a TOML file that `calibrate`, `loop` or `rig new` wrote.
-        library: effects by name that the file may use; notes: receives remarks on the file.
+        library: effects by name that the file may use.
+        notes: receives remarks on the file.
 
     Raises:
         BadConfiguration: no such name or file, or an invalid value in the file.
@@ -129,19 +131,19 @@ def find_robot_file(
 
 
 def parse_robot_file(path: Path, library: Library = effects.BY_NAME, notes: list[str] | None = None) -> RobotFile:
-    """Read a robot file; its effects are looked up in `library` and among the curves.
+    """Read a robot file. Its effects are looked up in `library` and among the curves.
 
     The file states, all optional:
         schema: version of this form.
-        base: name of the robot that it starts from, `nominal` if left out; `none` starts from nothing.
+        base: name of the robot that it starts from, `nominal` if left out. `none` starts from nothing.
         imposed, channels, start, columns, instruments: how it is driven and measured, see `rig_file`.
-        sides: number of motors; `battery.cells`: cells in series.
-        configurations: names of the robot's configurations, in order; default: those of the base, or all tables.
+        sides: number of motors. `battery.cells`: cells in series.
+        configurations: names of the robot's configurations, in order. Default: those of the base, or all tables.
             A configuration that is not in the base states `like`, the base's configuration that it starts from.
             Otherwise it states `movers` (`tracks` or `wheels`) or `load` (see `rig_file.LOADS`), and every parameter
             without default.
         parameters: in tables by dotted name in SI units, e.g. `[motor] resistance = 0.9`, or with the sd of their
-            prior as `"0.9 ± 5 %"`; RATINGS; SWITCHES, true or false; and CHOICES.
+            prior as `"0.9 ± 5 %"`. RATINGS. SWITCHES, true or false, and CHOICES.
         effects: an effect is present if the file has its table `[effects.NAME]`. The table may name the
             `configurations` that the effect acts on, and scale its priors and limits by `scaled` (see
             `effects.scaled`).
@@ -194,7 +196,8 @@ def _without_parameters(
     """The robot of a file's content before the parameters that it states, the sds stated of those, its linear units.
 
     Args:
-        base: None starts from nothing; content: the function removes keys other than parameters.
+        base: None starts from nothing.
+        content: the function removes keys other than parameters.
     """
     if base is None:
         resolved_likes(content, where)
@@ -249,7 +252,7 @@ def with_effects(
     """The robot with these effects of `library`, or curves, present, each with amplitude 0.
 
     Args:
-        configurations: by an effect's name, the list of its configurations; default: as in its class.
+        configurations: by an effect's name, the list of its configurations. Default: as in its class.
         where: opens the message of an error.
 
     Raises:
@@ -271,10 +274,12 @@ def with_effects(
 
 
 def change_robot(robot: Robot, values: Mapping[str, Any], where: str, notes: list[str] | None = None) -> Robot:
-    """The robot with parameters replaced, each checked; `sides`, `battery.cells`, RATINGS, SWITCHES and CHOICES too.
+    """The robot with parameters replaced, each checked. `sides`, `battery.cells`, RATINGS, SWITCHES and CHOICES too.
 
     Args:
-        values: by dotted name [SI]; where: opens the message of an error; notes: as for `find_robot_file`.
+        values: by dotted name [SI].
+        where: opens the message of an error.
+        notes: as for `find_robot_file`.
 
     Raises:
         BadConfiguration: as `parse_robot_file`.
@@ -316,7 +321,7 @@ def change_robot(robot: Robot, values: Mapping[str, Any], where: str, notes: lis
 
 
 def _refused(name: str, value: Any, known: Mapping[str, params.Parameter]) -> str:
-    """Reason why a value of a parameter is refused; empty if it is allowed."""
+    """Reason why a value of a parameter is refused, empty if it is allowed."""
     if name not in known:
         return f"no such parameter; {_parameters(name, known)}"
     spec = known[name].spec
@@ -417,7 +422,7 @@ def _check_pairs(robot: Robot, where: str) -> None:
 
 
 def write_robot(robot: Robot, path: Path, *, note: str = "") -> None:
-    """Write a robot with everything that it states, with unit, meaning and source; `read_robot` gives it back.
+    """Write a robot with everything that it states, with unit, meaning and source. `read_robot` gives it back.
 
     Parameters that a robot which starts from nothing does not state are left out.
     """

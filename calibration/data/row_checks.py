@@ -40,13 +40,13 @@ STEPS = 0.5
 
 
 def reading_period(values: np.ndarray) -> float:
-    """Rows of a log between two readings of a slow sensor; 0 for a channel that is read in every row.
+    """Rows of a log between two readings of a slow sensor, 0 for a channel that is read in every row.
 
     A slow sensor changes at even distances of two rows or more, and rarely sooner. An instrument of coarse steps
     repeats numbers too, but changes by its smallest step, or at any distance.
 
     Args:
-        values: readings of a channel in one recording, in the order of time; NaN if missing.
+        values: readings of a channel in one recording, in the order of time, NaN if missing.
     """
     values = values[np.isfinite(values)]
     changed = np.flatnonzero(np.diff(values) != 0)
@@ -68,11 +68,12 @@ def reading_period(values: np.ndarray) -> float:
 
 def used_once(values: np.ndarray, time: np.ndarray, run: np.ndarray | None = None) -> tuple[np.ndarray, float]:
     """Returns a channel's values with one row for each reading of a slow sensor, NaN in the rows that repeat it, and
-    the rows between readings; the unchanged values and 0 if no reading is repeated.
+    the rows between readings. The unchanged values and 0 if no reading is repeated.
 
     Args:
-        values: NaN for a missing reading, shape (rows,); time: of the rows; run: name of the recording of each row;
-            None: all are of one.
+        values: NaN for a missing reading, shape (rows,).
+        time: of the rows.
+        run: name of the recording of each row. None: all are of one.
     """
     if (np.diff(values) == 0).sum() < LEAST * len(values):
         return values, 0.0
@@ -150,22 +151,17 @@ def _fill(name: str, columns: Columns, rows: int, layout: Layout) -> None:
     if layout.complete:
         return
     if "configuration" not in columns and layout.configurations:
-        columns["configuration"] = np.full(rows, _only(name, columns, layout))
+        labels = np.unique(columns.get("surface", np.zeros(0, str)))
+        found = surfaces.common_configuration(layout.configurations, labels)
+        if found is None:
+            raise BadData(
+                f"{name}: column configuration is missing, and the robot has {', '.join(layout.configurations)}"
+            )
+        columns["configuration"] = np.full(rows, found)
     if layout.imposed_column == SPEED and set(SPEEDS) <= set(columns):
         columns[SPEED] = np.mean([columns[c] for c in SPEEDS], 0)
     for column, value in DEFAULTS.items():
         columns.setdefault(column, np.full(rows, value))
-
-
-def _only(name: str, columns: Columns, layout: Layout) -> str:
-    """Returns the configuration of a table without that column: the only one, or the only one with its surfaces."""
-    labels = np.unique(columns.get("surface", np.zeros(0, str)))
-    found = surfaces.common_configuration(layout.configurations, labels)
-    if found is None:
-        raise BadData(
-            f"{name}: column configuration is missing, and the robot has {', '.join(layout.configurations)}"
-        )
-    return found
 
 
 def _check_driving(name: str, columns: Columns) -> None:
@@ -202,7 +198,10 @@ def _check_held(name: str, columns: Columns) -> None:
     """Refuses a clamp in a log, and a load torque beside it: what the clamp carries is a reading."""
     held = columns.get("held", np.zeros(1)) > 0.5
     if held.any() and set(TIME) <= set(columns):
-        raise BadData(f"{name}: column held is for settled rows; expected no time_s, or rows without a clamp")
+        raise BadData(
+            f"{name}: column held is for settled rows; expected no time_s, held = 1 in every row of a log, or a file "
+            "of its own for rows of a clamp"
+        )
     for at in np.flatnonzero(held & (columns.get(LOAD, 0.0) != 0))[:1]:
         raise BadData(
             f"{name} row {at + 1}, {LOAD}: got {bound_text(columns[LOAD][at])} where held is 1; expected 0, as the "
@@ -237,38 +236,53 @@ def _check_deviations(name: str, columns: Columns, shown: tuple[Channel, ...]) -
 def settled_points(name: str, columns: Columns, layout: Layout, robot: Robot) -> tuple[Columns, Names]:
     """Returns columns without the time if each row is a settled run, and a note that says so.
 
-    Rows are `SECONDS_APART` and `CONSTANTS_APART` time constants of the motors after one another, and half of them
-    have another setting than the row before. Readings follow the setting of their own row as well as that of the
-    row before. They do not if a setting begins at its row.
+    Rows are `CONSTANTS_APART` time constants after one another: of the windings where a clamp holds the output in
+    every row, else of the motors, and then they are points as of `_are_points`.
     """
     kept, time = dict(columns), columns.get("time_s")
-    if time is None or len(time) < 3 or layout.imposed != "voltage" or SUPPLY not in columns:
+    if time is None or len(time) < 3 or {"mode", *layout.sides} & set(columns):
         return kept, ()
-    if {"held", "mode", *layout.sides} & set(columns):
+    step = np.diff(time)
+    apart, clamped = float(step[step > 0].min(initial=math.inf)), _is_clamped(columns, layout)
+    windings = float(robot.motor.inductance / robot.motor.resistance) if robot.knows(VOLTAGE) else 0.0
+    constant = windings if clamped else time_constant(robot)
+    if not math.inf > apart >= CONSTANTS_APART * constant or not (clamped or _are_points(columns, layout, apart)):
         return kept, ()
-    shown = [c for c in layout.channels if c.column in columns]
-    constant, step = time_constant(robot), np.diff(time)
-    apart = float(step[step > 0].min(initial=math.inf))
-    if not all(c.settled for c in shown) or not math.inf > apart >= max(SECONDS_APART, CONSTANTS_APART * constant):
-        return kept, ()
-    settings = [c for c in (SUPPLY, "duty", LOAD, "slope_deg", "payload_kg") if c in columns]
-    changed = np.any([np.diff(columns[c]) != 0 for c in settings], 0) if settings else np.zeros(1, bool)
-    if changed.mean() < 0.5:
-        return kept, ()
-    drive = columns[SUPPLY] * columns.get("duty", 1.0)
-    others = [columns[c] for c in settings if c not in (SUPPLY, "duty")]
-    for channel in shown:
-        own, before = (
-            _unexplained(columns[channel.column][1:], [x[k : len(x) - 1 + k] for x in (drive, *others)])
-            for k in (1, 0)
-        )
-        if own > 2 * before:
-            return kept, ()
     for column in (*TIME, "run_id"):
         kept.pop(column, None)
     said = f"rows are {three_digits(apart)} s apart or more, most at another setting"
     settle = f", and the motors settle in about {three_digits(CONSTANTS_APART * constant)} s" if constant > 0 else ""
-    return kept, (f"{name}: {said}{settle}: each row is read as a settled run, without its time",)
+    why = "the output is held in every row" if clamped else f"{said}{settle}"
+    return kept, (f"{name}: {why}: each row is read as a settled run, without its time",)
+
+
+def _is_clamped(columns: Columns, layout: Layout) -> bool:
+    """True if a clamp holds the output in every row, or an imposed speed of 0 holds it against a torque."""
+    if "held" in columns:
+        return bool((columns["held"] > 0.5).all())
+    speed = columns.get(layout.imposed_column, np.ones(1))
+    return layout.imposed == "motor_speed" and LOAD in columns and not speed.any()
+
+
+def _are_points(columns: Columns, layout: Layout, apart: float) -> bool:
+    """True for rows `SECONDS_APART` or more after one another, half of them at another setting than the row before.
+
+    Readings follow the setting of their own row as well as that of the row before. They do not if a setting begins at
+    its row.
+    """
+    shown = [c for c in layout.channels if c.column in columns]
+    if layout.imposed != "voltage" or SUPPLY not in columns or "held" in columns or apart < SECONDS_APART:
+        return False
+    settings = [c for c in (SUPPLY, "duty", LOAD, "slope_deg", "payload_kg") if c in columns]
+    if not all(c.settled for c in shown) or np.any([np.diff(columns[c]) != 0 for c in settings], 0).mean() < 0.5:
+        return False
+    drive = columns[SUPPLY] * columns.get("duty", 1.0)
+    others = [columns[c] for c in settings if c not in (SUPPLY, "duty")]
+
+    def left(readings: np.ndarray, k: int) -> float:
+        return _unexplained(readings[1:], [x[k : len(x) - 1 + k] for x in (drive, *others)])
+
+    return all(left(columns[c.column], 1) <= 2 * left(columns[c.column], 0) for c in shown)
 
 
 def _unexplained(readings: np.ndarray, settings: Sequence[np.ndarray]) -> float:
@@ -288,7 +302,7 @@ def inertia_at_motor(robot: Robot, load: Load) -> float:
 
 
 def time_constant(robot: Robot) -> float:
-    """Time constant J R/k² of the motors' speed with the slowest load [s]; infinite if it is unknown."""
+    """Time constant J R/k² of the motors' speed with the slowest load [s]. Infinite if it is unknown."""
     motor, slowest = robot.motor, 0.0
     if not robot.knows(VOLTAGE):
         return math.inf
@@ -310,14 +324,24 @@ def driven_rows(name: str, columns: Columns, layout: Layout) -> tuple[Columns, n
     if note:
         columns = {column: values[driven] for column, values in columns.items()}
     if {*layout.sides, *HEADING} & set(columns):
-        _check_level(name, columns)
+        slope = columns["slope_deg"]
+        if slope.any():
+            row = int(np.flatnonzero(slope)[0])
+            more = (
+                f", and so in {np.count_nonzero(slope)} of {len(slope)} rows" if np.count_nonzero(slope) > 1 else ""
+            )
+            raise BadData(
+                f"{name} row {row + 1}, slope_deg: got {bound_text(slope[row])} in a table of settled turns{more}; "
+                "on a slope the heading changes all the time, so that no turn is settled there: expected 0; remove "
+                "such rows (simulate --left, --right and --slope with --model drive follows one over time)"
+            )
     if not set(layout.sides) & set(columns):
         _check_signs(name, columns, layout)
     return columns, driven, (note,) if note else ()
 
 
 def _driven(name: str, columns: Columns, layout: Layout) -> tuple[np.ndarray, str]:
-    """True for rows of settled runs in which something drives the motors; a sentence on the other rows.
+    """True for rows of settled runs in which something drives the motors. A sentence on the other rows.
 
     Raises:
         BadData: no row is driven, or a speed is read where nothing drives the motors.
@@ -352,19 +376,6 @@ def _driven(name: str, columns: Columns, layout: Layout) -> tuple[np.ndarray, st
     return size != 0, (
         f"{name}: {which} left out, as nothing drives the motors ({zero or column} 0); rows are counted without them"
     )
-
-
-def _check_level(name: str, columns: Columns) -> None:
-    """Refuses readings of turns on a slope, since no turn is settled there."""
-    slope = columns["slope_deg"]
-    if slope.any():
-        row = int(np.flatnonzero(slope)[0])
-        more = f", and so in {np.count_nonzero(slope)} of {len(slope)} rows" if np.count_nonzero(slope) > 1 else ""
-        raise BadData(
-            f"{name} row {row + 1}, slope_deg: got {bound_text(slope[row])} in a table of settled turns{more}; on a "
-            "slope the heading changes all the time, so that no turn is settled there: expected 0; remove such rows "
-            "(simulate --left, --right and --slope with --model drive follows one over time)"
-        )
 
 
 def _check_signs(name: str, columns: Columns, layout: Layout) -> None:

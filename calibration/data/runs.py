@@ -29,6 +29,7 @@ from calibration.data import (
     sides,
 )
 from calibration.data.columns import CONDITIONS, DUTY, SUPPLY, TIME, WHEN, Column, Layout
+from calibration.data.computed_columns import without_computed_torques
 from calibration.data.input_errors import BadConfiguration, BadData, bound_text
 from calibration.data.named_arrays import NamedArrays, Raw, column_numbers, column_texts, missing_readings
 from calibration.data.sources import opening, reading
@@ -121,16 +122,16 @@ def of_arrays(
 
     Args:
         arrays: columns of the source.
-        measured: True if at least one channel is required; without any, `total_mass_kg` may be missing too.
-        battery: True if the runs are on the on-board battery; the column of the voltage is missing then, or empty.
+        measured: True if at least one channel is required, without any, `total_mass_kg` may be missing too.
+        battery: True if the runs are on the on-board battery. The column of the voltage is missing then, or empty.
         robot: defines the columns that are needed, and the channels. None: the packaged robot, with a channel for
             each further column of one.
         of_turns: True to give a table of turns a channel for each of its columns of one side or of the yaw.
-        mapped: columns that have other names in the source, as `Layout.mapped`; None: from the robot's file.
+        mapped: columns that have other names in the source, as `Layout.mapped`. None: from the robot's file.
 
     Raises:
-        BadData: no columns or rows, no channel, a missing, misspelt or repeated column, or a wrong unit; values that
-            contradict each other or the robot; a value that is no number, not finite or out of range. The sentence
+        BadData: no columns or rows, no channel, a missing, misspelt or repeated column, or a wrong unit. Values that
+            contradict each other or the robot. A value that is no number, not finite or out of range. The sentence
             has source, row, column, value and the allowed values.
     """
     inferred = robot is None
@@ -178,7 +179,7 @@ def of_arrays(
     runs = Runs(name, columns, tuple(extras), arrays.digest, extras, layout, notes, headings)
     if robot is not None:
         contradictions.check_contradictions(runs, robot)
-        runs = without_unread(runs, robot)
+        runs = without_computed_torques(without_unread(runs, robot), robot)
     return runs
 
 
@@ -223,7 +224,8 @@ def _listed(name: str, said: Sequence[str], count: int) -> str:
     """One message on all refused cells, the first row first, without repeated advice.
 
     Args:
-        said: sentences, at least the first `LISTED`; count: number of cells.
+        said: sentences, at least the first `LISTED`.
+        count: number of cells.
     """
     first, *others = said
     if not others:
@@ -315,10 +317,10 @@ def _refuse_stated(arrays: NamedArrays, voltages: Raw) -> None:
 
 
 def single_run(cells: Json, layout: Layout | None = None) -> Runs:
-    """Returns one run from options by column name, each checked as a cell of a file; on a battery without a voltage.
+    """Returns one run from options by column name, each checked as a cell of a file. On a battery without a voltage.
 
     Args:
-        layout: of the robot's tables; None: of the packaged one's.
+        layout: of the robot's tables. None: of the packaged one's.
 
     Raises:
         BadConfiguration: an option that is out of range, not finite or an unknown word.

@@ -66,9 +66,11 @@ class Signal:
     """Readings of a channel in settled travel, sample by sample.
 
     Attributes:
-        channel: of the table of settled runs; shown: its readings [unit of the column], NaN if missing or a glitch.
+        channel: of the table of settled runs.
+        shown: its readings [unit of the column], NaN if missing or a glitch.
         angle: the angle whose rate it is [unit of its column], empty if the channel is read directly.
-        step: of its instrument [unit], 0 without; largest: size of its readings but for the last two in a hundred.
+        step: of its instrument [unit], 0 without.
+        largest: size of its readings but for the last two in a hundred.
         glitches: True for readings far from the readings next to them, see `find_glitches`, shape (rows,).
     """
 
@@ -81,7 +83,7 @@ class Signal:
 
     @functools.cached_property
     def filled(self) -> float:
-        """Share of the log's rows that have a reading; below 1 where instruments log at different rates."""
+        """Share of the log's rows that have a reading. Below 1 where instruments log at different rates."""
         return float(np.isfinite(self.shown).mean())
 
 
@@ -90,7 +92,7 @@ class Inertia:
     """Current that the acceleration of a configuration's motors takes.
 
     Attributes:
-        speed, current: names of channels; `current` is empty if the current is imposed.
+        speed, current: names of channels. `current` is empty if the current is imposed.
         per_rate: current [A] of one unit of the speed's column a second.
         least: current below which shares are of this [A].
     """
@@ -106,12 +108,16 @@ class Stretch:
     """Samples of a log that go together.
 
     Attributes:
-        run: name of; rows: indices in the table, in the order of time; begin, end: of time [s].
-        why: empty for a settled run, else one of `REASONS`; channel: the channel to blame, if there is one;
-            size: of its change, as a share.
-        mean, sd: of each channel, by name [unit of the column]; only for a settled run.
-        drift: change of each channel over it, by name [unit]; imposed: mean of what drives the motors.
-        glitches: readings of each channel that its mean leaves out, by name; only channels that have some.
+        run: name of.
+        rows: indices in the table, in the order of time.
+        begin, end: of time [s].
+        why: empty for a settled run, else one of `REASONS`.
+        channel: the channel to blame, if there is one.
+        size: of its change, as a share.
+        mean, sd: of each channel, by name [unit of the column]. Only for a settled run.
+        drift: change of each channel over it, by name [unit].
+        imposed: mean of what drives the motors.
+        glitches: readings of each channel that its mean leaves out, by name. Only channels that have some.
     """
 
     run: str
@@ -138,8 +144,11 @@ class Settled:
     """Settled travel of a log.
 
     Attributes:
-        runs: of the log; stretches: all of them, in the order of the log; signals: of its channels.
-        shortest, drift: as requested; gaps: rows after which samples are missing.
+        runs: of the log.
+        stretches: all of them, in the order of the log.
+        signals: of its channels.
+        shortest, drift: as requested.
+        gaps: rows after which samples are missing.
         scatter: sd of each channel between stretches under the same conditions beyond their own sds, by name [unit].
     """
 
@@ -205,7 +214,7 @@ def settle_log(
 
     The log is divided into levels where the imposed quantity changes. Of each level the end is taken, extended
     backward while every channel's mean stays the same within its noise. The means over this stretch are the settled
-    run. Means leave out glitches; see `find_glitches`. The sd of a mean has four parts:
+    run. Means leave out glitches. See `find_glitches`. The sd of a mean has four parts:
 
     * noise with its autocorrelation (Geyer's initial positive sequence, 1992),
     * the error from the steps of the instrument (Widrow and Kollár, Quantization noise, 2008, first term for normal
@@ -214,26 +223,32 @@ def settle_log(
     * the scatter of stretches under the same conditions.
 
     Args:
-        shortest: stretch [s]; None: 0.3 s, and at least 20 samples.
+        shortest: stretch [s]. None: 0.3 s, and at least 20 samples.
         drift: largest change of a mean within a stretch, as a share of it.
-        inertia: by configuration; a stretch whose acceleration takes more than `drift` of its current is left out.
+        inertia: by configuration. A stretch whose acceleration takes more than `drift` of its current is left out.
         loop: command that fits the log as it is, for messages.
         rolling: by configuration, readings of channels by name, with motors at 1 rad/s [unit of the column].
 
     Raises:
-        BadData: time that does not increase; a channel with a single number; no stretch at all; speeds or currents
-            without a sign; speeds or rates of angles in other units than their columns state.
+        BadData: time that does not increase. A channel with a single number. No stretch at all. Speeds or currents
+            without a sign. Speeds or rates of angles in other units than their columns state.
     """
     result = _divided(runs, shortest, drift, inertia)
     if not result.kept:
         raise BadData(_nothing(result, loop))
     _check_signs(result)  # by sds of their own: repeats whose signs differ widen them
     _check_units(result, rolling or {})
-    return dataclasses.replace(result, stretches=tuple(_wider(s, result.scatter) for s in result.stretches))
+    return dataclasses.replace(
+        result,
+        stretches=tuple(
+            dataclasses.replace(s, sd={name: math.hypot(sd, result.scatter[name]) for name, sd in s.sd.items()})
+            for s in result.stretches
+        ),
+    )
 
 
 def doubtful_sign(runs: Runs) -> str:
-    """Reason to doubt the sign of a channel of a log, from its settled stretches; empty without evidence."""
+    """Reason to doubt the sign of a channel of a log, from its settled stretches, empty without evidence."""
     try:
         result = _divided(runs, None, DRIFT, None)
     except BadData:  # a log without a stretch
@@ -314,7 +329,7 @@ def _in_order(runs: Runs) -> list[np.ndarray]:
 def _signals(
     runs: Runs, each: list[np.ndarray], levels: list[np.ndarray], half: int, drift: float
 ) -> tuple[Signal, ...]:
-    """Returns the settled readings of each channel of a log; of an angle its rate, if no channel reads the rate."""
+    """Returns the settled readings of each channel of a log. Of an angle its rate, if no channel reads the rate."""
     none, width = np.zeros(0), min(max(6 * half, BESIDE[0]), BESIDE[1])
     found = []
     for c in runs.channels:
@@ -351,9 +366,11 @@ def find_glitches(
     readings of a level may be a start, so `PART` in a row are no glitches there.
 
     Args:
-        shown: readings, NaN where missing; levels: rows of each level, in the order of time.
-        width: readings that a median is of; step: of the instrument [unit of the readings].
-        drift: largest change of a mean within a stretch, as a share of it; None: the readings are an angle.
+        shown: readings, NaN where missing.
+        levels: rows of each level, in the order of time.
+        width: readings that a median is of.
+        step: of the instrument [unit of the readings].
+        drift: largest change of a mean within a stretch, as a share of it. None: the readings are an angle.
     """
     from scipy.ndimage import binary_opening, median_filter
 
@@ -442,7 +459,7 @@ def _stuck(signal: Signal, each: list[np.ndarray]) -> np.ndarray:
 
 
 def _noise(x: np.ndarray) -> float:
-    """Sd of changes from sample to sample, robust to steps; 0 if most samples equal the sample before."""
+    """Sd of changes from sample to sample, robust to steps, 0 if most samples equal the sample before."""
     steps = np.diff(x[np.isfinite(x)])
     return 1.4826 * float(np.median(np.abs(steps - np.median(steps)))) / math.sqrt(2) if len(steps) else 0.0
 
@@ -484,7 +501,8 @@ class _End:
     """The end of a level, before the test that it is settled.
 
     Attributes:
-        rows: of it; seen: mean, sd and change of each channel over it, by name [unit of the column].
+        rows: of it.
+        seen: mean, sd and change of each channel over it, by name [unit of the column].
         left_over: largest significant change of a channel within it, as a share.
         glitches: readings of each channel that its mean leaves out.
     """
@@ -534,7 +552,11 @@ def _settled(
     seen = {name: x for name, x in found.seen.items() if math.isfinite(x[0])}
     if not seen:
         return out("unread")
-    if _rests(signals, seen):
+    moving = [
+        s for s in signals if s.channel.zero_at_rest and s.channel.name in seen and s.channel.name not in OF_YAW
+    ]
+    ends = [(s, *seen[s.channel.name][:2]) for s in moving]
+    if bool(ends) and all(abs(mean) < max(STILL * s.largest, SDS * sd) for s, mean, sd in ends):
         return out("rest")
     acting = inertia.get(str(runs["configuration"][rows[0]]))
     lasts = float(time[found.rows[-1]] - time[found.rows[0]])
@@ -597,19 +619,10 @@ def _unsettled(signals: tuple[Signal, ...], rows: np.ndarray, end: _End, drift: 
     return None, left_over
 
 
-def _rests(signals: tuple[Signal, ...], seen: Mapping[str, tuple[float, float, float]]) -> bool:
-    """True if channels that are zero at rest were read and none of them moves."""
-    moving = [
-        s for s in signals if s.channel.zero_at_rest and s.channel.name in seen and s.channel.name not in OF_YAW
-    ]
-    ends = [(s, *seen[s.channel.name][:2]) for s in moving]
-    return bool(ends) and all(abs(mean) < max(STILL * s.largest, SDS * sd) for s, mean, sd in ends)
-
-
 def _accelerates(
     acting: Inertia, seen: Mapping[str, tuple[float, float, float]], lasts: float, imposed: float, drift: float
 ) -> _Why | None:
-    """Reason if acceleration takes too large a share of the current over so many seconds; else None."""
+    """Reason if acceleration takes too large a share of the current over so many seconds, else None."""
     if acting.speed not in seen or (acting.current and acting.current not in seen):
         return None
     a_second = acting.per_rate / lasts
@@ -634,7 +647,7 @@ def _certain(signal: Signal, mean: float, sd: float, change: float) -> float:
 def _to_come(signal: Signal, rows: np.ndarray, mean: float) -> float:
     """Change along a level that is still to come at its end, as a share of `_scale`.
 
-    It is the tail of a lag. Changes between quarters of the level show its decay; where noise hides the last change,
+    It is the tail of a lag. Changes between quarters of the level show its decay. Where noise hides the last change,
     it follows from those before.
     """
     quarters = [signal.shown[q] for q in np.array_split(rows, 4)]
@@ -705,7 +718,7 @@ def _noise_of_mean(signal: Signal, rows: np.ndarray, ends: list[tuple[int, int]]
 
 
 def _correlation_time(x: np.ndarray) -> float:
-    """1 + 2 Σ ρ_k up to where sums of two autocorrelations turn negative (Geyer 1992); at least 1."""
+    """1 + 2 Σ ρ_k up to where sums of two autocorrelations turn negative (Geyer 1992), at least 1."""
     power = float(np.mean(x**2))
     if len(x) < 4 or power <= 0:
         return 1.0
@@ -749,7 +762,7 @@ def _mean(signal: Signal, time: np.ndarray, rows: np.ndarray) -> tuple[float, fl
 
 
 def _scatter(runs: Runs, found: list[Stretch], signals: tuple[Signal, ...], largest: float) -> dict[str, float]:
-    """Scatter of stretches under the same conditions beyond their own sds, for each channel [unit]; 0 with too few
+    """Scatter of stretches under the same conditions beyond their own sds, for each channel [unit], 0 with too few
     repeats."""
     alike = [c for c in EXACT if runs.has(c)]
     groups: list[list[Stretch]] = []
@@ -784,10 +797,6 @@ def _held(runs: Runs, stretch: Stretch) -> tuple[int, ...]:
     return tuple(
         round(float(np.mean(x[stretch.rows])) / (DRIFT * float(np.max(np.abs(x))))) if x.any() else 0 for x in signals
     )
-
-
-def _wider(stretch: Stretch, scatter: Mapping[str, float]) -> Stretch:
-    return dataclasses.replace(stretch, sd={name: math.hypot(sd, scatter[name]) for name, sd in stretch.sd.items()})
 
 
 #: Sds beyond zero from which on a mean has a sign.
@@ -872,7 +881,7 @@ def _read(runs: Runs, channel: str) -> bool:
 
 
 def _nothing(found: Settled, loop: str) -> str:
-    """Message on a log without settled stretch: main reason and advice; `loop` is the command that takes it."""
+    """Message on a log without settled stretch: main reason and advice. `loop` is the command that takes it."""
     direct = "" if found.runs.turns else f"use the log itself ({loop}), or "
     source, longest = found.runs.source, max(found.stretches, key=lambda s: s.lasts)
     whys = [s.why for s in found.stretches]
@@ -923,7 +932,7 @@ def _nothing(found: Settled, loop: str) -> str:
 def rolling_readings(robot: Robot) -> dict[str, dict[str, float]]:
     """Readings of speeds in each configuration at 1 rad/s of the motors, the load rolling [unit of the column].
 
-    By channel; only speeds of shafts for a vehicle, which slips.
+    By channel. Only speeds of shafts for a vehicle, which slips.
     """
     found = {}
     for k, (name, load) in enumerate(robot.configurations.items()):
@@ -955,7 +964,7 @@ def acceleration_currents(robot: Robot) -> dict[str, Inertia]:
 
 
 def _shown(robot: Robot, configuration: int, channel: Channel, state: State) -> float:
-    """Reading of a channel that follows from a state alone [unit of its column]; 0 for others."""
+    """Reading of a channel that follows from a state alone [unit of its column], 0 for others."""
     signals = balances.begin_signals(robot, Conditions(configuration), state)
     try:
         return float(channel.read(robot, signals)) / channel.factor

@@ -27,7 +27,8 @@ def supply_and_shares(volts: np.ndarray, supply: np.ndarray | None = None) -> tu
     """Returns the supply's voltage [V], by default the larger of both sides', and the share of each side.
 
     Args:
-        volts: of left and right side [V], shape (2, rows); supply: shape (rows,).
+        volts: of left and right side [V], shape (2, rows).
+        supply: shape (rows,).
     """
     source = np.max(np.abs(volts), 0) if supply is None else supply
     return source, np.divide(volts, source, out=np.zeros_like(volts), where=source != 0)
@@ -37,7 +38,7 @@ def of_volts(name: str, columns: Columns, battery: bool) -> Names:
     """Replaces the sides' voltages of a table by their shares of the supply's voltage.
 
     Returns:
-        A note on the replacement; none if the table has no such column.
+        A note on the replacement. None if the table has no such column.
 
     Raises:
         BadData: a battery feeds the motors, one side's voltage is missing, the table also states shares, or a voltage
@@ -105,7 +106,7 @@ def check_turns(runs: Runs) -> None:
 def _refuse_against(
     runs: Runs, column: str, shown: tuple[np.ndarray, ...], readings: np.ndarray, drive: np.ndarray, expected: str
 ) -> None:
-    """Refuses readings that mostly have the other sign than their drive; the message names the clearest row.
+    """Refuses readings that mostly have the other sign than their drive. The message names the clearest row.
 
     Args:
         shown: values of the columns in every row.

@@ -1,4 +1,4 @@
-"""Numbers with their uncertainty: `5.95 ± 5 %`, `0.82 ± 0.02`; `12 ± 0` is exact."""
+"""Numbers with their uncertainty: `5.95 ± 5 %`, `0.82 ± 0.02`. `12 ± 0` is exact."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def stated_number(text: str, where: str) -> tuple[float, float]:
 
 
 def taken_apart(table: Json, where: str, prefix: str = "") -> dict[str, float]:
-    """Replaces each `value ± sd` of a table and its subtables by the value; returns the sds by dotted name.
+    """Replaces each `value ± sd` of a table and its subtables by the value. Returns the sds by dotted name.
 
     Raises:
         BadConfiguration: as `stated_number`.

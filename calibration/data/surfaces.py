@@ -27,7 +27,7 @@ V = TypeVar("V")
 
 
 def common_configuration(configurations: Sequence[str], labels: Iterable[str]) -> str | None:
-    """Returns the only configuration, or the configuration with all of these surfaces; otherwise None."""
+    """Returns the only configuration, or the configuration with all of these surfaces, otherwise None."""
     if len(configurations) == 1:
         return configurations[0]
     stems = [
@@ -39,7 +39,7 @@ def common_configuration(configurations: Sequence[str], labels: Iterable[str]) -
 
 
 def allowed_labels(label: str, layout: Layout) -> str:
-    """Allowed labels for the message about a label; empty if the label is allowed itself."""
+    """Allowed labels for the message about a label, empty if the label is allowed itself."""
     if not layout.inherits:
         return "" if label else "the name of a surface"
     if label in SURFACES:
@@ -109,7 +109,7 @@ def of_surfaces(stated: Mapping[str, V], robot: Robot, runs: Runs) -> dict[str, 
 def names_of_surfaces(names: Iterable[str], robot: Robot, runs: Runs) -> list[str]:
     """Names of parameters, with replaced configurations renamed to the configurations of their surfaces.
 
-    A parameter of the ground becomes one for each surface; any other becomes the first surface's.
+    A parameter of the ground becomes one for each surface. Any other becomes the first surface's.
     """
     found: list[str] = []
     for name in names:

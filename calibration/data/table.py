@@ -37,7 +37,7 @@ def driven_on(columns: Mapping[str, np.ndarray], layout: Layout) -> np.ndarray:
 
 
 def drive_of_sides(columns: Mapping[str, np.ndarray], layout: Layout) -> np.ndarray:
-    """Voltage [V] of the left and the right side, on a battery a share of it, or their speed [rpm], shape (2, rows);
+    """Voltage [V] of the left and the right side, on a battery a share of it, or their speed [rpm], shape (2, rows),
     negative backward.
 
     Args:
@@ -55,16 +55,16 @@ class Runs:
 
     Attributes:
         source: where it came from, for messages.
-        columns: name → array of shape (rows,); numbers in the unit of the name, words as str; NaN for a reading
+        columns: name → array of shape (rows,). Numbers in the unit of the name, words as str, NaN for a reading
             that is missing.
         unknown: columns of the file that this program does not know.
         digest: SHA-256 of the file, empty for a table that came from none.
         extras: cells of `unknown` columns, shape (rows,): numbers, NaN if empty, or words. They are not in `columns`,
-            as they have no role; only the search for correlations with residuals reads them.
+            as they have no role. Only the search for correlations with residuals reads them.
         layout: meaning of its columns for its robot, and its channels.
         notes: sentences on the reading of the file, and on missing data.
         headings: names of the columns in the file, by their names in this program.
-        log: the whole log, if these rows are a selection of it (see `thinning`); None: all rows are here.
+        log: the whole log, if these rows are a selection of it (see `thinning`). None: all rows are here.
     """
 
     source: str
@@ -94,7 +94,7 @@ class Runs:
 
     @property
     def of_sides(self) -> np.ndarray:
-        """See `drive_of_sides`; of a table with `turns`."""
+        """See `drive_of_sides`. Of a table with `turns`."""
         return drive_of_sides(self.columns, self.layout)
 
     @property
@@ -103,7 +103,7 @@ class Runs:
         return self.layout.channels
 
     def of(self, robot: Robot) -> Runs:
-        """The table with the channels of a robot; columns of other channels become unknown columns without a role.
+        """The table with the channels of a robot. Columns of other channels become unknown columns without a role.
 
         Raises:
             BadData: the table was read for a robot without a channel of this one, so its column was left out.
@@ -171,7 +171,7 @@ class Runs:
 
     @property
     def run_names(self) -> np.ndarray:
-        """Name of the run that each row is of, shape (rows,); of a table without `run_id` all are of one, ""."""
+        """Name of the run that each row is of, shape (rows,). Of a table without `run_id` all are of one, ""."""
         return self["run_id"] if self.has("run_id") else np.zeros(len(self), str)
 
     def in_order(self, name: str) -> np.ndarray:
@@ -216,7 +216,7 @@ class Runs:
         else the row's configuration.
 
         Raises:
-            InputError: a configuration that the robot does not have; the message lists its configurations.
+            InputError: a configuration that the robot does not have. The message lists its configurations.
         """
         which = np.empty(len(self), int)
         names = self.configurations_named(robot)
@@ -232,7 +232,7 @@ class Runs:
         return which
 
     def configurations_named(self, robot: Robot) -> np.ndarray:
-        """Names of `configurations`; a configuration that the robot does not have keeps the table's name."""
+        """Names of `configurations`. A configuration that the robot does not have keeps the table's name."""
         stated = self["configuration"]
         if not self.has("surface"):
             return stated
@@ -248,7 +248,8 @@ class Runs:
 
         Args:
             robot: has the configurations of the table.
-            battery: 1 for the on-board battery; discharge: charge already taken from it [C].
+            battery: 1 for the on-board battery.
+            discharge: charge already taken from it [C].
 
         Raises:
             BadData: as `configurations`.

@@ -147,7 +147,7 @@ def read_sequence(path: Path, robot: Robot, begins: tuple[float, float]) -> Sequ
 
 
 def lever_start_refusal(robot: Robot, angle: float) -> str:
-    """Reason why levers cannot begin at an angle [deg] on level ground; empty if they can."""
+    """Reason why levers cannot begin at an angle [deg] on level ground, empty if they can."""
     gear = robot.running_gear
     axle = robot.radius_pulley + gear.grouser_height
     above = float(roller_clearance(axle, gear, jnp.radians(angle)))
@@ -161,7 +161,7 @@ def lever_start_refusal(robot: Robot, angle: float) -> str:
 
 
 def lever_angle_refusal(robot: Robot, angle: float) -> str:
-    """Reason why levers cannot reach an angle [deg]; empty if they can."""
+    """Reason why levers cannot reach an angle [deg], empty if they can."""
     levers = robot.running_gear.levers
     least, most = (float(np.degrees(np.asarray(x))) for x in (levers.angle_least, levers.angle_most))
     within = least - 1e-6 <= angle <= most + 1e-6

@@ -23,7 +23,7 @@ def used_rows(runs: Runs, robot: Robot, most: int = ROWS) -> Runs:
     """Returns the rows of a robot's runs that a fit uses, with the robot's channels.
 
     Raises:
-        BadConfiguration: other objects than `Runs` and a `Robot`; or as `thin_rows`.
+        BadConfiguration: other objects than `Runs` and a `Robot`, or as `thin_rows`.
         BadData: as `Runs.of` and `thin_rows`.
     """
     for name, value, kind in (("runs", runs, Runs), ("robot", robot, Robot)):
@@ -34,7 +34,7 @@ def used_rows(runs: Runs, robot: Robot, most: int = ROWS) -> Runs:
 
 
 def thin_rows(runs: Runs, most: int = ROWS) -> Runs:
-    """Returns runs with about `most` of their rows, if they have more; `Runs.log` keeps all rows.
+    """Returns runs with about `most` of their rows, if they have more. `Runs.log` keeps all rows.
 
     Of a log, each run keeps its first rows, its last row, and one row of every few in between. A table without
     `time_s` is sorted by its conditions, the imposed quantity first, and treated as one run, so that the rows kept

@@ -178,7 +178,7 @@ def toml_value(value: Any) -> str:
 
 
 def write_table(path: Path, columns: Mapping[str, np.ndarray], tables: str = "csv") -> None:
-    """Write a table as CSV; numbers that are not finite become empty cells.
+    """Write a table as CSV. Numbers that are not finite become empty cells.
 
     Args:
         tables: `parquet` to write the same columns into a file of that format too, with all their digits.
@@ -210,7 +210,7 @@ _FORMULA = re.compile(r"'*[=+\-@\t\r]")
 
 
 def cell_text(value: Any) -> str:
-    """A cell of a table; a word that a spreadsheet would run as a formula gets an apostrophe (`cell_word`)."""
+    """A cell of a table. A word that a spreadsheet would run as a formula gets an apostrophe (`cell_word`)."""
     if isinstance(value, float | np.floating):
         return f"{value:.9g}" if math.isfinite(value) else ""
     text = printable(str(value)).replace("\n", " ")

@@ -34,12 +34,13 @@ class ActiveSet(eqx.Module):
 
     z = [base, amplitudes, shapes], all with standard normal priors: an amplitude is width · sd · z, a shape
     its nominal value times exp(spread · z). The effect in a slot is data, not structure, so that fits
-    of many candidates are one vmapped batch; an empty slot keeps its coordinates at 0.
+    of many candidates are one vmapped batch. An empty slot keeps its coordinates at 0.
 
     Attributes:
         base: coordinates of the base parameters.
-        active: index into `names` of the effect in each slot, -1 if it is empty; shape (slots,).
-        sd: of each effect's amplitude, including the width; scales: of each effect's shape, see `shape_scales`.
+        active: index into `names` of the effect in each slot, -1 if it is empty, shape (slots,).
+        sd: of each effect's amplitude, including the width.
+        scales: of each effect's shape, see `shape_scales`.
         names, shapes: names of the robot's effects, and of their shape parameters ("" for none).
     """
 
@@ -85,9 +86,9 @@ class ActiveSet(eqx.Module):
 def _parts(space: ActiveSet, z: Array) -> tuple[Array, tuple[Array, ...], tuple[Array, ...]]:
     """Coordinates of the base, and amplitude and shape of each effect."""
     base, amplitude, shape = space.parts(z)
-    held = space.held()
-    amplitudes = space.sd * (amplitude @ held)
-    shapes = shape_at(space.scales, shape @ held)
+    held_vector = space.held()
+    amplitudes = space.sd * (amplitude @ held_vector)
+    shapes = shape_at(space.scales, shape @ held_vector)
     return base, params.split_numbers(amplitudes), params.split_numbers(shapes)
 
 
@@ -98,7 +99,8 @@ class ScoredLibrary:
     Attributes:
         effects: those that the data can show and the robot does not have yet.
         scored: the same, with their grids.
-        of: index of each instance's effect; at: its shape's coordinate; shape (instances,).
+        of: index of each instance's effect.
+        at: its shape's coordinate, shape (instances,).
     """
 
     effects: tuple[Effect, ...]
@@ -124,21 +126,14 @@ class ScoredLibrary:
 
     def largest(self, instances: np.ndarray) -> np.ndarray:
         """Maximum of a non-negative number over each effect's instances, shape (effects,)."""
-        whole = np.zeros(len(self))
-        np.maximum.at(whole, self.of, instances)
-        return whole
+        largest_scores = np.zeros(len(self))
+        np.maximum.at(largest_scores, self.of, instances)
+        return largest_scores
 
     def best_instance(self, name: str, single: np.ndarray) -> int:
         """The instance of an effect with the largest |score|."""
-        mine = np.flatnonzero(self.of == self.names.index(name))
-        return int(mine[np.argmax(np.abs(np.asarray(single)[mine]))])
-
-
-def scored_library(effects: Sequence[Effect]) -> ScoredLibrary:
-    """Library of the effects, each at every point of its shape's grid."""
-    grids = tuple(with_shape_grid(e) for e in effects)
-    effect = np.repeat(np.arange(len(grids)), [len(s.at) for s in grids])
-    return ScoredLibrary(tuple(effects), grids, effect, np.concatenate([s.at for s in grids]))
+        instances = np.flatnonzero(self.of == self.names.index(name))
+        return int(instances[np.argmax(np.abs(np.asarray(single)[instances]))])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -146,7 +141,8 @@ class CandidateSpace:
     """Problems of a search: the base, and the base with any effects of a library in a few slots.
 
     Attributes:
-        bare: problem of the base only; equipped: of the base and the effects in the slots, whichever these are.
+        bare: problem of the base only.
+        equipped: of the base and the effects in the slots, whichever these are.
         library: the effects.
         room: names of effects that the program of every fit of histories includes, see `fitted_by`.
         near: coordinates of fits of the same histories with other sds, by their effects. Fits then start there and
@@ -207,20 +203,20 @@ class CandidateSpace:
         sets = [tuple(names) for names in sets]
         if not self.bare.observe.long:
             return self.equipped, [self.library.indices(names) for names in sets]
-        wanted = {*self.room, *(n for names in sets for n in names if n)} or {*self.library.names[:1]}
-        chosen = [k for k, n in enumerate(self.library.names) if n in wanted]
-        names, every = tuple(self.library.names[k] for k in chosen), self.coordinates
-        value, spread, sd, low, high = (x[np.asarray(chosen)] for x in every.scales)
+        effects_to_place = {*self.room, *(n for names in sets for n in names if n)} or {*self.library.names[:1]}
+        chosen = [k for k, n in enumerate(self.library.names) if n in effects_to_place]
+        names, all_coordinates = tuple(self.library.names[k] for k in chosen), self.coordinates
+        value, spread, sd, low, high = (x[np.asarray(chosen)] for x in all_coordinates.scales)
         coordinates = dataclasses.replace(
-            every,
-            sd=every.sd[np.asarray(chosen)],
+            all_coordinates,
+            sd=all_coordinates.sd[np.asarray(chosen)],
             scales=(value, spread, sd, low, high),
             names=names,
-            shapes=tuple(every.shapes[k] for k in chosen),
+            shapes=tuple(all_coordinates.shapes[k] for k in chosen),
         )
         robot = self.equipped.base
-        kept = {e.name for e in self.bare.base.effects} | wanted
-        robot = dataclasses.replace(robot, effects=tuple(e for e in robot.effects if e.name in kept))
+        effect_names = {e.name for e in self.bare.base.effects} | effects_to_place
+        robot = dataclasses.replace(robot, effects=tuple(e for e in robot.effects if e.name in effect_names))
         index = {n: k for k, n in enumerate(names)} | {"": -1}
         problem = dataclasses.replace(self.equipped, base=robot, coordinates=coordinates)
         return problem, [tuple(index[n] for n in each) for each in sets]
@@ -261,4 +257,10 @@ def candidate_space(
     more = tuple(library[e.name]() for e in effects if e.name not in have)
     robot = params.without_weak_types(dataclasses.replace(bare.base, effects=(*bare.base.effects, *more)))
     data = dataclasses.replace(bare.data, centre=jnp.zeros(len(coordinates)))
-    return CandidateSpace(bare, Problem(robot, coordinates, bare.observe, data), scored_library(effects))
+    grids = tuple(with_shape_grid(e) for e in effects)
+    effect = np.repeat(np.arange(len(grids)), [len(s.at) for s in grids])
+    return CandidateSpace(
+        bare,
+        Problem(robot, coordinates, bare.observe, data),
+        ScoredLibrary(tuple(effects), grids, effect, np.concatenate([s.at for s in grids])),
+    )

@@ -16,7 +16,8 @@ class AdequacyTest:
     """Test of a fit's residuals against its bootstrap.
 
     Attributes:
-        found: the strongest statistics of the data; null: of the bootstrap, shape (replicates,) each.
+        found: the strongest statistics of the data.
+        null: of the bootstrap, shape (replicates,) each.
         settings: shares of the family-wise error, and margins.
     """
 
@@ -44,7 +45,7 @@ class AdequacyTest:
         return any(map(self.beyond_doubt, self.settings.shares))
 
     def beyond_doubt(self, kind: str, found: float | None = None) -> bool:
-        """True if a statistic of a kind exceeds its threshold by the margin; None takes the one found."""
+        """True if a statistic of a kind exceeds its threshold by the margin. None takes the strongest one."""
         if kind not in self.settings.shares:
             return False
         statistic = float(getattr(self.found, kind)) if found is None else found
@@ -62,7 +63,9 @@ class Diagnosis:
     """Diagnosis of a fit's residuals.
 
     Attributes:
-        linear: the fit, linearised; scores: of effects and curves; test: of the residuals.
+        linear: the fit, linearised.
+        scores: of effects and curves.
+        test: of the residuals.
     """
 
     linear: Linearization

@@ -1,6 +1,6 @@
 """Discrepancy without a name: its location, its shape as a smooth curve fitted with the base, and a formula.
 
-Defects and formulas are linear algebra at a fit, with every column projected against the free parameters; the curve
+Defects and formulas are linear algebra at a fit, with every column projected against the free parameters. The curve
 itself is fitted together with the base.
 """
 
@@ -60,27 +60,28 @@ def locate_discrepancy(left: Diagnosis, bases: Bases, included: np.ndarray) -> D
     The place is that of the most significant curve. The variable is that of the curve with most evidence there.
 
     Args:
-        left: diagnosis of a fit; included: True for included rows, shape (rows,).
+        left: diagnosis of a fit.
+        included: True for included rows, shape (rows,).
     """
     names = bases_room.family_names(bases)
     deviate, explained = np.asarray(left.scores.curve), np.asarray(left.scores.explained)
     happens = np.array([bases_room.window_from_name(n[1]) is not None for n in names])
     # A smooth curve responds to a temporary change too, and a window to a smooth curve.
     for_a_while = bool(np.max(deviate[happens], initial=-np.inf) > np.max(deviate[~happens]) + ALIKE)
-    those = [j for j in range(len(names)) if happens[j] == for_a_while]
-    k = max(those, key=lambda j: deviate[j])
+    same_kind = [j for j in range(len(names)) if happens[j] == for_a_while]
+    k = max(same_kind, key=lambda j: deviate[j])
     # A balance takes precedence over an instrument with a similar score, which is listed as an alternative.
-    lacks = [j for j in those if not bases_room.is_channel_place(names[j][0]) and deviate[j] > deviate[k] - ALIKE]
+    lacks = [j for j in same_kind if not bases_room.is_channel_place(names[j][0]) and deviate[j] > deviate[k] - ALIKE]
     k = max(lacks, key=lambda j: deviate[j]) if lacks else k
     place = names[k][0]
-    over = [j for j in those if names[j][0] == place and names[j][1] != bases_room.CONDITIONS]
+    over = [j for j in same_kind if names[j][0] == place and names[j][1] != bases_room.CONDITIONS]
     j = k if for_a_while else max(over, key=lambda j: deviate[j])
     if names[j][1] in bases_room.VARIABLES:
         smoothly = [i for i in over if bases_room.window_from_name(names[i][1]) is None]
         evidence = {i: smooth_curve(left.linear, *names[i], included).evidence for i in smoothly}
         j = max(smoothly, key=lambda i: evidence[i] - INDIRECT * (names[i][1] == "voltage"))
-    every = dict.fromkeys(names[i][0] for i in those)
-    best = {b: max(deviate[i] for i in those if names[i][0] == b) for b in every}
+    places = dict.fromkeys(names[i][0] for i in same_kind)
+    best = {b: max(deviate[i] for i in same_kind if names[i][0] == b) for b in places}
     alike = [(b, *bases_room.STANDS_FOR.get(b, ())) for b, d in best.items() if d > deviate[k] - ALIKE]
     variable, strength = names[j][1], float(explained[j])
     happening = bases_room.window_from_name(variable)
@@ -104,7 +105,7 @@ def similar_variables(names: Sequence[tuple[str, str]], deviate: np.ndarray, pla
 
 
 def _axis(variable: str) -> str:
-    """Key shared by all windows along an axis; a smooth curve has a key of its own."""
+    """Key shared by all windows along an axis. A smooth curve has a key of its own."""
     happens = bases_room.window_from_name(variable)
     return variable if happens is None else f"{happens.axis} for a while"
 
@@ -114,7 +115,7 @@ def refine_window(
 ) -> tuple[bases_room.Window, float]:
     """Window of an axis that explains most, and its decrease of χ² [σ²].
 
-    Windows begin and end at the axis's instants and hold at most half of the rows; those of the tests are coarser.
+    Windows begin and end at the axis's instants and hold at most half of the rows. Those of the tests are coarser.
 
     Args:
         included: True for included rows, shape (rows,).
@@ -132,8 +133,12 @@ def refine_window(
     rows = np.append(0, np.add.reduceat(counts, np.arange(0, len(levels), merged)).cumsum())
     first, last = np.triu_indices(len(edges) + 1, 1)
     norm2 = sums[last, last] - 2 * sums[first, last] + sums[first, first]
-    held = rows[last] - rows[first]
-    fair = (held >= bases_room.FEWEST) & (held <= 0.5 * rows[-1]) & (norm2 > 1e-9 * max(float(a.max()), 1e-300))
+    rows_in_window = rows[last] - rows[first]
+    fair = (
+        (rows_in_window >= bases_room.FEWEST)
+        & (rows_in_window <= 0.5 * rows[-1])
+        & (norm2 > 1e-9 * max(float(a.max()), 1e-300))
+    )
     gain = np.where(fair, (pull[last] - pull[first]) ** 2 / np.where(fair, norm2, 1.0), -np.inf)
     k = int(np.argmax(gain))
     inside = included & (index >= first[k]) & (index < last[k])
@@ -147,7 +152,9 @@ class Shaped(eqx.Module):
     """Coordinates of a base fit, then those of a curve's ordinates: y = L z, all standard normal.
 
     Attributes:
-        base: of the base; root: L, shape (ordinates, ordinates); names: dotted, of the ordinates.
+        base: of the base.
+        root: L, shape (ordinates, ordinates).
+        names: dotted, of the ordinates.
         fitted_once: True, because few fits use such coordinates.
     """
 
@@ -179,9 +186,10 @@ class Discrepancy:
     Attributes:
         balance, variable, unit: its place and variable, and the unit of the balance.
         effect: name of the curve among the effects of `robot`, the fitted robot with the curve.
-        defect: of the balance, by row, at the fit without the curve; None if single rows do not show it.
-        grid: of the variable [SI]; curve, sd: there [unit], shape (points,); the 95 % band is ±1.96 sd. The
-            band includes the uncertainty of the base, so it is wide if base parameters can replace the curve.
+        defect: of the balance, by row, at the fit without the curve, None if single rows do not show it.
+        grid: of the variable [SI].
+        curve, sd: there [unit], shape (points,). The 95 % band is ±1.96 sd. The band includes the uncertainty
+            of the base, so it is wide if base parameters can replace the curve.
         chi2: twice the objective before and after [σ²], priors included.
         z, covariance: posterior of the coordinates of `problem`, the ordinates last.
         problem: of the fit.
@@ -214,7 +222,8 @@ def fit_discrepancy(
     """Discrepancy of a balance over a variable: its defects, its curve, a formula.
 
     Args:
-        base: the fit without the curve; linear: the same, linearised.
+        base: the fit without the curve.
+        linear: the same, linearised.
         balance: one of `bases.BALANCES`, or a channel.
         variable: one of `bases.VARIABLES`, of `bases.ORDERS`, or a window.
     """
@@ -225,7 +234,7 @@ def fit_discrepancy(
     starts = np.zeros((STARTS, len(problem.coordinates)))
     starts[:, :inner] = base.z[:inner]
     starts[:, inner:] = np.linspace(1.0, 0.0, STARTS)[:, None] * at_base.start
-    optima, seen = search_each(problem, list(starts), [space.weight] * STARTS)
+    optima, observations = search_each(problem, list(starts), [space.weight] * STARTS)
     k = int(np.argmin(np.where(np.isfinite(optima.cost), optima.cost, np.inf)))
     z = np.asarray(optima.z[k])
     covariance = np.asarray(optima.covariance[k])
@@ -246,7 +255,7 @@ def fit_discrepancy(
         z=z,
         covariance=covariance,
         problem=problem,
-        reading=np.asarray(seen.reading[k]),
+        reading=np.asarray(observations.reading[k]),
         converged=bool(optima.converged[k]),
         proposal=propose_formula(linear, balance, included, at_base, voltage=space.bare.base.rig.shows_voltage),
     )
@@ -291,12 +300,12 @@ class CurveBeside:
 
 
 def _with_curve(space: CandidateSpace, base: Candidate, curve: Smooth) -> Problem:
-    """Problem of the base and a curve; the coordinates of the curve's ordinates come last."""
+    """Problem of the base and a curve. The coordinates of the curve's ordinates come last."""
     problem = space.problem(base.active) if base.effects else space.bare
     # A curve of this name from an earlier round is replaced, because its parameters have the same names.
-    kept = tuple(e for e in problem.base.effects if e.name != curve.effect)
+    other_effects = tuple(e for e in problem.base.effects if e.name != curve.effect)
     added = params.replace(UNNAMED[curve.effect](), {n: jnp.asarray(v) for n, v in curve.values.items()})
-    robot = dataclasses.replace(problem.base, effects=(*kept, added))
+    robot = dataclasses.replace(problem.base, effects=(*other_effects, added))
     names = tuple(f"effects.{curve.effect}.{n}" for n in curve.ordinates)
     shaped = Shaped(problem.coordinates, jnp.asarray(curve.root), names)
     data = dataclasses.replace(problem.data, centre=jnp.zeros(len(shaped)))

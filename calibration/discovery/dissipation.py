@@ -29,11 +29,13 @@ ROUNDING = 1e-9
 def supplying_effects(space: CandidateSpace, active: Sequence[str], amplitude: np.ndarray, z: np.ndarray) -> Names:
     """Dissipative effects of negative amplitude with a balance that would supply power in an included row.
 
-    An effect corrects the law of its balance; a negative one means that the law takes too much. Histories and turns
+    An effect corrects the law of its balance. A negative one means that the law takes too much. Histories and turns
     have no operating point for each row and are judged only by the sign of the term.
 
     Args:
-        active: name of the effect in each slot; amplitude: of each; z: coordinates of the fit.
+        active: name of the effect in each slot.
+        amplitude: of each.
+        z: coordinates of the fit.
     """
     negative = [n for n, a in zip(active, amplitude, strict=True) if n and a <= 0 and space.library[n].dissipative]
     if not negative or space.bare.observe.long:
@@ -41,8 +43,8 @@ def supplying_effects(space: CandidateSpace, active: Sequence[str], amplitude: n
     power = _dissipated_power(space.bare.observe, space.problem(active).robot(jnp.asarray(z)))
     if power is None:
         return tuple(negative)
-    taken = dict(zip(SINK, np.asarray(power)[:, space.included], strict=True))
-    return tuple(n for n in negative if not _dissipates(taken.get(space.library[n].balance)))
+    power_by_balance = dict(zip(SINK, np.asarray(power)[:, space.included], strict=True))
+    return tuple(n for n in negative if not _dissipates(power_by_balance.get(space.library[n].balance)))
 
 
 def _dissipates(power: np.ndarray | None) -> bool:
@@ -54,7 +56,7 @@ def _dissipates(power: np.ndarray | None) -> bool:
 
 @functools.partial(compiled, options=SELDOM)
 def _dissipated_power(observe: Observer, robot: Robot) -> Float[Array, "balances rows"] | None:
-    """Power that each balance of `SINK` takes in each row [W]; None if rows have no operating point."""
+    """Power that each balance of `SINK` takes in each row [W], None if rows have no operating point."""
     signals = observe.operating(robot)
     if signals is None:
         return None

@@ -7,7 +7,7 @@ and Verdinelli, Bayesian experimental design, Statistical Science 10 (1995)). Th
 A, B is √(dᵀ S⁻¹ d), d = y_A - y_B. It takes the S with the smaller result (Hunter and Reiner, Designs for
 discriminating between two rival models, Technometrics 7 (1965)). If one of them is true, the χ² of the other is
 larger by σ² ± 2σ, where σ is their separation. So the probability that the false one is refuted is
-Φ((σ² - refuted) / 2σ). The proposal is expected to separate most of all pairs; if one experiment is not enough, two
+Φ((σ² - refuted) / 2σ). The proposal is expected to separate most of all pairs. If one experiment is not enough, two
 are proposed.
 """
 
@@ -64,8 +64,9 @@ class PredictedReadings:
     Attributes:
         names: of the alternatives, the best fit first.
         experiments: the menu.
-        value: readings [SI], shape (alternatives, readings); sd: of the instruments [SI], shape (readings,).
-        half: J C^½, so that the covariance due to the fit is half halfᵀ; shape
+        value: readings [SI], shape (alternatives, readings).
+        sd: of the instruments [SI], shape (readings,).
+        half: J C^½, so that the covariance due to the fit is half halfᵀ. Shape
             (alternatives, readings, coordinates).
         exists: True for readings that every alternative has, shape (readings,).
         settings: thresholds of the separation.
@@ -98,8 +99,9 @@ class Ranked:
     """One experiment of the menu, or several carried out together.
 
     Attributes:
-        experiments: their names; sigma: separation of every two alternatives, in the order of
-            `itertools.combinations`, so with the pairs of the best fit first [σ].
+        experiments: their names.
+        sigma: separation of every two alternatives, in the order of `itertools.combinations`, so with the
+            pairs of the best fit first [σ].
         separates: alternatives that they separate from the best fit, at `Settings.apart`.
         settings: thresholds of the separation.
     """
@@ -131,10 +133,10 @@ class Proposal:
     """The next experiment, or two if one is not enough.
 
     Attributes:
-        experiments: names of the experiments; only `NONE` if no experiment helps.
+        experiments: names of the experiments. Only `NONE` if no experiment helps.
         instruction: instruction for the experimenter.
         separates: alternatives that it separates from the best fit.
-        expected_sigma: smallest separation of a pair that is worth an experiment; 0 for none.
+        expected_sigma: smallest separation of a pair that is worth an experiment, 0 for none.
         settles: True if it separates every two alternatives, at `Settings.apart`.
         table: the whole menu, the most useful experiment first.
     """
@@ -156,22 +158,22 @@ class Proposal:
 
 
 def alternatives_of_class(best: Candidate, found: Classes, *, stated: bool = True) -> dict[str, Candidate]:
-    """Candidates that the table cannot separate, by the names of their effects; the best fit first.
+    """Candidates that the table cannot separate, by the names of their effects. The best fit first.
 
     Args:
         stated: True to include stated values that may be wrong instead of an effect, by their names.
     """
     fitted = {c.key: c for c in sorted(found.ladder, key=lambda c: -c.cost)}
-    kept = {best.active: best}
+    alternatives = {best.active: best}
     for slot, members in enumerate(found.members):
         for name in members[1:]:
             active = tuple(name if s == slot else n for s, n in enumerate(best.active))
-            kept[active] = fitted[frozenset(n for n in active if n)]
-    named = {" + ".join(c.effects): c for c in kept.values()}
+            alternatives[active] = fitted[frozenset(n for n in active if n)]
+    by_name = {" + ".join(c.effects): c for c in alternatives.values()}
     if stated:
         for shifts in found.stated:
-            named |= {" + ".join((s.name, *s.fit.effects)): s.fit for s in shifts}
-    return named
+            by_name |= {" + ".join((s.name, *s.fit.effects)): s.fit for s in shifts}
+    return by_name
 
 
 # --- predictions ------------------------------------------------------------------------------------
@@ -188,16 +190,16 @@ def _predicted(
 ) -> tuple[predicted.Predicted, Array]:
     """Readings of the menu, and the square root of their covariance due to the fit, by alternative.
 
-    `other` are coordinates that the table does not show at all, known only by their priors; `informed` is the
+    `other` are coordinates that the table does not show at all, known only by their priors. `informed` is the
     Jacobian of the readings and priors of each fit.
     """
 
     def one(w: Array, z: Float[Array, " coordinates"], informed: Array) -> tuple[predicted.Predicted, Array]:
-        here = problem.coordinates.with_effects(w)
+        coordinates = problem.coordinates.with_effects(w)
 
         def robot(x: Array) -> Robot:
             base = problem.base if other is None else other.robot(problem.base, x[z.size :])
-            return here.robot(base, x[: z.size])
+            return coordinates.robot(base, x[: z.size])
 
         wide = jnp.concatenate([z, jnp.zeros(0 if other is None else len(other))])
         unknowns, solved = predicted.map_over_runs(IMPLICIT.solve, robot(wide), batch)
@@ -216,37 +218,40 @@ def _predicted(
     return jax.vmap(one)(which, z, informed)
 
 
-def _informed(problem: Problem, at: Candidate, active: tuple[int, ...]) -> Array:
-    return problem.observe.at(problem, at.z, active)[1][informative_residuals(problem.data)]
-
-
 def predict_menu(space: CandidateSpace, candidates: Mapping[str, Candidate], settings: Settings) -> PredictedReadings:
     """Predictions of the menu by these alternatives, with instruments as good as those of the table.
 
     The menu has the experiments within reach of the table that the robots of all alternatives can do and that
     are not forbidden.
     """
-    names, those = list(candidates), list(candidates.values())
-    those += [those[0]] * (-len(those) % PAD)
+    names, alternatives = list(candidates), list(candidates.values())
+    alternatives += [alternatives[0]] * (-len(alternatives) % PAD)
     robot = space.bare.base
-    whole = priors.free_names(robot, robot.configurations.names)
-    more = [n for n in whole if n not in space.coordinates.base.names]
+    all_parameters = priors.free_names(robot, robot.configurations.names)
+    more = [n for n in all_parameters if n not in space.coordinates.base.names]
     other = priors.parameter_coordinates(robot, more) if more else None
-    equipped, indices = space.fitted_by(c.active for c in those)
+    equipped, indices = space.fitted_by(c.active for c in alternatives)
     active = jnp.asarray(indices)
-    z = jnp.asarray(np.stack([c.z for c in those]))
-    informed = jnp.stack([_informed(equipped, c, mine) for c, mine in zip(those, indices, strict=True)])
-    within = reach_of_space(space, space.bare.robot(jnp.asarray(those[0].z[: space.free])))
-    everything, shown = menu.experiment_menu(within), channels.channel_names(space.bare.channels)
-    found, half = jax.device_get(
-        _predicted(equipped, other, predicted.batch_experiments(everything, shown), active, z, informed)
+    z = jnp.asarray(np.stack([c.z for c in alternatives]))
+    informed = jnp.stack(
+        [
+            equipped.observe.at(equipped, c.z, mine)[1][informative_residuals(equipped.data)]
+            for c, mine in zip(alternatives, indices, strict=True)
+        ]
     )
-    found, half = jax.tree.map(lambda x: np.asarray(x)[: len(names)], (found, half))
-    experiments, kept = _possible(everything, found, within, settings)
+    within = reach_of_space(space, space.bare.robot(jnp.asarray(alternatives[0].z[: space.free])))
+    all_experiments, shown_channels = menu.experiment_menu(within), channels.channel_names(space.bare.channels)
+    predictions, half = jax.device_get(
+        _predicted(equipped, other, predicted.batch_experiments(all_experiments, shown_channels), active, z, informed)
+    )
+    predictions, half = jax.tree.map(lambda x: np.asarray(x)[: len(names)], (predictions, half))
+    experiments, kept = _possible(all_experiments, predictions, within, settings)
     medians = np.median(np.asarray(space.equipped.data.sd), 0)
-    sd = predicted.reading_sds(experiments, dict(zip(shown, medians, strict=True)))
-    value, half = np.nan_to_num(found.value[:, kept]), np.nan_to_num(half[:, kept])
-    return PredictedReadings(tuple(names), experiments, value, half, sd, np.all(found.exists, 0)[kept], settings)
+    sd = predicted.reading_sds(experiments, dict(zip(shown_channels, medians, strict=True)))
+    value, half = np.nan_to_num(predictions.value[:, kept]), np.nan_to_num(half[:, kept])
+    return PredictedReadings(
+        tuple(names), experiments, value, half, sd, np.all(predictions.exists, 0)[kept], settings
+    )
 
 
 def _possible(
@@ -259,24 +264,24 @@ def _possible(
     """
     runs = [e for e in experiments if isinstance(e, menu.Run)]
     ends = dict(zip((r.name for r in runs), np.cumsum([len(r.voltage) for r in runs]).tolist(), strict=True))
-    left: list[menu.Experiment] = []
+    possible_experiments: list[menu.Experiment] = []
     kept: list[np.ndarray] = []
     for e in experiments:
         rows = np.ones(predicted.reading_count(e), bool)
         if isinstance(e, menu.Run):
             span = slice(ends[e.name] - len(e.voltage), ends[e.name])
             grips = np.abs(found.grip[:, span]) < np.where(np.asarray(e.slope) > e.beyond, menu.GRIP, np.inf)
-            done = menu.possible_runs(e, np.all(found.does[:, span] & grips, 0))
-            if done.any():
+            possible_runs = menu.possible_runs(e, np.all(found.does[:, span] & grips, 0))
+            if possible_runs.any():
                 hot, fast = np.asarray(found.temperature)[0, span], np.asarray(found.speed)[0, span]
-                e = menu.restrict_run(e, done, hot, fast, within)
-            rows = np.repeat(done, len(e.channels))
+                e = menu.restrict_run(e, possible_runs, hot, fast, within)
+            rows = np.repeat(possible_runs, len(e.channels))
         if set(e.kinds) & set(settings.forbidden):
             rows = np.zeros(len(rows), bool)
         if rows.any():
-            left.append(e)
+            possible_experiments.append(e)
         kept.append(rows)
-    return tuple(left), np.concatenate(kept)
+    return tuple(possible_experiments), np.concatenate(kept)
 
 
 # --- the choice -------------------------------------------------------------------------------------
@@ -285,8 +290,8 @@ def _possible(
 def _rank_experiment(seen: PredictedReadings, *experiments: str) -> Ranked:
     pairs = itertools.combinations(range(len(seen.names)), 2)
     sigma = tuple(seen.apart(a, b, *experiments) for a, b in pairs)
-    others = zip(seen.names[1:], sigma, strict=False)  # the pairs of the best fit come first
-    return Ranked(experiments, sigma, tuple(n for n, s in others if s >= seen.settings.apart), seen.settings)
+    separations = zip(seen.names[1:], sigma, strict=False)  # the pairs of the best fit come first
+    return Ranked(experiments, sigma, tuple(n for n, s in separations if s >= seen.settings.apart), seen.settings)
 
 
 def _usefulness(r: Ranked) -> tuple[bool, float]:
@@ -295,7 +300,7 @@ def _usefulness(r: Ranked) -> tuple[bool, float]:
 
 
 def rank_experiments(seen: PredictedReadings) -> tuple[Ranked, ...]:
-    """The whole menu by the expected number of separated pairs; ties, within `Settings.enough`, keep the menu's
+    """The whole menu by the expected number of separated pairs. Ties, within `Settings.enough`, keep the menu's
     order, the least effort first."""
     return tuple(sorted((_rank_experiment(seen, e.name) for e in seen.experiments), key=_usefulness, reverse=True))
 
@@ -307,14 +312,14 @@ def choose_experiment(seen: PredictedReadings) -> Proposal:
         return Proposal((NONE,), NothingPossible(), (), 0.0, False, ())
     plan = table[0]
     (first,) = plan.experiments
-    both = (_rank_experiment(seen, first, e.name) for e in seen.experiments if e.name != first)
-    more = max(both, key=_usefulness, default=plan)
+    rankings = (_rank_experiment(seen, first, e.name) for e in seen.experiments if e.name != first)
+    more = max(rankings, key=_usefulness, default=plan)
     if more.told and (not plan.told or _usefulness(more)[1] > _usefulness(plan)[1] + seen.settings.gain):
         plan = more
     if not plan.told:
         return Proposal((NONE,), NothingTells(seen.names, seen.settings.worth), (), 0.0, False, table)
-    named = {e.name: e for e in seen.experiments}
-    what = CarryOut(tuple(named[name] for name in plan.experiments))
+    by_name = {e.name: e for e in seen.experiments}
+    what = CarryOut(tuple(by_name[name] for name in plan.experiments))
     return Proposal(
         plan.experiments, what, plan.separates, min(plan.told), plan.smallest >= seen.settings.apart, table
     )
@@ -363,6 +368,6 @@ def propose_nothing(space: CandidateSpace) -> Proposal:
 
 
 def propose_separating(space: CandidateSpace, best: Candidate, found: Classes, settings: Settings) -> Proposal | None:
-    """Experiment that separates the alternatives of a class; None if each effect has one name."""
-    left = alternatives_of_class(best, found)
-    return choose_experiment(predict_menu(space, left, settings)) if len(left) > 1 else None
+    """Experiment that separates the alternatives of a class, None if each effect has one name."""
+    alternatives = alternatives_of_class(best, found)
+    return choose_experiment(predict_menu(space, alternatives, settings)) if len(alternatives) > 1 else None

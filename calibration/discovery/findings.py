@@ -78,7 +78,7 @@ def found_effects(
     """Each effect of the best candidate, with its class, amplitude and evidence.
 
     Args:
-        test: of the base fit; its bootstrap gives the p-values.
+        test: of the base fit. Its bootstrap gives the p-values.
     """
     gains = _without_each(space, base, best, found.ladder, settings)
     null, excess = np.asarray(test.null.single), excess_misfit(space, base)
@@ -109,17 +109,19 @@ def _parameters(space: CandidateSpace, best: Candidate, slot: int, settings: Set
     effect, p = space.library[best.active[slot]], space.free
     amplitude, unit = amplitude_of(effect), amplitude_unit(effect)
     sd = settings.width * best.sd[p + slot] * unit
-    held = held_by_prior(best.sd)
+    held_names = held_by_prior(best.sd)
     values = {
         amplitude.name: Estimate(
-            float(best.amplitude[slot] * unit), float(sd), amplitude.spec.unit, bool(held[p + slot])
+            float(best.amplitude[slot] * unit), float(sd), amplitude.spec.unit, bool(held_names[p + slot])
         )
     }
     shape = shape_of(effect)
     if shape is not None:
         k, scales = p + settings.slots + slot, shape_scales(shape)
         value, slope = _shaped(scales, best.z[k])
-        values[shape.name] = Estimate(float(value), float(slope) * float(best.sd[k]), shape.spec.unit, bool(held[k]))
+        values[shape.name] = Estimate(
+            float(value), float(slope) * float(best.sd[k]), shape.spec.unit, bool(held_names[k])
+        )
     return values
 
 
@@ -128,8 +130,8 @@ _shaped = jax.jit(jax.value_and_grad(shape_at, argnums=1))
 
 def _member(space: CandidateSpace, best: Candidate, found: Classes, slot: int, name: str) -> Member:
     """An effect of a class in place of the leader."""
-    wanted = frozenset(name if s == slot else n for s, n in enumerate(best.active)) - {""}
-    other = next(c for c in (best, *found.ladder) if c.key == wanted)
+    active_names = frozenset(name if s == slot else n for s, n in enumerate(best.active)) - {""}
+    other = next(c for c in (best, *found.ladder) if c.key == active_names)
     position = other.active.index(name)
     amplitude = other.amplitude[position] * amplitude_unit(space.library[name])
     return Member(float(amplitude), float(other.size[position]), float(2 * (other.cost - best.cost)))
@@ -154,7 +156,7 @@ def _without_each(
 def unnamed_discrepancy(
     found: Discrepancy, where: DiscrepancyLocation, p_value: float, linear: Linearization, rows: int
 ) -> UnnamedDiscrepancy:
-    """Discrepancy of an `unnamed_discrepancy` verdict, over the rows of the table; curve and rows are of one fit.
+    """Discrepancy of an `unnamed_discrepancy` verdict, over the rows of the table. Curve and rows are of one fit.
 
     Args:
         linear: the fit with the curve, linearised.
@@ -187,13 +189,14 @@ def unnamed_discrepancy(
 def listed_alternatives(
     space: CandidateSpace, best: Candidate, cost: float, ladder: Sequence[Candidate], settings: Settings
 ) -> tuple[tuple[Alternative, ...], tuple[Alternative, ...]]:
-    """Simulated candidates that explain the data nearly as well as the proposal; and those of implausible size.
+    """Simulated candidates that explain the data nearly as well as the proposal, and those of implausible size.
 
     A candidate that only adds effects to the proposal, or to another candidate of the list, is omitted if they
     explain little.
 
     Args:
-        cost: of the proposal [½σ²]; best: the proposal, if it is a candidate.
+        cost: of the proposal [½σ²].
+        best: the proposal, if it is a candidate.
     """
     near: tuple[list[Alternative], list[Alternative]] = ([], [])
     simpler = {best.key: cost} if best.key else {}
@@ -244,9 +247,9 @@ def _alternative(space: CandidateSpace, c: Candidate, rise: float, settings: Set
 
 def proposed_robot(space: CandidateSpace, best: Candidate) -> Robot:
     """Fitted base with the effects of the proposal and no other."""
-    whole = space.problem(best.active).robot(jnp.asarray(best.z))
+    robot = space.problem(best.active).robot(jnp.asarray(best.z))
     keep = set(best.effects) | {e.name for e in space.bare.base.effects}
-    return dataclasses.replace(whole, effects=tuple(e for e in whole.effects if e.name in keep))
+    return dataclasses.replace(robot, effects=tuple(e for e in robot.effects if e.name in keep))
 
 
 def next_experiment(proposal: Proposal | None) -> NextExperiment | None:
@@ -281,13 +284,14 @@ def base_shift(space: CandidateSpace, before: np.ndarray, after: np.ndarray, sd:
     """Every base parameter before and after, in its unit and in prior sds.
 
     Args:
-        before, after: coordinates, the base's first; sd: of `after`.
+        before, after: coordinates, the base's first.
+        sd: of `after`.
     """
     coordinates, p = space.coordinates.base, space.free
     z = [np.asarray(x[:p]) for x in (before, after)]
     value = [coordinates.value(np.asarray(x)) for x in (np.zeros(p), *z)]
     slope = np.asarray(coordinates.slope(jnp.asarray(z[1])))
-    fields, held = priors.parameters_by_name(space.bare.base), held_by_prior(sd)
+    fields, held_names = priors.parameters_by_name(space.bare.base), held_by_prior(sd)
     return {
         name: BaseShift(
             prior=float(value[0][k]),
@@ -298,14 +302,14 @@ def base_shift(space: CandidateSpace, before: np.ndarray, after: np.ndarray, sd:
             meaning=fields[name].spec.meaning,
             shift_before=float(z[0][k]),
             shift_after=float(z[1][k]),
-            held_by_prior=bool(held[k]),
+            held_by_prior=bool(held_names[k]),
         )
         for k, name in enumerate(coordinates.names)
     }
 
 
 def effect_scores(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> tuple[EffectScore, ...]:
-    """Every effect at its best shape and plausible size, strongest first; equal scores are sorted by name."""
+    """Every effect at its best shape and plausible size, strongest first. Equal scores are sorted by name."""
     listed = []
     for effect in space.library.effects:
         amplitude, explained = _plausible_score(space, effect, scores, settings)
@@ -363,10 +367,10 @@ def _plausible_score(
 
 def invisible_effects(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> tuple[str, ...]:
     """Effects that the data cannot show: even the largest plausible amplitude changes the readings too little."""
-    left = space.library.largest(np.asarray(scores.left))
+    largest_scores = space.library.largest(np.asarray(scores.left))
     return tuple(
         e.name
-        for e, x in zip(space.library.effects, left, strict=True)
+        for e, x in zip(space.library.effects, largest_scores, strict=True)
         if settings.plausible * x < settings.visible
         and _plausible_score(space, e, scores, settings)[1] < settings.visible**2
     )
@@ -401,7 +405,7 @@ def readings_of_rows(
     known_before: HeldOutReadings | None = None,
     known_after: HeldOutReadings | None = None,
 ) -> ReadingsOfRows:
-    """Fitted and held-out readings, for every kind of block; `after` None is the same as before.
+    """Fitted and held-out readings, for every kind of block. `after` None is the same as before.
 
     Args:
         kinds: blocks, as from `blocks.predictable_blocks`.

@@ -99,7 +99,8 @@ def monomial_dictionary(ratios: np.ndarray, kinds: tuple[Ratio, ...] = RATIOS) -
     is omitted, and so are all but the first of several proportional monomials.
 
     Args:
-        ratios: values, shape (rows, ratios); kinds: signal and scale of each.
+        ratios: values, shape (rows, ratios).
+        kinds: signal and scale of each.
     """
     low, high = ratios.min(0), ratios.max(0)
     lively = [k for k in range(ratios.shape[1]) if high[k] - low[k] > 1e-6 * max(abs(high[k]), abs(low[k]), 1e-9)]
@@ -132,11 +133,13 @@ class Proposal:
     """A formula for a discrepancy: one term of a dictionary of dimensionless monomials.
 
     Attributes:
-        formula: e.g. `ΔU = 0.42 V (I/2 A)^2`, "" if no single term explains `MOST` of the curve; mark: its label.
-        terms: its monomials; coefficients, sds: of each [unit of the balance].
+        formula: as `ΔU = 0.42 V (I/2 A)^2`, "" if no single term explains `MOST` of the curve.
+        mark: its label.
+        terms: its monomials.
+        coefficients, sds: of each [unit of the balance].
         variables: signals of the terms, without repeats.
         explained: decrease of χ² at the base fit.
-        gain: BIC of the smooth curve less that of the formula; positive favours the formula.
+        gain: BIC of the smooth curve less that of the formula. Positive favours the formula.
         tried: size of the dictionary: a larger one makes a good formula less significant.
     """
 
@@ -156,17 +159,21 @@ def propose_formula(
 ) -> Proposal:
     """Term with the least BIC that explains `MOST` of the curve, or a simpler one without loss of evidence.
 
-    The formula is empty if no single term does; the curve is then described by its values. Variables other than
+    The formula is empty if no single term does. The curve is then described by its values. Variables other than
     the curve's add a penalty.
 
     Args:
-        counts: True for included rows, shape (rows,); curve: for comparison with the formula.
+        counts: True for included rows, shape (rows,).
+        curve: for comparison with the formula.
         voltage: True for a rig with an imposed or measured voltage.
     """
     if curve.wave:
         return _wave_formula(balance, curve)
     if curve.happening:
-        return _temporary_formula(balance, curve)
+        level = float(np.mean((curve.scale * curve.root @ curve.start)[1:-1]))
+        formula = f"{SYMBOL[balance]} = {level:.2g} {PLACES[balance][0]} while {curve.variable}"
+        axis = curve.variable.split()[0]
+        return Proposal(formula, (), (level,), (float("nan"),), (axis,), curve.explained, 0.0, 1)
     if curve.variable in FADING:
         return _decay_formula(linear, balance, counts, curve)
     counts = linear.at_points(counts)
@@ -217,14 +224,6 @@ def _wave_formula(balance: str, curve: Smooth) -> Proposal:
         f"{SYMBOL[balance]} = {size:.2g} {unit} sin({order:.3g} θ_k {'-' if phase < 0 else '+'} {abs(phase):.2g})"
     )
     return Proposal(formula, (), (size,), (float("nan"),), ("angle of the driving shaft",), curve.explained, 0.0, 1)
-
-
-def _temporary_formula(balance: str, curve: Smooth) -> Proposal:
-    """Formula of a temporary change: its mean."""
-    level = float(np.mean((curve.scale * curve.root @ curve.start)[1:-1]))
-    formula = f"{SYMBOL[balance]} = {level:.2g} {PLACES[balance][0]} while {curve.variable}"
-    axis = curve.variable.split()[0]
-    return Proposal(formula, (), (level,), (float("nan"),), (axis,), curve.explained, 0.0, 1)
 
 
 def _decay_formula(linear: Linearization, balance: str, counts: np.ndarray, curve: Smooth) -> Proposal:

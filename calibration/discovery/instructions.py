@@ -1,4 +1,4 @@
-"""Instructions for the next experiment, as data; `mmrjax.describe` makes their sentences."""
+"""Instructions for the next experiment, as data. `mmrjax.describe` makes their sentences."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class NothingPossible:
 
 @dataclasses.dataclass(frozen=True)
 class NoMenu:
-    """The menu has no runs of the table's kind; `word` is the name of its rows."""
+    """The menu has no runs of the table's kind. `word` is the name of its rows."""
 
     word: str
 
@@ -43,8 +43,9 @@ class MoreRuns:
     Attributes:
         runs: number of runs in the series.
         low, high: range of its voltages, top: the highest voltage of the table [V].
-        slope [deg], payload [kg]: largest values; steps: of voltage, slope and payload.
-        within: reach of the table; by_duty: True if the table varied the duty at one supply voltage.
+        slope [deg], payload [kg]: largest values. `steps`: of voltage, slope and payload.
+        within: reach of the table.
+        by_duty: True if the table varied the duty at one supply voltage.
     """
 
     place: str

@@ -1,4 +1,4 @@
-"""Storage of the loop's finished stages, so that an interrupted loop can resume; and its time budget."""
+"""Storage of the loop's finished stages, so that an interrupted loop can resume, and its time budget."""
 
 from __future__ import annotations
 
@@ -22,4 +22,4 @@ def keep_nothing(name: str, make: Callable[[], T]) -> T:
 
 
 class OutOfTime(KeyboardInterrupt):
-    """The loop's time budget is spent before a verdict; it ends as if interrupted."""
+    """The loop's time budget is spent before a verdict. It ends as if interrupted."""

@@ -32,12 +32,13 @@ class DiscrepancyLocation:
     """Location of a discrepancy.
 
     Attributes:
-        place: balance with the curve that explains most, or channel with shifted readings; variable: of the curve.
+        place: balance with the curve that explains most, or channel with shifted readings.
+        variable: of the curve.
         alike: places with curves that explain as much, or that represent balances without curves of their own.
-        variables_alike: other variables with curves of similar significance there, the most significant first; of
+        variables_alike: other variables with curves of similar significance there, the most significant first. Of
             temporary changes one along each axis.
-        explained: decrease of χ² by the curves of that balance and variable [σ²]; strongest: by the most significant
-            family.
+        explained: decrease of χ² by the curves of that balance and variable [σ²].
+        strongest: by the most significant family.
         by_duty: True if the motors' voltage varied only with the duty.
     """
 

@@ -44,19 +44,23 @@ class NameTest:
     """Test of one effect of a candidate, at the fit of all the others.
 
     Attributes:
-        effect: its name; root: of its score in addition to curves of other equations [σ]; needed: critical value for
-            the strongest effect [σ]; curves: those of other equations.
+        effect: its name.
+        root: of its score in addition to curves of other equations [σ].
+        needed: critical value for the strongest effect [σ].
+        curves: those of other equations.
         evidence: twice the log evidence of the effect over the best smooth curve of its own equation [σ²].
-        row: number of the run with the smallest root when left out, None if none was; root_without: that root.
-            A settled run is a row of its table, see `what`; for histories it is scaled to the remaining runs.
+        row: number of the run with the smallest root when left out, None if none was.
+        root_without: that root. A settled run is a row of its table, see `what`. For histories it is scaled
+            to the remaining runs.
         again: share of the informative blocks without which an effect of its family is still the strongest.
         larger: effects of a set without it that is the better explanation, but not of a plausible size.
         remains: True if the largest set of the search leaves a discrepancy in its equation.
         what: name of a run, `row` or `run`.
-        varies: root of the score of an amplitude that changes with a variable, in addition to the largest set [σ];
-            over: that variable; by_chance: critical value for as many variables, independent of the library.
+        varies: root of the score of an amplitude that changes with a variable, in addition to the largest set [σ].
+        over: that variable.
+        by_chance: critical value for as many variables, independent of the library.
         spread: relative change of the amplitude to either end of that variable [-].
-        offset: zero error of an instrument without a stated noise, over the rms of its readings [-]; else infinite.
+        offset: zero error of an instrument without a stated noise, over the rms of its readings [-], else infinite.
     """
 
     effect: str
@@ -83,14 +87,14 @@ class NameTest:
 
     @property
     def rests_on(self) -> int | None:
-        """Number of the row without which it would fail; None if it needs no single row, or fails anyway."""
+        """Number of the row without which it would fail, None if it needs no single row, or fails anyway."""
         if self.root < self.needed:
             return None
         return self.row if self.root_without < max(self.needed, KEPT[self.what] * self.root) else None
 
     @property
     def fails(self) -> tuple[str, ...]:
-        """Reasons against the name, rows of `loop_words.DOUBTS`; empty for an established one."""
+        """Reasons against the name, rows of `loop_words.DOUBTS`, empty for an established one."""
         doubts = {
             "chance": self.root < self.needed,
             "curve": self.evidence < -BETTER,
@@ -120,8 +124,10 @@ class NameSupport:
 
     Attributes:
         stands: whether one at least does.
-        why: reason for the verdict, a row of `loop_words.REASONS`; "" for none.
-        effects: that this is said of; curves: that were put beside, or do as well; tests: of each effect.
+        why: reason for the verdict, a row of `loop_words.REASONS`, "" for none.
+        effects: that this is said of.
+        curves: that were put beside, or do as well.
+        tests: of each effect.
     """
 
     stands: bool
@@ -131,7 +137,7 @@ class NameSupport:
     tests: tuple[NameTest, ...] = ()
 
     def test_of(self, effect: str) -> NameTest | None:
-        """Test of an effect; None if it was not tested."""
+        """Test of an effect, None if it was not tested."""
         return next((t for t in self.tests if t.effect == effect), None)
 
     def stands_in(self, effect: str) -> bool:
@@ -148,7 +154,7 @@ class NameSupport:
         return self.stands and (not self.tests if test is None else test.established)
 
     def rests_on(self, effect: str) -> int | None:
-        """Number of the row that an effect depends on; None if it depends on none, or was not tested."""
+        """Number of the row that an effect depends on, None if it depends on none, or was not tested."""
         test = self.test_of(effect)
         return None if test is None else test.rests_on
 
@@ -183,8 +189,11 @@ class Missing:
     """An effect that was found.
 
     Attributes:
-        names: that these data cannot separate; values: stated values that may be wrong instead.
-        families: of the names; established: True if it is; test: of its own, None without one.
+        names: that these data cannot separate.
+        values: stated values that may be wrong instead.
+        families: of the names.
+        established: True if it is.
+        test: of its own, None without one.
     """
 
     names: tuple[str, ...]
@@ -223,12 +232,12 @@ class Mechanism:
 
     @property
     def drivers(self) -> tuple[str, ...]:
-        """Possible drivers; the families differ in these, or only in the equation."""
+        """Possible drivers. The families differ in these, or only in the equation."""
         return tuple(dict.fromkeys(f.partition(" that ")[2] for f in self.families))
 
     @property
     def fails(self) -> tuple[str, ...]:
-        """Reasons against the mechanism, rows of `loop_words.NO_MECHANISM`; empty for an established one."""
+        """Reasons against the mechanism, rows of `loop_words.NO_MECHANISM`, empty for an established one."""
         doubts = {
             "share": self.share < HALF,
             "gain": not self.gain > SURE * self.se,
@@ -251,15 +260,19 @@ class Summary:
     """A verdict and all data of its statement.
 
     Attributes:
-        verdict: `none`, `named`, `class`, `mechanism`, `place` or `undescribed`; p: family-wise.
+        verdict: `none`, `named`, `class`, `mechanism`, `place` or `undescribed`.
+        p: family-wise.
         where: location of the discrepancy, or of the remaining one.
-        missing: the effects found, established or tentative; only tentative ones without names.
-        nearest: effects that fit best if none may be named; support: tests of the names.
+        missing: the effects found, established or tentative. Only tentative ones without names.
+        nearest: effects that fit best if none may be named.
+        support: tests of the names.
         aside, of: number of isolated outliers if they are many (else 0), and of all rows.
-        noise: wrong sds, if they are the only finding; cluster: common property of outliers.
-        mechanism: if no name is established; it may not be established either.
-        missed: as of `LoopStages`; unused: columns of numbers that vary and are not used;
-            far: base parameters beyond three prior sds.
+        noise: wrong sds, if they are the only finding.
+        cluster: common property of outliers.
+        mechanism: if no name is established. It may not be established either.
+        missed: as of `LoopStages`.
+        unused: columns of numbers that vary and are not used.
+        far: base parameters beyond three prior sds.
     """
 
     verdict: str
@@ -283,12 +296,13 @@ class Headline:
     """Claims that hold at every noise that was tried.
 
     Attributes:
-        level: of the claims, a verdict; `open` if the noise decides whether an effect is missing.
+        level: of the claims, a verdict, `open` if the noise decides whether an effect is missing.
         claims: laws, mechanisms or places, each with its indistinguishable alternatives.
         factors: on the noise.
-        shared: number of the first members of each mechanism or place that hold at every noise; at some noises the
+        shared: number of the first members of each mechanism or place that hold at every noise. At some noises the
             others cannot be separated from these.
-        families: of each law, equation and driver in words; values: stated values that may be wrong instead of it.
+        families: of each law, equation and driver in words.
+        values: stated values that may be wrong instead of it.
     """
 
     level: str
@@ -304,8 +318,10 @@ class RuledOut:
     """Reason why an effect is not plausible.
 
     Attributes:
-        name: of the effect; why: its balance would supply `power`, its `size`, or it is within an sd of the `edge`.
-        size: over the largest plausible one; check: values that this depends on.
+        name: of the effect.
+        why: its balance would supply `power`, its `size`, or it is within an sd of the `edge`.
+        size: over the largest plausible one.
+        check: values that this depends on.
     """
 
     name: str
@@ -320,7 +336,8 @@ class Asked:
 
     Attributes:
         why: a discrepancy is `missing` an effect, effects are `found`, or some explain nearly as much (`near`).
-        balance, variable: of the discrepancy; effects: their names.
+        balance, variable: of the discrepancy.
+        effects: their names.
     """
 
     why: str
@@ -342,7 +359,8 @@ class Heat:
 
     Attributes:
         how: it happens in a motor that is `held` or `braked`, or in a `run`.
-        temperature: after long running, infinite if none settles; allowed: None if unknown [°C].
+        temperature: after long running, infinite if none settles.
+        allowed: None if unknown [°C].
         current: of a motor that is held [A], else 0.
     """
 

@@ -48,10 +48,11 @@ class Act:
     """A calibration act: a reading that does not depend on a run.
 
     Attributes:
-        name: of it; kinds: of `KINDS`.
+        name: of it.
+        kinds: of `KINDS`.
         reading: function of a robot and of the settings [SI], shape (readings,).
-        at: settings, one tuple a reading [SI]; of `weigh`, the configuration's index and the payload.
-        sd: of a single reading [SI]; None: that of the table's readings of `channel`.
+        at: settings, one tuple a reading [SI]. Of `weigh`, the configuration's index and the payload.
+        sd: of a single reading [SI]. None: that of the table's readings of `channel`.
         repeats: number of readings that are averaged.
         channel: channel of the instrument for a reading of zero, "" for another act.
     """
@@ -70,20 +71,23 @@ class Run:
     """Settled runs under conditions that the table does not have.
 
     Attributes:
-        name: of them; kinds: of `KINDS`, and the configuration where there is one.
-        doing: a row of `experiment_words.DOING`; where: the configuration's name, "" for none; motors: of the robot.
+        name: of them.
+        kinds: of `KINDS`, and the configuration where there is one.
+        doing: a row of `experiment_words.DOING`.
+        where: the configuration's name, "" for none.
+        motors: of the robot.
         setup: how the robot is set up.
         voltage [V], slope [deg], payload [kg]: conditions of each run, shape (runs,).
         channels: names of the channels to read.
         configuration: index of the robot's.
-        sides: number of motors that are on; None: all.
+        sides: number of motors that are on. None: all.
         brake: torque on each motor shaft [N·m].
         beyond: angle above which a slope is steeper than any of the table [deg].
         steepest: True if only the steepest slope that the robot climbs is informative.
         repeats: number of readings that are averaged.
         watch: risks of damage, with their indications.
-        imposed: quantity instead of the voltage, see `Rig`; `motor_speed`: [rad/s]; `motor_current`: [A].
-        torque: of a brake on the output, against forward rotation [N·m]; empty without a brake.
+        imposed: quantity instead of the voltage, see `Rig`. `motor_speed`: [rad/s]. `motor_current`: [A].
+        torque: of a brake on the output, against forward rotation [N·m], empty without a brake.
     """
 
     name: str
@@ -128,7 +132,7 @@ ABOUT = 0.01
 
 
 def step_of_settings(span: float, count: int) -> float:
-    """The step of `STEPS` nearest in ratio to that of `count` even steps over a span; 0 for no span."""
+    """The step of `STEPS` nearest in ratio to that of `count` even steps over a span, 0 for no span."""
     if span <= 0:
         return 0.0
     step = span / count
@@ -137,7 +141,7 @@ def step_of_settings(span: float, count: int) -> float:
 
 
 def last_setting(most: float, step: float) -> float:
-    """Largest multiple of a step up to a number, within the tolerance `ABOUT`; the number itself without a step."""
+    """Largest multiple of a step up to a number, within the tolerance `ABOUT`. The number itself without a step."""
     if step == 0:
         return most
     return float(f"{step * math.floor(most * (1 + ABOUT) / step + 1e-9):.6g}")
@@ -203,8 +207,8 @@ def calibration_acts(reach: Reach) -> tuple[Act, ...]:
     amperes = round_significant(0.15 * total, 1), round_significant(0.75 * total, 1)
     turning = round_significant(0.25 * reach.motor_speed), round_significant(0.65 * reach.motor_speed)
     paces = round_significant(0.35 * reach.speed), round_significant(0.8 * reach.speed)
-    at = tuple((float(u.index), m) for u in reach.used for m in loads)
-    weighing = Act("weigh", ("weigh",), _weighed, at, 0.02, repeats=1)
+    settings = tuple((float(u.index), m) for u in reach.used for m in loads)
+    weighing = Act("weigh", ("weigh",), _weighed, settings, 0.02, repeats=1)
     ammeter = [
         Act("zero current", ("zero current",), _shunted, ((0.0,),), 0.02),
         Act("shunt", ("shunt",), _shunted, _one_tuple_each(amperes), 0.02),
@@ -252,11 +256,12 @@ def _runs(
     """Runs under every combination of slopes, voltages and, with a brake, its torques."""
     each = list(itertools.product(dict.fromkeys(slopes), dict.fromkeys(voltages), dict.fromkeys(torques)))
     slope, voltage, torque = (tuple(x) for x in zip(*each, strict=True))
-    own = (at.configuration,) if at is not None else ()
+    stated = (at.configuration,) if at is not None else ()
     return Run(
-        ", ".join((name, *own)), (*(kinds or (name,)), *own), doing, setup, voltage, slope, (payload,) * len(each),
+        ", ".join((name, *stated)), (*(kinds or (name,)), *stated), doing, setup, voltage, slope,
+        (payload,) * len(each),
         tuple(c for c in (read or reach.measured) if c in reach.measured), 0 if at is None else at.index, sides,
-        brake, math.inf if at is None else at.steepest, steepest, where=", ".join(own), motors=reach.motors,
+        brake, math.inf if at is None else at.steepest, steepest, where=", ".join(stated), motors=reach.motors,
         torque=torque if reach.torques else (),
     )  # fmt: skip
 
@@ -395,23 +400,24 @@ def possible_runs(run: Run, does: np.ndarray) -> np.ndarray:
     Args:
         does: True for runs that the robot can do, shape (runs,).
     """
-    kept = np.ones(len(does), bool)
+    possible = np.ones(len(does), bool)
     axes = [np.asarray(x) for x in (run.slope, run.voltage, run.payload, run.torque) if len(x)]
-    while kept.any() and not does[kept].all():
-        levels = [(axis, level) for axis in axes for level in np.unique(axis[kept])]
-        axis, level = max(levels, key=lambda at: float(np.mean(~does[kept & (at[0] == at[1])])))
-        kept &= axis != level
-    if run.steepest and kept.any():
-        kept &= axes[0] == axes[0][kept].max()
-    return kept
+    while possible.any() and not does[possible].all():
+        levels = [(axis, level) for axis in axes for level in np.unique(axis[possible])]
+        axis, level = max(levels, key=lambda at: float(np.mean(~does[possible & (at[0] == at[1])])))
+        possible &= axis != level
+    if run.steepest and possible.any():
+        possible &= axes[0] == axes[0][possible].max()
+    return possible
 
 
 def restrict_run(run: Run, kept: np.ndarray, temperature: np.ndarray, speed: np.ndarray, reach: Reach) -> Run:
     """A run with only its possible conditions, and with the risks to watch.
 
     Args:
-        kept: by `possible_runs`; temperature: of a winding after long running [°C]; speed: of the motor shaft
-            [rad/s]; both predicted, shape (runs,).
+        kept: by `possible_runs`.
+        temperature: of a winding after long running [°C].
+        speed: of the motor shaft [rad/s]. Both predicted, shape (runs,).
     """
     voltage, slope, payload, torque = (
         tuple(v for v, k in zip(x, kept, strict=True) if k) if x else ()

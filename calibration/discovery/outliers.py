@@ -32,10 +32,11 @@ class Screening:
     """The base fit after isolated outliers were excluded.
 
     Attributes:
-        base: the fit; outliers: indices of the excluded rows, in the order of their exclusion.
+        base: the fit.
+        outliers: indices of the excluded rows, in the order of their exclusion.
         bases: of the curves for a discrepancy, at that fit.
         diagnosed: the fit linearised, and scores of effects and curves on its residuals.
-        cluster: common property of outliers, which were then not excluded; None for none.
+        cluster: common property of outliers, which were then not excluded, None for none.
     """
 
     base: BaseFit
@@ -52,7 +53,7 @@ def compile_ahead(
     """Context that compiles programs on other cores, in parallel with the base fit.
 
     It runs a first diagnosis at the prior's mean, a replicate of a bootstrap there and a fit with slots for effects.
-    The function that it gives takes the base fit; it compiles the prediction of experiments too, or for long runs the
+    The function that it gives takes the base fit. It compiles the prediction of experiments too, or for long runs the
     fits with slots for effects. All results are discarded.
     """
     nothing, none = np.zeros(len(space.coordinates)), empty_slots(settings)
@@ -95,26 +96,27 @@ def compile_ahead(
 def screen_outliers(base: BaseFit, bases_at: Callable[[BaseFit], Bases], runs: Runs, settings: Settings) -> Screening:
     """Exclude rows with an isolated wrong reading: its own shift is more significant than any effect or curve.
 
-    Outliers that form a cluster are not excluded; `cluster` describes it.
+    Outliers that form a cluster are not excluded. `cluster` describes it.
 
     Args:
-        bases_at: bases of curves at a fit of the base; runs: the table.
+        bases_at: bases of curves at a fit of the base.
+        runs: the table.
     """
     where = runs.source
-    found = _exclude_outliers(base, bases_at, settings, where)
-    mine = np.zeros(len(base.space.included), bool)
-    mine[list(found.outliers)] = True
-    together = _common_property(found, mine, runs, settings)
+    screened = _exclude_outliers(base, bases_at, settings, where)
+    cluster_rows = np.zeros(len(base.space.included), bool)
+    cluster_rows[list(screened.outliers)] = True
+    together = _common_property(screened, cluster_rows, runs, settings)
     if together is None:
-        return found
-    bases, seen = _diagnose_base(base, bases_at, settings)
-    return Screening(base, (), bases, seen, together)
+        return screened
+    bases, diagnosis = _diagnose_base(base, bases_at, settings)
+    return Screening(base, (), bases, diagnosis, together)
 
 
 def screen_known_rows(
     base: BaseFit, bases_at: Callable[[BaseFit], Bases], known: Screening, settings: Settings
 ) -> Screening:
-    """Diagnosis of a base fit to the included rows of another trace of the same table; no further row is excluded.
+    """Diagnosis of a base fit to the included rows of another trace of the same table. No further row is excluded.
 
     Args:
         base: fitted without the rows that `known` excludes.
@@ -174,15 +176,15 @@ def _exclude_outliers(
     """Base fit without rows whose own shift is more significant than any effect or curve."""
     allowed = settings.outliers(int(base.space.included.sum()))
     base, outliers = _set_gross_aside(base, settings, where)
-    bases, seen = _diagnose_base(base, bases_at, settings)
+    bases, diagnosis = _diagnose_base(base, bases_at, settings)
     while len(outliers) < allowed:
-        far = _isolated_rows(base, seen[1], bases, allowed - len(outliers), settings)
+        far = _isolated_rows(base, diagnosis[1], bases, allowed - len(outliers), settings)
         if not far.size:
             break
         outliers = (*outliers, *map(int, far))
         base = _refit_without(base, far, settings, where)
-        bases, seen = _diagnose_base(base, bases_at, settings)
-    return Screening(base, outliers, bases, seen)
+        bases, diagnosis = _diagnose_base(base, bases_at, settings)
+    return Screening(base, outliers, bases, diagnosis)
 
 
 def _diagnose_base(
@@ -218,8 +220,8 @@ def _set_gross_aside(base: BaseFit, settings: Settings, where: str) -> tuple[Bas
         return base, ()
     for _ in range(settings.reweightings):
         robust = space.weight / np.sqrt(1 + (far / settings.cauchy) ** 2)[:, None]
-        optima, seen = search_each(problem, [start], [robust], None if active is None else [active])
-        far, start = off(np.asarray(seen.reading[0])), np.asarray(optima.z[0])
+        optima, observations = search_each(problem, [start], [robust], None if active is None else [active])
+        far, start = off(np.asarray(observations.reading[0])), np.asarray(optima.z[0])
     gross = included & (far > settings.gross * max(1.0, float(np.median(far[included]))))
     if not gross.any() or gross.sum() > settings.outliers(int(included.sum())):
         return base, ()

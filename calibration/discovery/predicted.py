@@ -29,13 +29,15 @@ UNLOADED = 1e-9
 
 
 class Batch(eqx.Module):
-    """Experiments as one batch; the compiled program depends on their kinds and sizes, not on their conditions.
+    """Experiments as one batch. The compiled program depends on their kinds and sizes, not on their conditions.
 
     Attributes:
-        acts: reading function of each; at: settings of each, see `Act`.
+        acts: reading function of each.
+        at: settings of each, see `Act`.
         conditions: of the runs of all experiments, in order, shape (runs,).
         brake: torque of the brake in each run [N·m].
-        set_up: distinct pairs of the robot's setup and the number of motors that are on; which: pair of each run.
+        set_up: distinct pairs of the robot's setup and the number of motors that are on.
+        which: pair of each run.
         read: positions of the channels to read in each experiment, and its number of runs.
         order: position of each experiment among the acts followed by the runs.
     """
@@ -54,10 +56,12 @@ class Predicted(eqx.Module):
     """Predicted readings of a batch.
 
     Attributes:
-        value: of each reading [SI]; exists: True if the robot has it: not if it slides, or stands still instead of
-            travelling; shape (readings,).
-        does: the same for each run; grip: used share of the adhesion [-]; temperature: of a winding after long
-            running [°C]; speed: of the motor shaft [rad/s]; shape (runs,).
+        value: of each reading [SI].
+        exists: True if the robot has it: not if it slides, or stands still instead of travelling, shape (readings,).
+        does: the same for each run.
+        grip: used share of the adhesion [-].
+        temperature: of a winding after long running [°C].
+        speed: of the motor shaft [rad/s], shape (runs,).
     """
 
     value: Float[Array, " readings"]
@@ -100,7 +104,7 @@ def _conditions(run: Run) -> Conditions:
 
 
 def map_over_runs(function: Callable[..., T], robot: Robot, experiments: Batch, *own: Array) -> T:
-    """`function` of the robot as set up for each run, its conditions, and further values of each run; the leading
+    """`function` of the robot as set up for each run, its conditions, and further values of each run. The leading
     axis is the runs."""
     conditions = experiments.conditions
     mass = jax.vmap(lambda k: robot.chassis(k).mass)(conditions.configuration) + conditions.payload
@@ -125,21 +129,21 @@ def predict_readings(
     robot: Robot, experiments: Batch, unknowns: Float[Array, "runs unknowns"], found: Bool[Array, " runs"]
 ) -> tuple[tuple[tuple[Array, ...], Array, Array], Predicted]:
     """Readings of each act, readings of each run at some unknowns, shape (runs, channels), residuals of its equations
-    there, (runs, unknowns); and all predictions."""
+    there, (runs, unknowns), and all predictions."""
     acts = tuple(act(robot, at) for act, at in zip(experiments.acts, experiments.at, strict=True))
     result, _, left = map_over_runs(IMPLICIT.shown, robot, experiments, unknowns, found)
-    every = jnp.stack([result.reading[c] for c in channels.channel_names(robot.channels)], -1)
-    held = np.array([experiments.set_up[k][0] is setups.blocked for k in experiments.which])
-    does = jnp.where(jnp.asarray(held), result.status == STALLED, is_done(result.status))
+    all_readings = jnp.stack([result.reading[c] for c in channels.channel_names(robot.channels)], -1)
+    is_held = np.array([experiments.set_up[k][0] is setups.blocked for k in experiments.which])
+    does = jnp.where(jnp.asarray(is_held), result.status == STALLED, is_done(result.status))
     exists = arrange_readings(
-        experiments, [jnp.ones(a.shape, bool) for a in acts], jnp.broadcast_to(does[:, None], every.shape)
+        experiments, [jnp.ones(a.shape, bool) for a in acts], jnp.broadcast_to(does[:, None], all_readings.shape)
     )
-    speed = jnp.where(jnp.asarray(held), 0.0, result.reading["motor_speed"])
-    shown = Predicted(
-        arrange_readings(experiments, acts, every), exists, does, jnp.asarray(result.adhesion_used),
+    speed = jnp.where(jnp.asarray(is_held), 0.0, result.reading["motor_speed"])
+    predicted_readings = Predicted(
+        arrange_readings(experiments, acts, all_readings), exists, does, jnp.asarray(result.adhesion_used),
         jnp.asarray(result.winding_settled), speed,
     )  # fmt: skip
-    return (acts, every, left), shown
+    return (acts, all_readings, left), predicted_readings
 
 
 def arrange_readings(experiments: Batch, acts: Sequence[Array], every: Float[Array, "runs channels ..."]) -> Array:
@@ -168,7 +172,7 @@ def reading_spans(experiments: Sequence[Experiment]) -> dict[str, slice]:
 
 
 def reading_sds(experiments: Sequence[Experiment], of_channels: Mapping[str, float]) -> np.ndarray:
-    """Sd of each reading [SI], with repeats averaged; runs, and zeros, are read with the instruments of the table.
+    """Sd of each reading [SI], with repeats averaged. Runs, and zeros, are read with the instruments of the table.
 
     Args:
         of_channels: sds of its channels [SI], by name.

@@ -34,7 +34,7 @@ class HeldOutScore:
     """Hold-out scores of a fit.
 
     Attributes:
-        by_kind: kind of block → log density of each reading, NaN for excluded ones; shape (rows, channels).
+        by_kind: kind of block → log density of each reading, NaN for excluded ones, shape (rows, channels).
         blocks: kind of block → index of each row's block, -1 for none.
         reading: kind of block → the scored predictions.
     """
@@ -53,22 +53,22 @@ class HeldOutScore:
         """Gain over another score, over the readings of both.
 
         Args:
-            where: True for included readings; None: all.
+            where: True for included readings. None: all.
             fewest: fewest blocks of a kind whose scatter counts: that of two has one degree of freedom.
         """
         if not self.by_kind:
             return Gain(0.0, np.inf)
-        each = np.stack([x - over.by_kind[kind] for kind, x in self.by_kind.items()])
-        each = each if where is None else np.where(where, each, np.nan)
-        scored = np.isfinite(each)
+        gains = np.stack([x - over.by_kind[kind] for kind, x in self.by_kind.items()])
+        gains = gains if where is None else np.where(where, gains, np.nan)
+        scored = np.isfinite(gains)
         counts = scored.sum((0, 2))
         rows = counts > 0
         total = int(counts.sum())
         if not total:
             return Gain(0.0, np.inf)
-        mean = float(np.nansum(each) / total)
+        mean = float(np.nansum(gains) / total)
         # Errors by row, and by block of each kind, because readings of a block share the rows that were left out.
-        off = np.nansum(each, (0, 2)) - mean * counts
+        off = np.nansum(gains, (0, 2)) - mean * counts
         several = [by for by in self.blocks.values() if len(np.unique(by[by >= 0])) >= fewest]
         groups = [np.arange(len(rows)), *several]
         return Gain(mean, max(_clustered_standard_error(off[rows], by[rows]) for by in groups) / total)
@@ -79,7 +79,7 @@ class Gain:
     """Difference of two scores and its standard error [nat a reading].
 
     Attributes:
-        errors: standard error by kind of block, if `se` is their mean; else empty.
+        errors: standard error by kind of block, if `se` is their mean, else empty.
     """
 
     mean: float
@@ -105,8 +105,9 @@ def score_readings(
     """Scores of hold-out predictions.
 
     Args:
-        reading: kind of block → predictions of each row by a fit without its block; NaN for none.
-        counts: True for included readings; kinds: of blocks, label → mask of its rows each.
+        reading: kind of block → predictions of each row by a fit without its block, NaN for none.
+        counts: True for included readings.
+        kinds: of blocks, label → mask of its rows each.
     """
     by_kind, blocks = {}, {}
     norm = math.lgamma((FREEDOM + 1) / 2) - math.lgamma(FREEDOM / 2) - 0.5 * math.log(FREEDOM * math.pi)

@@ -14,7 +14,7 @@ class Projection:
     """Projection of columns on the complement of the free parameters, as if these were fitted again.
 
     Args:
-        linear: at the base fit of settled rows; its prior rows are those of the free parameters.
+        linear: at the base fit of settled rows. Its prior rows are those of the free parameters.
     """
 
     def __init__(self, linear: Linearization) -> None:
@@ -39,7 +39,7 @@ class Defect:
     """Defect of a place in each row, after the free parameters have absorbed their part.
 
     Attributes:
-        value, sd: [unit of the place], shape (rows,); NaN if the readings do not show it.
+        value, sd: [unit of the place], shape (rows,), NaN if the readings do not show it.
     """
 
     value: np.ndarray
@@ -57,9 +57,9 @@ def defect_by_row(linear: Linearization, place: str) -> Defect:
     shapes[places, np.arange(len(places))] = 1.0
     columns = place_signature(linear, place, shapes)
     a, b = Projection(linear)(columns)
-    norm2, whole = np.diag(a), np.sum(columns**2, 0)
-    seen = norm2 > 1e-6 * np.maximum(whole, 1e-300)
-    norm2 = np.where(seen, norm2, np.nan)
+    norm2, total_norm = np.diag(a), np.sum(columns**2, 0)
+    is_visible = norm2 > 1e-6 * np.maximum(total_norm, 1e-300)
+    norm2 = np.where(is_visible, norm2, np.nan)
     value, sd = np.full(linear.rows, np.nan), np.full(linear.rows, np.nan)
     value[places], sd[places] = b / norm2, 1 / np.sqrt(norm2)
     return Defect(value, sd)

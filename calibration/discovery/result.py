@@ -24,7 +24,7 @@ from calibration.discovery.loop_notes import Asked, Headline, Mechanism, NameSup
 from calibration.discovery.prediction import Gain
 from calibration.discovery.settings import Settings
 from calibration.inference.details import Detail
-from calibration.inference.fit_notes import Notes, Pair, Remark
+from calibration.inference.fit_notes import Notes, Pair, Remark, with_codes
 from calibration.inference.fit_posterior import determined_together
 from calibration.inference.residual_clusters import ResidualCluster
 from calibration.inference.simulation_errors import OF_SIZE
@@ -56,7 +56,9 @@ class Member:
     """An effect of a class in place of the leader.
 
     Attributes:
-        amplitude: its own [unit]; size: over the largest plausible one; rise_chi2: compared with the leader [σ²].
+        amplitude: its own [unit].
+        size: over the largest plausible one.
+        rise_chi2: compared with the leader [σ²].
     """
 
     amplitude: float
@@ -69,8 +71,10 @@ class StatedValue:
     """A base parameter with a stated value that may be wrong, instead of an effect.
 
     Attributes:
-        value: that explains as much; stated: its prior mean; both in `unit`.
-        prior_sds: distance from its prior; rise_chi2: compared with the effect [σ²].
+        value: that explains as much.
+        stated: its prior mean, both in `unit`.
+        prior_sds: distance from its prior.
+        rise_chi2: compared with the effect [σ²].
     """
 
     value: float
@@ -85,12 +89,15 @@ class FoundEffect:
     """An effect of the verdict.
 
     Attributes:
-        name: of the leader of its class; members: effects that these data cannot separate from it, itself first.
+        name: of the leader of its class.
+        members: effects that these data cannot separate from it, itself first.
         stated: base parameters that may be wrong instead, by name.
-        families: of the members, the leader's first; a single family identifies the equation and its driver.
-        balance, unit: of the balance that it enters; equation, source: from its docstring.
-        parameters: its amplitude and shape; p_value: compared with the strongest of all effects in each bootstrap
-            table; score: rise of χ² without it after a refit [σ²].
+        families: of the members, the leader's first. A single family identifies the equation and its driver.
+        balance, unit: of the balance that it enters.
+        equation, source: from its docstring.
+        parameters: its amplitude and shape.
+        p_value: compared with the strongest of all effects in each bootstrap table.
+        score: rise of χ² without it after a refit [σ²].
         share: of the excess misfit, χ² less its expectation, that it explains [-].
     """
 
@@ -110,7 +117,7 @@ class FoundEffect:
 
 @dataclasses.dataclass(frozen=True)
 class Formula:
-    """A formula for a curve; see `formula.Proposal`."""
+    """A formula for a curve. See `formula.Proposal`."""
 
     JSON = ("formula", "mark", "coefficients", "sds", "bic_gain_over_curve", "tried")
     expression: str
@@ -133,13 +140,15 @@ class UnnamedDiscrepancy(DiscrepancyLocation):
     Attributes:
         unit: of the balance.
         families: equation and driver, in words, as in `FoundEffect`.
-        window: axis, first and last place of a temporary change; None for other discrepancies.
+        window: axis, first and last place of a temporary change, None for other discrepancies.
         effect: name of the smooth curve in the proposed robot.
-        p_value: family-wise; score: decrease of χ² by the curve [σ²]; score_free_in_each_run: by a wave with a phase
-            for each run, None for other curves.
-        at: of the variable [SI]; value, sd: of the curve there [unit].
+        p_value: family-wise.
+        score: decrease of χ² by the curve [σ²].
+        score_free_in_each_run: by a wave with a phase for each run, None for other curves.
+        at: of the variable [SI].
+        value, sd: of the curve there [unit].
         over, defect, defect_sd: for each row the fitted variable [SI] and the defect of the balance [unit]: the curve
-            there plus the row's residual, along the travel; None if single rows do not show it.
+            there plus the row's residual, along the travel, None if single rows do not show it.
         proposal: a formula.
     """
 
@@ -164,8 +173,10 @@ class HiddenEffect:
     """An effect that the effects found could hide.
 
     Attributes:
-        amplitude: the largest possible one in `unit`; sigmas: its change of the readings without them [σ].
-        experiment: that would show it; separation: expected of it [σ]; "" and 0 for none.
+        amplitude: the largest possible one in `unit`.
+        sigmas: its change of the readings without them [σ].
+        experiment: that would show it.
+        separation: expected of it [σ]. "" and 0 for none.
     """
 
     name: str
@@ -181,7 +192,9 @@ class Alternative:
     """Effects that were fitted and are not proposed.
 
     Attributes:
-        effects: amplitudes; prior_sds: the same in prior sds; sizes: over the largest plausible ones.
+        effects: amplitudes.
+        prior_sds: the same in prior sds.
+        sizes: over the largest plausible ones.
         rise_chi2: over the proposed fit [σ²], negative if they explain more.
         reasons: for their implausibility.
     """
@@ -234,8 +247,11 @@ class Ranked:
     """An effect by regression: all other parameters are refitted on the linearised equations of the base fit.
 
     Attributes:
-        name: of the effect; family: equation and driver in words; unit: of its amplitude.
-        score: that it alone would explain at plausible size [σ²]; amplitude, sd: then [its unit].
+        name: of the effect.
+        family: equation and driver in words.
+        unit: of its amplitude.
+        score: that it alone would explain at plausible size [σ²].
+        amplitude, sd: then [its unit].
         supplies: True if that sign would supply power, so that it explains nothing.
     """
 
@@ -253,10 +269,11 @@ class Ranking:
     """Ranking of the library by regression before any set of effects is fitted, unconfirmed.
 
     Attributes:
-        missing: True if an effect is missing; p_value: of that test, family-wise.
+        missing: True if an effect is missing.
+        p_value: of that test, family-wise.
         chance: critical score of the strongest effect [σ²].
         effects: the strongest first, then those that would supply power.
-        windows: number of equations of the log in weak form; 0 for a ranking by signatures along the base fit.
+        windows: number of equations of the log in weak form, 0 for a ranking by signatures along the base fit.
     """
 
     missing: bool
@@ -278,7 +295,7 @@ class KindOfEvidence:
 
 @dataclasses.dataclass(frozen=True)
 class Evidence:
-    """Evidence in one fit's residuals, by kind and family-wise; adequate: True without a significant discrepancy."""
+    """Evidence in one fit's residuals, by kind and family-wise. A fit without significant evidence is `adequate`."""
 
     kinds: dict[str, KindOfEvidence]
     p_value: float
@@ -298,7 +315,7 @@ class RankedExperiment:
 
 @dataclasses.dataclass(frozen=True)
 class NextExperiment:
-    """The next experiment, with the whole menu; see `experiments.Proposal`."""
+    """The next experiment, with the whole menu. See `experiments.Proposal`."""
 
     JSON = ("name", "experiments", "description", "separates", "expected_sigma", "settles", "menu")
     name: str
@@ -320,7 +337,8 @@ class ReadingsOfRows:
     """Readings of all rows [SI], shape (rows, channels), NaN if missing.
 
     Attributes:
-        measured, sd: of the table; as_stated: by the robot before any fit, at its prior means.
+        measured, sd: of the table.
+        as_stated: by the robot before any fit, at its prior means.
         before, after: by the base and by the proposed robot, fitted to all rows.
         held_out: kind of block → (before, after), each row by fits without its block.
         blocks: kind of block → labels.
@@ -343,8 +361,10 @@ class Worse:
     """A channel with larger hold-out errors of the proposal than of the refit.
 
     Attributes:
-        kind: of the blocks held out; channel: its name.
-        rows: number that both fits predict; before, after: rms error over these [%].
+        kind: of the blocks held out.
+        channel: its name.
+        rows: number that both fits predict.
+        before, after: rms error over these [%].
     """
 
     kind: str
@@ -359,9 +379,11 @@ class HeldOutAlternative:
     """An alternative of a class, refitted without each block.
 
     Attributes:
-        effects: its names; leads: True if it is the one proposed.
+        effects: its names.
+        leads: True if it is the one proposed.
         rise_chi2: of the fit to all rows, above the best one [σ²].
-        rms_sigma: over the readings of all kinds of blocks that every alternative predicts [σ]; by_kind: of each.
+        rms_sigma: over the readings of all kinds of blocks that every alternative predicts [σ].
+        by_kind: of each.
         lost: number of held-out readings without a prediction, because its robot slides or fails there.
     """
 
@@ -383,9 +405,12 @@ class Resolved:
         robot: for `--model track`, with the running gear that fits best.
         constants: of the running gear and the friction, by name.
         alike: strongly correlated pairs of constants, with their correlation.
-        outside: constants further than `PLAUSIBLE` prior sds from their priors; settled: True if both searches ended.
-        fall: decrease of twice the objective by the running gear, priors included [σ²]; p: its p-value.
-        chi2: of the readings with the gear as stated and with the best one [σ²]; readings: number included.
+        outside: constants further than `PLAUSIBLE` prior sds from their priors.
+        settled: True if both searches ended.
+        fall: decrease of twice the objective by the running gear, priors included [σ²].
+        p: its p-value.
+        chi2: of the readings with the gear as stated and with the best one [σ²].
+        readings: number included.
         rms_percent: by channel, with the gear as stated and with the best one [%].
         slip_rms: the same for the slip [percentage points].
         remarks: of the search.
@@ -456,38 +481,48 @@ class DiscoveryResult:
     Attributes:
         verdict: `none`, `named`, `class`, `mechanism`, `place` or `undescribed`.
         summary: the verdict with all data of its statement.
-        robot: as written; refit: with nothing added; written: True if the robot has the proposal.
-        gain: hold-out gain of the proposal over the refit; None if no block can be held out.
-        converged: True if the fit of that robot is an optimum; posterior: of all fitted parameters.
-        runs: the table; numbers: of its rows, as in messages.
-        included: True for included rows; outliers, unusable: numbers of excluded rows.
-        effects: in the model, established or tentative; unnamed: the discrepancy of that verdict; remains: the
-            discrepancy that the effects leave.
-        next_experiment: the most informative one; None if there are no alternatives to separate.
-        cannot_see: effects that the data cannot show; needs_histories: that only histories can; needs_reverse: that
-            only runs in both directions can.
-        alternatives, implausible: candidates nearly as good; those of implausible size or sign.
+        robot: as written.
+        refit: with nothing added.
+        written: True if the robot has the proposal.
+        gain: hold-out gain of the proposal over the refit, None if no block can be held out.
+        converged: True if the fit of that robot is an optimum.
+        posterior: of all fitted parameters.
+        runs: the table.
+        numbers: of its rows, as in messages.
+        included: True for included rows.
+        outliers, unusable: numbers of excluded rows.
+        effects: in the model, established or tentative.
+        unnamed: the discrepancy of that verdict.
+        remains: the discrepancy that the effects leave.
+        next_experiment: the most informative one, None if there are no alternatives to separate.
+        cannot_see: effects that the data cannot show.
+        needs_histories: that only histories can.
+        needs_reverse: that only runs in both directions can.
+        alternatives, implausible: candidates nearly as good. Those of implausible size or sign.
         hidden: effects that the effects found could hide, the largest first.
-        support: tests of the names; None if none was tested.
-        cluster: common property of outliers, which were then not excluded; None for none.
+        support: tests of the names, None if none was tested.
+        cluster: common property of outliers, which were then not excluded, None for none.
         residual_clusters: clusters of the proposed robot's residuals by columns without a role.
         before, after: evidence in the residuals of base and proposed robot.
-        chi2: twice the objective before and after [σ²]; readings: number included.
-        base_shift: of every base parameter; scores: of the library at the base fit, strongest first.
-        cosine: |cos| between the projected signatures of two effects; shape (scores, scores), their order.
+        chi2: twice the objective before and after [σ²].
+        readings: number included.
+        base_shift: of every base parameter.
+        scores: of the library at the base fit, strongest first.
+        cosine: |cos| between the projected signatures of two effects, shape (scores, scores), their order.
         detail: further findings for the kind of data: defects of equations by run, or memory, orders and drift.
         readings_of_rows: measured and simulated.
         errors_as_stated: rms by channel, of the robot before any fit.
-        errors, errors_held_out: rms by channel, before and after, over the rows that both predict; by kind of block.
+        errors, errors_held_out: rms by channel, before and after, over the rows that both predict. By kind of block.
         held_out_unpredictable: kinds with at least one block that the others cannot predict.
         held_out_worse: rises of hold-out errors.
-        alternatives_held_out: of a class, by hold-out errors; empty for a single one, or for histories unless
+        alternatives_held_out: of a class, by hold-out errors, empty for a single one, or for histories unless
             requested.
         noise: channel → source and median sd [%].
-        settings: the statistical constants; replicates: number of bootstrap tables with successful refits.
+        settings: the statistical constants.
+        replicates: number of bootstrap tables with successful refits.
         remarks: notes on the result.
         sensitivity: verdicts with other assumed noise.
-        resolved: result of the track model; None if it was not run, or does not apply.
+        resolved: result of the track model, None if it was not run, or does not apply.
     """
 
     verdict: str
@@ -540,8 +575,9 @@ class DiscoveryResult:
 
     @property
     def statement(self) -> str:
-        """The answer in a sentence or two."""
-        return describe(self.headline)
+        """The answer in a sentence or two, after lost motion, which no effect of the library explains."""
+        lost = (f"{note}." for note in sentences(with_codes(self.remarks, "lost_motion")))
+        return " ".join((*lost, describe(self.headline)))
 
     @property
     def verdict_statement(self) -> str:
@@ -560,7 +596,7 @@ class DiscoveryResult:
 
     @property
     def standing(self) -> str:
-        """Reasons for or against the names, as a sentence; "" for none."""
+        """Reasons for or against the names, as a sentence, "" for none."""
         return describe(self, "standing")
 
     @property
@@ -579,10 +615,14 @@ class DiscoveryResult:
 
         `chi2` also contains the parameters' distances from their priors, and penalties.
         """
-        seen = self.readings_of_rows
+        readings = self.readings_of_rows
         before, after = (
-            float(np.nansum(np.where(self.included[:, None], (simulated - seen.measured) / seen.sd, np.nan) ** 2))
-            for simulated in (seen.before, seen.after)
+            float(
+                np.nansum(
+                    np.where(self.included[:, None], (simulated - readings.measured) / readings.sd, np.nan) ** 2
+                )
+            )
+            for simulated in (readings.before, readings.after)
         )
         return before, after
 
@@ -607,15 +647,15 @@ class DiscoveryResult:
     def held_by_prior(self) -> tuple[str, ...]:
         """Names of the fitted parameters of the proposed robot that are held by their priors."""
         base = [name for name, p in self.base_shift.items() if p.held_by_prior]
-        each = [(f"effects.{e.name}.{name}", p) for e in self.effects for name, p in e.parameters.items()]
-        return (*base, *(name for name, p in each if p.held_by_prior))
+        parameters = [(f"effects.{e.name}.{name}", p) for e in self.effects for name, p in e.parameters.items()]
+        return (*base, *(name for name, p in parameters if p.held_by_prior))
 
     @property
     def together(self) -> tuple[Pair, ...]:
         """Pairs of base parameters and effects' parameters that the data determine only in combination."""
-        own = {*self.base_shift, *(f"effects.{e.name}.{name}" for e in self.effects for name in e.parameters)}
+        shown_names = {*self.base_shift, *(f"effects.{e.name}.{name}" for e in self.effects for name in e.parameters)}
         pairs = determined_together(self.posterior, self.held_by_prior)
-        return tuple(pair for pair in pairs if own >= {pair.one, pair.other})
+        return tuple(pair for pair in pairs if shown_names >= {pair.one, pair.other})
 
     def to_json(self) -> dict[str, Any]:
         """Everything as JSON-able data, as docs/schemas/loop.schema.json describes it."""
@@ -705,21 +745,24 @@ class DiscoveryResult:
 
     def rows_table(self) -> dict[str, np.ndarray]:
         """Table by row: conditions, readings measured, simulated before and after and held out, defects if known."""
-        seen = self.readings_of_rows
-        known = ("run_id", *WHEN, "configuration", *self.runs.axes, *DRIVING)
-        table = {"row": self.numbers, **{k: self.runs[k] for k in known if self.runs.has(k)}}
-        main = next(iter(seen.held_out.values()), None)
+        readings = self.readings_of_rows
+        known_columns = ("run_id", *WHEN, "configuration", *self.runs.axes, *DRIVING)
+        table = {"row": self.numbers, **{k: self.runs[k] for k in known_columns if self.runs.has(k)}}
+        main = next(iter(readings.held_out.values()), None)
         for k, channel in enumerate(self.channels):
             column, unit = channel.column, channel.factor
-            table[column] = seen.measured[:, k] / unit
-            table[channel.sd_column] = seen.sd[:, k] / unit
-            table[f"before_{column}"], table[f"after_{column}"] = seen.before[:, k] / unit, seen.after[:, k] / unit
+            table[column] = readings.measured[:, k] / unit
+            table[channel.sd_column] = readings.sd[:, k] / unit
+            table[f"before_{column}"], table[f"after_{column}"] = (
+                readings.before[:, k] / unit,
+                readings.after[:, k] / unit,
+            )
             if main is not None:
                 table[f"held_out_before_{column}"] = main[0][:, k] / unit
                 table[f"held_out_after_{column}"] = main[1][:, k] / unit
-            for when, simulated in (("before", seen.before), ("after", seen.after)):
+            for when, simulated in (("before", readings.before), ("after", readings.after)):
                 name = f"residual_{when}_{channel.name}_sigma"
-                table[name] = (simulated[:, k] - seen.measured[:, k]) / seen.sd[:, k]
+                table[name] = (simulated[:, k] - readings.measured[:, k]) / readings.sd[:, k]
         table |= self.detail.columns()
         use = np.full(len(self.runs), "used", dtype="<U8")
         use[np.isin(self.numbers, self.outliers)] = "outlier"
@@ -741,8 +784,8 @@ class DiscoveryResult:
         folder.mkdir(parents=True, exist_ok=True)
         write_json(folder / "result.json", self.to_json())
         write_table(folder / "rows.csv", self.rows_table(), tables)
-        held = [describe(Remark("held_by_prior", names=self.held_by_prior))] if self.held_by_prior else []
-        note = "\n".join([describe(self, "header", robot_name), *held])
+        held_sentence = [describe(Remark("held_by_prior", names=self.held_by_prior))] if self.held_by_prior else []
+        note = "\n".join([describe(self, "header", robot_name), *held_sentence])
         robot_file.write_robot(self.robot, folder / "robot.toml", note=note)
         robot_file.write_robot(self.refit, folder / REFIT_FILE, note=describe(self, "refit header", robot_name))
         posterior.write_posterior(self.posterior, folder / posterior.FILE)
@@ -773,8 +816,8 @@ class Sensitivity:
 
     def to_json(self) -> dict[str, Any]:
         """Entry of result.json."""
-        found = {n: getattr(self, n) for n in ("factor", "verdict", "statement", "classes", "adequate_after")}
-        return found | ({"near": True} if self.near else {})
+        entries = {n: getattr(self, n) for n in ("factor", "verdict", "statement", "classes", "adequate_after")}
+        return entries | ({"near": True} if self.near else {})
 
 
 def _effect(e: FoundEffect, support: NameSupport | None) -> dict[str, Any]:

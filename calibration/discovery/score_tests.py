@@ -45,11 +45,14 @@ class ScoreTable(eqx.Module):
     """Scores of candidates on a fit's residuals.
 
     Attributes:
-        single: signed root of each instance's score, -(r·e)/‖r‖, shape (instances,); amplitude: -(r·e)/‖r‖²,
-            in prior sds; left: ‖r‖, the change of the readings by a prior sd in sigmas.
-        pair: scores of pairs of instances (χ² with two degrees of freedom), shape (instances, instances);
-            zero if they can't be separated; cosine: between two projected signatures.
-        curve: of each family, as a normal deviate, shape (families,); explained: its ridge score [σ²].
+        single: signed root of each instance's score, -(r·e)/‖r‖, shape (instances,).
+        amplitude: -(r·e)/‖r‖², in prior sds.
+        left: ‖r‖, the change of the readings by a prior sd in sigmas.
+        pair: scores of pairs of instances (χ² with two degrees of freedom), shape (instances, instances).
+            Zero if they can't be separated.
+        cosine: between two projected signatures.
+        curve: of each family, as a normal deviate, shape (families,).
+        explained: its ridge score [σ²].
         row: signed root of the score of a shift of each single reading, shape (rows, channels).
         fall: further decrease of the objective predicted by a step of the fit [½σ²].
     """
@@ -70,7 +73,8 @@ class Fit(eqx.Module):
 
     Attributes:
         half: L⁻¹ Jᵀ of the readings, shape (coordinates, readings).
-        step: L⁻¹ Jᵀ e, shape (coordinates,); left: e of the readings after that step.
+        step: L⁻¹ Jᵀ e, shape (coordinates,).
+        left: e of the readings after that step.
     """
 
     half: Float[Array, "coordinates readings"]
@@ -81,8 +85,8 @@ class Fit(eqx.Module):
     def of(linear: Linearization) -> Fit:
         """Factors of a linearisation."""
         jacobian, e, readings = linear.jacobian, linear.residual, linear.readings
-        asked = jnp.concatenate([jacobian[:readings].T, (jacobian.T @ e)[:, None]], 1)
-        solved = solve_lower(jacobian.T @ jacobian, asked)
+        right_sides = jnp.concatenate([jacobian[:readings].T, (jacobian.T @ e)[:, None]], 1)
+        solved = solve_lower(jacobian.T @ jacobian, right_sides)
         half, step = solved[:, :-1], solved[:, -1]
         return Fit(half, step, e[:readings] - half.T @ step)
 
@@ -96,23 +100,25 @@ def score_tests(linear: Linearization, bases: Bases) -> ScoreTable:
     """Scores of each instance, pair, curve and reading."""
     g, fit = linear.signatures, Fit.of(linear)
     dots, products = fit.projected(g)
-    whole = jnp.sum(g**2, 0)
+    total_norm = jnp.sum(g**2, 0)
     norm2 = jnp.maximum(jnp.diag(products), 0.0)
-    seen = norm2 > ABSORBED**2 * jnp.maximum(whole, 1e-300)
-    norm = jnp.sqrt(jnp.where(seen, norm2, 1.0))
-    single = jnp.where(seen, -dots / norm, 0.0)
-    both_seen = seen[:, None] & seen
+    is_visible = norm2 > ABSORBED**2 * jnp.maximum(total_norm, 1e-300)
+    norm = jnp.sqrt(jnp.where(is_visible, norm2, 1.0))
+    single = jnp.where(is_visible, -dots / norm, 0.0)
+    both_seen = is_visible[:, None] & is_visible
     cosine = jnp.where(both_seen, products / (norm[:, None] * norm), 0.0)
     apart = jnp.where(both_seen, 1 - cosine**2, 0.0)
-    both = (single[:, None] ** 2 + single**2 - 2 * cosine * single[:, None] * single) / jnp.maximum(apart, 1e-9)
-    pair = jnp.where(apart > 1e-2, both, 0.0)
+    pair_scores = (single[:, None] ** 2 + single**2 - 2 * cosine * single[:, None] * single) / jnp.maximum(
+        apart, 1e-9
+    )
+    pair = jnp.where(apart > 1e-2, pair_scores, 0.0)
 
     leverage = jnp.sum(fit.half**2, 0)
     row = jnp.where(leverage < 1 - 1e-6, fit.left / jnp.sqrt(jnp.maximum(1 - leverage, 1e-12)), 0.0)
 
     scores = [jax.vmap(lambda c: _curve_score(fit, c))(basis.signatures(linear)) for basis in bases]
     deviate, explained = (jnp.concatenate([f[k] for f in scores] or [jnp.zeros(0)]) for k in (0, 1))
-    amplitude = jnp.where(seen, -dots / norm**2, 0.0)
+    amplitude = jnp.where(is_visible, -dots / norm**2, 0.0)
     row = row.reshape(linear.rows, -1)
     fall = 0.5 * jnp.sum(fit.step**2)
     return ScoreTable(single, amplitude, jnp.sqrt(norm2), pair, cosine, deviate, explained, row, fall)
@@ -125,17 +131,17 @@ def _curve_score(fit: Fit, columns: Array) -> tuple[Array, Array]:
     """
     dots, products = fit.projected(columns)
     norm2 = jnp.diag(products)
-    seen = norm2 > ABSORBED**2 * jnp.maximum(jnp.sum(columns**2, 0), 1e-300)
-    scale = jnp.where(seen, 10.0 / jnp.sqrt(jnp.where(seen, norm2, 1.0)), 0.0)
+    is_visible = norm2 > ABSORBED**2 * jnp.maximum(jnp.sum(columns**2, 0), 1e-300)
+    scale = jnp.where(is_visible, 10.0 / jnp.sqrt(jnp.where(is_visible, norm2, 1.0)), 0.0)
     products = products * scale[:, None] * scale
     dots = dots * scale
-    asked = jnp.concatenate([dots[:, None], jnp.eye(dots.size)], 1)
-    half = solve_lower(products + jnp.eye(dots.size), asked)
+    right_sides = jnp.concatenate([dots[:, None], jnp.eye(dots.size)], 1)
+    half = solve_lower(products + jnp.eye(dots.size), right_sides)
     explained = jnp.sum(half[:, 0] ** 2)
     # E = tr(A (A + I)⁻¹) under the null: degrees of freedom.
     freedom = dots.size - jnp.sum(half[:, 1:] ** 2)
     deviate = normal_deviate(explained, jnp.maximum(freedom, 1e-3))
-    return jnp.where(jnp.any(seen), deviate, -1.0 / ABSORBED), explained
+    return jnp.where(jnp.any(is_visible), deviate, -1.0 / ABSORBED), explained
 
 
 def normal_deviate(chi2: Array, freedom: Array) -> Array:
@@ -157,7 +163,7 @@ def normal_deviate(chi2: Array, freedom: Array) -> Array:
 class Statistics(eqx.Module):
     """Strongest statistics: |single|, pair [σ²], curve [normal deviate], χ² and memory of the residuals.
 
-    `settled` is True if the fit is an optimum; `white` is `Linearization.memory`.
+    `settled` is True if the fit is an optimum. `white` is `Linearization.memory`.
     """
 
     single: Array
@@ -169,7 +175,7 @@ class Statistics(eqx.Module):
 
 
 def strongest_statistics(scores: ScoreTable, linear: Linearization) -> Statistics:
-    """Largest statistics of a table; a bootstrap draws their distribution."""
+    """Largest statistics of a table. A bootstrap draws their distribution."""
     return Statistics(
         jnp.max(jnp.abs(scores.single)),
         jnp.max(scores.pair),
@@ -189,7 +195,7 @@ def diagnose_fit(
     """A linearised fit, the scores of effects and curves on its residuals, and the strongest of these.
 
     Args:
-        near: linearization of a fit nearby; its signatures and defects are reused for long runs, because a curve
+        near: linearization of a fit nearby. Its signatures and defects are reused for long runs, because a curve
             changes the residuals, but barely the signatures.
     """
     if not problem.observe.long:
@@ -248,11 +254,11 @@ def augment_with_columns(linear: Linearization, extra: np.ndarray) -> tuple[np.n
     """
     jacobian, (readings, wide) = np.asarray(linear.jacobian), extra.shape
     total, free = jacobian.shape
-    whole = np.zeros((total + wide, free + wide))
-    whole[:total, :free] = jacobian
-    whole[:readings, free:] = extra
-    whole[total:, free:] = np.eye(wide)
-    return whole, np.concatenate([np.asarray(linear.residual), np.zeros(wide)])
+    augmented = np.zeros((total + wide, free + wide))
+    augmented[:total, :free] = jacobian
+    augmented[:readings, free:] = extra
+    augmented[total:, free:] = np.eye(wide)
+    return augmented, np.concatenate([np.asarray(linear.residual), np.zeros(wide)])
 
 
 def statistics_with_columns(
@@ -262,7 +268,8 @@ def statistics_with_columns(
     family of curves, -inf for families in the columns' own places.
 
     Args:
-        extra: columns over the readings, shape (readings, columns); names: their places.
+        extra: columns over the readings, shape (readings, columns).
+        names: their places.
     """
     wide: tuple[Any, Any] = augment_with_columns(linear, extra)
     scores, _ = _padded_scores(dataclasses.replace(linear, jacobian=wide[0], residual=wide[1]), bases)
@@ -297,33 +304,34 @@ def bootstrap(
     seed: int,
     freedom: np.ndarray | None = None,
 ) -> Statistics:
-    """Statistics of `replicates` tables drawn from the fitted base and fitted again; shape (replicates,).
+    """Statistics of `replicates` tables drawn from the fitted base and fitted again, shape (replicates,).
 
     Replicates with a refit that did not settle are omitted, so there may be fewer.
 
     Args:
-        problem: of the base only, z its fit; linear: the same fit, linearised.
+        problem: of the base only, z its fit.
+        linear: the same fit, linearised.
         seed: random seed.
-        freedom: degrees of freedom of each channel's estimated sd, infinite if it is known; None if all are known.
+        freedom: degrees of freedom of each channel's estimated sd, infinite if it is known, None if all are known.
             Each table is drawn with random true sds, given such estimates.
     """
     count = -(-replicates // CHUNK)
-    drawn = problem.observe.draws(
+    draws = problem.observe.draws(
         problem, jnp.asarray(z), linear, _keys(jnp.asarray(seed), count, replicates),
         _factors(freedom, len(problem.channels), replicates, seed),
     )  # fmt: skip
     # Padded to whole batches by repeats, which are cut off later.
-    drawn = jax.tree.map(lambda x: np.resize(np.asarray(x), (count, CHUNK, *x.shape[1:])), drawn)
+    draws = jax.tree.map(lambda x: np.resize(np.asarray(x), (count, CHUNK, *x.shape[1:])), draws)
 
     def part(k: int) -> Statistics:
-        mine = jax.tree.map(lambda x: x[k], drawn)
-        return jax.device_get(_replicates(problem, linear, effects, bases, mine))
+        draws_of_part = jax.tree.map(lambda x: x[k], draws)
+        return jax.device_get(_replicates(problem, linear, effects, bases, draws_of_part))
 
     # The first batch compiles the program of the others; a batch keeps one core busy.
     with Threads(CORES) as cores:
         parts = [part(0), *cores.map(part, range(1, count))]
-    whole = jax.tree.map(lambda *x: np.concatenate(x)[:replicates], *parts)
-    return jax.tree.map(lambda x: x[whole.settled], whole)
+    statistics = jax.tree.map(lambda *x: np.concatenate(x)[:replicates], *parts)
+    return jax.tree.map(lambda x: x[statistics.settled], statistics)
 
 
 def _factors(freedom: np.ndarray | None, channels: int, replicates: int, seed: int) -> np.ndarray:
@@ -343,7 +351,7 @@ def _replicates(
     """A batch of a bootstrap, from the observer's draws."""
 
     def one(drawn: Any) -> Statistics:
-        again = problem.observe.replicate(problem, problem.data, effects, linear, drawn)
-        return strongest_statistics(score_tests(again, bases), again)
+        replicate = problem.observe.replicate(problem, problem.data, effects, linear, drawn)
+        return strongest_statistics(score_tests(replicate, bases), replicate)
 
     return jax.vmap(one)(drawn)

@@ -29,9 +29,11 @@ class Search:
 
     Attributes:
         ladder: every candidate that was fitted.
-        best: the proposed one, None without a plausible one; diagnosis: of its residuals.
-        asked, otherwise: number of simulated sets that were screened by regression, and of unconfirmed ones among
-            them, see `screening.Confirmed`; room: effects in the program of these fits.
+        best: the proposed one, None without a plausible one.
+        diagnosis: of its residuals.
+        asked, otherwise: number of simulated sets that were screened by regression, and of unconfirmed ones
+            among them, see `screening.Confirmed`.
+        room: effects in the program of these fits.
     """
 
     ladder: tuple[Candidate, ...]
@@ -47,9 +49,9 @@ def diagnose_candidate(
 ) -> Diagnosis:
     """Diagnosis of a fit."""
     z = jnp.asarray(fitted.z)
-    seen = diagnose_fit(space.problem(fitted.active), z, space.library.scored, bases)
-    linear, scores, found = jax.device_get(seen)
-    return Diagnosis(linear, scores, AdequacyTest(found, null, settings))
+    diagnosis = diagnose_fit(space.problem(fitted.active), z, space.library.scored, bases)
+    linear, scores, statistics = jax.device_get(diagnosis)
+    return Diagnosis(linear, scores, AdequacyTest(statistics, null, settings))
 
 
 def search_effects(
@@ -63,19 +65,25 @@ def search_effects(
     """Smallest set of effects that explains the discrepancy of the base to within the test's margin.
 
     Args:
-        base: the fit without effects; left: its diagnosis.
+        base: the fit without effects.
+        left: its diagnosis.
     """
-    rounds = [_singles(space, base, left, settings)]
+    names = _ranked(space, left.scores)
+    if not space.bare.observe.long:
+        names = names[: _batch(space)]
+    rounds = [_fit_sets(space, [(fill_slots([name], settings), base, left) for name in names], settings)]
     space = space.with_room(rounds[0].room)
     ladder = list(rounds[0].candidates)
     null = np.asarray(left.test.null.single)
-    best, diagnosis, seen = _best(ladder), None, None
+    best, diagnosis, diagnosed = _best(ladder), None, None
     if best is not None and single_p_value(2 * (base.cost - best.cost), null) > settings.family_wise_error:
         best = None
     while best is not None:
-        seen = best
+        diagnosed = best
         diagnosis = diagnose_candidate(space, best, bases, left.test.null, settings)
-        if not diagnosis.test.rejected_with_margin or len(best.effects) == _largest_set_size(space, settings):
+        if not diagnosis.test.rejected_with_margin or len(best.effects) == int(
+            min(settings.slots, max(1, space.included.sum() // settings.rows_per_effect))
+        ):
             break
         progress(next_step("more effects", best.effects))
         rounds.append(_extend(space, best, diagnosis, base, left, settings))
@@ -88,8 +96,8 @@ def search_effects(
             gains = [2 * (c.cost - best.cost) for c in fewer]
             if any(single_p_value(gain, null) > settings.family_wise_error for gain in gains):
                 best = None
-    asked, otherwise = (sum(getattr(r, name) for r in rounds) for name in ("asked", "otherwise"))
-    return Search(tuple(ladder), seen, diagnosis, asked, otherwise, space.room)
+    simulated_count, otherwise = (sum(getattr(r, name) for r in rounds) for name in ("asked", "otherwise"))
+    return Search(tuple(ladder), diagnosed, diagnosis, simulated_count, otherwise, space.room)
 
 
 def best_of_each_size(found: Search) -> list[Candidate]:
@@ -128,30 +136,17 @@ def without_each(
     return [simulated[w] for w in fewer]
 
 
-def _largest_set_size(space: CandidateSpace, settings: Settings) -> int:
-    """Largest number of effects that the data allow, at most the number of slots."""
-    return int(min(settings.slots, max(1, space.included.sum() // settings.rows_per_effect)))
-
-
 def _ranked(space: CandidateSpace, scores: ScoreTable, without: Sequence[str] = ()) -> list[str]:
-    """Effects by their best |score|, the strongest first; those in `without` come last."""
+    """Effects by their best |score|, the strongest first. Those in `without` come last."""
     strength = space.library.largest(np.abs(np.asarray(scores.single)))
     strength[list(space.library.indices(without))] = 0.0
     return [space.library.names[k] for k in np.argsort(-strength)]
 
 
-def _singles(space: CandidateSpace, base: Candidate, left: Diagnosis, settings: Settings) -> Confirmed:
-    """Single effects: those with the highest scores, or for long runs all of them by regression."""
-    names = _ranked(space, left.scores)
-    if not space.bare.observe.long:
-        names = names[: _batch(space)]
-    return _fit_sets(space, [(fill_slots([name], settings), base, left) for name in names], settings)
-
-
 def _fit_sets(
     space: CandidateSpace, wanted: Sequence[tuple[Names, Candidate, Diagnosis]], settings: Settings
 ) -> Confirmed:
-    """Sets of effects, each in addition to another fit and its diagnosis; for long runs first screened by
+    """Sets of effects, each in addition to another fit and its diagnosis. For long runs first screened by
     regression."""
     if not space.bare.observe.long:
         return Confirmed(tuple(fit_in_addition(space, [(w, at, by.scores) for w, at, by in wanted], settings)))
@@ -175,8 +170,8 @@ def _extend(
     sources = {fill_slots([*best.effects, name], settings): (best, left_by_best) for name in names}
     if len(best.effects) == 1:
         for pair in _pairs(space, left.scores):
-            one, other = fill_slots(pair, settings), fill_slots(pair[::-1], settings)
-            if one not in sources and other not in sources:
+            one, swapped = fill_slots(pair, settings), fill_slots(pair[::-1], settings)
+            if one not in sources and swapped not in sources:
                 sources[one] = (base, left)
     return _fit_sets(space, [(w, at, by) for w, (at, by) in sources.items()], settings)
 

@@ -25,30 +25,36 @@ MARGINS = {"single": 0.5, "curve": 0.7, "pair": 6.0, "chi2": 10.0, "white": 1.0}
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """Constants that decide a verdict; written to `result.json`.
+    """Constants that decide a verdict, written to `result.json`.
 
     Attributes:
-        shares: family-wise error by kind of evidence; margins: see `MARGINS`.
-        replicates: of the bootstrap; seed: random seed.
-        slots: largest number of effects in a fit; rows_per_effect: rows that each needs.
-        width: prior sd of an amplitude in a fit, in sds of its field: wide enough not to shrink a visible effect;
-            plausible: largest plausible amplitude in sds of its field; stretched: factor on that for effects listed
-            next to a plausible one of their family, because their size is equally uncertain.
+        shares: family-wise error by kind of evidence.
+        margins: see `MARGINS`.
+        replicates: of the bootstrap.
+        seed: random seed.
+        slots: largest number of effects in a fit.
+        rows_per_effect: rows that each needs.
+        width: prior sd of an amplitude in a fit, in sds of its field: wide enough not to shrink a visible effect.
+        plausible: largest plausible amplitude in sds of its field.
+        stretched: factor on that for effects listed next to a plausible one of their family, because their
+            size is equally uncertain.
         visible: least change of the readings by the largest plausible amplitude of a visible effect [σ].
         same, same_parallel: largest rise of the objective for another effect that explains the data as well, and the
             same if |cos| of the signatures is above `parallel` [σ²].
-        form, form_family: share of an effect's sigmas that another one may lack and still differ only in its form;
-            the same within one family.
+        form, form_family: share of an effect's sigmas that another one may lack and still differ only in its form.
+            The same within one family.
         alike: |cos| above which an effect is tried in place of another one.
         needed: least contribution of each of two effects, given the other, for both to be named [σ].
         preferred: advantage in evidence of a smooth curve that refutes names [σ²].
         alternative: largest rise of the objective for a listed candidate [σ²].
-        outlier_share: largest share of excluded rows; outlier_few: largest number in a short table, up to a fifth
-            of it; outlier_error: family-wise error of an exclusion.
+        outlier_share: largest share of excluded rows.
+        outlier_few: largest number in a short table, up to a fifth of it.
+        outlier_error: family-wise error of an exclusion.
         gross: distance over the median row's beyond which a row cannot have been measured as stated [σ].
-        cauchy: scale of Cauchy's weights [σ]; reweightings: their iterations.
+        cauchy: scale of Cauchy's weights [σ].
+        reweightings: their iterations.
         worth, apart: least separation of an experiment to be worthwhile, and to separate two alternatives [σ].
-        enough, gain: probability above which a better separation is no gain; least addition of a second experiment
+        enough, gain: probability above which a better separation is no gain. Least addition of a second experiment
             to the expected number of separated pairs.
         refuted: rise of χ² that refutes an alternative [σ²].
         prefer: one of `PREFERENCES`.
@@ -112,7 +118,7 @@ def settings_for(kind: type[Observer], replicates: int = 500, seed: int = 0, pre
     """Settings for data of a kind.
 
     Raises:
-        BadConfiguration: `prefer` is not one of `PREFERENCES`; a number of replicates or a seed that is not allowed.
+        BadConfiguration: `prefer` is not one of `PREFERENCES`. A number of replicates or a seed that is not allowed.
     """
     stated_count(replicates, "replicates", 1, 100_000)
     stated_count(seed, "seed", 0, SEEDS)

@@ -26,7 +26,7 @@ def without(robot: Robot, *closed: str) -> Robot:
 
 
 def on_ground(robot: Robot, brake: Scalar = 0.0) -> Robot:
-    """The unchanged robot; all setups except `braked` ignore the brake."""
+    """The unchanged robot. All setups except `braked` ignore the brake."""
     return robot
 
 
@@ -49,7 +49,7 @@ def lifted(robot: Robot, brake: Scalar = 0.0) -> Robot:
 
 
 def bare(robot: Robot, brake: Scalar = 0.0) -> Robot:
-    """The motors with their gearboxes uncoupled; only supply, electrical and motor balances remain."""
+    """The motors with their gearboxes uncoupled. Only supply, electrical and motor balances remain."""
     losses = {f"{c}.track.loss_{kind}": 0.0 for c in robot.configurations for kind in ("coulomb", "viscous")}
     gear = {"gearbox.friction_coulomb": 0.0, "gearbox.friction_viscous": 0.0, "gearbox.efficiency_load": 1.0}
     return _with(without(lifted(robot), "gearbox", "track"), losses | gear)

@@ -34,11 +34,14 @@ class Smooth:
     """A smooth curve (or a wave) at the base fit, with the prior of the greatest evidence.
 
     Attributes:
-        effect, variable: name of the curve, and its variable; low, high: ends of its range; scale: its amplitude.
+        effect, variable: name of the curve, and its variable.
+        low, high: ends of its range.
+        scale: its amplitude.
         root: L of the prior covariance L Lᵀ of the ordinates, shape (ordinates, ordinates).
         start: ordinates in prior coordinates, y = L z, shape (ordinates,).
-        explained: decrease of χ²; freedom: effective number of parameters; evidence: twice the log of the marginal
-            likelihood over that without a curve [σ²].
+        explained: decrease of χ².
+        freedom: effective number of parameters.
+        evidence: twice the log of the marginal likelihood over that without a curve [σ²].
     """
 
     effect: str
@@ -120,14 +123,14 @@ def smooth_curve(linear: Linearization, balance: str, variable: str, counts: np.
         evidence = 0.5 * pull @ z - 0.5 * np.linalg.slogdet(information)[1]
         if evidence > best[0]:
             explained = 2 * pull @ z - z @ inner @ z
-            taken = float(np.trace(np.linalg.solve(information, inner)))
-            best = evidence, (scale, root, z, float(explained), taken, 2 * float(evidence))
+            degrees_taken = float(np.trace(np.linalg.solve(information, inner)))
+            best = evidence, (scale, root, z, float(explained), degrees_taken, 2 * float(evidence))
     name = f"wave_{balance}" if variable in ORDERS else f"curve_{balance}_{axis}"
     return Smooth(name, variable, low, high, *best[1])
 
 
 def _smoothness(length: float, happening: bool = False) -> np.ndarray:
-    """L of the prior covariance of the ordinates at a correlation length [spacings]; a temporary change is zero at
+    """L of the prior covariance of the ordinates at a correlation length [spacings]. A temporary change is zero at
     its ends."""
     distance = np.subtract.outer(np.arange(len(ORDINATES)), np.arange(len(ORDINATES)))
     across = np.linspace(-1.0, 1.0, len(ORDINATES))
@@ -146,7 +149,8 @@ class Surface:
 
     Attributes:
         columns: its signatures, scaled to the prior of the greatest evidence, shape (readings, terms).
-        explained: decrease of χ² [σ²]; evidence: as in `Smooth`.
+        explained: decrease of χ² [σ²].
+        evidence: as in `Smooth`.
     """
 
     columns: np.ndarray
@@ -159,7 +163,7 @@ def smooth_surface(
 ) -> Surface:
     """Discrepancy over two variables, as products of Legendre polynomials.
 
-    The prior sd of a term decreases with its degree; the common size has the greatest evidence.
+    The prior sd of a term decreases with its degree. The common size has the greatest evidence.
 
     Args:
         counts: True for included rows, shape (rows,).

@@ -1,4 +1,4 @@
-"""Bases of smooth curves over the rows; the search for a discrepancy that no effect explains uses them."""
+"""Bases of smooth curves over the rows. The search for a discrepancy that no effect explains uses them."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class Basis(eqx.Module):
 
     Attributes:
         columns: of each family, shape (families, rows, terms).
-        places: place of each family; all are balances, or all are channels.
+        places: place of each family. All are balances, or all are channels.
         variables: independent variable of each family.
     """
 
@@ -101,8 +101,8 @@ class Basis(eqx.Module):
         Families are computed one at a time, because each takes a copy of a balance's defects for histories.
         """
         of_channels = is_channel_place(self.places[0])
-        known, change = (linear.channels, linear.shown) if of_channels else (linear.probed, linear.columns)
-        places = jnp.asarray([known.index(place) for place in self.places])
+        places_known, change = (linear.channels, linear.shown) if of_channels else (linear.probed, linear.columns)
+        places = jnp.asarray([places_known.index(place) for place in self.places])
         return jax.lax.map(lambda family: change(*family), (places, self.columns))
 
 
@@ -110,12 +110,12 @@ Bases = tuple[Basis, ...]
 
 
 def is_channel_place(place: str) -> bool:
-    """True if a place is a channel, whose readings have an error; False if it is a balance."""
+    """True if a place is a channel, whose readings have an error, False if it is a balance."""
     return place not in (*BALANCES, *OF_TURNS) and place in channels.channel_names(channels.EVERY)
 
 
 def balance_of(place: str) -> str:
-    """The balance of a place; `sensor` for a channel."""
+    """The balance of a place, `sensor` for a channel."""
     return "sensor" if is_channel_place(place) else place
 
 
@@ -132,26 +132,26 @@ def place_signature(linear: Linearization, place: str, shapes: np.ndarray) -> np
 
 
 def scale_to_unit_range(x: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """x mapped linearly so that rows of positive weight span -1 to 1; zeros if x does not vary."""
+    """x mapped linearly so that rows of positive weight span -1 to 1. Zeros if x does not vary."""
     counting = x[weight > 0]
     low, high = counting.min(), counting.max()
     return np.clip((2 * x - low - high) / (high - low), -1, 1) if high - low > 1e-9 * max(abs(high), 1e-9) else 0 * x
 
 
 def balances_of(robot: Robot | None, among: Sequence[str] = BALANCES) -> Names:
-    """Balances of `among` that a robot has; all for None."""
+    """Balances of `among` that a robot has. All for None."""
     if robot is None:
         return tuple(among)
     return tuple(b for b in among if b not in absent_balances(robot))
 
 
 def channels_of(robot: Robot | None) -> tuple[Channel, ...]:
-    """Channels of a robot; for None, of the packaged one."""
+    """Channels of a robot. For None, of the packaged one."""
     return Layout.of(robot).channels
 
 
 def axes_of(robot: Robot | None) -> Names:
-    """Columns of conditions that are variables of a robot's curves; for None, of the packaged robot's."""
+    """Columns of conditions that are variables of a robot's curves. For None, of the packaged robot's."""
     axes = Layout.of(robot).axes
     return tuple(c for c in (SPEED, CURRENT, *EVERY_AXIS) if c in axes)
 
@@ -165,7 +165,7 @@ class Scope:
 
     @classmethod
     def of(cls, robot: Robot | None) -> Scope:
-        """All balances and conditions of a robot's straight travel; for None, of the packaged one."""
+        """All balances and conditions of a robot's straight travel. For None, of the packaged one."""
         return cls(balances_of(robot), axes_of(robot))
 
     def over(self, columns: Mapping[str, np.ndarray]) -> Scope:
@@ -196,10 +196,11 @@ def curve_families(
     time or order.
 
     Args:
-        columns: of the table, with fitted readings; weight: 0 for excluded rows, shape (rows,), or of points
-            (see `Linearization`).
-        robot: its channels and balances are searched; scope: None takes `Scope.of` the robot.
-        ways: of each point, shape (rows,); None: all forward.
+        columns: of the table, with fitted readings.
+        weight: 0 for excluded rows, shape (rows,), or of points (see `Linearization`).
+        robot: its channels and balances are searched.
+        scope: None takes `Scope.of` the robot.
+        ways: of each point, shape (rows,). None: all forward.
     """
     scope = (Scope.of(robot) if scope is None else scope).over(columns)
     balances = scope.balances
@@ -226,10 +227,14 @@ def curve_families(
         )
 
     names = [(balance, variable) for variable in over.values() for balance in balances]
-    shown = [(c.name, v) for c in channels_of(robot) for v in over if v in AXES or v == READ_BY.get(c.name)]
-    new = [n for n in shown if over[n[1]] == n[1]]
+    channel_variables = [
+        (c.name, v) for c in channels_of(robot) for v in over if v in AXES or v == READ_BY.get(c.name)
+    ]
+    new = [n for n in channel_variables if over[n[1]] == n[1]]
     # As above: a skipped curve is replaced by another of its channel, or else by the first.
-    read = [n if n in new else next((m for m in new if m[0] == n[0]), new[0]) for n in shown] if new else []
+    read = (
+        [n if n in new else next((m for m in new if m[0] == n[0]), new[0]) for n in channel_variables] if new else []
+    )
     groups = [
         (names, [curve(*n) for n in names]),
         (
@@ -244,7 +249,7 @@ def curve_families(
 def condition_polynomials(
     columns: Mapping[str, np.ndarray], weight: np.ndarray, scope: Scope, ways: Ways, place: str
 ) -> Float[np.ndarray, "points terms"]:
-    """Polynomials in all conditions for each configuration; arguments as in `curve_families`."""
+    """Polynomials in all conditions for each configuration. Arguments as in `curve_families`."""
     of_column = {column: variable for variable, column in VARIABLES.items()}
     of_column |= {CURRENT: "current", LOAD: "current"}  # its sign is also that of the torque that drives the shafts
     along = (in_travel_frame(place, of_column[c], np.asarray(columns[c]), ways.__getitem__)[0] for c in scope.axes)
@@ -270,7 +275,7 @@ class Window:
         return f"{self.axis} {self.low:.5g} to {self.high:.5g}"
 
     def holds(self, x: np.ndarray) -> np.ndarray:
-        """True for places of the axis in the window; its ends are rounded to five digits."""
+        """True for places of the axis in the window. Its ends are rounded to five digits."""
         slack = 1e-4 * max(abs(self.low), abs(self.high), 1e-9)
         return (x >= self.low - slack) & (x <= self.high + slack)
 
@@ -282,7 +287,7 @@ class Window:
 
 
 def window_from_name(variable: str) -> Window | None:
-    """Window that a variable's name describes; None if the name is no window's."""
+    """Window that a variable's name describes, None if the name is no window's."""
     match = re.fullmatch(rf"({'|'.join((*AXES, *LEVELS))}) (\S+) to (\S+)", variable)
     return None if match is None else Window(match[1], float(match[2]), float(match[3]))
 
@@ -296,11 +301,11 @@ def window_families(
 ) -> Bases:
     """Windows of time or of the order of runs, and levels of conditions, in each balance and channel.
 
-    Windows of time are at the same instants in all runs. Windows of the order are omitted if the conditions
-    explain the order.
+    Windows of time are at the same instants in all runs. Windows are omitted if the conditions explain time or order.
 
     Args:
-        columns: of the table; weight: 0 for excluded rows, shape (rows,).
+        columns: of the table.
+        weight: 0 for excluded rows, shape (rows,).
         robot, scope, ways: as in `curve_families`.
     """
     counts = weight > 0
@@ -313,7 +318,7 @@ def window_families(
         x = np.asarray(columns[VARIABLES[axis]], float)
         low, high = x[counts].min(), x[counts].max()
         # Consecutive runs then have similar conditions, and conditions have windows of their own.
-        sorted_runs = axis == "order" and order_collinearity(columns, weight, scope.axes) > COLLINEAR
+        sorted_runs = order_collinearity(columns, weight, scope.axes, VARIABLES[axis]) > COLLINEAR
         for share in WINDOWS:
             size = share * (high - low)
             for k in range(round(2 / share) - 1):
@@ -323,8 +328,8 @@ def window_families(
     for condition, (factor, _) in LEVELS.items():
         if VARIABLES[condition] not in scope.axes:
             continue
-        told = factor * np.asarray(columns[VARIABLES[condition]], float)
-        x, _ = in_travel_frame(SHAFTS, condition, told, facing.__getitem__)
+        values = factor * np.asarray(columns[VARIABLES[condition]], float)
+        x, _ = in_travel_frame(SHAFTS, condition, values, facing.__getitem__)
         levels = np.unique(x[counts])
         levels = levels if 2 < len(levels) <= MOST_LEVELS else levels[:0]
         offered += [(condition, x, counts & (x == level)) for level in levels]
@@ -363,8 +368,9 @@ def order_collinearity(
     and polynomials of the others and of their ranks.
 
     Args:
-        columns, weight: as in `curve_families`; axes: columns of the conditions, None: of the packaged robot's;
-            column: `order` or `time_s`.
+        columns, weight: as in `curve_families`.
+        axes: columns of the conditions, None: of the packaged robot's.
+        column: `order` or `time_s`.
     """
     counts = weight > 0
     x = np.asarray(columns[column], float)[counts]
@@ -387,20 +393,20 @@ def order_collinearity(
     terms = np.concatenate([np.zeros((len(x), 1)), *each], 1)
     # Without the means of each level: a matrix with a column for each level would be rows times rows.
     count = np.bincount(level)
-    inner, left = (v - (_level_sums(level, v) / count[:, None])[level] for v in (terms, x[:, None]))
+    inner, terms_left = (v - (_level_sums(level, v) / count[:, None])[level] for v in (terms, x[:, None]))
     ways, size, _ = np.linalg.svd(inner, full_matrices=False)
     ways = ways[:, size > len(x) * np.finfo(float).eps * np.linalg.norm(terms)]
-    left = left - ways @ (ways.T @ left)
+    terms_left = terms_left - ways @ (ways.T @ terms_left)
     terms_used = len(count) + ways.shape[1]
     freedom = (len(x) - 1) / max(len(x) - terms_used, 1)
-    return float(1 - freedom * np.sum(left**2) / np.sum((x - x.mean()) ** 2))
+    return float(1 - freedom * np.sum(terms_left**2) / np.sum((x - x.mean()) ** 2))
 
 
 def _level_sums(level: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Sum of the rows of each level, shape (levels, columns)."""
-    found = np.zeros((int(level.max()) + 1, values.shape[1]))
-    np.add.at(found, level, values)
-    return found
+    sums = np.zeros((int(level.max()) + 1, values.shape[1]))
+    np.add.at(sums, level, values)
+    return sums
 
 
 def wave_families(
@@ -413,7 +419,8 @@ def wave_families(
     and trend. If all runs are shorter, a wave has one amplitude and phase, as if all runs began at a mark.
 
     Args:
-        on_tracks: True for rows of a run on tracks; angle: of the driving shaft [rad]; shape (rows,).
+        on_tracks: True for rows of a run on tracks.
+        angle: of the driving shaft [rad], shape (rows,).
         rows: indices of each run's rows in the order of time, -1 beyond its last, shape (runs, samples).
         knots: rows between which a defect is linear, shape (runs, knots).
         robot: its balances are searched.
@@ -422,17 +429,17 @@ def wave_families(
     for word, (order, belted) in ORDERS.items():
         wave, pieces = np.zeros((2, len(angle), 2 * len(rows)))
         for k, row in enumerate(rows):
-            mine = row[row >= 0]
-            if len(mine) < 8 or (belted and not on_tracks[mine[0]]):
+            rows_of_wave = row[row >= 0]
+            if len(rows_of_wave) < 8 or (belted and not on_tracks[rows_of_wave[0]]):
                 continue
-            turned = order * angle[mine]
+            turned = order * angle[rows_of_wave]
             step = np.abs(np.diff(order * angle[knots[k]]))
             if not step.any() or np.median(step[step > 0]) > RESOLVED:
                 continue
             shape = np.stack([np.cos(turned), np.sin(turned)], 1)
-            pieces[mine, :2] = shape
+            pieces[rows_of_wave, :2] = shape
             if np.ptp(turned) >= 4 * np.pi:
-                wave[mine, 2 * k : 2 * k + 2] = shape
+                wave[rows_of_wave, 2 * k : 2 * k + 2] = shape
         if pieces.any():
             bases.append(wave if wave.any() else pieces)
             words.append(word)

@@ -32,7 +32,7 @@ TURN = "turn"
 
 
 def kind_in_words(by: str, joint: str = " and ") -> str:
-    """Name of a kind of blocks in words; `joint` joins two conditions."""
+    """Name of a kind of blocks in words. `joint` joins two conditions."""
     for one in ("motor_speed", "load_torque"):
         by = by.replace(one, one.replace("_", " "))
     return by.replace("_", joint)
@@ -76,9 +76,9 @@ def blocks_by_sharpness(runs: Runs) -> Columns:
 
 
 def blocks_of_kind(runs: Runs, by: str) -> Columns:
-    """Label → mask of its rows, for each block of `by`; empty if the data do not vary in it.
+    """Label → mask of its rows, for each block of `by`, empty if the data do not vary in it.
 
-    A run of a history in which the quantity changes is a block of its own; empty if it changes in all runs.
+    A run of a history in which the quantity changes is a block of its own, empty if it changes in all runs.
     """
     if by == TURN:
         return blocks_by_sharpness(runs) if runs.turns else {}
@@ -123,7 +123,7 @@ def predictable_blocks(runs: Runs, problem: Problem) -> dict[str, Columns]:
         informs[k].add(_configuration_of_parameter(follower, names))
     owned = [np.isin(names, list(owners)) for owners in informs if "" not in owners]
     kinds = {
-        kind: {label: m for label, m in by.items() if not any(m[mine].all() for mine in owned)}
+        kind: {label: m for label, m in by.items() if not any(m[block_rows].all() for block_rows in owned)}
         for kind, by in distinct_blocks(runs, problem.observe.blocks).items()
     }
     return {kind: by for kind, by in kinds.items() if by}
@@ -131,12 +131,12 @@ def predictable_blocks(runs: Runs, problem: Problem) -> dict[str, Columns]:
 
 def unpredictable_kinds(runs: Runs, problem: Problem) -> Names:
     """Kinds with at least one block that the other rows cannot predict."""
-    every, told = distinct_blocks(runs, problem.observe.blocks), predictable_blocks(runs, problem)
-    return tuple(kind for kind, by in every.items() if len(told.get(kind, {})) < len(by))
+    all_blocks, predictable = distinct_blocks(runs, problem.observe.blocks), predictable_blocks(runs, problem)
+    return tuple(kind for kind, by in all_blocks.items() if len(predictable.get(kind, {})) < len(by))
 
 
 def _configuration_of_parameter(parameter: str, configurations: np.ndarray) -> str:
-    """Configuration that a parameter belongs to, among those of a table's rows; empty for none."""
+    """Configuration that a parameter belongs to, among those of a table's rows, empty for none."""
     first = parameter.partition(".")[0]
     return first if first in configurations else ""
 
@@ -166,14 +166,17 @@ def hold_out_by_kind(problem: Problem, start: np.ndarray, masks: dict[str, Colum
     """Refit without each block of each kind in turn (with the given sds), and predict the omitted rows.
 
     Args:
-        problem: as fitted to all rows; start: its optimum.
-        masks: kind → label → mask, from `blocks_of_kind`; kinds without blocks are omitted from the result.
+        problem: as fitted to all rows.
+        start: its optimum.
+        masks: kind → label → mask, from `blocks_of_kind`. Kinds without blocks are omitted from the result.
     """
     answers = {}
     fits: dict[tuple[bytes, ...], refits.HeldOutFits] = {}  # shared by kinds that divide the rows in the same way
     for kind, by in masks.items():
         if by:
             parts = tuple(m.tobytes() for m in by.values())
-            seen = fits[parts] = fits.get(parts) or refits.hold_out_blocks(problem, start, list(by.values()))
-            answers[kind] = HeldOut(tuple(by), seen.block, seen.reading, seen.status, seen.z, seen.converged)
+            held_out = fits[parts] = fits.get(parts) or refits.hold_out_blocks(problem, start, list(by.values()))
+            answers[kind] = HeldOut(
+                tuple(by), held_out.block, held_out.reading, held_out.status, held_out.z, held_out.converged
+            )
     return answers

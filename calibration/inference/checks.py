@@ -10,14 +10,13 @@ from calibration.data.columns import SUPPLY
 from calibration.data.courses import applied_drive
 from calibration.data.input_errors import BadConfiguration, BadData, bound_text
 from calibration.data.runs import Runs
-from calibration.described import describe
 from calibration.inference import observers
 from calibration.inference.conduct import conduct_notes
 from calibration.inference.fit_notes import Remark
 from calibration.inference.lost_motion import lost_motion_notes
 from calibration.inference.noise import Noise
 from calibration.inference.ranges import check_ranges
-from calibration.inference.uninformative import computed_load, copied_channels, nothing_varies
+from calibration.inference.uninformative import copied_channels, nothing_varies
 from calibration.inference.unused import unexplained_torque_notes, unused_notes
 from mmrjax.errors import count_noun
 from mmrjax.model.robot import Robot
@@ -25,25 +24,32 @@ from mmrjax.model.signals import SLIDES, STATUSES
 
 
 def check_data(runs: Runs, robot: Robot, names: Sequence[str], noise: Noise) -> list[Remark | str]:
-    """Refuse data that cannot be fitted; return notes on data that can.
+    """Refuse data that cannot be fitted. Return notes on data that can.
 
     Raises:
         BadData: too few readings, a stuck channel, contradictory replicates, samples of one run under
             different conditions, a configuration that `robot` does not have, readings in other units.
         BadConfiguration: a free parameter of a configuration that has no rows.
     """
-    _check_configurations(runs, robot, names)
+    present = {robot.configurations.names[k] for k in np.unique(runs.configurations(robot))}
+    for name in names:
+        word = name.split(".")[0]
+        if word in robot.configurations and word not in present:
+            raise BadConfiguration(
+                f"--free {name}: {runs.source} has no {word} rows, so nothing measures it; "
+                f"add {word} runs or leave it fixed"
+            )
     _check_enough_readings(runs, names, noise)
     _check_motion(runs, noise)
-    said = [
+    remarks = [
         *runs.missing(),
         *_check_stuck_channels(runs),
         *observers.observer_kind(runs).check(runs, noise),
         *_constant_conditions(runs),
     ]
-    said += [*unused_notes(runs), *unexplained_torque_notes(runs)]
-    said += [*check_ranges(runs, robot), *_uninformative(runs, robot, noise)]
-    return [*said, *conduct_notes(runs, robot), *lost_motion_notes(runs, robot)]
+    remarks += [*unused_notes(runs), *unexplained_torque_notes(runs)]
+    remarks += [*check_ranges(runs, robot), *_uninformative(runs, robot, noise)]
+    return [*remarks, *conduct_notes(runs, robot), *lost_motion_notes(runs, robot)]
 
 
 #: Scatter of a speed over the scatter of its changes from row to row, up to which the speed is only noise.
@@ -57,9 +63,9 @@ def _check_motion(runs: Runs, noise: Noise) -> None:
         return
     driven = bool(applied_drive(runs).any())
     for k, channel in speeds:
-        shown = runs[channel.column][np.isfinite(runs[channel.column])]
-        scatter = float(np.std(np.diff(shown))) / 2**0.5 if len(shown) > 2 else 0.0
-        if np.std(shown) > WHITE * scatter or abs(np.mean(shown)) > WHITE * scatter:
+        readings = runs[channel.column][np.isfinite(runs[channel.column])]
+        scatter = float(np.std(np.diff(readings))) / 2**0.5 if len(readings) > 2 else 0.0
+        if np.std(readings) > WHITE * scatter or abs(np.mean(readings)) > WHITE * scatter:
             return
         if driven and scatter <= WHITE * float(np.nanmax(noise.sd[:, k])) / channel.factor:
             return
@@ -77,45 +83,36 @@ def _check_motion(runs: Runs, noise: Noise) -> None:
 
 
 def _uninformative(runs: Runs, robot: Robot, noise: Noise) -> list[Remark]:
-    """Notes on settled runs of one condition, and on channels computed from others; a computed load is refused."""
+    """Notes on settled runs of one condition, and on channels computed from others."""
     if runs.sampled or runs.turns:
         return []
-    if (computed := computed_load(runs)) is not None:
-        raise BadData(describe(computed))
     same = nothing_varies(runs, robot, noise)
     return [same] if same is not None else [*copied_channels(runs, robot)]
-
-
-def _check_configurations(runs: Runs, robot: Robot, names: Sequence[str]) -> None:
-    present = {robot.configurations.names[k] for k in np.unique(runs.configurations(robot))}
-    for name in names:
-        word = name.split(".")[0]
-        if word in robot.configurations and word not in present:
-            raise BadConfiguration(
-                f"--free {name}: {runs.source} has no {word} rows, so nothing measures it; "
-                f"add {word} runs or leave it fixed"
-            )
 
 
 def _check_enough_readings(runs: Runs, names: Sequence[str], noise: Noise) -> None:
     levels = int(noise.estimated.sum())
     readings = int(np.isfinite(runs.measured()).sum())
-    shown = sum(word != "no readings" for word in noise.source)
-    needed = max(2, -(-(len(names) + levels) // max(shown, 1)) + (levels > 0))
-    if readings >= needed * shown:
+    channels_with_readings = sum(word != "no readings" for word in noise.source)
+    needed = max(2, -(-(len(names) + levels) // max(channels_with_readings, 1)) + (levels > 0))
+    if readings >= needed * channels_with_readings:
         return
     also = f" and estimate {levels} noise levels" if levels else ""
     cure = "fix some with --fix, or state --noise" if levels else "fix some with --fix"
-    whole = readings == len(runs) * shown
+    is_complete = readings == len(runs) * channels_with_readings
     rows = count_noun(len(runs), "row")
-    have = f"{rows} of {shown} channels" if whole else f"{count_noun(readings, 'reading')} in {rows}"
-    least = f"{needed} rows" if whole else f"{needed * shown} readings"
+    have = (
+        f"{rows} of {channels_with_readings} channels"
+        if is_complete
+        else f"{count_noun(readings, 'reading')} in {rows}"
+    )
+    least = f"{needed} rows" if is_complete else f"{needed * channels_with_readings} readings"
     what = f"cannot fit {count_noun(len(names), 'parameter')}{also}" if names else "cannot be fitted"
     raise BadData(f"{runs.source}: {have} {what}; at least {least} are needed{f', or {cure}' if names else ''}")
 
 
 def _check_stuck_channels(runs: Runs) -> list[Remark]:
-    """Refuses a channel with one value under several conditions; returns notes for a motor voltage with one value."""
+    """Refuses a channel with one value under several conditions. Returns notes for a motor voltage with one value."""
     labels = () if runs.layout.complete else ("configuration", "surface")
     columns = [c for c in (*observers.observer_kind(runs).axes_of(runs), *labels) if runs.has(c)]
     varied = [np.unique(runs[c], return_inverse=True)[1] for c in columns]
@@ -164,8 +161,10 @@ def infeasible_error(
     """Error for rows that the model does not reach at the best point of all searches.
 
     Args:
-        robot: of that point; status: of each row there, shape (rows,).
-        lost: True for rows not reached, shape (rows,); names: of the free parameters.
+        robot: of that point.
+        status: of each row there, shape (rows,).
+        lost: True for rows not reached, shape (rows,).
+        names: of the free parameters.
     """
 
     def rows(which: np.ndarray) -> str:

@@ -10,7 +10,7 @@ from calibration.data import Columns, Json, Names
 
 @dataclasses.dataclass(frozen=True)
 class Detail(abc.ABC):
-    """Further findings of one kind of data; reports select their section by its type."""
+    """Further findings of one kind of data. Reports select their section by its type."""
 
     @abc.abstractmethod
     def to_json(self) -> Json:
@@ -45,7 +45,7 @@ class EquationDefects(Detail):
 class Memory:
     """Autocorrelation of the residuals: the Ljung-Box statistic as a normal deviate, with threshold and p.
 
-    Threshold and p are from bootstrap tables; `autocorrelation` is each channel's, at lags 1 to `lags`.
+    Threshold and p are from bootstrap tables. `autocorrelation` is each channel's, at lags 1 to `lags`.
     """
 
     deviate: float
@@ -66,7 +66,7 @@ class Strongest:
 
 @dataclasses.dataclass(frozen=True)
 class TimeSide:
-    """Statistics of one fit over time: memory; order (word, waves a turn of the driving shaft) → score; drift.
+    """Statistics of one fit over time: memory. Order (word, waves a turn of the driving shaft) → score, drift.
 
     Without drift if the other conditions determine the time (see `bases.COLLINEAR`).
     """
@@ -86,7 +86,8 @@ class TimeStatistics(Detail):
     """Statistics that only histories have.
 
     Attributes:
-        runs, samples: counts; orders_unresolved: waves that the samples do not resolve.
+        runs, samples: counts.
+        orders_unresolved: waves that the samples do not resolve.
         before, after: statistics of the base and of the proposed robot.
     """
 

@@ -55,17 +55,18 @@ def parameter_estimates(
 
     Args:
         posed, base: the problem, and the robot whose values are the prior means.
-        z: the optimum; beside: the optimum of the same problem with `steady`, or None.
+        z: the optimum.
+        beside: the optimum of the same problem with `steady`, or None.
         about, profile: the linear analysis there, and the profiles, if any.
-        sources: of priors other than the fields' own; scans: of the scanned coordinates, whose intervals are those
-            of their profiles.
+        sources: of priors other than the fields' own.
+        scans: of the scanned coordinates, whose intervals are those of their profiles.
     """
     coordinates = posed.coordinates
-    at, sd = np.asarray(z), np.asarray(about.sd)
-    value, slope = coordinates.value(at), np.asarray(coordinates.slope(at))
-    linear = np.stack([coordinates.value(at + side * Z95 * sd) for side in (-1, 1)], 1)
-    median = coordinates.value(np.zeros_like(at))
-    wide = np.stack([coordinates.value(np.full_like(at, side * Z95)) for side in (-1, 1)], 1)
+    point, sd = np.asarray(z), np.asarray(about.sd)
+    value, slope = coordinates.value(point), np.asarray(coordinates.slope(point))
+    linear = np.stack([coordinates.value(point + side * Z95 * sd) for side in (-1, 1)], 1)
+    median = coordinates.value(np.zeros_like(point))
+    wide = np.stack([coordinates.value(np.full_like(point, side * Z95)) for side in (-1, 1)], 1)
     other = None if beside is None else coordinates.value(np.asarray(beside))
     bound, fields = coordinates.beyond(z), priors.parameters_by_name(base)
     estimates = {}
@@ -77,7 +78,7 @@ def parameter_estimates(
             is_open = (bool(profile.open[k, 0]), bool(profile.open[k, 1]))
         if k in scans:
             shift, is_open = np.array(scans[k].interval()), scans[k].open()
-            ends = [np.where(np.arange(len(z)) == k, x, at) for x in shift]
+            ends = [np.where(np.arange(len(z)) == k, x, point) for x in shift]
             interval = np.array([coordinates.value(end)[k] for end in ends])
         estimates[name] = Estimate(
             value=float(value[k]),
@@ -133,7 +134,7 @@ def channel_noise(posed: Problem, known: Noise, shares: np.ndarray, measured: np
 def errors_by_channel(
     shown: Sequence[Channel], simulated: np.ndarray, measured: np.ndarray, sd: np.ndarray
 ) -> Errors:
-    """Errors by channel; arrays of shape (rows, channels)."""
+    """Errors by channel, arrays of shape (rows, channels)."""
     return _errors(shown, simulated, measured, sd, sized_error(simulated, measured))
 
 
@@ -177,7 +178,7 @@ def readings_by_channel(
     before: np.ndarray,
     after: np.ndarray,
 ) -> dict[str, ChannelReadings]:
-    """Readings by channel; arrays of shape (rows, channels), NaN for missing ones."""
+    """Readings by channel, arrays of shape (rows, channels), NaN for missing ones."""
     percent, sigma = sized_error(after, measured), (after - measured) / sd
     return {
         name: ChannelReadings(*(x[:, k] for x in (measured, sd, before, after, percent, sigma)))

@@ -35,12 +35,7 @@ MOVES = 0.03
 #: Least misfit of a straight law that a bend removes [share of the change of speed].
 LEAST = 0.05
 #: Ratio of a speed in a wrong unit to the rate of the position.
-WRONG_UNITS = {
-    60.0: "per minute", 1 / 60: "per second, and the position's clock in minutes", 2 * np.pi: "in radians",
-    1 / (2 * np.pi): "in rotations", 360.0: "in degrees", 1 / 360: "in rotations",
-    60 / (2 * np.pi): "in rotations per minute, and the position in radians", 1000.0: "in millimetres",
-    100.0: "in centimetres",
-}  # fmt: skip
+WRONG_UNITS = (60.0, 1 / 60, 2 * np.pi, 1 / (2 * np.pi), 360.0, 1 / 360, 60 / (2 * np.pi), 1000.0, 100.0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -154,8 +149,8 @@ def fit_feedforward(log: DriveLog, mechanism: str = "simple", tolerances: Tolera
         delay = 0.0
     if level:
         most = None if log.current is None else float(np.nanmax(np.abs(log.current)))
-        code = "feedforward_limit" if bend < 0 else "feedforward_skid"
-        remarks.append(Remark(code, level=level, current=most))
+        limited = Remark("feedforward_limit", level=level, current=most)
+        remarks.append(limited if bend < 0 else Remark("feedforward_skid", level=level))
     kept = _rows(windows, windows["demand"] < level) if level else windows
     values, covariance, _ = _fit(kept, mechanism)
     sds = np.sqrt(np.diag(covariance))
@@ -254,8 +249,8 @@ def _speeds(log: DriveLog) -> tuple[DriveLog, float, list[Remark]]:
         remarks.append(Remark("feedforward_speed_sign"))
     if abs(abs(ratio) - 1) > 0.05:
         near = min(WRONG_UNITS, key=lambda f: abs(np.log(abs(ratio) / f)))
-        meant = WRONG_UNITS[near] if abs(np.log(abs(ratio) / near)) < 0.03 else ""
-        remarks.append(Remark("feedforward_unit", ratio=abs(ratio), meant=meant))
+        known = abs(np.log(abs(ratio) / near)) < 0.03
+        remarks.append(Remark("feedforward_unit", ratio=abs(ratio), near=near if known else 0.0))
         speed = speed / abs(ratio)
     speed = speed * np.sign(ratio)
     lags = np.arange(0, LONGEST, step / 4)

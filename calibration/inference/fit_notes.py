@@ -12,11 +12,11 @@ from calibration.described import describe
 
 @dataclasses.dataclass(frozen=True, init=False)
 class Remark:
-    """A remark on a table or a result, as data; `mmrjax.describe` makes its sentence.
+    """A remark on a table or a result, as data. `mmrjax.describe` makes its sentence.
 
     Attributes:
         code: of its sentence in `calibration/words`.
-        values: of the sentence, by name; each is an attribute too.
+        values: of the sentence, by name. Each is an attribute too.
     """
 
     code: str
@@ -49,9 +49,10 @@ class Pair(NamedTuple):
     """Two parameters that the data determine only in combination.
 
     Attributes:
-        one, other: their names; correlation: of their posterior.
+        one, other: their names.
+        correlation: of their posterior.
         form: of the combination: their `ratio`, their `product`, or `linear`: `one` + `weight` · `other`.
-        weight: of `other` [unit of one / unit of other]; negative if the difference is determined.
+        weight: of `other` [unit of one / unit of other]. Negative if the difference is determined.
     """
 
     one: str
@@ -69,7 +70,8 @@ class Determination(NamedTuple):
     """Whether data determine a parameter.
 
     Attributes:
-        held: True if only its prior does; others: parameters that it is determined together with.
+        held: True if only its prior does.
+        others: parameters that it is determined together with.
     """
 
     held: bool
@@ -93,11 +95,13 @@ class Edge(NamedTuple):
 
 
 class Shown(NamedTuple):
-    """Finding of a test of adequacy; the order of the fields decides between equal p-values.
+    """Finding of a test of adequacy. The order of the fields decides between equal p-values.
 
     Attributes:
-        channel: of the residuals, "" for all; what: `repeats` or `stated` (residuals exceed the scatter of repeats
-            or the stated noise), `follow` a variable, or `remember` the previous sample; variable: column or name.
+        channel: of the residuals, "" for all.
+        what: `repeats` or `stated` (residuals exceed the scatter of repeats or the stated noise), `follow` a
+            variable, or `remember` the previous sample.
+        variable: column or name.
     """
 
     channel: str = ""

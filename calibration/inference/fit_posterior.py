@@ -39,7 +39,7 @@ def determined_together(posterior: Posterior, held: Collection[str] = ()) -> tup
     """Pairs of parameters with a posterior correlation beyond `TOGETHER`, strongest first, and their combination.
 
     Args:
-        held: names of parameters held by their priors; a pair of two of these is omitted. In a pair with one of them,
+        held: names of parameters held by their priors. A pair of two of these is omitted. In a pair with one of them,
             the other is known only as well as that prior, and the data determine only their combination.
     """
     sd = np.sqrt(np.diag(posterior.covariance))

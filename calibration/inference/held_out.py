@@ -22,11 +22,13 @@ def search_each(
     """Fits from several starts, each with its own weights.
 
     Args:
-        starts: coordinates; weights: of the readings, (rows, channels) each; active: sets of effects, None for a
-            problem without slots; most: largest number of steps of each, None for no limit.
+        starts: coordinates.
+        weights: of the readings, (rows, channels) each.
+        active: sets of effects, None for a problem without slots.
+        most: largest number of steps of each, None for no limit.
 
     Returns:
-        Optimum of each search and the model's observation there; the leading axis is the starts.
+        Optimum of each search and the model's observation there. The leading axis is the starts.
     """
     z, weight = (np.stack([np.asarray(x) for x in xs]) for xs in (starts, weights))
     which = None if active is None else np.stack([np.asarray(x) for x in active])
@@ -38,10 +40,12 @@ class HeldOutFits:
     """Fits without each block.
 
     Attributes:
-        reading: of each row by the fit without its block [SI], NaN if no block holds the row or the fit does not
-            reach it, shape (rows, channels); status: of each row, -1 if no block holds it.
-        block: index of each row's block, -1 for none; shape (rows,).
-        z: of each block's fit, shape (blocks, coordinates); converged: True if it is an optimum.
+        reading: of each row by the fit without its block [SI], NaN if no block holds the row or the fit does
+            not reach it, shape (rows, channels).
+        status: of each row, -1 if no block holds it.
+        block: index of each row's block, -1 for none, shape (rows,).
+        z: of each block's fit, shape (blocks, coordinates).
+        converged: True if it is an optimum.
     """
 
     reading: np.ndarray
@@ -57,26 +61,28 @@ def hold_out_blocks(
     """Refit without each block in turn, and predict the omitted rows.
 
     Args:
-        problem: as fitted to all rows; start: its optimum; active: its effects, for one with slots.
-        masks: of the rows of each block, shape (rows of the table,); the problem's rows may be padded beyond these.
+        problem: as fitted to all rows.
+        start: its optimum.
+        active: its effects, for one with slots.
+        masks: of the rows of each block, shape (rows of the table,). The problem's rows may be padded beyond these.
     """
     rows, weight = len(masks[0]), np.asarray(problem.data.weight)
     out = [np.concatenate([m, np.zeros(len(weight) - rows, bool)]) for m in masks]
     which = None if active is None else [active] * len(masks)
-    optima, seen = search_each(problem, [start] * len(masks), [weight * ~m[:, None] for m in out], which)
+    optima, observations = search_each(problem, [start] * len(masks), [weight * ~m[:, None] for m in out], which)
     reading, status = np.full((rows, weight.shape[1]), np.nan), np.full(rows, -1)
     block = np.full(rows, -1)
     for k, mask in enumerate(masks):
-        lost = problem.observe.unreachable(np.asarray(seen.status[k]))[:rows, None]
-        reading[mask] = np.where(lost, np.nan, seen.reading[k][:rows])[mask]
-        status[mask], block[mask] = seen.status[k][:rows][mask], k
+        lost = problem.observe.unreachable(np.asarray(observations.status[k]))[:rows, None]
+        reading[mask] = np.where(lost, np.nan, observations.reading[k][:rows])[mask]
+        status[mask], block[mask] = observations.status[k][:rows][mask], k
     return HeldOutFits(reading, status, block, np.asarray(optima.z), np.asarray(optima.converged))
 
 
 def predict_unseen(
     problem: Problem, start: np.ndarray, masks: Sequence[np.ndarray], active: Sequence[int] | None = None
 ) -> HeldOutFits:
-    """Hold-out fits as `hold_out_blocks`; for long runs each refit is one Gauss-Newton step from the fit to all rows.
+    """Hold-out fits as `hold_out_blocks`. For long runs each refit is one Gauss-Newton step from the fit to all rows.
 
     A log has hundreds of readings a parameter, and without one block a fit stays within the linear range.
     """
@@ -85,22 +91,24 @@ def predict_unseen(
     rows, start_values = len(masks[0]), np.asarray(start)
     out = [np.concatenate([m, np.zeros(len(problem.data.weight) - rows, bool)]) for m in masks]
     data = problem.data
-    residual, jacobian, seen = problem.observe.at(problem, start_values, active)
-    residual, jacobian, read = np.asarray(residual), np.asarray(jacobian), np.asarray(seen.reading)
+    residual, jacobian, observation = problem.observe.at(problem, start_values, active)
+    residual, jacobian, read = np.asarray(residual), np.asarray(jacobian), np.asarray(observation.reading)
     scale = np.asarray(data.weight / data.sd)
     count, size = scale.shape[1], scale.size
     slopes = jacobian[:size].reshape(*scale.shape, -1)
     with np.errstate(invalid="ignore", divide="ignore"):
         per_unit = np.where(scale[..., None] > 0, slopes / scale[..., None], 0.0)
-    lost = problem.observe.unreachable(np.asarray(seen.status))
+    lost = problem.observe.unreachable(np.asarray(observation.status))
     reading, status = np.full((rows, count), np.nan), np.full(rows, -1)
     block, z = np.full(rows, -1), np.tile(start_values, (len(out), 1))
     for k, mask in enumerate(out):
-        kept = np.concatenate([np.repeat(~mask, count), ~mask, np.ones(len(residual) - size - len(mask), bool)])
-        j = jacobian[kept]
-        step = -np.linalg.solve(j.T @ j, j.T @ residual[kept])
+        kept_residuals = np.concatenate(
+            [np.repeat(~mask, count), ~mask, np.ones(len(residual) - size - len(mask), bool)]
+        )
+        j = jacobian[kept_residuals]
+        step = -np.linalg.solve(j.T @ j, j.T @ residual[kept_residuals])
         z[k] += step
-        mine = mask[:rows]
-        reading[mine] = np.where(lost[:, None], np.nan, read + per_unit @ step)[:rows][mine]
-        status[mine], block[mine] = np.asarray(seen.status)[:rows][mine], k
+        held_rows = mask[:rows]
+        reading[held_rows] = np.where(lost[:, None], np.nan, read + per_unit @ step)[:rows][held_rows]
+        status[held_rows], block[held_rows] = np.asarray(observation.status)[:rows][held_rows], k
     return HeldOutFits(reading, status, block, z, np.ones(len(out), bool))

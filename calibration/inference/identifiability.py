@@ -40,13 +40,13 @@ class Identifiability:
 
     Attributes:
         names: of the parameters.
-        covariance: posterior, of z; shape (parameters, parameters).
+        covariance: posterior, of z, shape (parameters, parameters).
         sd: posterior sd of z, thus the square root of the posterior over the prior variance.
         singular_values: of the whitened Jacobian of the readings without priors: prior sd over data sd along each
-            direction, largest first; above 1 the data are more informative than the prior.
-        directions: right singular vectors, one a row; those beyond the rank as `separate_directions` returns them.
+            direction, largest first. Above 1 the data are more informative than the prior.
+        directions: right singular vectors, one a row. Those beyond the rank as `separate_directions` returns them.
         rank: number of singular values above 1e-8 of the largest.
-        sensitivity: norm of each column of that Jacobian: change of the readings by one prior sd, in data sds;
+        sensitivity: norm of each column of that Jacobian: change of the readings by one prior sd, in data sds,
             0 for a parameter that nothing measures.
         leverage: share of each reading's variance that the fit explains, shape (rows, channels).
         jacobian: of the whitened readings, row by row, shape (rows · channels, parameters).
@@ -99,11 +99,11 @@ def separate_directions(directions: np.ndarray) -> np.ndarray:
     Args:
         directions: orthonormal, shape (directions, parameters), as the result.
     """
-    left, separated = directions.T @ directions, np.zeros_like(directions)
+    projector, separated = directions.T @ directions, np.zeros_like(directions)
     for row in separated:
-        k = int(np.argmax(np.round(np.diag(left), 6)))
-        row[:] = left[k] / np.sqrt(left[k, k])
-        left = left - np.outer(row, row)
+        k = int(np.argmax(np.round(np.diag(projector), 6)))
+        row[:] = projector[k] / np.sqrt(projector[k, k])
+        projector = projector - np.outer(row, row)
     return separated
 
 
@@ -123,13 +123,13 @@ def analyse_identifiability(
     """
     data = problem.data if data is None else data
     if slope is not None:
-        whole, readings = np.concatenate([slope, np.eye(len(z))]), slope
+        all_slopes, readings = np.concatenate([slope, np.eye(len(z))]), slope
     elif problem.observe.long:
         jacobian = np.asarray(optimizers.linearise(problem, z, data)[1])
-        whole, readings = jacobian[optimizers.informative_residuals(data)], jacobian[: data.measured.size]
+        all_slopes, readings = jacobian[optimizers.informative_residuals(data)], jacobian[: data.measured.size]
     else:
-        whole, readings = (np.asarray(j) for j in _jacobians(optimizers.with_roots(problem, z), z, data))
-    _, s, v = np.linalg.svd(whole, full_matrices=False)
+        all_slopes, readings = (np.asarray(j) for j in _jacobians(optimizers.with_roots(problem, z), z, data))
+    _, s, v = np.linalg.svd(all_slopes, full_matrices=False)
     covariance = (v.T / s**2) @ v
     _, singular, directions = np.linalg.svd(readings, full_matrices=False)
     rank = int(np.sum(singular > 1e-8 * singular.max()))
@@ -156,9 +156,9 @@ class Profile:
         z: coordinate of the profiled parameter, shape (parameters, points), increasing.
         value: the parameter there [SI].
         rise: twice the objective's rise above the optimum [σ²], χ² with one degree of freedom.
-        low, high: ends of the 95 % interval, where the rise is 3.84 [SI]; shape (parameters,).
+        low, high: ends of the 95 % interval, where the rise is 3.84 [SI], shape (parameters,).
         open: True if an end is beyond the last point (the interval is at least that wide), (parameters, 2).
-        better: largest decrease below the given optimum among the refits [½σ²]; 0 if the optimum is the best.
+        better: largest decrease below the given optimum among the refits [½σ²], 0 if the optimum is the best.
     """
 
     z: np.ndarray
@@ -178,7 +178,7 @@ def _profiles(problem: Problem, data: Data, starts: Array, pins: Pin) -> optimiz
 def profile_likelihoods(
     problem: Problem, z: Array, cost: float, about: Identifiability, data: Data | None = None
 ) -> Profile:
-    """Profiles of all parameters; all points of all profiles are one vmapped batch of refits.
+    """Profiles of all parameters. All points of all profiles are one vmapped batch of refits.
 
     Each refit starts on the line along which the linear analysis moves the other parameters. The end of an
     interval is interpolated on the signed root of the rise, which is straight for a linear model.
@@ -205,6 +205,6 @@ def profile_likelihoods(
 
 
 def _interval_ends(at: np.ndarray, root: np.ndarray) -> tuple[float, float]:
-    """Coordinates where a profile's signed root reaches ∓Z95; its end points if it does not reach them."""
+    """Coordinates where a profile's signed root reaches ∓Z95. Its end points if it does not reach them."""
     rising = np.maximum.accumulate(root)
     return float(np.interp(-Z95, rising, at)), float(np.interp(Z95, rising, at))

@@ -41,7 +41,9 @@ def with_slope(y: Array, value: Array, slope: Array) -> Array:
     """Returns `value` with `slope` as its derivative by y.
 
     Args:
-        y: shape (n,); value: shape (m,); slope: shape (m, n).
+        y: shape (n,).
+        value: shape (m,).
+        slope: shape (m, n).
     """
     return value
 
@@ -71,7 +73,7 @@ def one_sided_step(r: Array, jacobian: Array, one_sided: slice, damping: Array |
     """Step to the optimum of a linearisation whose one-sided residuals count where they are positive.
 
     min_d ½ Σ (r + J d)² + ½ damping |d|², over the two-sided residuals and the one-sided ones that are positive at
-    its end; these are found iteratively (a semismooth Newton method). A step that assumed the residuals positive at
+    its end. These are found iteratively (a semismooth Newton method). A step that assumed the residuals positive at
     its start would cross a nearby edge, and predict a gain that does not exist.
 
     Args:
@@ -88,9 +90,9 @@ def one_sided_step(r: Array, jacobian: Array, one_sided: slice, damping: Array |
         turns, active, _, best, lowest = carry
         counts = edge * active[:, None]
         d = -solve(normal + counts.T @ counts, gradient + counts.T @ height)
-        beyond, here = height + edge @ d > 0, value(d)
-        better = here < lowest
-        return turns + 1, beyond, active, jnp.where(better, d, best), jnp.where(better, here, lowest)
+        beyond, values = height + edge @ d > 0, value(d)
+        better = values < lowest
+        return turns + 1, beyond, active, jnp.where(better, d, best), jnp.where(better, values, lowest)
 
     still = jnp.zeros(jacobian.shape[1])
 
@@ -171,21 +173,27 @@ def mixed_step(stride: Z, moved: Z, changed: Z) -> Z:
     d - θ (Δy + Δd), θ = d·Δd / |Δd|².
 
     Args:
-        stride: d, the step of the linearisation at y; moved: Δy, from the point before; changed: Δd, from the stride
-            there.
+        stride: d, the step of the linearisation at y.
+        moved: Δy, from the point before.
+        changed: Δd, from the stride there.
     """
     share = stride @ changed / jnp.maximum(changed @ changed, jnp.finfo(stride.dtype).tiny)
     return stride - jnp.clip(share, -MIXED_MOST, MIXED_MOST) * (moved + changed)
 
 
 class Searching(eqx.Module):
-    """State of a search between two steps; y, the best point so far, is kept by the caller of the solver.
+    """State of a search between two steps. y, the best point so far, is kept by the caller of the solver.
 
     Attributes:
-        found: linearisation at y; aux: auxiliary output of its evaluation; stride: step of the linearisation there.
-        ahead: point of the next evaluation; mixed: True if `mixed_step` leads there.
+        found: linearisation at y.
+        aux: auxiliary output of its evaluation.
+        stride: step of the linearisation there.
+        ahead: point of the next evaluation.
+        mixed: True if `mixed_step` leads there.
         region: state of the trust region.
-        steps: evaluations so far; rejected: those since y was found; over: True if the search has ended.
+        steps: evaluations so far.
+        rejected: those since y was found.
+        over: True if the search has ended.
     """
 
     found: Linearisation
@@ -200,20 +208,20 @@ class Searching(eqx.Module):
 
 
 class OneSidedLevenbergMarquardt(optx.AbstractLeastSquaresSolver[Z, Array, Any, Searching]):
-    """Levenberg-Marquardt for partly one-sided residuals; evaluates the function once a step.
+    """Levenberg-Marquardt for partly one-sided residuals. Evaluates the function once a step.
 
     A step is rejected, and the next one shortened, if the objective falls by less than `LITTLE` of the prediction.
     The next one may be longer if it falls by `NEARLY_ALL` of it. A `mixed_step` has to leave the same one-sided
-    residuals positive; after a rejected one the step of the linearisation alone is tried. A search ends if an
+    residuals positive. After a rejected one the step of the linearisation alone is tried. A search ends if an
     accepted step changes neither y nor any residual by more than the tolerances, or after `PATIENCE` rejected steps
     in a row. Each of those is a quarter of the one before, so that only rounding is left to gain (or a rollout's
     tolerance).
 
     Attributes:
         rtol, atol, norm: of the last step, as of optimistix's solvers.
-        first, last: the one-sided residuals are those from `first` up to `last`; the function returns them with their
+        first, last: the one-sided residuals are those from `first` up to `last`. The function returns them with their
             signs.
-        near: largest step that is mixed with the last one, `NEAR`; 0 for none.
+        near: largest step that is mixed with the last one, `NEAR`, 0 for none.
     """
 
     rtol: float

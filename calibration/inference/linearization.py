@@ -41,8 +41,8 @@ def balance_probe(whose: str) -> Effect:
         )
 
         def term(self, robot: Robot, signals: Signals) -> Scalar:
-            own = jnp.asarray(self.amplitude)
-            return jnp.where(signals.side > 0, own[0], own[1]) if own.ndim else own
+            amplitude = jnp.asarray(self.amplitude)
+            return jnp.where(signals.side > 0, amplitude[0], amplitude[1]) if amplitude.ndim else amplitude
 
     return Probe()
 
@@ -60,7 +60,7 @@ Scales = tuple[Scalar, Scalar, Scalar, Scalar, Scalar]
 def shape_scales(shape: Parameter | None) -> tuple[float, float, float, float, float]:
     """(value, spread, sd, low, high) of a shape parameter, value · exp(spread · z) + sd · z at coordinate z.
 
-    A phase is shifted, a scale multiplied; `shape_at` applies the bounds.
+    A phase is shifted, a scale multiplied. `shape_at` applies the bounds.
     """
     if shape is None:
         return 1.0, 0.0, 0.0, -math.inf, math.inf
@@ -93,7 +93,8 @@ class ScoredEffect(eqx.Module):
     Attributes:
         effect: of amplitude one sd.
         shape: name of its shape parameter, "" for none.
-        at: coordinates of the shape on the grid, in its sds; values: values of the shape there.
+        at: coordinates of the shape on the grid, in its sds.
+        values: values of the shape there.
     """
 
     effect: Effect
@@ -150,7 +151,7 @@ def effect_terms(robot: Robot, signals: Signals, effects: tuple[ScoredEffect, ..
     """Terms of effects in their balances at an instant, shape (instances,).
 
     Args:
-        memory: of each effect at each point of its grid; any number for an effect without memory.
+        memory: of each effect at each point of its grid. Any number for an effect without memory.
     """
 
     def term(effect: Effect, remembered: Array) -> Array:
@@ -173,10 +174,11 @@ class Linearization(eqx.Module):
             adhesion (1 a row), priors.
         jacobian: by the free coordinates, shape (residuals, coordinates).
         signatures: by each instance's amplitude in prior sds, shape (readings, instances).
-        defects: by a defect of each balance of `probed` [its unit]; further axes depend on the observer.
+        defects: by a defect of each balance of `probed` [its unit]. Further axes depend on the observer.
         scale: change of a whitened reading per unit of the reading [1/SI], 0 if excluded, shape (rows, channels).
         signals: of each row, at the fit.
-        channels: names of the readings' channels, in order; magnitudes: channels shown without a sign.
+        channels: names of the readings' channels, in order.
+        magnitudes: channels shown without a sign.
         probed: balances with known defects.
 
     A defect of a balance has a value at each point: one for each row, or for a robot with independently driven sides
@@ -218,29 +220,31 @@ class Linearization(eqx.Module):
         return self.rows
 
     def at_points(self, rows: np.ndarray) -> np.ndarray:
-        """Values by row, repeated at each point; shape (points,)."""
+        """Values by row, repeated at each point, shape (points,)."""
         return rows
 
     def of_rows(self, points: np.ndarray) -> np.ndarray:
-        """True for rows with at least one point in a mask; shape (rows,)."""
+        """True for rows with at least one point in a mask, shape (rows,)."""
         return points
 
     def columns(self, balance: Scalar | int, shapes: Array | np.ndarray) -> Float[Array, "readings terms"]:
-        """Change of the whitened readings by defects of a balance; each column is a defect over the points.
+        """Change of the whitened readings by defects of a balance. Each column is a defect over the points.
 
         Args:
-            balance: index into `probed`; shapes: shape (points, terms).
+            balance: index into `probed`.
+            shapes: shape (points, terms).
         """
         raise NotImplementedError
 
     def shown(self, channel: Scalar | int, shapes: Array | np.ndarray) -> Float[Array, "readings terms"]:
-        """Change of the whitened readings by errors of a channel's readings [SI]; each column is over the points.
+        """Change of the whitened readings by errors of a channel's readings [SI]. Each column is over the points.
 
         Args:
-            channel: position in the table of channels; shapes: shape (points, terms).
+            channel: position in the table of channels.
+            shapes: shape (points, terms).
         """
-        mine = self.scale * (np.arange(self.scale.shape[1]) == channel)
-        return (mine[:, :, None] * shapes[:, None, :]).reshape(-1, shapes.shape[1])
+        channel_scale = self.scale * (np.arange(self.scale.shape[1]) == channel)
+        return (channel_scale[:, :, None] * shapes[:, None, :]).reshape(-1, shapes.shape[1])
 
     def places(self) -> np.ndarray:
         """Indices of the rows with an identifiable defect of a single row."""
@@ -256,19 +260,19 @@ class Linearization(eqx.Module):
         return np.asarray(x), np.broadcast_to(way, (self.points,))
 
     def runs(self) -> list[np.ndarray]:
-        """Indices of the rows of each run; a settled run has one row."""
+        """Indices of the rows of each run. A settled run has one row."""
         return list(np.arange(self.rows)[:, None])
 
     def turned(self) -> np.ndarray | None:
-        """Angle of the driving shaft at each row since the start of its run [rad]; None for settled runs."""
+        """Angle of the driving shaft at each row since the start of its run [rad], None for settled runs."""
         return None
 
     def series(self) -> Float[Array, "runs samples channels"]:
-        """Whitened residuals of the readings of each run in the order of time; a settled row is a run."""
+        """Whitened residuals of the readings of each run in the order of time. A settled row is a run."""
         return self.by_row()[:, None]
 
     def memory(self) -> Array:
-        """Test of autocorrelation of the residuals, as a normal deviate; -inf if their order has no meaning."""
+        """Test of autocorrelation of the residuals, as a normal deviate. -inf if their order has no meaning."""
         return jnp.asarray(-jnp.inf)
 
 

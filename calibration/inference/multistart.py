@@ -40,7 +40,7 @@ class Starts:
         cost: objective of each [½σ²], shape (starts,).
         converged: True for converged searches.
         infeasible: number of starts where some row slides or fails.
-        z: end of each search, shape (starts, parameters); None if not kept.
+        z: end of each search, shape (starts, parameters), None if not kept.
     """
 
     cost: np.ndarray
@@ -81,7 +81,8 @@ class SearchResult:
     """Result of the searches.
 
     Attributes:
-        problem: with the noise (and stiffness) of the last round; best: its optimum.
+        problem: with the noise (and stiffness) of the last round.
+        best: its optimum.
         starts: outcome of the searches.
         shares: estimated sd of each channel as a share of its size, NaN if the sd was known.
         searched: the population that preceded the search, None without one.
@@ -95,27 +96,27 @@ class SearchResult:
 
 
 def unreachable_rows(posed: Problem, status: np.ndarray) -> np.ndarray:
-    """True for rows with readings for which the model has no operating point; shape of `status`, (..., rows)."""
+    """True for rows with readings for which the model has no operating point, shape of `status`, (..., rows)."""
     return posed.observe.unreachable(np.asarray(status)) & (np.asarray(posed.data.weight).max(1) > 0)
 
 
 def search_from_starts(
     posed: Problem, noise: Noise, points: np.ndarray, solver: optimizers.Solver | None = None
 ) -> SearchResult:
-    """Search from all points in one batch; where the noise is not known, estimate it and search again until it
+    """Search from all points in one batch. Where the noise is not known, estimate it and search again until it
     settles.
 
     The best optimum so far is one more start, so that every round runs the same compiled batch.
 
     Args:
-        solver: of optimistix; None for ours.
+        solver: of optimistix, None for ours.
     """
     by = functools.partial(optimizers.search_starts, solver=solver)
     z = points[0]
     shares = initial_noise_shares(noise)
     for _ in range(ROUNDS):
-        posed, found, feasible = _search_until_feasible(posed, np.concatenate([points, z[None]]), by)
-        best = _pick_member(found, int(np.nanargmin(found.cost)))
+        posed, optima, feasible = _search_until_feasible(posed, np.concatenate([points, z[None]]), by)
+        best = _pick_member(optima, int(np.nanargmin(optima.cost)))
         z = np.asarray(best.z)
         new = _reestimate_shares(posed, noise, z, shares)
         if new is None:
@@ -123,7 +124,7 @@ def search_from_starts(
         shares = new
         posed = _with_noise_shares(posed, noise, shares)
     return SearchResult(
-        posed, best, _outcome_of_searches(jax.tree.map(lambda x: x[:-1], found), feasible[:-1]), shares
+        posed, best, _outcome_of_searches(jax.tree.map(lambda x: x[:-1], optima), feasible[:-1]), shares
     )
 
 
@@ -139,8 +140,10 @@ def search_one_by_one(
     start once each. One that ends lower takes its place, and the noise settles again.
 
     Args:
-        posed: with the initial noise; shares: that noise as shares of the readings.
-        tell: callback for progress after every step; solver: of optimistix, None for ours.
+        posed: with the initial noise.
+        shares: that noise as shares of the readings.
+        tell: callback for progress after every step.
+        solver: of optimistix, None for ours.
     """
     begun = time.perf_counter()
 
@@ -155,36 +158,38 @@ def search_one_by_one(
                 posed, jnp.asarray(z), data, tell=lambda *done: tell(next_step("search", *done, minutes()))
             )
 
-        found, start, end = one(points[0])
-        found, end = scans.search_lower_basins(posed, (found, end), data, lambda z: one(z)[::2], tell)
-        found, start, end = jax.tree.map(lambda x: jnp.asarray(x)[None], (found, start, end))
-        return found, start.status, end.status
+        optima, start, end = one(points[0])
+        optima, end = scans.search_lower_basins(posed, (optima, end), data, lambda z: one(z)[::2], tell)
+        optima, start, end = jax.tree.map(lambda x: jnp.asarray(x)[None], (optima, start, end))
+        return optima, start.status, end.status
 
     first = points[0]
     for _ in range(len(points)):
         z = first
         for round_ in range(1, ROUNDS + 1):
-            posed, found, feasible = _search_until_feasible(posed, z[None], step)
-            z = np.asarray(found.z[0])
-            tell(next_step("round", round_, found.cost[0], found.steps[0], minutes()))
+            posed, optima, feasible = _search_until_feasible(posed, z[None], step)
+            z = np.asarray(optima.z[0])
+            tell(next_step("round", round_, optima.cost[0], optima.steps[0], minutes()))
             new = _reestimate_shares(posed, noise, z, shares)
             if new is None:
                 break
             shares = new
             posed = _with_noise_shares(posed, noise, shares)
-        ends, feasibles = [found], [feasible]
+        ends, feasibles = [optima], [feasible]
         for k, point in enumerate(points[1:], 2):
             end, status, _ = step(posed, point[None], posed.data)
             ends.append(end)
             feasibles.append(~np.any(unreachable_rows(posed, status), axis=1))
             tell(next_step("start", k, len(points), end.cost[0], end.steps[0], minutes()))
-        found = jax.tree.map(lambda *x: jnp.concatenate(x), *ends)
-        k = int(np.nanargmin(found.cost))
-        if not found.cost[k] < found.cost[0] - AGREE * (1 + found.cost[0]):
+        optima = jax.tree.map(lambda *x: jnp.concatenate(x), *ends)
+        k = int(np.nanargmin(optima.cost))
+        if not optima.cost[k] < optima.cost[0] - AGREE * (1 + optima.cost[0]):
             k = 0
             break
-        first = np.asarray(found.z[k])
-    return SearchResult(posed, _pick_member(found, k), _outcome_of_searches(found, np.concatenate(feasibles)), shares)
+        first = np.asarray(optima.z[k])
+    return SearchResult(
+        posed, _pick_member(optima, k), _outcome_of_searches(optima, np.concatenate(feasibles)), shares
+    )
 
 
 def starts_from_posterior(easy: Problem, z: np.ndarray, rng: np.random.Generator, count: int) -> np.ndarray:
@@ -220,12 +225,12 @@ def optimum_of_population(
     """What a population found, its best member searched on by gradients where those are to be trusted."""
     z = searched.found.z[searched.at]
     if searched.slope is None:
-        found = search_one_by_one(posed, noise, z[None], shares, tell, solver)
-        return dataclasses.replace(found, searched=searched)
-    seen = Observation(*(jnp.asarray(x[searched.at]) for x in (
+        optima = search_one_by_one(posed, noise, z[None], shares, tell, solver)
+        return dataclasses.replace(optima, searched=searched)
+    observation = Observation(*(jnp.asarray(x[searched.at]) for x in (
         searched.found.reading, searched.found.adhesion_used, searched.found.status, searched.found.flags,
     )))  # fmt: skip
-    error = np.concatenate([np.asarray(posed.whitened(seen, posed.data)), z - np.asarray(posed.data.centre)])
+    error = np.concatenate([np.asarray(posed.whitened(observation, posed.data)), z - np.asarray(posed.data.centre)])
     rows = np.zeros((posed.data.measured.shape[0], len(z)))  # of the penalty on adhesion
     best = optimizers.optimum_at_point(np.concatenate([searched.slope, rows, np.eye(len(z))]), error, z, posed.data)
     settled = np.array([searched.found.settled])
@@ -241,7 +246,7 @@ def reestimate_noise_at(posed: Problem, noise: Noise, searched: Population, at: 
 
 
 def initial_noise_shares(noise: Noise) -> np.ndarray:
-    """Initial estimated shares, NaN if the sd is known; shape (channels,)."""
+    """Initial estimated shares, NaN if the sd is known, shape (channels,)."""
     return np.where(noise.estimated, noise_room.START, np.nan)
 
 
@@ -255,7 +260,7 @@ def _outcome_of_searches(found: optimizers.Optimum, feasible: np.ndarray) -> Sta
 
 
 def _reestimate_shares(posed: Problem, noise: Noise, z: np.ndarray, shares: np.ndarray) -> np.ndarray | None:
-    """New estimates of the shares at z; None without unknown noise, or if the shares have settled."""
+    """New estimates of the shares at z, None without unknown noise, or if the shares have settled."""
     if not noise.estimated.any():
         return None
     new = _estimate_shares(posed, noise, z)
@@ -276,17 +281,17 @@ def _search_until_feasible(
         The problem, the searches, and True for feasible starts.
     """
     for _ in range(TIGHTENINGS + 1):
-        found, status_start, status_end = search(posed, jnp.asarray(points), posed.data)
-        k = int(np.nanargmin(found.cost))
+        optima, status_start, status_end = search(posed, jnp.asarray(points), posed.data)
+        k = int(np.nanargmin(optima.cost))
         if not unreachable_rows(posed, status_end)[k].any():
             break
         data = dataclasses.replace(posed.data, stiffness=posed.data.stiffness / 10)
         posed = dataclasses.replace(posed, data=data)
-    return posed, found, ~np.any(unreachable_rows(posed, status_start), axis=1)
+    return posed, optima, ~np.any(unreachable_rows(posed, status_start), axis=1)
 
 
 def _estimate_shares(posed: Problem, noise: Noise, z: np.ndarray) -> np.ndarray:
-    """Sd over size of each channel from the misfit, corrected for degrees of freedom; NaN if known.
+    """Sd over size of each channel from the misfit, corrected for degrees of freedom, NaN if known.
 
     s² = Σ (error / size)² / (readings - Σ leverage). It contains model error as well as noise, so a fit with it can't
     be tested for adequacy.
@@ -297,6 +302,6 @@ def _estimate_shares(posed: Problem, noise: Noise, z: np.ndarray) -> np.ndarray:
     error = np.asarray(optimizers.observe_at(posed, jnp.asarray(z)).reading - data.measured) / size
     error = np.where(weight > 0, error, 0.0)
     leverage = identifiability.analyse_identifiability(posed, jnp.asarray(z)).leverage
-    left = np.maximum(weight.sum(0) - leverage.sum(0), 1.0)
-    shares = np.maximum(np.sqrt(np.sum(error**2, 0) / left), series_noise.FLOOR)
+    freedom = np.maximum(weight.sum(0) - leverage.sum(0), 1.0)
+    shares = np.maximum(np.sqrt(np.sum(error**2, 0) / freedom), series_noise.FLOOR)
     return np.where(noise.estimated, shares, np.nan)

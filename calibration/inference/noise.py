@@ -32,7 +32,7 @@ class Noise:
 
     Attributes:
         channels: of the sds, in the order of arrays.
-        sd: [SI], shape (rows, channels); an initial guess if estimated, 1 for missing readings.
+        sd: [SI], shape (rows, channels). An initial guess if estimated, 1 for missing readings.
         estimated: True for channels with an sd to be estimated from the misfit, shape (channels,).
         source: one word a channel: `columns`, `stated`, `estimated`, `series`, `assumed`, or `no readings`.
         along_series: estimates, for channels with the source `series`.
@@ -56,7 +56,7 @@ class Noise:
 
     @property
     def freedom(self) -> Float[np.ndarray, " channels"]:
-        """Degrees of freedom of each channel's sd; infinite if it is stated or assumed."""
+        """Degrees of freedom of each channel's sd. Infinite if it is stated or assumed."""
         freedoms = {s.channel: s.freedom for s in self.along_series}
         return np.array([freedoms.get(c, np.inf) for c in self.channels])
 
@@ -73,7 +73,7 @@ def parse_noise(text: str, shown: tuple[Channel, ...]) -> dict[int, tuple[float,
         shown: the available channels.
 
     Returns:
-        Position of the channel → (number, True for a share of the reading); absolute numbers in SI.
+        Position of the channel → (number, True for a share of the reading). Absolute numbers in SI.
 
     Raises:
         BadConfiguration: an unknown channel, a number that is not positive, or another unit.
@@ -111,7 +111,7 @@ def noise_from_table(runs: Runs, sizes: np.ndarray, stated: str | None = None) -
     Known sds include the quantisation error of the instrument, `Instrument.variance`.
 
     Args:
-        sizes: reference size of each reading [SI] for shares, see `Observer.sizes`; shape (rows, channels).
+        sizes: reference size of each reading [SI] for shares, see `Observer.sizes`, shape (rows, channels).
         stated: as `parse_noise`.
 
     Raises:
@@ -168,13 +168,13 @@ def infer_noise(runs: Runs, sizes: np.ndarray, stated: str | None = None) -> Noi
         return given
     sd, words, series = given.sd.copy(), list(given.source), []
     guess = noise_from_table(runs, sizes, default_noise(runs.channels))
-    shown = (None,) * len(words) if runs.sampled else series_noise.estimate_noise(runs, sizes)
+    from_series = (None,) * len(words) if runs.sampled else series_noise.estimate_noise(runs, sizes)
     for k in np.flatnonzero(given.estimated):
-        found = shown[k]
-        if found is None:
+        estimate = from_series[k]
+        if estimate is None:
             sd[:, k], words[k] = guess.sd[:, k], "assumed"
         else:
-            sd[:, k] = np.where(np.isfinite(runs.measured()[:, k]), found.sd(sizes[:, k]), 1.0)
+            sd[:, k] = np.where(np.isfinite(runs.measured()[:, k]), estimate.sd(sizes[:, k]), 1.0)
             words[k] = "series"
-            series.append(found)
+            series.append(estimate)
     return Noise(runs.channels, sd, np.zeros(len(words), bool), tuple(words), tuple(series))

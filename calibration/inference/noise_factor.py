@@ -20,7 +20,7 @@ ALIKE = 1.3
 
 
 def noise_factors(fit: Residuals, level: float = LEVEL) -> dict[str, float]:
-    """Ratios of the residuals of each channel to its sds, if significant; empty if they have structure.
+    """Ratios of the residuals of each channel to its sds, if significant, empty if they have structure.
 
     Structure is tested with sds estimated from the misfit, so that it does not depend on the stated ones.
 
@@ -42,7 +42,7 @@ def noise_factors(fit: Residuals, level: float = LEVEL) -> dict[str, float]:
 
 
 def common_factors(fit: Residuals) -> dict[str, float]:
-    """`noise_factors` if every channel has the same one; empty otherwise, or with too few readings.
+    """`noise_factors` if every channel has the same one. Empty otherwise, or with too few readings.
 
     A model error affects some channels more than others. So structure has to be highly significant to refute a
     factor that is common to all channels.
@@ -59,7 +59,7 @@ def _is_common_factor(fit: Residuals, factors: dict[str, float]) -> bool:
 
 
 def noise_remarks(fit: Residuals, source: str = "stated") -> list[Remark]:
-    """Notes on sds that are wrong by a factor; `source` is the origin of the sds."""
+    """Notes on sds that are wrong by a factor. `source` is the origin of the sds."""
     factors = noise_factors(fit)
     if _is_common_factor(fit, factors):
         return [

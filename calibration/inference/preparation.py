@@ -30,11 +30,15 @@ class Prepared:
 
     Attributes:
         robot: with instruments, configurations and mass from the table, and the initial states of its runs.
-        observe: the kind of the data; noise: of the readings.
+        observe: the kind of the data.
+        noise: of the readings.
         stated: priors by name of parameter, (mean, sd) [SI].
         names: free parameters that were chosen, see `prepare`.
-        foreign: remarks on priors of another robot; checked: on the table; begins: on the beginnings of its runs;
-            weighed: on the masses that it states; doubted: on units that may be others.
+        foreign: remarks on priors of another robot.
+        checked: on the table.
+        begins: on the beginnings of its runs.
+        weighed: on the masses that it states.
+        doubted: on units that may be others.
     """
 
     robot: Robot
@@ -61,7 +65,8 @@ def prepare(
     """A table and a robot, prepared for any fit.
 
     Args:
-        noise: as `noise.parse_noise`; stated: parameter → (mean, sd) [SI], by the names that the user knows.
+        noise: as `noise.parse_noise`.
+        stated: parameter → (mean, sd) [SI], by the names that the user knows.
         assume: True to take a usual sd for a channel without one, False to let the fit estimate it.
         choose: function from the preparation to the names of the free parameters.
 
@@ -80,16 +85,16 @@ def prepare(
     own_mass.check_priors(priors, robot, runs)
     as_stated, weighed = robot, own_mass.mass_notes(robot, runs)
     robot = own_mass.with_table_mass(robot, runs)
-    known = (noise_room.infer_noise if assume else noise_room.noise_from_table)(runs, observe.sizes(runs), noise)
-    known, larger = repeats.enlarge_noise(known, runs)
-    robot = observe.with_initial_states(robot, runs, known)
-    found = Prepared(robot, observe, known, priors, (), (), (), (), tuple(weighed))
-    names = tuple(choose(found))
+    noise_sds = (noise_room.infer_noise if assume else noise_room.noise_from_table)(runs, observe.sizes(runs), noise)
+    noise_sds, larger = repeats.enlarge_noise(noise_sds, runs)
+    robot = observe.with_initial_states(robot, runs, noise_sds)
+    result = Prepared(robot, observe, noise_sds, priors, (), (), (), (), tuple(weighed))
+    names = tuple(choose(result))
     # The table's masses are compared with those of the file, which are not yet replaced there.
-    checked = checks.check_data(runs, as_stated, names, known)
-    begins = observe.check_start(runs, known, robot)
+    checked = checks.check_data(runs, as_stated, names, noise_sds)
+    begins = observe.check_start(runs, noise_sds, robot)
     return dataclasses.replace(
-        found,
+        result,
         names=names,
         foreign=tuple(inherited_priors(robot, priors)),
         checked=(*larger, *checked),

@@ -72,7 +72,7 @@ SOFTNESS = 0.05  # of a prior sd: the width over which a bound is rounded
 
 
 def clip_softly(u: Array, low: Array | np.ndarray, high: Array | np.ndarray, width: Array | np.ndarray) -> Array:
-    """u + w S((low - u)/w) - w S((u - high)/w), S softplus, within low and high; clipped there for w = 0."""
+    """u + w S((low - u)/w) - w S((u - high)/w), S softplus, within low and high. Clipped there for w = 0."""
     xp = np if isinstance(u, np.ndarray) else jnp
     w = xp.where(xp.asarray(width) > 0, width, 1.0)
     soft = u + w * xp.logaddexp((low - u) / w, 0.0) - w * xp.logaddexp((u - high) / w, 0.0)
@@ -92,9 +92,9 @@ class Coordinates(eqx.Module):
     parameter is held by its prior, which is on z and acts everywhere.
 
     Attributes:
-        location, spread, low, high: in units of θ, or of log θ for a scale; shape (parameters,).
+        location, spread, low, high: in units of θ, or of log θ for a scale, shape (parameters,).
         names, units, scale: of each parameter.
-        ratios: of each parameter tied to a free one, to that one; shape (followers,).
+        ratios: of each parameter tied to a free one, to that one, shape (followers,).
         followers: (its name, index of the free one) of each.
     """
 
@@ -118,7 +118,7 @@ class Coordinates(eqx.Module):
         return tuple((name, k, float(ratios[n])) for n, (name, k) in enumerate(self.followers))
 
     def value(self, z: Float[Array | np.ndarray, "... parameters"]) -> Any:
-        """Parameters θ [SI] at coordinates z; NumPy in, NumPy out."""
+        """Parameters θ [SI] at coordinates z. NumPy in, NumPy out."""
         xp, arrays = (np, jax.tree.map(np.asarray, self)) if isinstance(z, np.ndarray) else (jnp, self)
         u = clip_softly(arrays.location + arrays.spread * z, arrays.low, arrays.high, SOFTNESS * arrays.spread)
         return xp.where(xp.asarray(self.scale), xp.exp(u), u)
@@ -143,7 +143,7 @@ class Coordinates(eqx.Module):
         return params.replace(base, dict(zip(names, _numbers(self, z), strict=True)))
 
     def beyond(self, z: np.ndarray) -> np.ndarray:
-        """-1 or 1 if z is on or beyond its lower or upper bound, else 0; shape (parameters,)."""
+        """-1 or 1 if z is on or beyond its lower or upper bound, else 0, shape (parameters,)."""
         arrays = jax.tree.map(np.asarray, self)
         u = arrays.location + arrays.spread * z
         return np.where(u <= arrays.low, -1, np.where(u >= arrays.high, 1, 0))
@@ -171,7 +171,7 @@ def friction_names(robot: Robot, configuration: str) -> Names:
     """Friction parameters of a configuration that are free by default.
 
     Parameters that are zero, or that no channel can show, are fixed. The ground's friction shows in the speed, as
-    slip; in turns it shows in all channels.
+    slip. In turns it shows in all channels.
     """
     names = [*FRICTION, *SHAFT]
     if float(robot.configurations[configuration].on_tracks) > 0.5:
@@ -189,8 +189,8 @@ def _uncertain(robot: Robot, names: Iterable[str]) -> Names:
     """
     fields, exact = parameters_by_name(robot), robot.rig.exact
     stated = robot.rig.stated if robot.rig.inherits else {*robot.rig.stated, DELAY}
-    mine = (n for n in names if n in fields and n not in exact)
-    return tuple(n for n in mine if float(fields[n].value) != 0.0 or n in stated)
+    own_names = (n for n in names if n in fields and n not in exact)
+    return tuple(n for n in own_names if float(fields[n].value) != 0.0 or n in stated)
 
 
 def stated_names(robot: Robot, configurations: Iterable[str], idle: Names = ()) -> Names:
@@ -204,10 +204,10 @@ def stated_names(robot: Robot, configurations: Iterable[str], idle: Names = ()) 
     """
     others = set(robot.configurations) - set(configurations)
     fields = parameters_by_name(robot)  # a prior may be of an effect that the robot no longer has
-    mine = [
+    own_names = [
         n for n, _, sd in robot.rig.priors if sd > 0 and n in fields and n.partition(".")[0] not in {"rig", *others}
     ]
-    return _drive(robot, (n for n in mine if _leader(robot, n) is None and not n.endswith(idle)))
+    return _drive(robot, (n for n in own_names if _leader(robot, n) is None and not n.endswith(idle)))
 
 
 def delay_names(robot: Robot, names: Iterable[str]) -> Names:
@@ -221,7 +221,7 @@ def default_names(
     """Default set of free parameters for data of these configurations.
 
     Args:
-        computed: parameters of a configuration that the fidelity computes, see `fidelities.Facts`; the guide
+        computed: parameters of a configuration that the fidelity computes, see `fidelities.Facts`. The guide
             friction μ_t then replaces the guides' share.
         turns: True for data of turns.
     """
@@ -265,7 +265,8 @@ def free_names(
     """Parameters that the loop frees for data of these configurations, among them all that the file states with ±.
 
     Args:
-        drive, chassis: further parameters that the data determine, see `Observer.free`; idle: as of `stated_names`.
+        drive, chassis: further parameters that the data determine, see `Observer.free`.
+        idle: as of `stated_names`.
     """
     present = set(configurations)
     names = [
@@ -340,7 +341,7 @@ def with_guide_share(robot: Robot, configuration: str) -> tuple[Robot, dict[str,
 def choose_free_names(
     robot: Robot, default: Sequence[str], free: Sequence[str] = (), fix: Sequence[str] = ()
 ) -> Names:
-    """Names of the free parameters: `free` if it has any, else the default set; less `fix`.
+    """Names of the free parameters: `free` if it has any, else the default set, less `fix`.
 
     In `free`, `default` means the default set. A name that ends in `.*` means all parameters below it.
 
@@ -371,7 +372,7 @@ def expand_name(word: str, everything: list[str], option: str) -> list[str]:
     """Parameters that a word names: one, or with `.*` at its end all below it.
 
     Raises:
-        BadConfiguration: no parameter of that name; the message has the option and the choices.
+        BadConfiguration: no parameter of that name. The message has the option and the choices.
     """
     if word.endswith(".*"):
         below = [n for n in everything if n.startswith(word[:-1])]
@@ -444,12 +445,12 @@ def parameter_coordinates(
     Args:
         robot: its values are the prior means (medians for scales).
         names: of the free parameters, from `choose_free_names`.
-        stated: name → (mean, sd) [SI]; these take precedence over the file's (`Rig.priors`), and those over the
+        stated: name → (mean, sd) [SI]. These take precedence over the file's (`Rig.priors`), and those over the
             fields'.
         any_surface: True for the priors of `SURFACE` on ground friction without a stated prior.
 
     Raises:
-        BadConfiguration: a stated prior for an unknown or a fixed parameter; a mean out of bounds; or a free
+        BadConfiguration: a stated prior for an unknown or a fixed parameter. A mean out of bounds, or a free
             parameter with a prior of zero width (nominal value 0 with a relative sd, or stated as exact).
     """
     stated = stated or {}

@@ -32,7 +32,7 @@ class Observation(eqx.Module):
 
     Attributes:
         reading: of each channel [SI], shape (rows, channels).
-        adhesion_used: demand on adhesion over its limit [-], 0 if irrelevant; shape (rows,).
+        adhesion_used: demand on adhesion over its limit [-], 0 if irrelevant, shape (rows,).
         status, flags: of the row's run, shape (rows,).
     """
 
@@ -43,14 +43,14 @@ class Observation(eqx.Module):
 
 
 class Data(eqx.Module):
-    """Readings and their weights; the part of a problem that varies between refits.
+    """Readings and their weights. The part of a problem that varies between refits.
 
     Attributes:
-        measured, sd: of each channel [SI], shape (rows, channels); arbitrary for missing readings.
+        measured, sd: of each channel [SI], shape (rows, channels). Arbitrary for missing readings.
         weight: 1 for a fitted reading, 0 for a held-out or missing one, shape (rows, channels).
-        centre: prior mean of z, shape (parameters,); 0 except in a bootstrap, which draws the bench
+        centre: prior mean of z, shape (parameters,), 0 except in a bootstrap, which draws the bench
             values too.
-        stiffness: of the penalty on adhesion, see `Problem`; shape ().
+        stiffness: of the penalty on adhesion, see `Problem`, shape ().
     """
 
     measured: Float[Array, "rows channels"]
@@ -64,7 +64,8 @@ def data_from_readings(measured: np.ndarray, sd: np.ndarray, parameters: int) ->
     """Data of a table in which every reading that is present has full weight.
 
     Args:
-        measured: [SI], NaN for missing readings; sd: of each, shapes (rows, channels).
+        measured: [SI], NaN for missing readings.
+        sd: of each, shapes (rows, channels).
         parameters: number of free parameters.
     """
     finite = np.isfinite(measured)
@@ -80,7 +81,7 @@ def data_from_readings(measured: np.ndarray, sd: np.ndarray, parameters: int) ->
 class Problem(eqx.Module):
     """Maximum a posteriori over z: minimise half the sum of squared residuals.
 
-    Residuals: (simulated - measured) / sd for each reading; z - centre for each free parameter; and, for a
+    Residuals: (simulated - measured) / sd for each reading. z - centre for each free parameter, and, for a
     settled row with a demand on adhesion above 1 - MARGIN of its limit, the excess over `stiffness`.
 
     Steady travel does not exist beyond the limit (status `slides`), yet the robot was measured
@@ -108,11 +109,11 @@ class Problem(eqx.Module):
         return self.observe(self.coordinates.robot(self.base, z))
 
     def misfit(self, z: Float[Array, " parameters"], data: Data) -> Float[Array, " residuals"]:
-        """Whitened residuals of the readings, then of adhesion; shape (rows (channels + 1),)."""
+        """Whitened residuals of the readings, then of adhesion, shape (rows (channels + 1),)."""
         return self.whitened(self.observation(z), data)
 
     def whitened(self, seen: Observation, data: Data) -> Float[Array, " residuals"]:
-        """Whitened residuals of an observation: readings, then adhesion; shape (rows (channels + 1),)."""
+        """Whitened residuals of an observation: readings, then adhesion, shape (rows (channels + 1),)."""
         error = (seen.reading - data.measured) / data.sd
         error = data.weight * jnp.where(jnp.isfinite(error), error, MISSING)
         return jnp.concatenate([error.ravel(), jax.nn.relu(self.excess(seen, data))])
@@ -127,36 +128,36 @@ class Problem(eqx.Module):
         """Residuals of a robot that depends on x, and their slopes, by one evaluation.
 
         Returns:
-            Residuals of readings, then of adhesion with their signs; their Jacobian by x; the observation; and the
+            Residuals of readings, then of adhesion with their signs. Their Jacobian by x. The observation, and the
             signals of each row, if the observer solves its equations (`Observer.solve`).
         """
         solved = self.observe.solve(robot(x)) if self.roots is None else self.roots
         if solved is None:
 
             def explicit(x: Array) -> tuple[Array, tuple[Array, Observation]]:
-                seen = self.observe(robot(x))
-                r = self.signed(seen, data)
-                return r, (r, seen)
+                observation = self.observe(robot(x))
+                r = self.signed(observation, data)
+                return r, (r, observation)
 
-            jacobian, (r, seen) = jax.jacfwd(explicit, has_aux=True)(x)
-            return r, jacobian, seen, None
+            jacobian, (r, observed) = jax.jacfwd(explicit, has_aux=True)(x)
+            return r, jacobian, observed, None
 
-        unknowns, found = solved
+        unknowns, was_found = solved
         size, (rows, count) = x.size, data.measured.shape
 
         def shown(x: Array) -> tuple[tuple[Array, Array], tuple[Array, Observation, Signals]]:
-            seen, signals, left = self.observe.shown(robot(x[:size]), unknowns + x[size:], found)
-            r = self.signed(seen, data)
-            return (r, left), (r, seen, signals)
+            observation, signals, left = self.observe.shown(robot(x[:size]), unknowns + x[size:], was_found)
+            r = self.signed(observation, data)
+            return (r, left), (r, observation, signals)
 
         wide = jnp.concatenate([x, jnp.zeros(unknowns.shape[1])])
-        (slope, left), (r, seen, signals) = jax.jacfwd(shown, has_aux=True)(wide)
+        (slope, left), (r, observed, signals) = jax.jacfwd(shown, has_aux=True)(wide)
         by_row = slope[: rows * count].reshape(rows, count, -1)
         by_row = implicit_slopes(jnp.concatenate([by_row, slope[rows * count :, None]], 1), left)
-        return r, jnp.concatenate([by_row[:, :count].reshape(-1, size), by_row[:, count]]), seen, signals
+        return r, jnp.concatenate([by_row[:, :count].reshape(-1, size), by_row[:, count]]), observed, signals
 
     def excess(self, seen: Observation, data: Data) -> Float[Array, " rows"]:
-        """Demand on adhesion above its margin, in units of the penalty; negative if a row leaves some."""
+        """Demand on adhesion above its margin, in units of the penalty. Negative if a row leaves some."""
         over = (seen.adhesion_used - (1 - MARGIN)) * jnp.max(data.weight, 1) / data.stiffness
         return jnp.where(jnp.isfinite(over), over, 0.0)
 

@@ -36,8 +36,9 @@ class Prior:
 
     Attributes:
         family: `normal` or `log-normal`.
-        median: [SI]; interval: that holds 95 % [SI].
-        source: source of a field, in words; else a row of `fit_words.PRIORS`, or `stated`.
+        median: [SI].
+        interval: that holds 95 % [SI].
+        source: source of a field, in words, else a row of `fit_words.PRIORS`, or `stated`.
     """
 
     family: str
@@ -68,7 +69,8 @@ class SteadyEstimate:
     """A parameter at the optimum of the same problem with `steady`.
 
     Attributes:
-        value: there [SI]; apart_in_sd: distance of the estimate from it [posterior sd].
+        value: there [SI].
+        apart_in_sd: distance of the estimate from it [posterior sd].
     """
 
     value: float
@@ -87,12 +89,15 @@ class Estimate:
     """Estimate of one free parameter.
 
     Attributes:
-        value: at the optimum; sd: posterior, linear; both [unit].
-        interval: of 95 %, from the profile if there is one; interval_linear: from the sd only [unit].
+        value: at the optimum.
+        sd: posterior, linear, both [unit].
+        interval: of 95 %, from the profile if there is one.
+        interval_linear: from the sd only [unit].
         interval_open: True if an end is beyond the last point of the profile.
         interval_shift: the ends of `interval` in prior sds from the prior's median.
         unit, meaning: of its field.
-        prior: before the fit; shift: of the value from the prior's median [prior sd].
+        prior: before the fit.
+        shift: of the value from the prior's median [prior sd].
         variance_ratio: posterior over prior variance [-].
         held_by_prior: True if it is, see `identifiability.held_by_prior`.
         at_bound: `lower`, `upper` or None.
@@ -120,8 +125,8 @@ class Estimate:
 
     def to_json(self) -> Json:
         """Entry of `parameters` in result.json."""
-        found = {name: getattr(self, name) for name in ENTRIES} | {"shift_in_prior_sd": self.shift}
-        return found if self.with_steady is None else {**found, "with_steady": self.with_steady}
+        entries = {name: getattr(self, name) for name in ENTRIES} | {"shift_in_prior_sd": self.shift}
+        return entries if self.with_steady is None else {**entries, "with_steady": self.with_steady}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -139,7 +144,7 @@ class ChannelNoise:
     Attributes:
         source: `stated`, `columns`, `estimated` (from the misfit), or `no readings`.
         median_percent: median over the readings of sd over reading.
-        estimated_percent: as a share of the channel's size, see `Observer.sizes`; None unless estimated.
+        estimated_percent: as a share of the channel's size, see `Observer.sizes`, None unless estimated.
     """
 
     source: str
@@ -153,7 +158,8 @@ class ChannelErrors:
 
     Attributes:
         rows: number of rows.
-        rms_percent, max_percent: of the channel's measured rms; rms_sigma: in sds of the noise.
+        rms_percent, max_percent: of the channel's measured rms.
+        rms_sigma: in sds of the noise.
         rms: in the channel's unit.
     """
 
@@ -180,7 +186,8 @@ class Block:
     """One held-out block.
 
     Attributes:
-        errors: of its rows; unreachable_rows: those that the fit without it does not reach, counted from 1.
+        errors: of its rows.
+        unreachable_rows: those that the fit without it does not reach, counted from 1.
         converged: True if that fit converged.
     """
 
@@ -202,7 +209,8 @@ class HeldOut:
     """Hold-out predictions of all rows by fits without their block, for one kind of blocks.
 
     Attributes:
-        errors: of all rows; unreachable_rows: those without a prediction, counted from 1.
+        errors: of all rows.
+        unreachable_rows: those without a prediction, counted from 1.
         blocks: by label.
         reading: by channel [SI], NaN if the fit's robot does not reach the row, shape (rows,).
     """
@@ -219,7 +227,8 @@ class ChannelReadings:
     """Readings of one channel, all arrays of shape (rows,).
 
     Attributes:
-        measured: [SI], NaN if missing; sd: of each.
+        measured: [SI], NaN if missing.
+        sd: of each.
         before, after: of the robot as given and as calibrated [SI], NaN if it does not reach the row.
         percent, sigma: errors after.
     """
@@ -247,24 +256,33 @@ class ChiSquare:
 
 @dataclasses.dataclass(frozen=True)
 class CalibrationResult:
-    """Result of `calibrate`; all files and figures are made from it.
+    """Result of `calibrate`. All files and figures are made from it.
 
     Attributes:
         robot: calibrated.
-        source: of the runs; channels: of the readings, in order; model: the fidelity; seed: of the starts.
-        parameters: the free ones, by name; tied: those tied to them, by name.
+        source: of the runs.
+        channels: of the readings, in order.
+        model: the fidelity.
+        seed: of the starts.
+        parameters: the free ones, by name.
+        tied: those tied to them, by name.
         noise: by channel.
         axis: column that orders the rows of a run.
         errors_before, errors_after: of the robot as given and as calibrated, by channel.
         held_out: by kind of block, the most informative first.
-        conditions: columns of the runs, as in their table; readings: by channel.
+        conditions: columns of the runs, as in their table.
+        readings: by channel.
         status_before, status: word of each row, shape (rows,).
         adhesion_used: by the calibrated robot [-], shape (rows,).
-        objective: at the optimum [½σ²]; converged: True if the search converged.
-        starts: outcome of all searches; searched: the population before them, None without.
-        chi_square: of the finite readings; adequacy: tests whether the residuals are consistent with noise.
+        objective: at the optimum [½σ²].
+        converged: True if the search converged.
+        starts: outcome of all searches.
+        searched: the population before them, None without.
+        chi_square: of the finite readings.
+        adequacy: tests whether the residuals are consistent with noise.
         residual_clusters: clusters of the residuals by columns without a role.
-        identifiability: the linear analysis; posterior: of the free parameters.
+        identifiability: the linear analysis.
+        posterior: of the free parameters.
         remarks: notes to read before the result is used.
     """
 
@@ -338,11 +356,11 @@ class CalibrationResult:
     def held_out_alike(self) -> dict[str, Names]:
         """Distinct kinds of blocks, each with the later kinds that predict every row in the same way (to 1 % of a
         reading's sd)."""
-        found: dict[str, Names] = {}
+        groups: dict[str, Names] = {}
         for kind, held in self.held_out.items():
-            like = next((k for k in found if self._same(self.held_out[k], held)), None)
-            found |= {kind: ()} if like is None else {like: (*found[like], kind)}
-        return found
+            like = next((k for k in groups if self._same(self.held_out[k], held)), None)
+            groups |= {kind: ()} if like is None else {like: (*groups[like], kind)}
+        return groups
 
     def _same(self, one: HeldOut, other: HeldOut) -> bool:
         return all(

@@ -2,7 +2,7 @@
 
 Along a series, rows that differ in one condition only, a model's readings are smooth. The difference of a reading
 from the line between its neighbours is noise, plus curvature if the steps are wide. So the estimate may be too
-large, never too small (second differences: von Neumann, Ann. Math. Stat. 12 (1941); Gasser, Sroka and
+large, never too small (second differences: von Neumann, Ann. Math. Stat. 12 (1941). Gasser, Sroka and
 Jennen-Steinmetz, Biometrika 73 (1986), for any spacing).
 """
 
@@ -40,9 +40,12 @@ class SeriesNoise:
     """Noise of a channel.
 
     Attributes:
-        channel: its channel; floor: constant part of the sd [SI]; share: part in proportion to the reading [-];
-            they add as squares.
-        freedom: degrees of freedom of the estimate; axis: column along which the series are; count: number of series.
+        channel: its channel.
+        floor: constant part of the sd [SI].
+        share: part in proportion to the reading [-]. They add as squares.
+        freedom: degrees of freedom of the estimate.
+        axis: column along which the series are.
+        count: number of series.
         least: sd of rounding by the step of the display [SI].
     """
 
@@ -60,7 +63,7 @@ class SeriesNoise:
 
 
 def estimate_noise(runs: Runs, sizes: Float[np.ndarray, "rows channels"]) -> tuple[SeriesNoise | None, ...]:
-    """Noise of each channel; None if too few rows are along series.
+    """Noise of each channel, None if too few rows are along series.
 
     Args:
         sizes: reference size of each reading for shares [SI].
@@ -77,7 +80,7 @@ def estimate_noise(runs: Runs, sizes: Float[np.ndarray, "rows channels"]) -> tup
 
 
 def series_along(runs: Runs, axis: str) -> list[np.ndarray]:
-    """Rows of each series along an axis, three or more; backward travel is a separate series.
+    """Rows of each series along an axis, three or more. Backward travel is a separate series.
 
     Voltages that differ only by the sag of the supply are the same level.
     """
@@ -99,7 +102,7 @@ def series_along(runs: Runs, axis: str) -> list[np.ndarray]:
 def without_sag(voltage: np.ndarray) -> np.ndarray:
     """Level of each voltage: the largest of its group.
 
-    Groups are narrower than `SAG` and than a third of the distance to the next; without such groups each voltage is
+    Groups are narrower than `SAG` and than a third of the distance to the next. Without such groups each voltage is
     its own level.
     """
     levels = np.unique(voltage)
@@ -118,9 +121,10 @@ def _noise_of_channel(
     """Noise as a mixture of two forms, a constant sd and a share of the reading, by their likelihood.
 
     A few series do not decide between the forms, and a pure share would give the smallest readings a far too large
-    weight. With four series of five, its smallest sd is too small by a factor of 3.7 in one table of twenty; the
-    mixture's is too small by 2.2.
+    weight. With four series of five, its smallest sd is too small by a factor of 3.7 in one table of twenty. The
+    mixture's is too small by 2.2. Motors at rest show 0 without noise, so such readings do not count.
     """
+    measured = np.where(channel.zero_at_rest & (measured == 0), np.nan, measured)
     weights, used = _differences(measured, x, series)
     if not used:
         return None
@@ -147,7 +151,7 @@ def _noise_of_channel(
 
 def _differences(measured: np.ndarray, x: np.ndarray, series: list[np.ndarray]) -> tuple[sparse.csr_array, int]:
     """Difference of each reading from the line between its neighbours, as weights of all readings, shape
-    (differences, rows); and the number of series with any."""
+    (differences, rows), and the number of series with any."""
     differences, used = [], 0
     for rows in series:
         rows = rows[np.isfinite(measured[rows])]
@@ -157,13 +161,13 @@ def _differences(measured: np.ndarray, x: np.ndarray, series: list[np.ndarray]) 
         share = np.where(wide > 0, (x[after] - x[middle]) / np.where(wide > 0, wide, 1.0), 0.5)
         k = np.tile(np.arange(len(middle)), 3)
         weights = np.concatenate([-share, np.ones(len(middle)), share - 1.0])
-        at = k, np.concatenate([before, middle, after])
-        differences.append(sparse.csr_array((weights, at), (len(middle), len(measured))))
+        second_differences = k, np.concatenate([before, middle, after])
+        differences.append(sparse.csr_array((weights, second_differences), (len(middle), len(measured))))
         used += bool(len(middle))
     return sparse.csr_array(sparse.vstack(differences)) if differences else sparse.csr_array((0, len(measured))), used
 
 
 def _without_wrong_readings(unit: np.ndarray) -> np.ndarray:
-    """True for differences without a wrong reading; all True if too many would be wrong."""
+    """True for differences without a wrong reading. All True if too many would be wrong."""
     sound = np.abs(unit) <= WRONG * 1.4826 * np.median(np.abs(unit))
     return sound if np.mean(~sound) <= MOST else np.ones(len(unit), bool)

@@ -58,8 +58,9 @@ class Plan(eqx.Module):
 
     Attributes:
         current: index of the channel of the current, -1 if it follows from an imposed quantity.
-        motion: index of the channel of the motion, -1 if it is imposed; angle: True if it is an angle, which enters
-            integrated twice; travels: True for motion of the load, not of a shaft.
+        motion: index of the channel of the motion, -1 if it is imposed.
+        angle: True if it is an angle, which enters integrated twice.
+        travels: True for motion of the load, not of a shaft.
         others: channels that follow from the states.
         imposed: as in `Rig.imposed`.
     """
@@ -83,28 +84,28 @@ class Plan(eqx.Module):
 
 
 def plan_of(problem: Problem) -> Plan | None:
-    """Returns the plan of a log; None if the log does not show the states."""
-    found = plan_or_lacking(problem)
-    return found if isinstance(found, Plan) else None
+    """Returns the plan of a log, None if the log does not show the states."""
+    plan = plan_or_lacking(problem)
+    return plan if isinstance(plan, Plan) else None
 
 
 def plan_or_lacking(problem: Problem) -> Plan | Lacking:
     """Returns the plan of a log, or the reason why there is none."""
     robot, counts = problem.base, np.asarray(problem.data.weight).sum(0) > 0
-    shown = {k: c for k, c in enumerate(problem.channels) if counts[k]}
+    channels_read = {k: c for k, c in enumerate(problem.channels) if counts[k]}
     if robot.rig.turns:
         return Lacking.TURN
     if robot.loose:
         return Lacking.SLACK
-    if {c.name for c in shown.values()} & robot.rig.magnitudes:
+    if {c.name for c in channels_read.values()} & robot.rig.magnitudes:
         return Lacking.SIGN
     imposed = robot.rig.imposed
     pulsed = np.ptp(np.asarray(problem.observe.of_rows.duty)) > 0  # type: ignore[attr-defined]
-    drawn = "total_current"  # proportional to the duty of pulses
-    currents = {k: c.name == drawn for k, c in shown.items() if c.rests_on == CURRENT}
-    voltages = [k for k, c in shown.items() if c.rests_on == VOLTAGE]
-    speeds = [k for k, c in shown.items() if c.zero_at_rest and c.settled]
-    angles = [k for k, c in shown.items() if c.zero_at_rest and not c.settled]
+    current_channel = "total_current"  # proportional to the duty of pulses
+    currents = {k: c.name == current_channel for k, c in channels_read.items() if c.rests_on == CURRENT}
+    voltages = [k for k, c in channels_read.items() if c.rests_on == VOLTAGE]
+    speeds = [k for k, c in channels_read.items() if c.zero_at_rest and c.settled]
+    angles = [k for k, c in channels_read.items() if c.zero_at_rest and not c.settled]
     if imposed == "motor_speed":
         others = (*currents, *voltages)
         return Plan(-1, -1, False, False, others, imposed) if others else Lacking.FOLLOWER
@@ -113,9 +114,13 @@ def plan_or_lacking(problem: Problem) -> Plan | Lacking:
     if not (speeds or angles):
         return Lacking.MOTION
     motion = (*speeds, *angles)[0]
-    slips = [k for k in speeds[1:] if robot.has_ground and _travels(shown[k]) and not _travels(shown[motion])]
+    slips = [
+        k
+        for k in speeds[1:]
+        if robot.has_ground and _travels(channels_read[k]) and not _travels(channels_read[motion])
+    ]
     others = (*slips, *(voltages if imposed == "motor_current" else ()))
-    return Plan(current, motion, not speeds, _travels(shown[motion]), others, imposed)
+    return Plan(current, motion, not speeds, _travels(channels_read[motion]), others, imposed)
 
 
 def _travels(channel: Channel) -> bool:
@@ -127,13 +132,18 @@ class Rows(eqx.Module):
     """Conditions, readings and states at each point of a log, shape (points, ...).
 
     Attributes:
-        conditions: means over `cell`; shown: readings [SI], means of their rows; sd: of these means.
-        rate: slope of the channel of the motion, if that is an angle [SI/s]; way: of travel, 0 if it may be at rest.
-        angle: of the output since the run's first row [rad]; since: time since the point before [s], 0 for the first
-            of a run; time: since the run's start [s].
+        conditions: means over `cell`.
+        shown: readings [SI], means of their rows.
+        sd: of these means.
+        rate: slope of the channel of the motion, if that is an angle [SI/s].
+        way: of travel, 0 if it may be at rest.
+        angle: of the output since the run's first row [rad].
+        since: time since the point before [s], 0 for the first of a run.
+        time: since the run's start [s].
         first: a row of the table at the point.
-        delay: of the rig, at which the conditions were taken [s]; drift: their derivatives by the delay, by field;
-            reach: change of the delay within which these hold [s].
+        delay: of the rig, at which the conditions were taken [s].
+        drift: their derivatives by the delay, by field.
+        reach: change of the delay within which these hold [s].
         memory: of the robot's effects that have one, by their names.
     """
 
@@ -152,7 +162,7 @@ class Rows(eqx.Module):
     memory: Mapping[str, Float[Array, " points"]] = eqx.field(default_factory=dict)
 
     def imposed(self, delay: Scalar) -> Conditions:
-        """Conditions at another delay, or the nearest within `reach` of theirs; traceable."""
+        """Conditions at another delay, or the nearest within `reach` of theirs, traceable."""
         conditions, late = self.conditions, jnp.clip(delay - self.delay, -self.reach, self.reach)
         for name, drift in self.drift.items():
             conditions = replaced(conditions, name, getattr(conditions, name) + late * drift)
@@ -160,7 +170,7 @@ class Rows(eqx.Module):
 
 
 def replaced(conditions: Conditions, name: str, value: Any) -> Conditions:
-    """Conditions with another value of a field; unlike a new one, this changes no shape of others."""
+    """Conditions with another value of a field. Unlike a new one, this changes no shape of others."""
     return eqx.tree_at(operator.attrgetter(name), conditions, value)
 
 
@@ -169,8 +179,9 @@ class Course:
     """Imposed quantities over time, as integrals, so that each interval has a mean at any delay.
 
     Attributes:
-        time: of knots of all runs, one run after the other [s]; values: from each on; integrals: up to each. Both by
-            field of `Conditions`.
+        time: of knots of all runs, one run after the other [s].
+        values: from each on.
+        integrals: up to each. Both by field of `Conditions`.
         cell: beginning and end of the interval of each point, in the same clock.
     """
 
@@ -211,7 +222,7 @@ class Windows:
 
 
 def window_function(share: np.ndarray, length: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """w = sin⁸ π s, w' and w'' of a window at shares s of its length [s]; 0 outside.
+    """w = sin⁸ π s, w' and w'' of a window at shares s of its length [s], 0 outside.
 
     Sums over rows integrate w'' times an angle without bias only if the window ends smoothly. With sin⁴ the inertia
     of 100 logs of an angle alone was off by 6 posterior sds, with sin⁸ by 0.1.
@@ -227,8 +238,9 @@ def windows_of_run(time: np.ndarray, piece: np.ndarray, length: float) -> list[t
     """Returns the windows of one run, each as (indices of its points, their positions as shares of its length).
 
     Args:
-        time: of the points [s], increasing; piece: of each, -1 for points in no window; a window is within one piece.
-        length: of a window [s]; a shorter piece has one window of its own length.
+        time: of the points [s], increasing.
+        piece: of each, -1 for points in no window. A window is within one piece.
+        length: of a window [s]. A shorter piece has one window of its own length.
     """
     windows = list[tuple[np.ndarray, np.ndarray]]()
     starts = np.flatnonzero(np.r_[True, np.diff(piece) != 0])
@@ -236,9 +248,9 @@ def windows_of_run(time: np.ndarray, piece: np.ndarray, length: float) -> list[t
         if piece[begin] < 0 or end - begin < FEWEST:
             continue
         times = time[begin:end]
-        whole = times[-1] - times[0]
-        each = min(length, whole)
-        for first in times[0] + np.linspace(0.0, whole - each, int((whole - each) / (APART * each)) + 1):
+        duration = times[-1] - times[0]
+        each = min(length, duration)
+        for first in times[0] + np.linspace(0.0, duration - each, int((duration - each) / (APART * each)) + 1):
             low, high = np.searchsorted(times, (first - 1e-9, first + each + 1e-9))
             if high - low >= FEWEST - 1:
                 windows.append((np.arange(begin + low, begin + high), (times[low:high] - first) / each))
@@ -246,7 +258,7 @@ def windows_of_run(time: np.ndarray, piece: np.ndarray, length: float) -> list[t
 
 
 def correlation_time(time: np.ndarray, speed: np.ndarray, noise: float) -> float:
-    """Lag at which the mean squared change of a speed equals its variance [s]; 0 if shorter than the time of a row.
+    """Lag at which the mean squared change of a speed equals its variance [s], 0 if shorter than the time of a row.
 
     Args:
         noise: sd of the readings of the speed, which does not count.
@@ -264,7 +276,8 @@ def correlation_time(time: np.ndarray, speed: np.ndarray, noise: float) -> float
 def slopes_of(time: np.ndarray, values: np.ndarray, piece: np.ndarray, count: int) -> np.ndarray:
     """Slope at each point of a cubic over the `count` points around it, within its piece."""
     out = np.zeros(len(time))
-    for begin, end in _stretches(piece):
+    starts = np.flatnonzero(np.r_[len(piece) > 0, np.diff(piece) != 0])
+    for begin, end in zip(starts.tolist(), [*starts[1:].tolist(), len(piece)], strict=True):
         wide = min(count, end - begin)
         if wide < FEWEST // 2:
             out[begin:end] = np.gradient(values[begin:end], time[begin:end]) if wide > 1 else 0.0
@@ -279,12 +292,6 @@ def slopes_of(time: np.ndarray, values: np.ndarray, piece: np.ndarray, count: in
             rise = np.einsum("nwi,nw->ni", powers, values[near] - values[here])
             out[begin + part] = np.linalg.solve(normal, rise[..., None])[:, 1, 0] / scale
     return out
-
-
-def _stretches(piece: np.ndarray) -> zip[tuple[int, int]]:
-    """Beginning and end of each stretch of equal values."""
-    starts = np.flatnonzero(np.r_[len(piece) > 0, np.diff(piece) != 0])
-    return zip(starts.tolist(), [*starts[1:].tolist(), len(piece)], strict=True)
 
 
 def slope_rows(time: np.ndarray, angle: np.ndarray, sd: float) -> tuple[int, float]:
@@ -316,12 +323,12 @@ class _Log:
         plan, time = self.plan, self.time[rows]
         if not plan.mechanical:
             return time, np.asarray(self.of_rows.motor_speed)[rows], 0.0
-        shown, sd = self.measured[rows, plan.motion], float(np.median(self.sd[rows, plan.motion]))
+        readings, sd = self.measured[rows, plan.motion], float(np.median(self.sd[rows, plan.motion]))
         if plan.angle:
-            lag = slope_rows(time, shown, sd)[0] // 2
+            lag = slope_rows(time, readings, sd)[0] // 2
             apart = time[lag:] - time[:-lag]
-            return time[lag:], (shown[lag:] - shown[:-lag]) / apart, 1.5 * sd / float(np.median(apart))
-        return time, shown, sd
+            return time[lag:], (readings[lag:] - readings[:-lag]) / apart, 1.5 * sd / float(np.median(apart))
+        return time, readings, sd
 
     def length(self) -> float:
         """Length of a window [s], by the bandwidth of the motion."""
@@ -332,10 +339,10 @@ class _Log:
         """Means of `size` rows of a run each, within stretches without a gap or a jump.
 
         Args:
-            delay: of jumps [s]; None for stretches that contain them.
+            delay: of jumps [s], None for stretches that contain them.
 
         Returns:
-            By name: row, time, shown, sd, cell as of `Rows`; stretch of each, -1 for points in no window.
+            By name: row, time, shown, sd, cell as of `Rows`. Stretch of each, -1 for points in no window.
         """
         rows = self.each[run]
         times = self.time[rows]
@@ -370,7 +377,7 @@ class _Log:
         }
 
     def course(self, cells: list[np.ndarray]) -> Course:
-        """Imposed quantities over time; `cells`: of the points of each run."""
+        """Imposed quantities over time. `cells`: of the points of each run."""
         changing = {
             name: np.asarray(x, float)
             for name in IMPOSED
@@ -380,8 +387,8 @@ class _Log:
         knots, moved = list[np.ndarray](), list[np.ndarray]()
         values, integrals = ({name: list[np.ndarray]() for name in changing} for _ in range(2))
         for rows, cell in zip(self.every, cells, strict=True):
-            whole = float(self.time[rows[-1]] - self.time[rows[0]]) + 1.0
-            time = np.r_[self.time[rows[0]] - whole, self.time[rows], self.time[rows[-1]] + whole]
+            period = float(self.time[rows[-1]] - self.time[rows[0]]) + 1.0
+            time = np.r_[self.time[rows[0]] - period, self.time[rows], self.time[rows[-1]] + period]
             begin = (knots[-1][-1] if knots else 0.0) + 1.0 - time[0]
             for name, x in changing.items():
                 shown = x[np.r_[rows[0], rows, rows[-1]]]
@@ -401,8 +408,8 @@ def rows_and_windows(
     """Returns the points of a log, what is imposed there over time, and the windows of its runs.
 
     Args:
-        delay: between the instant of a jump in its column and its action [s]; across: True for windows that contain
-            jumps.
+        delay: between the instant of a jump in its column and its action [s].
+        across: True for windows that contain jumps.
     """
     log = _Log(problem, plan)
     length = log.length()
@@ -416,7 +423,7 @@ def rows_and_windows(
     conditions: Any = jax.tree.map(lambda x: np.asarray(x)[joined["row"]], log.of_rows)
     for name, x in mean.items():
         conditions = replaced(conditions, name, x)
-    time, shown, sd = joined["time"], joined["shown"], joined["sd"]
+    time, readings, sd = joined["time"], joined["shown"], joined["sd"]
     since = np.where(np.diff(run, prepend=-1) != 0, 0.0, np.diff(time, prepend=0.0))
     # Points of different runs or on both sides of a jump are apart for slopes, and those of both ways for windows.
     apart = np.cumsum(np.r_[False, (np.diff(run) != 0) | (np.diff(joined["stretch"]) != 0)])
@@ -426,15 +433,15 @@ def rows_and_windows(
         angle, sds = (x[longest, plan.motion] for x in (log.measured, log.sd))
         wide, noise = slope_rows(log.time[longest], angle, float(np.median(sds)))
         wide = max(FEWEST, wide // size | 1)
-        rate = slopes_of(time, shown[:, plan.motion], apart, wide)
-    way, speed = _ways(problem, plan, conditions, shown, sd, rate, noise)
+        rate = slopes_of(time, readings[:, plan.motion], apart, wide)
+    way, speed = _ways(problem, plan, conditions, readings, sd, rate, noise)
     usable = (way != 0) & (joined["stretch"] >= 0)
     piece = np.where(usable, np.cumsum(np.r_[False, (np.diff(apart) != 0) | (np.diff(way) != 0)]), -1)
     if plan.angle:
-        rate = slopes_of(time, shown[:, plan.motion], piece, wide)
+        rate = slopes_of(time, readings[:, plan.motion], piece, wide)
     turned = np.cumsum(np.where(since > 0, 0.5 * (speed + np.roll(speed, 1)) * since, 0.0))
     none = np.zeros(len(run))
-    arrays = shown, sd, rate, way, turned - turned[count[:-1]][run], since, time, joined["row"]
+    arrays = readings, sd, rate, way, turned - turned[count[:-1]][run], since, time, joined["row"]
     late = none + delay, none + log.step, drift
     windows = [
         _weights(r, time, windows_of_run(time, np.where(run == r, piece, -1), length)) for r in range(len(parts))
@@ -463,8 +470,8 @@ def _consistent(weights: np.ndarray, share: np.ndarray, length: float) -> np.nda
 
     Sums over rows at irregular times would not, and an angle is far from 0, so that its sum would be mostly error.
     """
-    w, powers, at = weights[0], np.arange(4), 2 * share[:, None] - 1
-    basis = at**powers
+    w, powers, scaled_place = weights[0], np.arange(4), 2 * share[:, None] - 1
+    basis = scaled_place**powers
     normal = np.linalg.pinv(basis.T @ (w[:, None] * basis))
     moments = w @ basis
     once = np.r_[0.0, powers[1:] * moments[:3]] * (2 / length)
@@ -503,16 +510,13 @@ def _ways(
     if plan.imposed == "motor_speed":
         speed, off = conditions.motor_speed / float(problem.base.gearbox.ratio), np.zeros(len(shown))
     else:
-        per = _wheel_per_unit(problem, plan)
+        robot, none = problem.base, jnp.zeros(())
+        chassis = robot.configurations.members[0]
+        rolling = State(none, robot.gearbox.ratio, chassis.radius, none, distance=chassis.radius)
+        per = 1 / float(
+            problem.channels[plan.motion].read(robot, balances.begin_signals(robot, Conditions(0), rolling))
+        )
         speed = per * (rate if plan.angle else shown[:, plan.motion])
         off = abs(per) * (np.full(len(shown), noise) if plan.angle else sd[:, plan.motion])
     limit = np.maximum(REST * np.abs(speed).max(initial=0.0), REST_SD * off)
     return np.where(np.abs(speed) > limit, np.sign(speed), 0.0), speed
-
-
-def _wheel_per_unit(problem: Problem, plan: Plan) -> float:
-    """Speed or angle of the output for one unit of the channel of the motion [rad/unit]."""
-    robot, none = problem.base, jnp.zeros(())
-    chassis = robot.configurations.members[0]
-    rolling = State(none, robot.gearbox.ratio, chassis.radius, none, distance=chassis.radius)
-    return 1 / float(problem.channels[plan.motion].read(robot, balances.begin_signals(robot, Conditions(0), rolling)))

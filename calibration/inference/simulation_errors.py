@@ -10,7 +10,7 @@ from mmrjax.model.channels import Channel
 
 
 def relative_error(simulated: np.ndarray, measured: np.ndarray) -> np.ndarray:
-    """δCV = (CV - EV) / CV · 100 [%], eq. (35), with CV simulated and EV measured; any shape."""
+    """δCV = (CV - EV) / CV · 100 [%], eq. (35), with CV simulated and EV measured, any shape."""
     return 100.0 * (simulated - measured) / simulated
 
 
@@ -31,7 +31,7 @@ def sized_error(simulated: np.ndarray, measured: np.ndarray) -> np.ndarray:
 
 
 def share_of_measured(simulated: np.ndarray, measured: np.ndarray) -> np.ndarray:
-    """rms error over the rms of the measured values [-], by channel over the rows with both; shape (channels,).
+    """rms error over the rms of the measured values [-], by channel over the rows with both, shape (channels,).
 
     NaN without such a row.
 
@@ -46,7 +46,7 @@ def share_of_measured(simulated: np.ndarray, measured: np.ndarray) -> np.ndarray
 
 
 def root_mean_square(errors: np.ndarray) -> float:
-    """Root mean square of the finite errors; NaN without any."""
+    """Root mean square of the finite errors, NaN without any."""
     finite = errors[np.isfinite(errors)]
     return float(np.sqrt(np.mean(finite**2))) if finite.size else float("nan")
 
@@ -89,7 +89,7 @@ def channel_errors(
     Args:
         shown: the channels.
         simulated, measured, sd: [SI], NaN if missing, shape (rows, channels).
-        percent: errors of the same shape; None takes `sized_error`.
+        percent: errors of the same shape. None takes `sized_error`.
     """
     percent = sized_error(simulated, measured) if percent is None else percent
     off = simulated - measured

@@ -28,12 +28,6 @@ EVALUATIONS, EVALUATIONS_LONG = 1_000_000, 100_000
 LEAST = 1_000
 
 
-def default_evaluations(outputs: tuple[Quantity, ...], model: str) -> int:
-    """Default number of model evaluations."""
-    long = fidelities.fidelity_facts(model).rollout or any(o in derived.OF_START for o in outputs)
-    return EVALUATIONS_LONG if long else EVALUATIONS
-
-
 def analyse_sensitivity(
     study: Study, method: str, evaluations: int | None = None, seed: int = 0, candidates: Candidates | None = None
 ) -> SensitivityResult:
@@ -41,9 +35,9 @@ def analyse_sensitivity(
 
     Args:
         method: one of `METHODS`.
-        evaluations: least number of model evaluations in all; None takes the default.
+        evaluations: least number of model evaluations in all. None takes the default.
         seed: random seed.
-        candidates: possible next runs; None proposes none.
+        candidates: possible next runs. None proposes none.
 
     Raises:
         BadConfiguration: an unknown method, a method that needs independent inputs, too few evaluations, inputs
@@ -56,7 +50,8 @@ def analyse_sensitivity(
         raise BadConfiguration(
             f"--method {method}: needs independent inputs, and those of a posterior are correlated; expected local"
         )
-    usual = default_evaluations(model.outputs, model.fidelity)
+    long = fidelities.fidelity_facts(model.fidelity).rollout or any(o in derived.OF_START for o in model.outputs)
+    usual = EVALUATIONS_LONG if long else EVALUATIONS
     evaluations = usual if evaluations is None else evaluations
     if evaluations < LEAST:
         raise BadConfiguration(f"--evaluations: got {evaluations}; expected {LEAST} or more")

@@ -2,9 +2,9 @@
 
 In scores, inputs are standard normal or uniform whatever their distribution. Poincaré's inequality bounds the total
 index from above, T_i ≤ C_i E[(∂y/∂s_i)²] / Var y. C is 1 for a standard normal score and 1/π² for a uniform one
-in 0..1 (Sobol' and Kucherenko, Math. Comput. Simul. 79 (2009); Lamboni et al., ibid. 87 (2013); Roustant et
+in 0..1 (Sobol' and Kucherenko, Math. Comput. Simul. 79 (2009). Lamboni et al., ibid. 87 (2013). Roustant et
 al., Electron. J. Stat. 11 (2017)). The linear term of the output's expansion bounds the first-order index from below:
-E[y s_i]² / Var y, and E[y s_i] = E[∂y/∂s_i] for a normal score (Stein); for a uniform one √12 E[y (s - 1/2)] =
+E[y s_i]² / Var y, and E[y s_i] = E[∂y/∂s_i] for a normal score (Stein). For a uniform one √12 E[y (s - 1/2)] =
 √3 E[s (1 - s) ∂y/∂s]. If both bounds agree, the output is linear in that input and the index is known exactly.
 """
 
@@ -23,8 +23,10 @@ class Terms:
     """Parts of the variance, by replicate, whose ratios are the bounds [output's unit²].
 
     Attributes:
-        variance: shape (replicates,); lower, upper: shape (replicates, inputs).
-        rows: number of included points; lost: number of points without a value of the model.
+        variance: shape (replicates,).
+        lower, upper: shape (replicates, inputs).
+        rows: number of included points.
+        lost: number of points without a value of the model.
     """
 
     variance: np.ndarray
@@ -45,7 +47,7 @@ class Terms:
 
 @dataclasses.dataclass(frozen=True)
 class Bounds:
-    """Bounds of one output: first-order indices are at least `lower`, total ones at most `upper`; shape (inputs,)."""
+    """Bounds of one output: first-order indices are at least `lower`, total ones at most `upper`, shape (inputs,)."""
 
     lower: Estimate
     upper: Estimate
@@ -68,8 +70,9 @@ def derivative_terms(
     """Parts of an output's variance and of its bounds.
 
     Args:
-        scores: of the design, shape (points, inputs); values, gradients: of the output there, by the scores.
-        normal: True for standard normal scores, False for uniform ones in 0..1; shape (inputs,).
+        scores: of the design, shape (points, inputs).
+        values, gradients: of the output there, by the scores.
+        normal: True for standard normal scores, False for uniform ones in 0..1, shape (inputs,).
 
     Returns:
         None if some replicate has no finite value.

@@ -18,8 +18,9 @@ class Choice:
     """Runs to make next, the most informative first.
 
     Attributes:
-        rows: of the candidates; gain: bits that each adds to those before it, shape (runs,).
-        covariance: of the scores after each run, starting with no run; shape (runs + 1, inputs, inputs).
+        rows: of the candidates.
+        gain: bits that each adds to those before it, shape (runs,).
+        covariance: of the scores after each run, starting with no run, shape (runs + 1, inputs, inputs).
     """
 
     rows: tuple[int, ...]
@@ -44,7 +45,8 @@ def choose_runs(information: np.ndarray, count: int) -> Choice:
     """Runs that together are most informative, each candidate at most once.
 
     Args:
-        information: of each candidate, from `fisher_information`; count: number of runs.
+        information: of each candidate, from `fisher_information`.
+        count: number of runs.
     """
     candidates, size, _ = information.shape
     count = min(count, candidates)

@@ -19,10 +19,12 @@ LOOKS, PLACES = 4, 12
 
 @dataclasses.dataclass(frozen=True)
 class Local:
-    """Values and derivatives at the medians of the inputs; arrays over (points, inputs), NaN without a value.
+    """Values and derivatives at the medians of the inputs. Arrays over (points, inputs), NaN without a value.
 
     Attributes:
-        value: [SI], shape (points,); derivative: by each input [SI per unit]; by_score: by its score [SI].
+        value: [SI], shape (points,).
+        derivative: by each input [SI per unit].
+        by_score: by its score [SI].
         swing: with each single input at the ends of its 95 % interval [SI], shape (2, points, inputs).
     """
 
@@ -36,7 +38,7 @@ class Local:
 def correlated_directions(inputs: Inputs) -> np.ndarray:
     """Directions in scores along which each input moves by one sd and the others follow by their correlation.
 
-    Each row has length 1; a condition moves along its own score.
+    Each row has length 1. A condition moves along its own score.
     """
     p = len(inputs.parameters)
     whole = np.eye(len(inputs))
@@ -75,7 +77,7 @@ def local_derivatives(study: Study) -> Local:
 
 
 def _by_inputs(inputs: Inputs, by_columns: np.ndarray) -> np.ndarray:
-    """Derivatives by inputs, shape (points, inputs), from those by columns; tied parameters follow their leader."""
+    """Derivatives by inputs, shape (points, inputs), from those by columns. Tied parameters follow their leader."""
     by_inputs = by_columns[:, inputs.places].copy()
     for j, (_, leader, ratio) in enumerate(inputs.parameters.tied):
         by_inputs[:, leader] += ratio * by_columns[:, len(inputs.parameters) + j]

@@ -1,4 +1,4 @@
-"""Methods over all operating points of a study; each gives a part of every output's result."""
+"""Methods over all operating points of a study. Each gives a part of every output's result."""
 
 from __future__ import annotations
 

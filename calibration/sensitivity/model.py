@@ -36,7 +36,7 @@ class Answer:
     """Outputs of many points.
 
     Attributes:
-        values: of each output [SI], NaN if its run did not converge; shape (points,).
+        values: of each output [SI], NaN if its run did not converge, shape (points,).
         statuses: source (a fidelity, or a module of derived outputs) → codes, shape (points,).
     """
 
@@ -78,13 +78,13 @@ def default_outputs(robot: Robot, turns: bool) -> Names:
 
 
 def chosen_outputs(words: Names, robot: Robot, turns: bool = False) -> tuple[Quantity, ...]:
-    """Outputs of these names, or the default ones for none; `start` means all outputs of a start.
+    """Outputs of these names, or the default ones for none. `start` means all outputs of a start.
 
     Args:
         turns: True if the robot is free to turn, with the instruments for it.
 
     Raises:
-        BadConfiguration: an unknown name, with the choices; an output of a ground or stance that the robot lacks, of
+        BadConfiguration: an unknown name, with the choices. An output of a ground or stance that the robot lacks, of
             turns if it travels straight, or of straight travel if it turns.
     """
     outputs, chosen = known_outputs(robot), []
@@ -122,7 +122,8 @@ class Model:
     """Outputs of a robot with some varying parameters and conditions.
 
     Attributes:
-        robot: start of every point; columns: names of the varying parameters and conditions.
+        robot: start of every point.
+        columns: names of the varying parameters and conditions.
         fidelity, options: of the simulation of outputs that are not derived.
         outputs: to be computed.
     """
@@ -158,7 +159,7 @@ class Model:
         return self.joined({source: self.of_source(source, values, conditions) for source in self.sources})
 
     def of_source(self, source: str, values: Float[np.ndarray, "points columns"], conditions: Conditions) -> Answer:
-        """Outputs of one source; see `sources`."""
+        """Outputs of one source. See `sources`."""
         made = self._chunked(self._function(source), self.chunk(source, len(values)), values, conditions)
         codes = made.pop(STATUS).astype(int)
         return Answer(made, {source: codes})
@@ -175,7 +176,7 @@ class Model:
         return tuple(sorted(set.intersection(*each)))
 
     def derivatives(self, values: Float[np.ndarray, "points columns"], conditions: Conditions) -> Columns:
-        """Exact derivatives of each output by each column [SI per unit], shape (points, columns); zeros for a run
+        """Exact derivatives of each output by each column [SI per unit], shape (points, columns). Zeros for a run
         without values."""
         found: Columns = {}
         for source in self.sources:
@@ -195,7 +196,7 @@ class Model:
     def _chunked(
         self, function: Callable[..., dict[str, Array]], size: int, values: Any, conditions: Conditions
     ) -> Columns:
-        """A function over chunks of one shape; the last is padded by its last point."""
+        """A function over chunks of one shape. The last is padded by its last point."""
         points, values = len(values), np.asarray(values)
         alike = conditions.shape == ()  # the program broadcasts them
         spread = conditions if alike else jax.tree.map(np.asarray, conditions)

@@ -23,8 +23,11 @@ class Effects:
     """Elementary effects of each input on an output [its unit per range of the input], shape (inputs,) each.
 
     Attributes:
-        mean: μ; size: μ* with its interval; spread: σ.
-        trajectories: number included; lost: number of those with a point without a value of the model.
+        mean: μ.
+        size: μ* with its interval.
+        spread: σ.
+        trajectories: number included.
+        lost: number of those with a point without a value of the model.
     """
 
     mean: np.ndarray
@@ -50,7 +53,8 @@ def elementary_effects(points: np.ndarray, values: np.ndarray) -> Effects | None
     """Elementary effects of an output.
 
     Args:
-        points: from `morris_design`; values: of the output there.
+        points: from `morris_design`.
+        values: of the output there.
 
     Returns:
         None if fewer than two trajectories have values at all points.

@@ -22,10 +22,11 @@ class Candidates:
     """Possible next runs.
 
     Attributes:
-        points, conditions: of them; source: of the list.
-        noise: channel's place → (number, True for a share of the reading), see `calibration.inference.noise`;
-            words: the same for a person.
-        sd: stated by the candidates [SI], NaN if not; shape (candidates, channels).
+        points, conditions: of them.
+        source: of the list.
+        noise: channel's place → (number, True for a share of the reading), see `calibration.inference.noise`.
+        words: the same for a person.
+        sd: stated by the candidates [SI], NaN if not, shape (candidates, channels).
         count: number to propose.
     """
 

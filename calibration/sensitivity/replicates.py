@@ -25,7 +25,8 @@ class Estimate:
     """Indices with their intervals.
 
     Attributes:
-        value: shape (...); low, high: ends of the 95 % interval.
+        value: shape (...).
+        low, high: ends of the 95 % interval.
     """
 
     value: np.ndarray
@@ -44,7 +45,8 @@ def ratio_estimate(numerator: np.ndarray, denominator: np.ndarray) -> Estimate:
     replicate's points.
 
     Args:
-        numerator: shape (replicates, ...); denominator: shape (replicates,), not negative.
+        numerator: shape (replicates, ...).
+        denominator: shape (replicates,), not negative.
 
     Returns:
         NaN if the denominator is 0: without variance there are no shares.

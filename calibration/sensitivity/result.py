@@ -1,4 +1,4 @@
-"""Result of a sensitivity study: typed, by name; JSON, tables, terminal and report are made from it."""
+"""Result of a sensitivity study: typed, by name. JSON, tables, terminal and report are made from it."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ NEGLIGIBLE = 0.01
 
 @dataclasses.dataclass(frozen=True)
 class Points:
-    """Operating points; arrays of shape (points,). With a battery their voltage is NaN.
+    """Operating points, arrays of shape (points,). With a battery their voltage is NaN.
 
     Attributes:
-        motor_speed: imposed [rpm] instead of the voltage, which is 0 then; None if the voltage is imposed.
-        has_ground: True if payload and slope act; else they are 0.
+        motor_speed: imposed [rpm] instead of the voltage, which is 0 then, None if the voltage is imposed.
+        has_ground: True if payload and slope act, else they are 0.
     """
 
     configuration: np.ndarray
@@ -72,7 +72,7 @@ class Points:
 
     @property
     def ground(self) -> tuple[tuple[str, np.ndarray, str], ...]:
-        """Conditions of the ground: columns, values, units; empty without a ground."""
+        """Conditions of the ground: columns, values, units, empty without a ground."""
         found = ("payload_kg", self.payload, " kg"), ("slope_deg", self.slope_deg, "°")
         return found if self.has_ground else ()
 
@@ -95,8 +95,11 @@ class Input:
     """An uncertain input.
 
     Attributes:
-        unit, meaning: of its field; distribution: log-normal, normal, uniform or posterior.
-        median: [unit]; interval: of 95 % [unit]; sd: to first order [unit].
+        unit, meaning: of its field.
+        distribution: log-normal, normal, uniform or posterior.
+        median: [unit].
+        interval: of 95 % [unit].
+        sd: to first order [unit].
         inert: True if all computed derivatives of all outputs by it were exactly zero. It is then not sampled.
     """
 
@@ -111,21 +114,23 @@ class Input:
 
 @dataclasses.dataclass(frozen=True)
 class OutputStudy:
-    """Results for one output; arrays over (points, inputs), NaN at points without a value.
+    """Results for one output. Arrays over (points, inputs), NaN at points without a value.
 
     Attributes:
         row: name, unit, label.
         value: at the medians of the inputs [SI], shape (points,).
-        derivative: by each input [SI per its unit]; elasticity: (x / y) ∂y/∂x [-].
+        derivative: by each input [SI per its unit].
+        elasticity: (x / y) ∂y/∂x [-].
         swing: output with each single input at the lower and upper end of its 95 % interval [SI], shape
             (2, points, inputs).
         sd: of the output over all inputs [SI], shape (points,): to first order, or of the sample if there is one.
         share: of the variance that involves an input, as the method defines it [-].
         overall: indices of each input over all points together, name → Estimate of shape (inputs,).
         at_points: the same at each point, name → Estimate of shape (points, inputs).
-        second: interactions over all points, Estimate of shape (inputs, inputs); None without.
+        second: interactions over all points, Estimate of shape (inputs, inputs), None without.
         convergence: (model evaluations, Estimate of the main index) at stages.
-        lost: share of base points without a value at each point, shape (points,); studied: True for included points.
+        lost: share of base points without a value at each point, shape (points,).
+        studied: True for included points.
     """
 
     row: Quantity
@@ -160,7 +165,8 @@ class Interaction:
     """Interaction of two inputs, in addition to their single effects.
 
     Attributes:
-        second: second-order index; interval: its 95 % interval.
+        second: second-order index.
+        interval: its 95 % interval.
         sure: True if it is also above zero with an interval that allows for all tested pairs.
     """
 
@@ -176,11 +182,13 @@ class NextRuns:
     """Most informative next runs.
 
     Attributes:
-        candidates: number of candidates; source: of their list.
-        points: those chosen, in order; gain: bits that each adds, shape (runs,).
+        candidates: number of candidates.
+        source: of their list.
+        points: those chosen, in order.
+        gain: bits that each adds, shape (runs,).
         noise: channel → sd as a share of the reading [-], and words for a person.
-        sd: of each input after so many runs, over that before any; shape (runs + 1, inputs).
-        output_sd: output → its sd, root mean square over the points, after so many runs [SI]; shape (runs + 1,).
+        sd: of each input after so many runs, over that before any, shape (runs + 1, inputs).
+        output_sd: output → its sd, root mean square over the points, after so many runs [SI], shape (runs + 1,).
     """
 
     candidates: int
@@ -197,13 +205,19 @@ class SensitivityResult:
     """A finished study.
 
     Attributes:
-        method: one of `METHODS`; model: fidelity; seed: random seed.
-        inputs: by name, in order; correlated: True for inputs of a posterior.
-        points: operating points; outputs: by name.
-        statuses: source → status → points, at the medians; sampled: the same over the sample.
+        method: one of `METHODS`.
+        model: fidelity.
+        seed: random seed.
+        inputs: by name, in order.
+        correlated: True for inputs of a posterior.
+        points: operating points.
+        outputs: by name.
+        statuses: source → status → points, at the medians.
+        sampled: the same over the sample.
         next_runs: None without a candidate that converges.
-        evaluations: number of model evaluations; seconds: their duration, including compilation.
-        comparison: of bounds with sampled indices, by output; empty for other methods.
+        evaluations: number of model evaluations.
+        seconds: their duration, including compilation.
+        comparison: of bounds with sampled indices, by output, empty for other methods.
         remarks: notes on the result.
     """
 
@@ -228,7 +242,7 @@ class SensitivityResult:
         return tuple(self.inputs)
 
     def importance(self) -> np.ndarray:
-        """Largest share of each input over all outputs and points, upper ends of intervals; shape (inputs,)."""
+        """Largest share of each input over all outputs and points, upper ends of intervals, shape (inputs,)."""
         most = np.zeros(len(self.inputs))
         for study in self.outputs.values():
             ends = [study.overall_share]

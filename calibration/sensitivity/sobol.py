@@ -1,10 +1,10 @@
 """Variance-based indices of independent inputs: first, total and second order (Sobol' 1993, Homma and Saltelli 1996).
 
 S_i = Var(E[y | x_i]) / Var y is the mean share of the variance that is removed if x_i is known. T_i =
-E[Var(y | all but x_i)] / Var y is the share that remains if all but x_i are known; T_i - S_i is due to interactions.
+E[Var(y | all but x_i)] / Var y is the share that remains if all but x_i are known. T_i - S_i is due to interactions.
 S_ij is the joint effect of x_i and x_j in addition to their single effects. Designs are SALib's (Saltelli's scheme on
 a scrambled Sobol sequence), and so are the estimators: Saltelli et al., Comput. Phys. Commun. 181 (2010) for first
-order and, after Jansen (1999), for the total; Saltelli, ibid. 145 (2002) for second order, the mean of both orders.
+order and, after Jansen (1999), for the total. Saltelli, ibid. 145 (2002) for second order, the mean of both orders.
 Intervals are from whole replicates.
 """
 
@@ -81,9 +81,11 @@ class Terms:
     """Parts of the variance of an output, by replicate, whose ratios are the indices [output's unit²].
 
     Attributes:
-        variance: shape (replicates,); first, total: shape (replicates, inputs).
-        second: of each pair, closed (with the single effects), shape (replicates, inputs, inputs); None without.
-        rows: number of included base points; lost: number of those with a missing value of the model.
+        variance: shape (replicates,).
+        first, total: shape (replicates, inputs).
+        second: of each pair, closed (with the single effects), shape (replicates, inputs, inputs), None without.
+        rows: number of included base points.
+        lost: number of those with a missing value of the model.
     """
 
     variance: np.ndarray
@@ -122,7 +124,7 @@ def sobol_terms(design: Design, values: np.ndarray) -> Terms | None:
     """Parts of an output's variance.
 
     A base point is omitted if the output is not finite in one of its blocks. If that depends on one
-    input only (an adhesion that is too small), the indices are exactly those of that input truncated there; otherwise
+    input only (an adhesion that is too small), the indices are exactly those of that input truncated there, otherwise
     approximately.
 
     Args:
@@ -164,7 +166,7 @@ def sobol_terms(design: Design, values: np.ndarray) -> Terms | None:
 
 @dataclasses.dataclass(frozen=True)
 class Indices:
-    """Indices of one output: shape (inputs,) each; second: shape (inputs, inputs), None without; variance [unit²]."""
+    """Indices of one output, shape (inputs,). `second` has shape (inputs, inputs) or is None. `variance`: [unit²]."""
 
     first: Estimate
     total: Estimate

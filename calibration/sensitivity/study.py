@@ -28,7 +28,7 @@ SILENCE = 10.0
 
 @dataclasses.dataclass(frozen=True)
 class Supply:
-    """Supply of the motors at each point: battery (1) or not (0), charge taken [C]; and the adhesion ratio there."""
+    """Supply of the motors at each point: battery (1) or not (0), charge taken [C], and the adhesion ratio there."""
 
     battery: float = 0.0
     discharge: float = 0.0
@@ -36,7 +36,7 @@ class Supply:
 
 
 class Study:
-    """One robot, its uncertain inputs, operating points and outputs; methods are functions of a study."""
+    """One robot, its uncertain inputs, operating points and outputs. Methods are functions of a study."""
 
     def __init__(
         self,
@@ -81,7 +81,7 @@ class Study:
         return np.asarray(self.inputs.values(scores))
 
     def sample(self, values: np.ndarray, points: Sequence[int]) -> Iterator[tuple[int, Columns]]:
-        """Outputs at the same values of the model's columns, one point at a time; counted and timed.
+        """Outputs at the same values of the model's columns, one point at a time, counted and timed.
 
         A source is not computed again if only conditions differ that it ignores.
         """

@@ -39,8 +39,9 @@ class Inputs:
     """Parameters, normal in their coordinates, and conditions, uniform in their ranges.
 
     Attributes:
-        parameters: distribution of the parameters; independent except for a posterior.
-        low, high: ranges of the conditions, in their units; conditions: their names.
+        parameters: distribution of the parameters. Independent except for a posterior.
+        low, high: ranges of the conditions, in their units.
+        conditions: their names.
         axes: facts about each input, by name.
         is_posterior: True for the correlated parameters of a fit.
     """
@@ -72,7 +73,7 @@ class Inputs:
     def values(self, scores: Any) -> Any:
         """Values of `columns` at independent scores: standard normal for parameters, in 0..1 for conditions.
 
-        NumPy in, NumPy out, without compilation; else traceable.
+        NumPy in, NumPy out, without compilation, else traceable.
 
         Args:
             scores: shape (..., inputs).
@@ -150,10 +151,11 @@ def inputs_from_priors(robot: Robot, words: Sequence[str], ranges: Mapping[str, 
     """Inputs from the priors of the parameters' fields, around the robot's values, and from stated ranges.
 
     Args:
-        words: parameters, `motor.*` a group; ranges: of conditions.
+        words: parameters, `motor.*` a group.
+        ranges: of conditions.
 
     Raises:
-        BadConfiguration: an unknown name, with the choices; one with a prior of zero width; or an invalid range.
+        BadConfiguration: an unknown name, with the choices. One with a prior of zero width, or an invalid range.
     """
     everything = list(priors.parameters_by_name(robot))
     names = list(

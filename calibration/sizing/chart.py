@@ -36,7 +36,9 @@ class Chart:
     """Nearest limit, shape (slopes, payloads).
 
     Attributes:
-        payload, slope: axes [kg], [deg]; nearest: index into `LIMITS`; margin: to it, negative beyond it.
+        payload, slope: axes [kg], [deg].
+        nearest: index into `LIMITS`.
+        margin: to it, negative beyond it.
     """
 
     payload: np.ndarray

@@ -48,10 +48,12 @@ RATED = {
 
 
 class Design(eqx.Module):
-    """Designs in numbers; every field batchable.
+    """Designs in numbers, every field batchable.
 
     Attributes:
-        continuous: logarithms of `CONTINUOUS`; drive, cell: numbers of `Options`, by name; cells: in series.
+        continuous: logarithms of `CONTINUOUS`.
+        drive, cell: numbers of `Options`, by name.
+        cells: in series.
     """
 
     continuous: Float[Array, "... 3"]
@@ -61,10 +63,10 @@ class Design(eqx.Module):
 
 
 def build_robot(robot: Robot, base_mass: float, configuration: str, design: Design) -> tuple[Robot, Ratings]:
-    """Robot of a design, from an initial robot, with its ratings; traceable.
+    """Robot of a design, from an initial robot, with its ratings, traceable.
 
     Motors, gearboxes and cells replace the robot's own in its mass. The cell's voltage depends on the used share
-    of its capacity as for the robot's cell; cells in parallel share the resistance.
+    of its capacity as for the robot's cell. Cells in parallel share the resistance.
     """
     ratio, radius, parallel = (jnp.exp(design.continuous[..., k]) for k in range(3))
     d, c = design.drive, design.cell
@@ -89,7 +91,7 @@ class Demand:
     """One requirement, with its points.
 
     Attributes:
-        requirement: as stated; None: the ratings of the parts. label: words.
+        requirement: as stated. None: the ratings of the parts. label: words.
         rows: of its points.
     """
 
@@ -99,12 +101,14 @@ class Demand:
 
 
 class Task(eqx.Module):
-    """Requirements as points and demands; each point needs one solution of the balances for each design.
+    """Requirements as points and demands. Each point needs one solution of the balances for each design.
 
     Attributes:
-        robot: to be changed, with one cell (see `sheet`); configuration: to be sized.
+        robot: to be changed, with one cell (see `sheet`).
+        configuration: to be sized.
         base_mass: of the parts in the robot's mass [kg].
-        points: shape (points,); middle: row of the middle of the envelope, for the energy.
+        points: shape (points,).
+        middle: row of the middle of the envelope, for the energy.
         demands: in order.
     """
 
@@ -197,9 +201,9 @@ def _middle(robot: Robot, e: Envelope) -> EnvelopePoint:
 
 
 def evaluate_design(asked: Task, design: Design) -> tuple[Array, Array]:
-    """Objectives (as `OBJECTIVES`) and margins (as `Task.labels`) of one design; traceable.
+    """Objectives (as `OBJECTIVES`) and margins (as `Task.labels`) of one design, traceable.
 
-    Margins are shares of the required or permitted value; a requirement is met if its margin is not negative.
+    Margins are shares of the required or permitted value. A requirement is met if its margin is not negative.
     """
     robot, ratings = build_robot(asked.robot, asked.base_mass, asked.configuration, design)
     states = jax.vmap(lambda p: travel_quantities(robot, p, ratings)[0])(asked.points)

@@ -51,9 +51,13 @@ class SizedDesign:
     """One design.
 
     Attributes:
-        drive, cell: sheets; ratio, radius: total ratio and rolling radius [m]; in_series, parallel: cells.
-        objectives: by name of `OBJECTIVES`; margins: by label, shares of what is required or permitted.
-        bounds: active bounds of the search; robot: of the design.
+        drive, cell: sheets.
+        ratio, radius: total ratio and rolling radius [m].
+        in_series, parallel: cells.
+        objectives: by name of `OBJECTIVES`.
+        margins: by label, shares of what is required or permitted.
+        bounds: active bounds of the search.
+        robot: of the design.
     """
 
     drive: Drive
@@ -74,7 +78,7 @@ class SizedDesign:
 
     @property
     def binds(self) -> list[str]:
-        """Active or violated limits, the nearest first; then active bounds of the search."""
+        """Active or violated limits, the nearest first. Then active bounds of the search."""
         order = sorted(self.margins.items(), key=lambda item: item[1])
         return [*(label for label, m in order if m < BINDS), *self.bounds]
 
@@ -93,13 +97,14 @@ class Sizing:
     """Result of a search.
 
     Attributes:
-        task, options: of the search; objective: that is minimised, of a Pareto front the first.
+        task, options: of the search.
+        objective: that is minimised, of a Pareto front the first.
         unmeetable: labels that no choice of parts meets, which were dropped.
-        ideal: the best with any ratio and fraction of a cell; None without one.
-        best: the best with a ratio of the sheets and whole cells; alternatives: the next best, with other motors or
-            cells.
+        ideal: the best with any ratio and fraction of a cell, None without one.
+        best: the best with a ratio of the sheets and whole cells.
+        alternatives: the next best, with other motors or cells.
         motors: by motor, its best design, feasible or the nearest to it.
-        front: designs of the Pareto front of two objectives; empty unless requested.
+        front: designs of the Pareto front of two objectives, empty unless requested.
         starts, evaluated: number of searches, and of all designs.
     """
 
@@ -137,7 +142,8 @@ def _descend(
     numbers. Steps are Adam's, clipped to bounds.
 
     Args:
-        weights: of the logarithms of the objectives in f; kept: 1 for included margins, 0 for others.
+        weights: of the logarithms of the objectives in f.
+        kept: 1 for included margins, 0 for others.
     """
     rate = optax.cosine_decay_schedule(RATE[0], STEPS, RATE[1] / RATE[0])
     adam = optax.adam(rate, b1=0.8, b2=0.95)
@@ -175,7 +181,8 @@ class Space:
     """All enumerated choices, a row each, with the bounds of the continuous numbers.
 
     Attributes:
-        drive, cell, in_series: of each choice; low, high: logarithms, shape (choices, 3).
+        drive, cell, in_series: of each choice.
+        low, high: logarithms, shape (choices, 3).
     """
 
     options: Options
@@ -244,11 +251,13 @@ def size_robot(
 
     Args:
         objectives: of `OBJECTIVES`, one to make small, or two for a Pareto front.
-        starts: searches in the batch; motors: names of those to choose from, empty: all; seed: of the starts.
+        starts: searches in the batch.
+        motors: names of those to choose from, empty: all.
+        seed: of the starts.
         tell: callback for progress.
 
     Raises:
-        BadConfiguration: any raised by `sheet.refuse_impossible`; an unknown objective or motor.
+        BadConfiguration: any raised by `sheet.refuse_impossible`. An unknown objective or motor.
     """
     for name in objectives:
         if name not in OBJECTIVES:
@@ -338,7 +347,9 @@ class _Search:
     """Steps of a search.
 
     Attributes:
-        kept: True for limits that some design meets; columns: of the objectives; evaluated: designs so far.
+        kept: True for limits that some design meets.
+        columns: of the objectives.
+        evaluated: designs so far.
     """
 
     problem: Task
@@ -432,7 +443,7 @@ def _starts(choice: Space, rows: np.ndarray, merit: np.ndarray, count: int) -> n
 
 
 def _cost(f: np.ndarray, g: np.ndarray, kept: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Cost of designs: logarithm of the objective; with a violated margin it is above that of any feasible design."""
+    """Cost of designs: logarithm of the objective. With a violated margin it is above that of any feasible design."""
     value = np.sum(np.where(weights > 0, weights * np.log(np.where(weights > 0, f, 1.0)), 0.0), axis=1)
     short = np.sum(np.maximum(-g[:, kept], 0.0), axis=1)
     return np.where(np.isfinite(value), value + np.where(short > 0, 100 + short, 0.0), 1e6)

@@ -36,7 +36,10 @@ class Drive(NamedTuple):
     """A motor with one size of gearbox (a family with so many stages), with a choice of ratios.
 
     Attributes:
-        motor: its sheet; family, stages: of the gearbox; ratios: total ones, ascending; gearbox: any of its sheets.
+        motor: its sheet.
+        family, stages: of the gearbox.
+        ratios: total ones, ascending.
+        gearbox: any of its sheets.
     """
 
     motor: MotorSheet
@@ -83,8 +86,9 @@ class Options:
     """Numbers of drives and cells, one row each, by name.
 
     Attributes:
-        drives, cells: the sheets; drive, cell: columns, shapes (drives,) and (cells,); base_mass: of the paper's two
-            motors, two gearboxes and cells, which a robot's mass includes [kg].
+        drives, cells: the sheets.
+        drive, cell: columns, shapes (drives,) and (cells,).
+        base_mass: of the paper's two motors, two gearboxes and cells, which a robot's mass includes [kg].
     """
 
     drives: tuple[Drive, ...]
@@ -102,7 +106,8 @@ def options_for_robot(robot: Robot, names: Names = ()) -> Options:
     """Options for a robot.
 
     Args:
-        robot: source of friction, efficiencies and cells missing in sheets; names: of motors, empty: all.
+        robot: source of friction, efficiencies and cells missing in sheets.
+        names: of motors, empty: all.
     """
     chosen, packs = drive_options(names), packable_cells()
     paper_motor = next(m for m in packaged_motors() if m.name == MOTOR)

@@ -48,7 +48,9 @@ class Change:
     """A change of a single parameter that meets a requirement.
 
     Attributes:
-        parameter: by dotted name; before, after: [unit]; unit: of its field.
+        parameter: by dotted name.
+        before, after: [unit].
+        unit: of its field.
         gradient: derivative of the quantity by the parameter at the worst corner [unit of quantity / unit].
         breaks: names of requirements that are met now and would be violated.
     """
@@ -68,11 +70,11 @@ class Outcome:
 
     Attributes:
         requirement: as stated, with its rating filled in.
-        value: of the quantity at the worst corner, in the unit of its name; None without a value there.
-        margin: to the limit, negative if it is missed; None without a value.
+        value: of the quantity at the worst corner, in the unit of its name, None without a value there.
+        margin: to the limit, negative if it is missed, None without a value.
         status: of the worst corner, of `STATUSES`.
         at: the worst corner.
-        change: single changes that would meet it, the smallest first; empty if it is met or none does.
+        change: single changes that would meet it, the smallest first, empty if it is met or none does.
     """
 
     JSON = (
@@ -118,8 +120,8 @@ def refuse_impossible(robot: Robot, asked: Requirements) -> None:
     """Refuse requirements that cannot be evaluated for a robot of these configurations.
 
     Raises:
-        BadConfiguration: a configuration that the robot does not have; a turn that it cannot make; a posture of a
-            robot without a stated stance; an envelope with a slope that the surface does not hold, whatever drives
+        BadConfiguration: a configuration that the robot does not have. A turn that it cannot make. A posture of a
+            robot without a stated stance. An envelope with a slope that the surface does not hold, whatever drives
             the robot: tan α above μ_s.
     """
     for r in asked.each:
@@ -269,15 +271,8 @@ class _QuantityOfRobot:
 
 
 def _computed_name(requirement: Requirement) -> str:
-    """Name by which a quantity is computed; the same for several names of one quantity, to share a program."""
+    """Name by which a quantity is computed. The same for several names of one quantity, to share a program."""
     return "speed_m_s" if requirement.name == "speed_end_of_charge_m_s" else requirement.name
-
-
-def changeable_parameters(robot: Robot, configuration: str) -> dict[str, params.Parameter]:
-    """Parameters of a robot that a designer can change, by name, without cells."""
-    by_name = {p.name: p for p in params.walk_parameters(robot)}
-    names = (*CHANGEABLE, *(f"{configuration}.{n}" for n in OF_CONFIGURATION))
-    return {name: by_name[name] for name in names if name in by_name}
 
 
 def check_requirements(
@@ -302,7 +297,13 @@ def check_requirements(
     for r in asked.each:
         configuration = _configuration(robot, r.envelope)
         of_levers = OF_LEVERS if r.quantity.group == "posture" else ()
-        held.append(_QuantityOfRobot(robot, r, (*changeable_parameters(robot, configuration), *of_levers, CELLS)))
+        by_name = {p.name: p for p in params.walk_parameters(robot)}
+        names = (*CHANGEABLE, *(f"{configuration}.{n}" for n in OF_CONFIGURATION))
+        held.append(
+            _QuantityOfRobot(
+                robot, r, (*{name: by_name[name] for name in names if name in by_name}, *of_levers, CELLS)
+            )
+        )
     found = []
     for k, h in enumerate(held, 1):
         tell(next_step("requirement", k, len(held), h.requirement.quantity.label))
@@ -431,7 +432,7 @@ def _changes(held: _QuantityOfRobot, outcome: Outcome) -> list[Change]:
 
 
 def _nearest(held: _QuantityOfRobot, name: str, begin: float, end: float) -> float | None:
-    """Value of a parameter nearest to `begin` towards `end` that meets the requirement; None without one."""
+    """Value of a parameter nearest to `begin` towards `end` that meets the requirement, None without one."""
     if begin == end:
         return None
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from calibration.inference.feedforward import Feedforward, units_of
+from calibration.inference.feedforward import WRONG_UNITS, Feedforward, units_of
 
 
 def feedforward_statement(found: Feedforward) -> str:
@@ -22,8 +22,19 @@ def _limit(level: float, current: float | None) -> str:
     )
 
 
-def _unit(ratio: float, meant: str) -> str:
-    told = f"it is probably {meant}" if meant else "check gear and wheel in the conversion"
+#: Ratio of a velocity in a wrong unit to the rate of the position → its unit.
+MEANT = dict(
+    zip(
+        WRONG_UNITS,
+        ("per minute", "per second, of a position in minutes", "in radians", "in rotations", "in degrees",
+         "in rotations", "in rotations per minute of a position in radians", "in millimetres", "in centimetres"),
+        strict=True,
+    )
+)  # fmt: skip
+
+
+def _unit(ratio: float, near: float) -> str:
+    told = f"it is probably {MEANT[near]}" if near else "check gear and wheel in the conversion"
     return (
         f"The velocity is {ratio:.4g} times the rate of the position: {told}. The constants are in the unit of the "
         "position."
@@ -52,7 +63,7 @@ SAID: dict[str, str | Callable[..., str]] = {
         "position. Shorten the filter of the velocity before using kP."
     ),
     "feedforward_limit": _limit,
-    "feedforward_skid": lambda level, current: (
+    "feedforward_skid": lambda level: (
         f"The wheels slip: above {level:.2g} V of accelerating voltage the velocity rises faster than below. Those "
         "windows are left out. Lower the voltage of the dynamic test."
     ),

@@ -191,7 +191,7 @@ def _percent(share: float) -> str:
 
 
 def adequacy_verdict(found: Adequacy) -> str:
-    """Verdict on the adequacy of a fit; first line of a calibration's output."""
+    """Verdict on the adequacy of a fit. First line of a calibration's output."""
     if found.obstacle:
         large = "it misses " + _misses([m for m in found.misses if m.large])
         return OBSTACLES[found.obstacle].format(large=large, every=_misses(found.misses))

@@ -32,7 +32,6 @@ if TYPE_CHECKING:
         Ranking,
         Resolved,
         Sensitivity,
-        StatedValue,
         UnnamedDiscrepancy,
         Worse,
     )
@@ -190,7 +189,7 @@ def no_mechanism(found: loop_notes.Mechanism) -> str:
 
 
 def curve_course(d: UnnamedDiscrepancy) -> str:
-    """Course of a smooth curve with its values at both ends; empty without a variable."""
+    """Course of a smooth curve with its values at both ends, empty without a variable."""
     if d.window is not None or d.variable not in bases.VARIABLES or len(d.at) < 2:
         return ""
     ends = [f"{d.value[k]:.2g} {d.unit} at {_level(d.variable, d.at[k])}" for k in (0, -1)]
@@ -231,7 +230,7 @@ def brief_verdict(said: loop_notes.Summary) -> str:
 
 
 def at_other_noise(found: Sequence[Sensitivity]) -> str:
-    """The verdicts with other noise, in a sentence; empty for none."""
+    """The verdicts with other noise, in a sentence, empty for none."""
     same: dict[str, list[str]] = {}
     for one in found:
         same.setdefault(brief_verdict(one.summary), []).append(f"{one.factor:g}")
@@ -316,12 +315,12 @@ def _shown(where: DiscrepancyLocation) -> str:
 
 
 def _within(where: DiscrepancyLocation) -> str:
-    """The window of what happens for a while, after a comma; empty for other discrepancies."""
+    """The window of what happens for a while, after a comma, empty for other discrepancies."""
     return "" if bases.window_from_name(where.variable) is None else f", {_shown(where)}"
 
 
 def shown_over(variable: str, by_duty: bool = False) -> str:
-    """Variable that shows a discrepancy; `by_duty`: only the duty changed the motors' voltage."""
+    """Variable that shows a discrepancy. `by_duty`: only the duty changed the motors' voltage."""
     variable = "duty" if by_duty and variable == "voltage" else variable
     happens = bases.window_from_name(variable)
     if variable == "side":
@@ -341,7 +340,7 @@ def freed_value(v: loop_notes.FreedValue) -> str:
 
 
 def p_value(p: float) -> str:
-    """A p-value; a bound for a small one, since the bootstrap cannot resolve it."""
+    """A p-value. A bound for a small one, since the bootstrap cannot resolve it."""
     if p > 0.01:
         return f"= {p:.2g}"
     step = 10.0 ** math.floor(math.log10(p))
@@ -394,7 +393,7 @@ def _rms(errors: Errors, total: int) -> str:
 
 
 def largest_share(found: DiscoveryResult) -> str:
-    """The reading that weighs most in what is left; empty where none stands out."""
+    """The reading that weighs most in what is left, empty where none stands out."""
     seen, runs = found.readings_of_rows, found.runs
     after = seen.after if found.written else seen.before
     squares = np.where(found.included[:, None], ((after - seen.measured) / seen.sd) ** 2, np.nan)
@@ -446,7 +445,7 @@ REASONS = {
 
 
 def support_reasons(support: loop_notes.NameSupport | None) -> str:
-    """Reasons for or against the names; empty for none."""
+    """Reasons for or against the names, empty for none."""
     if support is None:
         return ""
     return REASONS[support.why].format(
@@ -458,7 +457,7 @@ def support_reasons(support: loop_notes.NameSupport | None) -> str:
 
 
 def naming_reasons(found: DiscoveryResult) -> str:
-    """Reasons for or against the names; a curve that explains everything comes first."""
+    """Reasons for or against the names. A curve that explains everything comes first."""
     said, lacks = support_reasons(found.support), found.unnamed
     if lacks is None or not found.after.adequate or (found.support is not None and found.support.curves):
         return said
@@ -486,7 +485,7 @@ DOUBTS = {
 
 
 def effect_doubts(test: loop_notes.NameTest | None) -> str:
-    """Reasons against an effect; empty for none."""
+    """Reasons against an effect, empty for none."""
     if test is None or not test.fails:
         return ""
     over = ", ".join(_over(c.place, *c.variables) for c in test.curves)
@@ -509,7 +508,7 @@ def _over(place: str, *variables: str) -> str:
 
 
 def support_sentence(found: DiscoveryResult) -> str:
-    """Sentence on the support of names; empty without one."""
+    """Sentence on the support of names, empty without one."""
     if not found.standing:
         return ""
     if found.verdict in WITHOUT_NAME:
@@ -524,7 +523,7 @@ def effect_called(found: DiscoveryResult, effect: FoundEffect) -> str:
 
 
 def tentative_reason(found: DiscoveryResult, effect: FoundEffect) -> str:
-    """In a few words, what speaks against the name of an effect; empty where it is established."""
+    """In a few words, what speaks against the name of an effect, empty where it is established."""
     if found.support is None or is_established(found, effect):
         return ""
     test = found.support.test_of(effect.name)
@@ -545,7 +544,7 @@ def why_ruled_out(reasons: Sequence[loop_notes.RuledOut]) -> str:
 
 
 def ruled_out(found: DiscoveryResult) -> str:
-    """Effects that explain the data at least as well but are ruled out by size or sign; empty for none."""
+    """Effects that explain the data at least as well but are ruled out by size or sign, empty for none."""
     candidates, same = found.implausible, found.settings.same
     if found.verdict not in WITHOUT_NAME:
         better = tuple(a for a in candidates if a.rise_chi2 < -same)
@@ -566,7 +565,7 @@ def ruled_out(found: DiscoveryResult) -> str:
 
 
 def hidden_effects_sentence(found: DiscoveryResult) -> str:
-    """Sentence on effects that the findings could hide, and on runs that would show them; empty for none."""
+    """Sentence on effects that the findings could hide, and on runs that would show them, empty for none."""
     if not found.hidden:
         return ""
     each = [
@@ -575,13 +574,6 @@ def hidden_effects_sentence(found: DiscoveryResult) -> str:
         for h in found.hidden
     ]
     return f"Could be hidden behind what was found: {', '.join(each)}."
-
-
-def stated_value(name: str, s: StatedValue) -> str:
-    """`motor.resistance is 1.94 ohm (stated 0.611, +9.6 sds)`."""
-    return (
-        f"{freed_value(loop_notes.FreedValue(name, s.value, s.unit))} (stated {s.stated:.3g}, {s.prior_sds:+.1f} sds)"
-    )
 
 
 def moved_parameter(name: str, value: float, stated: float, unit: str, shift: float) -> str:
@@ -610,12 +602,15 @@ def indistinguishable_effects(found: DiscoveryResult, e: FoundEffect) -> str:
         ]
         + [f"{name} (time histories alone tell that)" for name in settled if name not in e.members]
     )
-    values = " or ".join(stated_value(name, s) for name, s in e.stated.items())
+    values = " or ".join(
+        f"{freed_value(loop_notes.FreedValue(name, s.value, s.unit))} (stated {s.stated:.3g}, {s.prior_sds:+.1f} sds)"
+        for name, s in e.stated.items()
+    )
     return ", or ".join(words for words in (others, values) if words)
 
 
 def rising_errors_sentence(found: Sequence[Worse], predicted: Mapping[str, tuple[int, int]]) -> str:
-    """Sentence on errors that rise and on rows that are no longer predicted; empty for none.
+    """Sentence on errors that rise and on rows that are no longer predicted, empty for none.
 
     Args:
         predicted: kind of block → rows that are predicted before and after.
@@ -736,7 +731,7 @@ def leader_choice(
     told: float,
     rise_chi2: float,
 ) -> str:
-    """Criterion that chose the leader of a class; a different choice by the other criterion is reported."""
+    """Criterion that chose the leader of a class. A different choice by the other criterion is reported."""
     criteria = {
         HELD_OUT: "errors held out",
         FIT: "the fit to all rows",

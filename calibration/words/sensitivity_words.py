@@ -32,7 +32,7 @@ _CAUSES = {
 
 
 def input_in_words(found: SensitivityResult, name: str) -> str:
-    """An input in words: its meaning without symbols' sources, and its configuration; the name of an effect's."""
+    """An input in words: its meaning without symbols' sources, and its configuration. The name of an effect's."""
     if name.startswith("effects.") or not found.inputs[name].meaning:
         return name
     words = re.split(r"[,;:] | \(", found.inputs[name].meaning)[0]

@@ -69,10 +69,11 @@ def levels_and_samples(found: Settled) -> str:
 
 
 def too_few(found: Settled, fewest: int, loop: str) -> str:
-    """Sentence for a log with too few settled runs: fit the log itself; empty where it has enough.
+    """Sentence for a log with too few settled runs: fit the log itself, empty where it has enough.
 
     Args:
-        fewest: rows that the loop asks for; loop: command that fits the log as it is.
+        fewest: rows that the loop asks for.
+        loop: command that fits the log as it is.
     """
     if len(found.kept) >= fewest:
         return ""

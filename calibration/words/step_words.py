@@ -63,10 +63,11 @@ def step_sentence(name: str, about: tuple[object, ...]) -> str:
 
 
 def expected_time(text: str, seconds: float) -> float | None:
-    """Time that a loop is expected to take yet, by what the stages before took [s]; None where that is not known.
+    """Time that a loop is expected to take yet, by what the stages before took [s], None where that is not known.
 
     Args:
-        text: line of a stage that begins; seconds: since the loop began.
+        text: line of a stage that begins.
+        seconds: since the loop began.
     """
     stage, _, rest = text.partition(f" of {OF}, ")
     over = OVER.get(int(stage)) if rest and stage.isdigit() else None

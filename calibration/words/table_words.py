@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable
 
 from calibration.data import Names
-from calibration.data.columns import LOAD
 from calibration.data.input_errors import bound_text
 
 #: Measurements that determine a parameter which the data do not, by the start or end of its name.
@@ -98,11 +97,6 @@ def copied_channel(source: str, column: str, other: str, intercept: float, slope
     said = f"{source}, {column}: in every row {start}{factor:.4g} times {other}, to the last digit"
     if tied:
         return f"{said}; if it is computed from it and no reading, remove it, as its noise then counts twice"
-    if column == LOAD:
-        return (
-            f"{said}: it is computed and was never measured, so it tells nothing of torque constant, friction or "
-            "efficiency; remove the column and keep the rows without a load, or give a torque that was set or read"
-        )
     return f"{said}: it is computed from it and no reading; remove it from channels and table, or read an instrument"
 
 

@@ -20,7 +20,8 @@ class Loop(eqx.Module):
     """A closed belt with grousers.
 
     Attributes:
-        first, second: pitch radii of the pulleys [m], first >= second; distance: of their axles [m].
+        first, second: pitch radii of the pulleys [m], first >= second.
+        distance: of their axles [m].
         grouser_height, grouser_length: over the pitch line, and along it [m].
         grousers: their number.
     """
@@ -136,7 +137,7 @@ class Tips(NamedTuple):
 
 
 def grouser_tips(loop: Loop, place: Float[Array, " n"]) -> Tips:
-    """Tips of the grousers at `place` [m along the path]; see `belt.tips_on_path` for their rigid bases."""
+    """Tips of the grousers at `place` [m along the path]. See `belt.tips_on_path` for their rigid bases."""
     tilt, rise = loop.tilt(place)
     normal = loop.normal(tilt)
     height = loop.grouser_height
@@ -148,8 +149,10 @@ class Corners(NamedTuple):
     """Distance of a belt from points.
 
     Attributes:
-        gap: distance [m]; normal: out of the belt, (n, 2); rate: displacement of the belt's material there per
-            displacement of the belt, (n, 2); place: on the path [m].
+        gap: distance [m].
+        normal: out of the belt, (n, 2).
+        rate: displacement of the belt's material there per displacement of the belt, (n, 2).
+        place: on the path [m].
     """
 
     gap: Array

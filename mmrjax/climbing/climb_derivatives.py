@@ -75,7 +75,7 @@ def smooth_minimum(values: Float[Array, " n"]) -> Scalar:
 
 
 def crest_sample(terrain: Terrain, record: ClimbRecord, over: bool) -> int | None:
-    """The first sample with the centre of mass past the obstacle, for a robot that gets over; else None."""
+    """The first sample with the centre of mass past the obstacle, for a robot that gets over, else None."""
     return int(jnp.argmax(record.centre > terrain.finish)) if over else None
 
 
@@ -115,7 +115,9 @@ class Derivatives(NamedTuple):
     """Outputs of a climb, by the names of `OUTPUTS`, and their derivatives.
 
     Attributes:
-        climb: the run; found: its outputs; by: their derivatives, of shape (values,).
+        climb: the run.
+        found: its outputs.
+        by: their derivatives, of shape (values,).
         slope, slope_sd: of straight lines through `BESIDE` runs along each value, and their standard deviations.
     """
 

@@ -1,6 +1,6 @@
 """Half a robot with levers on a terrain in its plane of travel: its state, one step, and the verdict of a run.
 
-The bodies are the chassis with payload, two pulleys and two levers; the belts run rigidly with the pulleys. The
+The bodies are the chassis with payload, two pulleys and two levers. The belts run rigidly with the pulleys. The
 levers' drives follow a sequence of angles, limited by the levers' rate, or have given voltages. `footing` computes
 the contacts, `balances` the drive of the tracks, `lever_drives` that of the levers.
 """
@@ -60,17 +60,17 @@ _ON_BELTS = np.eye(COORDINATES)[LED] + np.eye(COORDINATES)[SHAFT]
 
 
 class Sequence(eqx.Module):
-    """Angles of the levers, or voltages of their motors, over distance or time; linear between knots.
+    """Angles of the levers, or voltages of their motors, over distance or time, linear between knots.
 
     Values beyond the first and last knot are constant.
 
     Attributes:
         at: knots, of the middle of the wheelbase from the start of the obstacle [m], or times [s].
-        front, rear: angles at the knots, 0 along the wheelbase outward, positive up [rad]; or voltages, positive up
+        front, rear: angles at the knots, 0 along the wheelbase outward, positive up [rad], or voltages, positive up
             [V].
-        begins: initial angles of front and rear levers driven by voltages [rad]; None: the sequence states angles.
+        begins: initial angles of front and rear levers driven by voltages [rad]. None: the sequence states angles.
         over_time: True if knots are times.
-        supply: highest voltage of the levers' motors [V]; None: that of the supply.
+        supply: highest voltage of the levers' motors [V]. None: that of the supply.
     """
 
     at: Float[Array, " knots"]
@@ -128,7 +128,8 @@ class ClimbRecord(eqx.Module):
     """An instant or a sample: means over it, and energy since the start of the run.
 
     Attributes:
-        current: of one motor [A]; total_current: of all motors, from the supply, I_s of (10) [A].
+        current: of one motor [A].
+        total_current: of all motors, from the supply, I_s of (10) [A].
         torque: of each drive on its pair of levers [N·m], lever_current [A] and lever_voltage [V] of its motor, up.
         holds: 1 if only its worm holds a pair, without current [-].
         energy: in and lost, by the names of `SOURCES` and `LOSSES`, of the whole robot [J].
@@ -136,8 +137,9 @@ class ClimbRecord(eqx.Module):
         body: share of all normal force that the body carries [-].
         grip: traction of all rolling contacts over the limit of their friction [-].
         carried: share of the weight that all contacts carry [-].
-        centre: x of the centre of mass [m]; base: distances of the outermost contacts behind and ahead of it [m]. For
-            a sample the largest, because contacts that open for a few steps still carry the robot.
+        centre: x of the centre of mass [m].
+        base: distances of the outermost contacts behind and ahead of it [m]. For a sample the largest,
+            because contacts that open for a few steps still carry the robot.
     """
 
     time: Scalar
@@ -169,7 +171,7 @@ class ClimbRecord(eqx.Module):
 
 
 class System(eqx.Module):
-    """Constants of one run; robot and chassis have only the main tracks' losses, the levers' tracks their own."""
+    """Constants of one run. Robot and chassis have only the main tracks' losses, the levers' tracks their own."""
 
     robot: Robot
     conditions: Conditions
@@ -187,7 +189,7 @@ class System(eqx.Module):
 def climb_system(
     robot: Robot, conditions: Conditions, terrain: Terrain, sequence: Sequence, step: Scalar = STEP
 ) -> System:
-    """Constants of one run (scalar conditions); the robot may hold tracers."""
+    """Constants of one run (scalar conditions). The robot may hold tracers."""
     zero = jnp.zeros_like(conditions.voltage)
     mass = balances.begin_signals(robot, conditions, State(zero, zero, zero, zero)).mass
     robot, gear = robot.within(conditions.configuration), robot.running_gear
@@ -217,7 +219,7 @@ def mass_matrix_and_bias(run: System, q: Array, v: Array) -> tuple[Float[Array, 
     """Mass matrix M without rotors, bias c (centrifugal forces and gravity) and potential energy, per side.
 
     M v' + c = Q. Each body's centre of mass moves by its arm about the middle of the wheelbase and, of a lever, about
-    its axle; gravity is tilted by the slope of the conditions.
+    its axle. Gravity is tilted by the slope of the conditions.
     """
     half, shape = run.half, run.shape
     body, *levers = footing.part_frames(shape, q)
@@ -290,7 +292,7 @@ def _sliding(at: Footing, v: Array, signals: Signals) -> Array:
 
 
 def climb_instant(run: System, motion: Motion, on: Scalar) -> tuple[Signals, Footing, _Pull, Array]:
-    """All signals, contacts, forces and load shares of an instant; `on`: share of their voltage at the motors."""
+    """All signals, contacts, forces and load shares of an instant. `on`: share of their voltage at the motors."""
     at = footing.footing(run.shape, run.terrain, motion.q, motion.v)
     # share of each rolling contact in the load, and the robot's speed along the ground, their load-weighted mean
     bears = at.force * at.rolls
@@ -325,7 +327,7 @@ def _loaded(run: System, motion: Motion) -> System:
 def demanded_lever_rates(run: System, motion: Motion, time: Scalar) -> Float[Array, " 2"]:
     """Demanded angular speeds of the levers after a step [rad/s].
 
-    They lead to the sequence's angles, limited by the levers' rate; levers at their angle stand.
+    They lead to the sequence's angles, limited by the levers' rate. Levers at their angle stand.
     """
     rate = run.robot.running_gear.levers.rate
     toward = (_turned(*run.sequence.asked(motion.q[0], time)) - motion.q[LED]) / (4 * _SWINGS)
@@ -334,7 +336,7 @@ def demanded_lever_rates(run: System, motion: Motion, time: Scalar) -> Float[Arr
 
 
 def _swung(run: System, motion: Motion, time: Scalar, source: Scalar, free: Array, yields: Array) -> Swing:
-    """Action of the drives on the levers in a step; without it they have the rates `free` afterwards [rad/s]."""
+    """Action of the drives on the levers in a step, without it they have the rates `free` afterwards [rad/s]."""
     levers, sequence = run.robot.running_gear.levers, run.sequence
     most = jnp.abs(source) if sequence.supply is None else sequence.supply
     high = jnp.stack([most, most])
@@ -467,7 +469,7 @@ def _base(centre: Scalar, at: Footing) -> Float[Array, " 2"]:
 
 
 def _shaft_loss(run: System, motion: Motion, signals: Signals, at: Footing) -> Scalar:
-    """Derivative of the drive's losses with respect to the shaft speed [N·m·s], at least 0; it is large at rest.
+    """Derivative of the drive's losses with respect to the shaft speed [N·m·s], at least 0. It is large at rest.
 
     Contacts and winding are excluded, because they are resolved.
     """
@@ -514,7 +516,7 @@ def stand_before_obstacle(run: System, clear: float = 0.1) -> Motion:
 def _judged(
     run: System, before: Motion, passed: ClimbRecord, motion: Motion, progress: Progress
 ) -> tuple[Motion, Progress]:
-    """Updates the verdict of a run after a sample; a run that has ended keeps its state."""
+    """Updates the verdict of a run after a sample. A run that has ended keeps its state."""
     q, v = motion.q, motion.v
     outer = run.shape.main.first + run.shape.gear.grouser_height
     finite = jnp.all(jnp.isfinite(q)) & jnp.all(jnp.isfinite(v)) & jnp.isfinite(motion.current)
@@ -610,7 +612,7 @@ class Climb(eqx.Module):
 
     @property
     def during(self) -> np.ndarray:
-        """Mask of the samples before a run's verdict, after which its state is constant; shape (runs, samples)."""
+        """Mask of the samples before a run's verdict, after which its state is constant, shape (runs, samples)."""
         return np.asarray(self.record.time) <= np.asarray(self.ended)[:, None] + 1e-9
 
     def run(self, k: int) -> ClimbRecord:
@@ -620,7 +622,7 @@ class Climb(eqx.Module):
 
 
 def _alike(robot: Robot) -> int | None:
-    """Axis of the runs in a robot's parameters; None if all runs have one robot."""
+    """Axis of the runs in a robot's parameters, None if all runs have one robot."""
     return 0 if jnp.ndim(robot.sides) else None
 
 
@@ -667,10 +669,11 @@ def climb_batch(
 
     Args:
         robot: of all runs, or with a leading axis in every parameter too.
-        duration: of the longest run [s]; step, sample: intervals of integration and of the record [s].
+        duration: of the longest run [s].
+        step, sample: intervals of integration and of the record [s].
         part: length of run between two checks for the end of all runs [s].
-        record: True to return all samples; False: only the last one.
-        start: initial motions; None: at rest before the obstacle.
+        record: True to return all samples. False: only the last one.
+        start: initial motions. None: at rest before the obstacle.
         progress: called with the finished share of the time.
     """
     parts, samples, steps = divide_run(duration, step, sample, part)

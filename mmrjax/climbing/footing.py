@@ -34,9 +34,10 @@ class Shape(eqx.Module):
     """Parts of half a robot that can touch the ground.
 
     Attributes:
-        main, lever: the belts of one side; both levers have equal ones.
+        main, lever: the belts of one side. Both levers have equal ones.
         gear: the running gear.
-        on_tracks: 1 if levers carry load, 0 if wheels do [-]; wheel: their radius [m].
+        on_tracks: 1 if levers carry load, 0 if wheels do [-].
+        wheel: their radius [m].
         belly: height of the body's underside over the axles [m].
     """
 
@@ -79,12 +80,18 @@ class Footing(eqx.Module):
     """All pairs that may touch, and their forces at an instant.
 
     Attributes:
-        gap: distance [m]; gap_rate [m/s]; normal: of the robot's contact, out of the ground.
+        gap: distance [m].
+        gap_rate: its rate [m/s].
+        normal: of the robot's contact, out of the ground.
         off, along: change of the contact's speed off the ground and along it (forward on level ground) per
-            velocity of `COORDINATES`; carried: along it with the belts at rest.
-        force: normal force [N]; damped: its decrease with the gap's rate [N·s/m]; elastic: its recoverable part [N];
-            energy: stored in it [J].
-        guided: share that passes to the lower guide [-]; rolls: 1 but for the body [-].
+            velocity of `COORDINATES`.
+        carried: along it with the belts at rest.
+        force: normal force [N].
+        damped: its decrease with the gap's rate [N·s/m].
+        elastic: its recoverable part [N].
+        energy: stored in it [J].
+        guided: share that passes to the lower guide [-].
+        rolls: 1 but for the body [-].
         place: x of the contact [m].
     """
 

@@ -40,7 +40,9 @@ class LeverDrive(eqx.Module):
     c = (2 - 1/η_w) / η_p. At rest e may have any value between the two.
 
     Attributes:
-        constant: i C_m [N·m/A, V·s/rad]; resistance: of the winding [ohm]; inertia: i² J_d [kg·m²].
+        constant: i C_m [N·m/A, V·s/rad].
+        resistance: of the winding [ohm].
+        inertia: i² J_d [kg·m²].
         dry, viscous: i M_df0 [N·m], i² K_fd [N·m·s].
         ahead, back: c for T with the motion and against it [-].
         current_limit: of the motor [A].
@@ -82,7 +84,9 @@ class Swing(NamedTuple):
     """Action of both pairs in a step, each (2,).
 
     Attributes:
-        torque: on the levers [N·m]; rate: after the step [rad/s]; voltage [V] and current [A] of their motors.
+        torque: on the levers [N·m].
+        rate: after the step [rad/s].
+        voltage, current: of their motors [V], [A].
         holds: True if only its worm holds a pair, without current.
     """
 
@@ -106,15 +110,19 @@ def step_levers(
     """One step of both pairs: the demanded rates if the voltages permit them, else the rates that these give.
 
     The levers' mechanics give ω = free + yields T after the step. The voltage is chosen between `least` and `most`
-    so that ω is the demanded rate; for a lever that has to stand, the smallest voltage that holds it. Each drive's
+    so that ω is the demanded rate. For a lever that has to stand, the smallest voltage that holds it. Each drive's
     law has straight pieces (`_PIECES`). Of all pairs of pieces the one whose solution is on both is taken, or the
     one with the smallest deviation.
     This is exact and has no iterations. A root finder cannot replace it: where a lever stands, its law allows a range
     of torques and is no function.
 
     Args:
-        step: [s]; rate: before it [rad/s]; free: after it, of levers without torque [rad/s]; yields: [rad/(N·m·s)].
-        asked: demanded rates after it [rad/s]; least, most: voltages of the motors [V].
+        step: [s].
+        rate: before it [rad/s].
+        free: after it, of levers without torque [rad/s].
+        yields: [rad/(N·m·s)].
+        asked: demanded rates after it [rad/s].
+        least, most: voltages of the motors [V].
     """
     limits = drive.constant * rate + drive.resistance * drive.current_limit * jnp.array([[-1.0], [1.0]])
     least, most = jnp.maximum(least, limits[0]), jnp.minimum(most, limits[1])

@@ -44,7 +44,7 @@ class Outline(eqx.Module):
         forward, up: centres of the circles, in the order of `CIRCLES` [m].
         radius: of the circles as they roll on the ground: wheels, or belts over the grousers [m].
         belt: radius of the main belt over its grousers [m].
-        tracked: 1 on tracks; on wheels there are no levers: their rollers are on the axles, with radius 0 [-].
+        tracked: 1 on tracks. On wheels there are no levers: their rollers are on the axles, with radius 0 [-].
         centre_forward, centre_up: centre of mass of all parts [m].
     """
 
@@ -83,7 +83,7 @@ def posture_masses(robot: Robot, conditions: Conditions, mass: Scalar | None = N
     """Masses of half a robot with the levers at the angles of the conditions.
 
     Args:
-        mass: total with payload [kg]; None: as stated.
+        mass: total with payload [kg]. None: as stated.
     """
     if mass is None:
         stated = robot.chassis(conditions.configuration).mass + conditions.payload
@@ -95,7 +95,7 @@ def side_outline(robot: Robot, conditions: Conditions, mass: Scalar | None = Non
     """Side view of a robot with the levers at the angles of the conditions.
 
     Args:
-        mass: total with payload [kg]; None: as stated.
+        mass: total with payload [kg]. None: as stated.
     """
     chassis, gear = robot.chassis(conditions.configuration), robot.running_gear
     tracked = jnp.asarray(chassis.on_tracks)
@@ -117,15 +117,16 @@ class Posture(eqx.Module):
     """Posture of a robot at rest on a plane.
 
     Attributes:
-        pitch: nose up [rad]; height: of the middle of the wheelbase above the plane [m].
+        pitch: nose up [rad].
+        height: of the middle of the wheelbase above the plane [m].
         rear, front: ends of the contact, ahead of the middle of the wheelbase along the plane [m].
         line: 1 if a belt carries load all along between them, 0 if only the ends do [-].
-        centre_ahead: centre of mass ahead of the middle of the wheelbase, along the plane [m]; centre_height: above
-            the plane [m].
-        load_front: share of the normal load at its front if only both ends carried it; outside 0..1 the robot
+        centre_ahead: centre of mass ahead of the middle of the wheelbase, along the plane [m].
+        centre_height: above the plane [m].
+        load_front: share of the normal load at its front if only both ends carried it. Outside 0..1 the robot
             tips [-].
         margin: distance along the plane from the intersection of gravity's line through the centre of mass to the
-            nearer end of the contact; negative if the robot tips [m].
+            nearer end of the contact. Negative if the robot tips [m].
         tips_back, tips_forward: tipping slopes, uphill and downhill [rad].
         inertia: in pitch about the centre of mass [kg·m²].
     """
@@ -150,7 +151,7 @@ class Posture(eqx.Module):
 
 
 def posture(robot: Robot, conditions: Conditions, mass: Scalar | None = None) -> Posture:
-    """The posture of a robot at rest on a slope, for one run; if several are possible, the one with least pitch.
+    """The posture of a robot at rest on a slope, for one run. If several are possible, the one with least pitch.
 
     Two circles i (tail) and j (nose), d apart in the direction β of the frame, touch a plane at the pitch
 
@@ -158,10 +159,10 @@ def posture(robot: Robot, conditions: Conditions, mass: Scalar | None = None) ->
 
     and carry the robot if no other circle is below and gravity's line through the centre of mass passes between them.
     The slope is that of the conditions, uphill ahead. If no edge holds, the nearest to holding is returned, with
-    a negative `margin`; postures with a pitch beyond `UPRIGHT` are excluded.
+    a negative `margin`. Postures with a pitch beyond `UPRIGHT` are excluded.
 
     Args:
-        mass: with payload [kg]; None: as stated.
+        mass: with payload [kg]. None: as stated.
     """
     inertia = robot.sides * posture_masses(robot, conditions, mass).inertia_pitch(robot.running_gear.wheelbase)
     return rest_outline(side_outline(robot, conditions, mass), conditions.slope, inertia)
@@ -173,7 +174,7 @@ def level_posture(robot: Robot, conditions: Conditions, mass: Scalar | None = No
 
 
 def rest_outline(side: Outline, slope: Scalar, inertia: Scalar) -> Posture:
-    """The posture of an outline on a slope [rad]; see `posture`."""
+    """The posture of an outline on a slope [rad]. See `posture`."""
     tail, nose = EDGES.T
     ahead, rise = side.forward[nose] - side.forward[tail], side.up[nose] - side.up[tail]
     apart = jnp.sqrt(jnp.maximum(ahead**2 + rise**2, 1e-12))

@@ -31,9 +31,10 @@ class StepLimit(eqx.Module):
     """The highest step that carries a robot with its centre of mass over the edge.
 
     Attributes:
-        height: of the step [m]; pitch: nose up [rad].
-        side: the robot there, in a frame along the ground with the middle of its wheelbase as origin; base: height of
-            that above the lower ground [m].
+        height: of the step [m].
+        pitch: nose up [rad].
+        side: the robot there, in a frame along the ground with the middle of its wheelbase as origin.
+        base: height of that above the lower ground [m].
     """
 
     height: Scalar
@@ -47,9 +48,9 @@ class StaticLimits(eqx.Module):
 
     Attributes:
         step: the highest, driven onto nose first [m].
-        gap: the widest gap that its contact bridges on both sides of its centre of mass [m]; 0 if no belt touches.
+        gap: the widest gap that its contact bridges on both sides of its centre of mass [m], 0 if no belt touches.
         contact: length of the contact on level ground [m].
-        tip_front, tip_rear: tops of the levers' rollers above level ground [m]; on wheels those of the wheels.
+        tip_front, tip_rear: tops of the levers' rollers above level ground [m]. On wheels those of the wheels.
         tips_back, tips_forward, tips_aside: tipping slopes: uphill, downhill, across [rad].
         length, height: overall, on level ground [m].
     """
@@ -123,7 +124,7 @@ def find_highest_step(side: Outline, pitch: Scalar | None = None) -> StepLimit:
     slopes s over pitch on the other side: dH = (s_1 dH_2 - s_2 dH_1) / (s_1 - s_2).
 
     Args:
-        pitch: of the highest step [rad]; None: it is searched.
+        pitch: of the highest step [rad]. None: it is searched.
     """
     still = jax.lax.stop_gradient(side)
     best = _highest(lambda pitch: step_height_at(still, pitch), *_PITCHES)[0] if pitch is None else pitch
@@ -173,7 +174,7 @@ def best_step(robot: Robot, conditions: Conditions) -> tuple[StepLimit, Scalar, 
 
     The derivatives are those at these angles [rad]. The step is a limit for any slow sequence of postures if the wall
     of the step carries no load. When the tail leaves the lower ground, the centre of mass must be over the step, and
-    the step is no higher than in the best posture. Only the pitch is searched; the levers' angles follow
+    the step is no higher than in the best posture. Only the pitch is searched. The levers' angles follow
     (`best_levers`).
     """
     still, run = jax.lax.stop_gradient((robot, conditions))

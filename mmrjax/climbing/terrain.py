@@ -28,7 +28,7 @@ class Terrain(eqx.Module):
     """A polyline of ground.
 
     Attributes:
-        points: its vertices [m]; repeated vertices count once.
+        points: its vertices [m]. Repeated vertices count once.
         nose: radius of its convex corners [m].
         finish: x of the end of the obstacle [m].
     """
@@ -39,7 +39,7 @@ class Terrain(eqx.Module):
 
     @property
     def corners(self) -> Float[Array, "corners 2"]:
-        """Convex corners, centres of the noses [m]; concave ones are out of reach."""
+        """Convex corners, centres of the noses [m]. Concave ones are out of reach."""
         before, at, after = self.points[:-2], self.points[1:-1], self.points[2:]
         turn = _cross(at - before, after - at)
         # A repeated vertex has no edge; its next different vertex gives the direction.
@@ -83,7 +83,7 @@ def _at(values: Array, which: Array) -> Array:
 
 
 def _terrain(points: Sequence[tuple[Scalar, Scalar]], finish: Scalar, nose: Scalar = 0.0, size: int = 0) -> Terrain:
-    """Terrain through points [m] between the ground before and the ground after; padded to `size` points."""
+    """Terrain through points [m] between the ground before and the ground after. Padded to `size` points."""
     zero = jnp.zeros(())
     rows = jnp.stack([jnp.stack([x + zero, z + zero]) for x, z in points])
     # Noses: the polyline is deeper by their radius; risers face backward.

@@ -42,7 +42,7 @@ SELDOM = {**SMALL, "xla_backend_optimization_level": 0 if SOUND_AT_LEVEL_0 in os
 
 
 def compiled(function: Callable[P, T], *, options: dict[str, Any] | None = None) -> Callable[P, T]:
-    """`eqx.filter_jit` of a function; a returned robot is reduced by `for_equations`.
+    """`eqx.filter_jit` of a function. A returned robot is reduced by `for_equations`.
 
     If a program folder is set, programs are stored there (`mmrjax.compile.programs`). Tracing is limited to one
     thread at a time. Programs run in parallel, and stored programs are also compiled in parallel.

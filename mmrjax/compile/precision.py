@@ -94,7 +94,7 @@ def as_floats(tree: T) -> T:
 
 
 def _widened(argument: Any) -> Any:
-    """Returns a module with its floating-point numbers as JAX arrays in double precision; others unchanged."""
+    """Returns a module with its floating-point numbers as JAX arrays in double precision, others unchanged."""
     return as_floats(argument) if isinstance(argument, eqx.Module) else argument
 
 
@@ -126,7 +126,7 @@ def as_array(value: Any, kind: type = float) -> Any:
 
 
 class Threads(concurrent.futures.ThreadPoolExecutor):
-    """Pool of threads; each call is computed in the precision of the thread that submits it."""
+    """Pool of threads. Each call is computed in the precision of the thread that submits it."""
 
     def __init__(self, workers: int) -> None:
         """Makes a pool of this number of threads."""

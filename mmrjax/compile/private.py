@@ -1,4 +1,4 @@
-"""Folders that only the user can change; native code is read only from these."""
+"""Folders that only the user can change. Native code is read only from these."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from pathlib import Path
 
 
 def exposure_reason(folder: Path) -> str:
-    """Reason why another user could place files in a folder; empty if only the user and root can.
+    """Reason why another user could place files in a folder, empty if only the user and root can.
 
     The folder and its files have to belong to the user, and neither the group nor others may write to it. Each folder
     above it has to belong to the user or to root, and be sticky if others may write to it: they could rename it.
 
     Args:
-        folder: may not exist yet; the folders above it are checked then.
+        folder: may not exist yet. The folders above it are checked then.
     """
     if not hasattr(os, "geteuid"):  # a system without owners and modes
         return ""

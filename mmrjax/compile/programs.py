@@ -105,11 +105,11 @@ class Programs:
         self._found: dict[Any, Future[Program | None]] = {}
 
     def of(self, arguments: tuple[tuple, dict[str, Any]]) -> Program | None:
-        """The program for positional and named arguments; None if it may not be stored."""
+        """The program for positional and named arguments, None if it may not be stored."""
         return self.of_structure(structure_of(arguments), arguments)
 
     def of_structure(self, structure: Hashable | None, arguments: tuple[tuple, dict[str, Any]]) -> Program | None:
-        """The program for arguments of known structure (`structure_of`); None if it may not be stored."""
+        """The program for arguments of known structure (`structure_of`), None if it may not be stored."""
         folder = os.environ.get(VARIABLE, "")
         if structure is None or not folder or not _keeps() or not _private(folder):
             return None
@@ -128,7 +128,7 @@ class Programs:
         return found.result()
 
     def _kept(self, structure: Hashable, make: Callable[[], T]) -> T:
-        """Result of `make`, stored; after an error it is forgotten, and waiting threads receive the error."""
+        """Result of `make`, stored. After an error it is forgotten, and waiting threads receive the error."""
         try:
             return make()
         except BaseException as error:
@@ -192,7 +192,7 @@ class Programs:
 
 
 def structure_of(arguments: Any) -> Hashable | None:
-    """Returns the structure of arguments that a program depends on; None if not hashable or if some are traced."""
+    """Returns the structure of arguments that a program depends on, None if not hashable or if some are traced."""
     leaves, tree = jax.tree.flatten(arguments)
     if has_tracer(leaves):
         return None
@@ -225,7 +225,7 @@ def _keeps() -> bool:
 
 
 def _shape(leaf: Any) -> Any:
-    """Structure of a leaf: shape and kind of an array; any other leaf is returned unchanged.
+    """Structure of a leaf: shape and kind of an array. Any other leaf is returned unchanged.
 
     Raises:
         Unnamed: an array of keys, or of another kind that NumPy does not have.
@@ -287,7 +287,7 @@ def _settings() -> tuple[tuple[str, str], ...]:
 
 
 @functools.cache
-def source_hash(root: Path = Path(__file__).resolve().parents[1]) -> str:  # noqa: B008 (a constant)
+def source_hash(root: Path = Path(__file__).resolve().parents[2]) -> str:  # noqa: B008 (a constant)
     """A hash of the source of our packages in a folder, of the versions of the libraries and of Python."""
     digest = hashlib.sha256(sys.version.encode())
     for library in LIBRARIES:
@@ -305,7 +305,7 @@ def _executable(folder: Path, name: str) -> Path:
 
 
 def _loaded(folder: Path, name: str, arrays: int, result: Any) -> Callable[..., list[Any]] | None:
-    """The executable with that name for this number of arrays; None if it is missing or unreadable."""
+    """The executable with that name for this number of arrays, None if it is missing or unreadable."""
     out = sum(isinstance(x, _Place) for x in jax.tree.leaves(result))
     try:
         written = zlib.decompress(_executable(folder, name).read_bytes())
@@ -340,7 +340,7 @@ def _read_from_cache() -> Iterator[list[str]]:
 
 
 def _write(path: Path, content: bytes) -> None:
-    """Writes a file completely or not at all; ignores a folder without write permission."""
+    """Writes a file completely or not at all. Ignores a folder without write permission."""
     partial = path.with_name(f"{path.name}.{os.getpid()}.{threading.get_ident()}")
     with contextlib.suppress(OSError):
         partial.write_bytes(content)

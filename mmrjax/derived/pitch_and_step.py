@@ -17,7 +17,7 @@ def compute(robot: Robot, conditions: Conditions) -> dict[str, Array]:
     """Pitch and highest steps of one run's robot, from geometry alone.
 
     Returns:
-        `pitch` [rad]; `highest_step`, in this posture, and `best_step`, in any [m]; `status`: always `converged`.
+        `pitch` [rad], `highest_step`, in this posture, and `best_step`, in any [m], `status`: always `converged`.
     """
     found = {
         "pitch": resting_posture.posture(robot, conditions).pitch,

@@ -33,8 +33,10 @@ class Ratings(eqx.Module):
     """Limits and counts that a robot holds as constants, in a form that can be batched.
 
     Attributes:
-        cells: in series [-]; voltage_cutoff: of a cell [V]; temperature: permissible winding temperature [°C];
-            torque: permissible continuous torque of a gearbox [N·m], inf if not stated.
+        cells: in series [-].
+        voltage_cutoff: of a cell [V].
+        temperature: permissible winding temperature [°C].
+        torque: permissible continuous torque of a gearbox [N·m], inf if not stated.
     """
 
     cells: Scalar
@@ -54,14 +56,18 @@ def ratings(robot: Robot) -> Ratings:
 
 
 class EnvelopePoint(eqx.Module):
-    """A point of the envelope; every field differentiable and batchable.
+    """A point of the envelope. Every field differentiable and batchable.
 
     Attributes:
-        configuration: index; battery: 1 on the battery.
+        configuration: index.
+        battery: 1 on the battery.
         adhesion, adhesion_lateral: of the surface as a ratio to the robot's own [-].
-        charge: state of charge [-], or voltage of an external supply [V]; charge_end: state of charge at the end.
-        share: share of time in motion, for the endurance; 0: standing still [-].
-        slope_deg: [deg]; payload: [kg]; ambient: [°C].
+        charge: state of charge [-], or voltage of an external supply [V].
+        charge_end: state of charge at the end.
+        share: share of time in motion, for the endurance. 0: standing still [-].
+        slope_deg: [deg].
+        payload: [kg].
+        ambient: [°C].
         tread: of stairs [m].
     """
 
@@ -82,7 +88,8 @@ class QuantityValue(eqx.Module):
     """Value of a quantity at one point.
 
     Attributes:
-        value: [SI], a number at any outcome; outcome: code into `STATUSES`; the value is valid if it is `converged`.
+        value: [SI], a number at any outcome.
+        outcome: code into `STATUSES`. The value is valid if it is `converged`.
     """
 
     value: Float[Array, "..."]
@@ -90,7 +97,7 @@ class QuantityValue(eqx.Module):
 
 
 def with_cells(robot: Robot, cells: Scalar) -> Robot:
-    """The robot with this number of cells in series, which may be traced; voltages scale with the number."""
+    """The robot with this number of cells in series, which may be traced. Voltages scale with the number."""
     battery = robot.battery
     more = cells / battery.cells
     battery = dataclasses.replace(
@@ -118,7 +125,7 @@ def _at(robot: Robot, point: EnvelopePoint, rated: Ratings) -> tuple[Robot, Cond
 def heat_left(robot: Robot, point: EnvelopePoint, current: Scalar, limit: Scalar) -> Scalar:
     """Relative thermal margin of a winding for continuous `current` [-]: 0 if it settles at `limit` [°C].
 
-    1 - I² R_th R (1 + α (T - 25 °C)) / (T - T_a); `robot` as stated, not as returned by `_at`.
+    1 - I² R_th R (1 + α (T - 25 °C)) / (T - T_a). `robot` as stated, not as returned by `_at`.
     """
     motor = robot.motor
     hot = motor.resistance * motor.resistance_ratio(limit)
@@ -126,7 +133,7 @@ def heat_left(robot: Robot, point: EnvelopePoint, current: Scalar, limit: Scalar
 
 
 def _cell(rated: Ratings, signals: Signals, point: EnvelopePoint) -> Scalar:
-    """Margin of a cell above its cut-off voltage [V]; inf on an external supply."""
+    """Margin of a cell above its cut-off voltage [V], inf on an external supply."""
     return jnp.where(point.battery > 0.5, signals.voltage_source / rated.cells - rated.voltage_cutoff, jnp.inf)
 
 
@@ -329,7 +336,9 @@ def evaluate_requirement(robot: Robot, point: EnvelopePoint, rated: Ratings, nam
     """Value of one quantity at one point.
 
     Args:
-        robot: its parameters may be tracers; point: scalars; rated: the robot's `ratings`, or others.
+        robot: its parameters may be tracers.
+        point: scalars.
+        rated: the robot's `ratings`, or others.
         name: of `QUANTITIES`.
     """
     return GROUPS[QUANTITIES[name].group](robot, point, rated, name)

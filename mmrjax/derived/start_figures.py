@@ -29,15 +29,15 @@ WITHIN, LAST = 0.01, 0.15
 
 @dataclasses.dataclass(frozen=True)
 class StartStages:
-    """The stages of one start; times since its first sample.
+    """The stages of one start. Times since its first sample.
 
     Attributes:
         sense: direction of the shafts at the end, 1 or -1.
         starting: end of the first stage [s]: the slide has reached its maximum, the shafts have spun up.
-        slipping: end of the second stage [s]: the slide stays within V_s from here; `starting` if it never left.
+        slipping: end of the second stage [s]: the slide stays within V_s from here, `starting` if it never left.
         settled: t' [s]: the speed is within 1 % of its last value, the mean over the last 0.15 s.
         end: of the run [s].
-        slip: of each stage, and over_settling: from 0 to t', by `mean_slip` [-]; NaN for a stage of no length.
+        slip: of each stage, and over_settling: from 0 to t', by `mean_slip` [-], NaN for a stage of no length.
     """
 
     sense: float
@@ -68,7 +68,7 @@ class StartStages:
 
 
 def _smoothed(time: np.ndarray, values: np.ndarray, period: float) -> np.ndarray:
-    """Means over a `period` about each instant of evenly spaced samples; at the ends, of the nearest whole period."""
+    """Means over a `period` about each instant of evenly spaced samples. At the ends, of the nearest whole period."""
     count = min(round(period / (time[-1] / len(time))) | 1, len(values) | 1) if time[-1] > 0 else 1
     if count < 3 or count > len(values):
         return values
@@ -105,9 +105,10 @@ def stages_of_start(
     """The stages of one start, from samples without gaps.
 
     Args:
-        time: [s]; speed, theoretical, sliding: V, r_k ω_k and the contact patch's speed over the ground [m/s].
+        time: [s].
+        speed, theoretical, sliding: V, r_k ω_k and the contact patch's speed over the ground [m/s].
         speed_static: V_s of the friction law [m/s].
-        way: distance of the movers between two contacts that cause ripple [m]; slide and speed are averaged over it
+        way: distance of the movers between two contacts that cause ripple [m]. Slide and speed are averaged over it
             at the last speed. 0: no ripple.
     """
     sense = -1.0 if theoretical[-1] < -1e-4 else 1.0
@@ -127,10 +128,10 @@ def stages_of_start(
 def stages_of_histories(
     robot: Robot, history: History, which: Sequence[int] | np.ndarray
 ) -> list[StartStages | None]:
-    """Stages of each run of a batch from standstill, up to its last number; None for a run without numbers.
+    """Stages of each run of a batch from standstill, up to its last number, None for a run without numbers.
 
     Args:
-        which: index of each run's configuration in `robot`; its loads are vehicles.
+        which: index of each run's configuration in `robot`. Its loads are vehicles.
     """
     found: list[StartStages | None] = []
     for k, index in enumerate(which):
@@ -153,7 +154,7 @@ def count_finite_samples(values: Float[np.ndarray, " times"]) -> int:
 
 
 def last_samples(time: Float[np.ndarray, " times"]) -> np.ndarray:
-    """Mask of the last 0.15 s, several pitches of the running gear; for a short run, of its last tenth."""
+    """Mask of the last 0.15 s, several pitches of the running gear. For a short run, of its last tenth."""
     return np.asarray(time >= time[-1] - min(LAST, 0.1 * float(time[-1])))
 
 
@@ -165,17 +166,12 @@ INRUSH, EARLIEST, LATEST, REST = 250, 2e-5, 0.02, 800
 TOLERANCE = 1e-7
 
 
-def start_times() -> np.ndarray:
-    """Times of a start [s]: spaced by 3 % while the current rises to its peak, then by 5 ms."""
-    early = np.geomspace(EARLIEST, LATEST, INRUSH, endpoint=False)
-    return np.concatenate([[0.0], early, np.linspace(LATEST, TIME_SETTLED, REST)])
-
-
 def curve_peak(times: Float[Array, " times"], x: Float[Array, " times"], kink: Scalar = np.inf) -> Float[Array, ""]:
     """Largest value of a sampled curve: the vertex of the parabola through its largest sample and both neighbours.
 
     Args:
-        times: not decreasing [s]; x: samples, NaN if the curve has no value.
+        times: not decreasing [s].
+        x: samples, NaN if the curve has no value.
         kink: largest value of the parabola. At a limit of the current the curve has a corner.
     """
     known = jnp.where(jnp.isfinite(x), x, -jnp.inf)
@@ -220,11 +216,12 @@ def compute(robot: Robot, conditions: Conditions) -> dict[str, Array]:
     """One start from standstill by `drive`, over `TIME_SETTLED`.
 
     Returns:
-        `peak_current` of all motors [A]; `time_to_speed`, until 95 % of the final speed [s]; `energy_start`,
-        ∫ U_e I_s dt until then [J]; `status` of the run. Numbers are NaN unless it is `converged`: a run that slides,
+        `peak_current` of all motors [A], `time_to_speed`, until 95 % of the final speed [s], `energy_start`,
+        ∫ U_e I_s dt until then [J]. `status` of the run. Numbers are NaN unless it is `converged`: a run that slides,
         stalls or has not settled has no final speed. Derivatives are forward.
     """
-    times = jnp.asarray(start_times())
+    early = np.geomspace(EARLIEST, LATEST, INRUSH, endpoint=False)
+    times = jnp.asarray(np.concatenate([[0.0], early, np.linspace(LATEST, TIME_SETTLED, REST)]))
     run = drive(robot, conditions, times, TOLERANCE)
     signals = run.signals
     speed, rate, current = (jnp.asarray(x) for x in (signals.speed, signals.acceleration, signals.total_current))

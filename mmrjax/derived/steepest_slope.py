@@ -32,7 +32,7 @@ def slope_margin(robot: Robot, conditions: Conditions, slope_deg: Scalar) -> Flo
 def travel_margin(robot: Robot, signals: Signals) -> Float[Array, ""]:
     """Smaller of two margins [-]: of adhesion, 1 - demand / limit, and of speed, V / (V_s / 10) - 1.
 
-    Positive if `steady` returns `converged`; continuous through the edge in both cases.
+    Positive if `steady` returns `converged`. Continuous through the edge in both cases.
     """
     rest = robot.chassis(signals.configuration).speed_still
     slowest = jnp.minimum(signals.speed_theoretical, signals.speed)
@@ -41,13 +41,13 @@ def travel_margin(robot: Robot, signals: Signals) -> Float[Array, ""]:
 
 @compiled
 def compute(robot: Robot, conditions: Conditions) -> dict[str, Array]:
-    """Steepest slope that one run's voltage and payload allow; the run's own slope has no influence.
+    """Steepest slope that one run's voltage and payload allow. The run's own slope has no influence.
 
     The root of `slope_margin` between level ground and `STEEPEST`, by bisection. Derivatives are implicit,
     dα = -(∂margin/∂α)⁻¹ ∂margin/∂θ dθ, forward and reverse.
 
     Returns:
-        `steepest_slope` [deg], NaN if the robot does not travel on level ground; `STEEPEST`, with zero derivatives,
+        `steepest_slope` [deg], NaN if the robot does not travel on level ground, `STEEPEST`, with zero derivatives,
         if it climbs that. `status` is that of level ground.
     """
     flat = operating_point(robot, dataclasses.replace(conditions, slope_deg=jnp.zeros_like(conditions.slope_deg)))[0]

@@ -28,7 +28,8 @@ def turning_radius(ahead: Any, aside: Any, rate: Any) -> Array:
     """Radius of the circle of the centre of mass, positive to the left, inf in straight travel [m].
 
     Args:
-        ahead, aside: speeds of the centre of mass [m/s]; rate: yaw rate [rad/s]; arrays of one shape.
+        ahead, aside: speeds of the centre of mass [m/s].
+        rate: yaw rate [rad/s], arrays of one shape.
     """
     turns = jnp.abs(rate) > NONE
     along = jnp.sqrt(jnp.maximum(jnp.square(ahead) + jnp.square(aside), 1e-24))  # a root of 0 has no derivative
@@ -41,7 +42,7 @@ def compute(robot: Robot, conditions: Conditions) -> dict[str, Array]:
     """The radius of a settled turn of one run.
 
     Returns:
-        `turning_radius` [m], NaN if no turn settles; `status` of the turn. Derivatives are implicit.
+        `turning_radius` [m], NaN if no turn settles. `status` of the turn. Derivatives are implicit.
     """
     point = steady(robot, conditions)
     found = turning_radius(*(point.reading[name] for name in PLANE))
@@ -61,7 +62,7 @@ def turns_under_equal_commands(robot: Robot, imposed: float) -> Result:
 
 
 def turning_columns(robot: Robot, reading: Mapping[str, Any], radius: np.ndarray) -> dict[str, np.ndarray]:
-    """The columns of settled turns, from the readings of their channels [SI]; arrays of one shape.
+    """The columns of settled turns, from the readings of their channels [SI], arrays of one shape.
 
     Args:
         radius: of the driving wheels [m].

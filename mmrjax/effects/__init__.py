@@ -1,4 +1,4 @@
-"""The library of effects, one file for each balance; a new effect is a class in the file of its balance."""
+"""The library of effects, one file for each balance. A new effect is a class in the file of its balance."""
 
 from mmrjax.effects import (
     duty_effects,

@@ -36,7 +36,7 @@ THE_SIDE = "the side"
 
 
 def amplitude(unit: str, meaning: str, bounds: tuple[float, float], source: str, *, sd: float) -> Any:
-    """Declares the amplitude of an effect, 0 (absent) by default; see `params.Spec` for the arguments."""
+    """Declares the amplitude of an effect, 0 (absent) by default. See `params.Spec` for the arguments."""
     return parameter(0.0, unit, meaning, bounds, source, sd=sd, amplitude=True)
 
 
@@ -48,23 +48,23 @@ class Effect(eqx.Module):
     defaults are stated as `dissipative = True`:
 
     Attributes:
-        name: its name in files and reports; by default made from the class name, `MassError` as `mass_error`.
-        balance: the balance it enters, one of `balances.BALANCES`, whose unit its term has; has no default. A
+        name: its name in files and reports. By default made from the class name, `MassError` as `mass_error`.
+        balance: the balance it enters, one of `balances.BALANCES`, whose unit its term has. Has no default. A
             positive term is a loss: a voltage drop, a loss torque, a resisting force, a lost speed. In `mass`,
-            `inertia` and `inductance` it adds; in `sensor` it adds to the reading of `channel`, which may be a
+            `inertia` and `inductance` it adds. In `sensor` it adds to the reading of `channel`, which may be a
             magnitude.
-        driver: the quantity that its term changes with: `speed`, `current`, `load`, ...; `direction` for the
+        driver: the quantity that its term changes with: `speed`, `current`, `load`, ..., `direction` for the
             direction of rotation, `the side` if it differs between the sides. Effects of one equation with one driver
             are a family: forms of a law that data may not distinguish. Empty if the term is a constant share.
         rests_on: dotted names of robot parameters that its term is proportional to, as hints if its amplitude is
             implausibly large.
-        dissipative: True if a positive amplitude can only remove power; in `slip` the power of the demand, which
+        dissipative: True if a positive amplitude can only remove power. In `slip` the power of the demand, which
             equals the traction in steady travel.
         channel: only for `sensor`: the channel that it changes, one of `channels.EVERY`.
         transient: True if steady travel does not show it, so that only histories can.
-        settles_to: name of the effect that looks the same in steady travel; only histories distinguish the two.
-        needs_battery: True if it acts only with the on-board battery; runs on an external supply do not show it.
-        needs_reverse: True if runs in one direction cannot distinguish it from a parameter of the robot; such a table
+        settles_to: name of the effect that looks the same in steady travel. Only histories distinguish the two.
+        needs_battery: True if it acts only with the on-board battery. Runs on an external supply do not show it.
+        needs_reverse: True if runs in one direction cannot distinguish it from a parameter of the robot. Such a table
             does not show it.
         needs_duty: True if it acts only at a duty below 1.
         odd_in_travel: True if it keeps its sign in space and not in the frame of travel, as a wrong slope does. For a
@@ -73,11 +73,11 @@ class Effect(eqx.Module):
         movers: `tracks` or `wheels` if it acts only on configurations of that kind.
         needs_belt: True if it belongs to a belt, which a load on a shaft does not have.
         memory_size: size of its memory, for an effect whose term depends on the past of the run (a
-            temperature, a phase); None: no memory. A run starts with memory 0.
+            temperature, a phase). None: no memory. A run starts with memory 0.
         memory_unit: unit of its memory.
-        plain: for a class with its own priors, the class of the library that it is made from; factors: ratios of its
-            priors to the library's, see `effects.scaled`.
-        configurations: names of the configurations that it acts on; empty: all, or those with its `movers`. A
+        plain: for a class with its own priors, the class of the library that it is made from.
+        factors: ratios of its priors to the library's, see `effects.scaled`.
+        configurations: names of the configurations that it acts on. Empty: all, or those with its `movers`. A
             field: the class states the default, and a robot file may state `configurations = ["4W2T"]`.
 
     An effect with a memory defines `rate`, and `settled` for the fidelities that keep no memory.
@@ -133,7 +133,7 @@ class Effect(eqx.Module):
 
     @property
     def unlike(self) -> bool:
-        """True if it makes the sides of a robot differ; needs a concrete amplitude."""
+        """True if it makes the sides of a robot differ. Needs a concrete amplitude."""
         return self.driver == THE_SIDE and bool(np.any(np.asarray(self.amplitude)))
 
     @property
@@ -150,14 +150,14 @@ class Effect(eqx.Module):
 
     @abc.abstractmethod
     def term(self, robot: Robot, signals: Signals) -> Scalar:
-        """The term [unit of its balance], linear in `amplitude`; may read all signals computed before it."""
+        """The term [unit of its balance], linear in `amplitude`. May read all signals computed before it."""
 
     def rate(self, robot: Robot, signals: Signals) -> Scalar:
-        """Rate of change of its memory [unit of the memory / s]; may read every signal."""
+        """Rate of change of its memory [unit of the memory / s]. May read every signal."""
         raise NotImplementedError(f"{self.name} has a memory but defines no rate")
 
     def settled(self, robot: Robot, signals: Signals) -> Scalar:
-        """Its memory after long steady travel; may read all signals computed before its balance."""
+        """Its memory after long steady travel. May read all signals computed before its balance."""
         raise NotImplementedError(f"{self.name} has a memory but defines no settled value")
 
     def initial(self, robot: Robot, angle: Scalar) -> Scalar:
@@ -171,19 +171,19 @@ class Effect(eqx.Module):
     def step_longest(self, robot: Robot, conditions: Conditions) -> Scalar:
         """Longest integration step that resolves an effect with a memory [s].
 
-        An integrator chooses its steps from the solution; this limit keeps the derivative at amplitude 0 correct,
+        An integrator chooses its steps from the solution. This limit keeps the derivative at amplitude 0 correct,
         where the solution does not show the effect.
         """
         return math.inf
 
 
 def name_class(kind: type[Effect], name: str) -> type[Effect]:
-    """Names a class made by a function; pickle finds it by that name in `Made` of its module."""
+    """Names a class made by a function. Pickle finds it by that name in `Made` of its module."""
     kind.__name__, kind.__qualname__ = name, f"Made.{name}"
     return kind
 
 
 def effects_of_module(module: ModuleType) -> tuple[type[Effect], ...]:
-    """The effects that a module defines, in its order; classes without a `term` are left out."""
+    """The effects that a module defines, in its order. Classes without a `term` are left out."""
     own = [v for v in vars(module).values() if inspect.isclass(v) and v.__module__ == module.__name__]
     return tuple(v for v in own if issubclass(v, Effect) and not inspect.isabstract(v))

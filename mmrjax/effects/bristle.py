@@ -1,4 +1,4 @@
-"""Friction through a bristle that bends before it slides; base of the effects that a reversal shows."""
+"""Friction through a bristle that bends before it slides. Base of the effects that a reversal shows."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def breakaway_parameter() -> Scalar:
 class Bristle(Effect):
     """A term in the bend z of a bristle at the driven shaft: θ_s z' = ω_k - |ω_k| z, z(0) = 0, settled z = sign ω_k.
 
-    Dahl, A solid friction model (1968), with exponent 1; the first order of Canudas de Wit, Olsson, Åström and
+    Dahl, A solid friction model (1968), with exponent 1. The first order of Canudas de Wit, Olsson, Åström and
     Lischinsky (1995) with a steady curve that does not depend on speed. The memory is z [-].
     """
 

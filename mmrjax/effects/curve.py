@@ -47,11 +47,14 @@ class Variable:
     """Abscissa of a curve: a signal of every balance above, or the time, the order or the side of a run.
 
     Attributes:
-        unit: SI; low, high: its ordinary range [unit].
-        column: of tables, or of points that stand for one; label: words of figures.
-        unit_shown: in figures; shown: SI value of it.
-        symbol: in formulas; empty: no formula has it.
-        driver: word for it as the driver of an effect; empty: its name.
+        unit: SI.
+        low, high: its ordinary range [unit].
+        column: of tables, or of points that stand for one.
+        label: words of figures.
+        unit_shown: in figures.
+        shown: SI value of it.
+        symbol: in formulas. Empty: no formula has it.
+        driver: word for it as the driver of an effect. Empty: its name.
         sign: what turns its sign, see `quantities.Quantity`.
         levels: True if a person sets it, so that one of its levels may differ from the rest.
     """
@@ -115,7 +118,8 @@ def sign_factor(place: str, way: Callable[[str], Any], magnitudes: Container[str
     For instruments that show only magnitudes the factor is 1.
 
     Args:
-        way: returns the signal of `WAYS` of a name; magnitudes: channels of such instruments.
+        way: returns the signal of `WAYS` of a name.
+        magnitudes: channels of such instruments.
     """
     counts = way(direction_signal(place))
     return abs(counts) if place in magnitudes else counts
@@ -129,7 +133,8 @@ def in_travel_frame(
     A variable that is not in `VARIABLES`, such as the angle of a wave, is returned unchanged.
 
     Args:
-        x: the variable [its unit], an array of NumPy or JAX; way, magnitudes: as for `sign_factor`.
+        x: the variable [its unit], an array of NumPy or JAX.
+        way, magnitudes: as for `sign_factor`.
     """
     if variable not in EVERY_VARIABLE:
         return x, 1.0
@@ -149,17 +154,18 @@ _EXTENDED[0, :3] = _EXTENDED[-1, :-4:-1] = 6.0, -8.0, 3.0
 
 
 def _level(u: Scalar) -> Float[Array, "..."]:
-    """u if positive; below 0 a parabola with slope 1 at 0 that is level from u = -LEVEL _LAST on."""
+    """u if positive. Below 0 a parabola with slope 1 at 0 that is level from u = -LEVEL _LAST on."""
     width = LEVEL * _LAST
     below = jnp.clip(u, -width, 0.0)
     return jnp.maximum(u, 0.0) + below + below**2 / (2 * width)
 
 
 def ordinate_weights(x: Scalar, low: Scalar, high: Scalar) -> Float[Array, "... 6"]:
-    """Weights of the ordinates at x: cubic convolution, Keys (1981) eq. (15); they sum to 1.
+    """Weights of the ordinates at x: cubic convolution, Keys (1981) eq. (15). They sum to 1.
 
     Args:
-        x: the variable; low, high: position of the first and the last ordinate [its unit].
+        x: the variable.
+        low, high: position of the first and the last ordinate [its unit].
     """
     u = _level((x - low) / (high - low) * _LAST)
     u = _LAST - _level(_LAST - u)
@@ -232,7 +238,7 @@ def _curve(place: str, over: str) -> type[Effect]:
             return self.amplitude * jnp.sum(ordinate_weights(x, self.low, self.high) * y, -1) * way
 
         def rate(self, robot: Robot, signals: Signals) -> Scalar:
-            """Rate of time [s/s]; only a curve over time has a memory."""
+            """Rate of time [s/s]. Only a curve over time has a memory."""
             return jnp.ones_like(signals.speed_motor)
 
         def settled(self, robot: Robot, signals: Signals) -> Scalar:

@@ -32,7 +32,7 @@ class DutyExponent(DutyEffect):
     A driver whose voltage is a power of the command, as a controller with a throttle curve.
 
     Source: Gabriel, Meyer and du Plessis, Brushless DC motor characterisation and selection for a fixed wing UAV,
-    IEEE Africon (2011), measure voltage over command of speed controllers, which is not a line; Box and Cox, An
+    IEEE Africon (2011), measure voltage over command of speed controllers, which is not a line. Box and Cox, An
     analysis of transformations, J. Royal Statistical Society B 26 (1964), for the form. n = 1 is the logarithm
     ΔD = -a D ln |D|. Below a duty of 0.001 the power continues as a line.
     """
@@ -74,7 +74,7 @@ class DutySaturation(DutyEffect):
 
     A driver or a supply that reaches its limit before full command.
 
-    Source: end points of speed controllers, and supplies in current limit; Åström and Murray, Feedback Systems
+    Source: end points of speed controllers, and supplies in current limit. Åström and Murray, Feedback Systems
     (2008), section 10.4, saturation of actuators. `driver.current_limit` limits the current instead of the voltage.
     """
 

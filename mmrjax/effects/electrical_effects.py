@@ -21,7 +21,7 @@ class SeriesResistance(ElectricalEffect):
 
     Leads, ammeter and brush contacts in series with each motor.
 
-    Source: Fig. 20 of the paper (leads and ammeter of the bench); Ohm (1827).
+    Source: Fig. 20 of the paper (leads and ammeter of the bench). Ohm (1827).
     """
 
     driver = "current"
@@ -40,7 +40,7 @@ class BrushDrop(ElectricalEffect):
 
     Contact voltage of the brushes, nearly equal at all currents.
 
-    Source: IEEE Std 113-1985 takes a constant 2 V for carbon and graphite brushes of large machines; small
+    Source: IEEE Std 113-1985 takes a constant 2 V for carbon and graphite brushes of large machines. Small
     graphite brushes on copper drop tenths of a volt. Below the smoothing current I_b the contact is ohmic.
     """
 
@@ -65,7 +65,7 @@ class WindingHeating(ElectricalEffect):
 
     The winding's resistance rises as the current heats it.
 
-    Source: IEC 60028 for α; the maker's sheet for R_th = 7.7 K/W. A run shorter than the thermal time
+    Source: IEC 60028 for α. The maker's sheet for R_th = 7.7 K/W. A run shorter than the thermal time
     constants (16 s winding, 593 s housing) reaches only a share of the settled rise: 1 is settled, 0 cold.
     The rise is computed at the cold resistance (first order in α) and limited to the winding's 125 °C. Otherwise the
     millisecond inrush of a start would count as a settled current of 50 A. If the winding's temperature is followed
@@ -95,9 +95,9 @@ class ThermalDrift(ElectricalEffect):
 
     The winding warms up while the run lasts.
 
-    Source: IEC 60028 for α; the maker's sheet of RE30 310007 for τ and R_wh. The housing, with 593 s, keeps its
+    Source: IEC 60028 for α. The maker's sheet of RE30 310007 for τ and R_wh. The housing, with 593 s, keeps its
     temperature during a run. Its share is `winding_heating`, which steady travel cannot distinguish from this.
-    The memory is T [K]; without a memory the settled value is used. If the winding's temperature is followed
+    The memory is T [K], without a memory the settled value is used. If the winding's temperature is followed
     (missions), its resistance follows that, and the effect adds 0.
     """
 

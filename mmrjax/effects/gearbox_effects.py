@@ -70,7 +70,7 @@ class StribeckGear(GearboxEffect):
 
     Gear friction that falls as the input gains speed.
 
-    Source: Tustin (1947), the exponential law; mixed lubrication of grease-packed planets (Niemann and
+    Source: Tustin (1947), the exponential law. Mixed lubrication of grease-packed planets (Niemann and
     Winter, 2003). With the same ω_s it is `stribeck_motor` times i η_rm.
     """
 
@@ -98,8 +98,8 @@ class BackdrivingLoss(GearboxEffect):
     Source: Duclusaud, Passault, Padois and Ly, Extended friction models for the physics simulation of servo
     actuators (2024, arXiv:2410.08650): directional models in which motor and load each have a share of friction.
     Niemann and Winter, Maschinenelemente II (2003): the backward efficiency 2 - 1/η is below η. A share 1 - a of the
-    load's torque reaches the gear, and eq. (19)'s η_b of that the motor; at a = 1 the gear is self-locking.
-    The load excludes the rotor's inertia; the effect fades at rest with the shaft's smooth sign.
+    load's torque reaches the gear, and eq. (19)'s η_b of that the motor. At a = 1 the gear is self-locking.
+    The load excludes the rotor's inertia. The effect fades at rest with the shaft's smooth sign.
     """
 
     driver = "load"
@@ -147,7 +147,7 @@ class BristleBackdrivingLoss(Bristle, GearboxEffect):
     `bristle_load_loss`.
 
     Source: Duclusaud, Passault, Padois and Ly (2024, arXiv:2410.08650): directional models in which motor and load
-    each have a share of friction; Dahl (1968). Settled z = sign ω_k: it then equals `backdriving_loss`, 0 if the
+    each have a share of friction. Dahl (1968). Settled z = sign ω_k: it then equals `backdriving_loss`, 0 if the
     motor drives the load and a |M_load| if the load drives the motor. Reversals under load distinguish the two. See
     `bristle_load_loss` for the sum of both.
     """

@@ -22,7 +22,7 @@ class SpeedRolling(GroundEffect):
 
     Rolling resistance that grows with the square of speed.
 
-    Source: Wong, Theory of Ground Vehicles (2008), ch. 1: f = f_0 + f_s V² of rolling tyres; Bekker (1969)
+    Source: Wong, Theory of Ground Vehicles (2008), ch. 1: f = f_0 + f_s V² of rolling tyres. Bekker (1969)
     for light tracks.
     """
 
@@ -43,7 +43,7 @@ class AdhesiveDrag(GroundEffect):
 
     Rubber that is peeled off the ground behind the contact.
 
-    Source: Roberts and Thomas, The adhesion and friction of smooth rubber surfaces, Wear 33 (1975) 45;
+    Source: Roberts and Thomas, The adhesion and friction of smooth rubber surfaces, Wear 33 (1975) 45.
     Maugis and Barquins, J. Phys. D 11 (1978) 1989: energy of peeling w (1 + (V/V_p)^0.6) times the width.
     Smoothed at rest, so that its derivative is finite.
     """
@@ -70,7 +70,7 @@ class WeightTransfer(GroundEffect):
 
     The slope loads the rear of the tracks, and uneven pressure costs more.
 
-    Source: load transfer (h/L) tan α of the weight (Wong 2008, ch. 1); resistance that is convex in the
+    Source: load transfer (h/L) tan α of the weight (Wong 2008, ch. 1). Resistance that is convex in the
     local pressure gains the square of an antisymmetric transfer (Bekker 1956: compaction as a power of the
     pressure above 1), so the first-order part cancels and a ~ f (h/L)².
     """
@@ -119,8 +119,8 @@ class SlopeBias(GroundEffect):
 
     The slope differs from the reading of the inclinometer.
 
-    Source: expansion of eq. (1); the change of the normal load, second order in a on the level, is left out.
-    On the level in forward travel it looks like rolling resistance; reverse travel distinguishes the two.
+    Source: expansion of eq. (1). The change of the normal load, second order in a on the level, is left out.
+    On the level in forward travel it looks like rolling resistance. Reverse travel distinguishes the two.
     """
 
     driver = "weight"

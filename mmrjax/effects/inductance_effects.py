@@ -15,7 +15,7 @@ class ArmatureInductance(Effect):
 
     Inductance of leads and supply in series with the armature.
 
-    Source: eq. (15); leads have about 1 µH/m, a supply's output choke tens to hundreds of µH. Visible only
+    Source: eq. (15). Leads have about 1 µH/m, a supply's output choke tens to hundreds of µH. Visible only
     while the current changes within a millisecond.
     """
 

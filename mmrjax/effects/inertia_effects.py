@@ -15,7 +15,7 @@ class RotatingInertia(Effect):
 
     Parts that turn with the driving wheel beyond Table 7.
 
-    Source: Table 7 lists pulleys, wheels and belts; teeth, grousers, shafts and the belt stage of the drive
+    Source: Table 7 lists pulleys, wheels and belts. Teeth, grousers, shafts and the belt stage of the drive
     are not included. It has no influence on steady travel.
     """
 

@@ -36,9 +36,9 @@ class MassError(MassEffect):
 
 
 class MassOffset(MassEffect):
-    """M = stated mass + a in the wheeled configuration; in the tracked one M is as stated.
+    """M = stated mass + a in the wheeled configuration. In the tracked one M is as stated.
 
-    Additional mass of one configuration; `configurations` may name others.
+    Additional mass of one configuration. `configurations` may name others.
 
     Source: Table A2 prints 13.1 kg for the wheeled robot, Table 7 states 11.5 kg. Weight, adhesion,
     guide load and inertia all follow from the mass, so it enters only there.

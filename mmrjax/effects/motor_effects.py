@@ -49,7 +49,7 @@ class StribeckMotor(MotorEffect):
     Friction of brushes and bearings that decreases with shaft speed.
 
     Source: Tustin, The effects of backlash and of speed-dependent friction on the stability of closed-cycle
-    control systems, J. IEE 94 (1947), the exponential law; Armstrong-Hélouvry, Dupont and Canudas de Wit
+    control systems, J. IEE 94 (1947), the exponential law. Armstrong-Hélouvry, Dupont and Canudas de Wit
     (1994), with exponent 1.
     """
 
@@ -75,7 +75,7 @@ class IronLoss(MotorEffect):
     Eddy currents in the motor's solid parts, weakened by their own field at high speed.
 
     Source: Wouterse, Critical torque and speed of eddy current brake with widely separated soft iron poles,
-    IEE Proc. B 138 (1991). Below ω_c the drag is proportional to speed, as eq. (14)'s viscous term; hysteresis
+    IEE Proc. B 138 (1991). Below ω_c the drag is proportional to speed, as eq. (14)'s viscous term. Hysteresis
     acts as its dry term. Only the bend towards ω_c distinguishes the effect from both.
     """
 
@@ -119,14 +119,14 @@ class TorqueConstantSaturation(MotorEffect):
 
 
 class Cogging(Periodic, MotorEffect):
-    """ΔM = a sin(n θ_m + φ) fade(n ω_m), with n ripples per turn; fade falls from 1 at ω_f to 0 at 2 ω_f.
+    """ΔM = a sin(n θ_m + φ) fade(n ω_m), with n ripples per turn. Fade falls from 1 at ω_f to 0 at 2 ω_f.
 
     The motor's torque ripples as its commutator turns.
 
     Source: Kenjo and Nagamori, Permanent-Magnet and Brushless DC Motors (1985): ripple at twice the number
     of segments. The RE30 has an ironless rotor, hence no reluctance torque, and 13 segments. Above ω_f the
     rotor's inertia limits the speed ripple to a / (J_d ω_f), 0.03 rad/s at the prior's size. The torque ripple is
-    therefore faded out instead of integrated at 5 kHz; it acts at low speed and during starts.
+    therefore faded out instead of integrated at 5 kHz. It acts at low speed and during starts.
     """
 
     driver = "angle"

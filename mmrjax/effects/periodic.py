@@ -1,4 +1,4 @@
-"""Effects that repeat with the angle of a shaft; a history shows them as orders."""
+"""Effects that repeat with the angle of a shaft. A history shows them as orders."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Periodic(Effect):
         return self.order(robot, signals.configuration) * signals.speed_motor
 
     def settled(self, robot: Robot, signals: Signals) -> Scalar:
-        """0: a phase has no settled value; `wave` then returns its mean."""
+        """0: a phase has no settled value. `wave` then returns its mean."""
         return jnp.zeros_like(signals.speed_motor)
 
     def wave(self, signals: Signals) -> Scalar:

@@ -21,7 +21,7 @@ def amplitude_of(effect: Effect) -> Parameter:
 
 
 def shape_of(effect: Effect) -> Parameter | None:
-    """The shape parameter that a fit frees: the first phase or scale after the amplitude; None without one."""
+    """The shape parameter that a fit frees: the first phase or scale after the amplitude, None without one."""
     for p in params.walk_parameters(effect):
         if not p.spec.amplitude and (p.name == "phase" or (p.spec.relative_sd and float(p.value) > 0)):
             return p

@@ -53,7 +53,7 @@ class AmmeterOffset(SensorEffect):
 
     The ammeter does not show zero at zero.
 
-    Source: zero error of meters, IEC 60051-2; other consumers on the same line, eq. (10).
+    Source: zero error of meters, IEC 60051-2. Other consumers on the same line, eq. (10).
     """
 
     channel = "total_current"
@@ -70,7 +70,7 @@ class EncoderScale(SensorEffect):
 
     The divisor for the counts of the motor's encoder is wrong.
 
-    Source: time base and pulses per turn of the counter; a tachometer's class by IEC 60051.
+    Source: time base and pulses per turn of the counter. A tachometer's class by IEC 60051.
     """
 
     channel = "motor_speed"
@@ -130,7 +130,7 @@ def _error(read: Channel, of_zero: bool) -> type[Effect]:
 def _errors() -> Iterator[type[Effect]]:
     """Yields the errors of every channel that the classes above do not cover.
 
-    First those of scale, except of temperatures, whose zero is a convention; then those of zero. Random numbers
+    First those of scale, except of temperatures, whose zero is a convention. Then those of zero. Random numbers
     depend on the position: add new ones at the end.
     """
     own = [c for c in channels.EVERY if c not in channels.usual_channels()]

@@ -44,7 +44,7 @@ class BeltCreep(SlipEffect):
     The belt stretches under traction and creeps on its pulley.
 
     Source: Firbank, Mechanics of the belt drive, Int. J. Mech. Sci. 12 (1970) 1053: creep = change of
-    tension over the belt's stiffness E A; so a = 1/(E A). The demand is used as traction, which it equals in
+    tension over the belt's stiffness E A, so a = 1/(E A). The demand is used as traction, which it equals in
     steady travel.
     """
 
@@ -65,8 +65,8 @@ class NonlinearSlip(SlipEffect):
 
     Slip that grows steeply as the adhesion is used up.
 
-    Source: Janosi and Hanamoto (1961): traction saturates over slip; the cube is the steep part of its
-    inverse. u is limited to 2; the robot slides from 1 on.
+    Source: Janosi and Hanamoto (1961): traction saturates over slip. The cube is the steep part of its
+    inverse. u is limited to 2. The robot slides from 1 on.
     """
 
     driver = "demand"
@@ -86,7 +86,7 @@ class SpeedSlip(SlipEffect):
 
     Slip that grows with speed.
 
-    Source: first term of an expansion of the slip in speed; treads that lift off between impacts. The loss
+    Source: first term of an expansion of the slip in speed. Treads that lift off between impacts. The loss
     is kinematic: on a descent it removes no power.
     """
 
@@ -103,7 +103,7 @@ class LoadSlip(SlipEffect):
 
     Belt and tyre yield under load, so that their rolling radius decreases.
 
-    Source: effective rolling radius of a loaded tyre (Wong 2008, ch. 1; Pacejka, Tire and Vehicle Dynamics,
+    Source: effective rolling radius of a loaded tyre (Wong 2008, ch. 1. Pacejka, Tire and Vehicle Dynamics,
     2012, ch. 1). Kinematic, so not dissipative.
     """
 
@@ -123,7 +123,7 @@ class PulleyEccentricity(Periodic, SlipEffect):
 
     The driving pulley or wheel is eccentric.
 
-    Source: order 1 of the driving wheel's angle; total run-out by ISO 1101. The lever arm of the traction
+    Source: order 1 of the driving wheel's angle. Total run-out by ISO 1101. The lever arm of the traction
     changes by the same share, which is left out: an effect enters only one balance.
     """
 
@@ -145,13 +145,13 @@ class PulleyEccentricity(Periodic, SlipEffect):
 class VibrationSlip(SlipEffect):
     """ΔV = a √((V_teor / V_1)² + 0.001²)^p u / √((1 - |u|)² + 0.05²), on tracks only.
 
-    u is the demand over the adhesion limit of eq. (6). Shaking contacts slide while their load is small; dry
+    u is the demand over the adhesion limit of eq. (6). Shaking contacts slide while their load is small. Dry
     friction becomes an apparent viscous friction.
 
-    Source: Section 3.2.4 and its ref. [46]; Blekhman, Vibrational Mechanics (2000). The law of Fig. 7 is averaged
+    Source: Section 3.2.4 and its ref. [46]. Blekhman, Vibrational Mechanics (2000). The law of Fig. 7 is averaged
     over contacts that oscillate by s (`mmrjax.vibration`), for V_s small compared with s. The slip is proportional to
     s and, because the load leads, to u. s grows as 1 / (1 - u), as the track model shows
-    (docs/explanation/vibration.md). It is smoothed at rest and within 0.05 of the limit; beyond, the robot slides. If
+    (docs/explanation/vibration.md). It is smoothed at rest and within 0.05 of the limit. Beyond, the robot slides. If
     the demand pulls forward, the robot runs ahead of its tracks.
     """
 

@@ -19,7 +19,7 @@ class SupplySag(SupplyEffect):
 
     Leads and internal resistance that both motors share.
 
-    Source: Fig. 20 of the paper (supply, leads and ammeter of the bench); Ohm (1827). With equal sides
+    Source: Fig. 20 of the paper (supply, leads and ammeter of the bench). Ohm (1827). With equal sides
     (assumption 3) it equals `series_resistance` of twice its size: only a run with one motor off
     distinguishes the two.
     """
@@ -42,8 +42,8 @@ class BatterySag(SupplyEffect):
     The battery's voltage falls over the first half minute of a load.
 
     Source: Chen and Rincón-Mora, Accurate electrical battery model capable of predicting runtime and I-V
-    performance, IEEE Trans. Energy Conversion 21 (2006), the first RC pair; a is its resistance for the
-    whole battery. The memory is q [A]; without a memory the settled value is used. The pair returns its stored
+    performance, IEEE Trans. Energy Conversion 21 (2006), the first RC pair. A is its resistance for the
+    whole battery. The memory is q [A], without a memory the settled value is used. The pair returns its stored
     energy, so it is not a pure loss. On an external supply it is absent.
     """
 

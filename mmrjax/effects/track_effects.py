@@ -24,7 +24,7 @@ class Churning(TrackEffect):
 
     Track loss that grows with the square of speed.
 
-    Source: the next term after eq. (24); impact of teeth and grousers transfers a momentum proportional to the
+    Source: the next term after eq. (24). Impact of teeth and grousers transfers a momentum proportional to the
     speed, at a rate proportional to the speed (Merritt, The Evolution of a Tank Transmission, 1946).
     """
 
@@ -46,7 +46,7 @@ class StribeckTrack(TrackEffect):
 
     Friction of belt and pulley bearings that decreases with belt speed.
 
-    Source: Tustin (1947), the exponential law; Armstrong-Hélouvry, Dupont and Canudas de Wit (1994).
+    Source: Tustin (1947), the exponential law. Armstrong-Hélouvry, Dupont and Canudas de Wit (1994).
     """
 
     driver = "speed"
@@ -70,7 +70,7 @@ class TensionFriction(TrackEffect):
     Belt friction that grows with the traction the belt carries.
 
     Source: Euler (1769) and Eytelwein (1808): normal force of a belt round a pulley in proportion to its
-    tension; Merritt, The Evolution of a Tank Transmission (1946), track efficiency as a share of the
+    tension. Merritt, The Evolution of a Tank Transmission (1946), track efficiency as a share of the
     tractive effort.
     """
 
@@ -93,7 +93,7 @@ class CentrifugalTension(TrackEffect):
     The belt's own centrifugal tension adds to its loss.
 
     Source: centrifugal tension ρ v² of a running belt (Eytelwein 1808; Budynas and Nisbett, Shigley's
-    Mechanical Engineering Design, 2011, ch. 17); so a = ρ / T_0. With the belts of Table 7, ρ = 0.05 kg/m,
+    Mechanical Engineering Design, 2011, ch. 17), so a = ρ / T_0. With the belts of Table 7, ρ = 0.05 kg/m,
     and T_0 of 1 to 10 N. Unlike `churning` it scales with the configuration's own M_t0. r_p is the radius of
     the pulley, which drives the belt in both configurations.
     """
@@ -119,7 +119,7 @@ class BendingLoss(TrackEffect):
     Rubber bent round the pulleys (or, for a load on a shaft, in a belt drive or coupling) relaxes while it passes.
 
     Source: Ferry, Viscoelastic Properties of Polymers (1980), ch. 3, the loss modulus G'' of a Maxwell
-    element; Gerbert, Traction Belt Mechanics (1999), bending loss of a belt at each run on and off a pulley.
+    element. Gerbert, Traction Belt Mechanics (1999), bending loss of a belt at each run on and off a pulley.
     Far from ω_r it is similar to eq. (24)'s terms.
     """
 
@@ -145,7 +145,7 @@ class StickSlip(TrackEffect):
     Break-away: dry contacts of the track hold a larger torque before they slip.
 
     Source: Dahl (1968) with the Stribeck curve of Canudas de Wit, Olsson, Åström and Lischinsky, A new model
-    for control of systems with friction, IEEE Trans. Automatic Control 40 (1995); the curve multiplies the drive of
+    for control of systems with friction, IEEE Trans. Automatic Control 40 (1995). The curve multiplies the drive of
     z, so that its rate stays finite. Settled: z = exp(-(ω_k/ω_s)²) sign ω_k, zero at travelling speed. Torque that
     decreases with speed lets a crawling drive stick and slip. The memory is z [-]. Bent bristles return energy, so
     it is not a pure loss.
@@ -189,10 +189,10 @@ class DirectionalFriction(TrackEffect):
     Dry friction that is larger in one direction of rotation than in the other.
 
     Source: Armstrong-Hélouvry, Control of Machines with Friction (1991), who states the Coulomb friction of a joint
-    separately for each direction; lip seals, teeth and belts that bear on another flank. The mean of both directions
+    separately for each direction. Lip seals, teeth and belts that bear on another flank. The mean of both directions
     is eq. (24)'s M_t0, half their difference is a. Runs in one direction show their sum, so that it cannot be
     distinguished from M_t0. A constant torque (`torque_offset`) does not depend on the direction. The effect is
-    dissipative only together with a larger M_t0; alone it adds power in one direction, so it is not dissipative.
+    dissipative only together with a larger M_t0. Alone it adds power in one direction, so it is not dissipative.
     """
 
     driver = "direction"
@@ -209,7 +209,7 @@ class DirectionalFriction(TrackEffect):
 
 
 class StribeckExponent(TrackEffect):
-    """ΔM_t = a exp(-(|ω_k| / ω_s)^δ) sign ω_k at the driven shaft; δ = 2 unless stated.
+    """ΔM_t = a exp(-(|ω_k| / ω_s)^δ) sign ω_k at the driven shaft. δ = 2 unless stated.
 
     Friction of bearings and seals that leaves mixed lubrication faster or more slowly than exponentially.
 
@@ -247,7 +247,7 @@ class DirectionalViscous(TrackEffect):
     Friction whose growth with speed is larger in one direction of rotation than in the other.
 
     Source: Armstrong-Hélouvry, Control of Machines with Friction (1991), who fits viscous friction of a joint
-    separately for each direction; lip seals, and guides that draw in their lubricant in one direction. It is the part
+    separately for each direction. Lip seals, and guides that draw in their lubricant in one direction. It is the part
     that grows with speed, in addition to `directional_friction`, which is even in the speed too. The mean of both
     directions is eq. (24)'s viscous loss: runs in one direction show their sum.
     """
@@ -267,7 +267,7 @@ class DirectionalViscous(TrackEffect):
 
 
 class TorqueOffset(TrackEffect):
-    """ΔM_t = a in both directions of rotation and at rest; at the radius a force a / r_k.
+    """ΔM_t = a in both directions of rotation and at rest. At the radius a force a / r_k.
 
     A constant pull in one direction: a cable, a spring, a counterweight, or an offset in a torque command or meter.
 
@@ -294,10 +294,10 @@ class Presliding(Bristle, TrackEffect):
 
     Dry friction builds up over a small angle instead of at once, as contacts yield before they slide.
 
-    Source: Dahl, A solid friction model (1968), with exponent 1; it is the first order of Canudas de Wit, Olsson,
+    Source: Dahl, A solid friction model (1968), with exponent 1. It is the first order of Canudas de Wit, Olsson,
     Åström and Lischinsky (1995) without their damping of the bristles. Settled z = sign ω_k: steady travel does not
     show it, reversals do. The memory is z [-]. At a = M_t0 all of the dry friction is Dahl's. `stick_slip` is the
-    additional torque beyond M_t0 before the contacts release; `bristle_load_loss` grows with the load.
+    additional torque beyond M_t0 before the contacts release. `bristle_load_loss` grows with the load.
     """
 
     driver = "direction"
@@ -319,7 +319,7 @@ class AngleFriction(Periodic, TrackEffect):
 
     Source: Popović and Goldenberg, Modeling of friction using spectral analysis, IEEE Trans. Robotics and Automation
     14 (1998) 114: friction of a joint over its angle, here its first order. If a history begins at a measured angle,
-    the phase is that of the shaft, else of the start of each run. As friction it reverses with the speed; an
+    the phase is that of the shaft, else of the start of each run. As friction it reverses with the speed. An
     amplitude as large as M_t0 would not be a loss at every angle.
     """
 
@@ -347,7 +347,7 @@ class PositionFriction(TrackEffect):
 
     Source: Armstrong-Hélouvry, Control of Machines with Friction (1991), ch. 4: friction of a joint over its
     position, to first order. The memory is θ [rad], counted as in the channel of the angle or position, which
-    the rig must show; without one it is 0 at the start of each run. Its mean over the travel is M_t0.
+    the rig must show, without one it is 0 at the start of each run. Its mean over the travel is M_t0.
     """
 
     driver = "position"
@@ -379,9 +379,9 @@ class DirectionalStribeck(TrackEffect):
     Friction whose decrease with speed is larger in one direction of rotation than in the other.
 
     Source: Canudas de Wit, Olsson, Åström and Lischinsky, A new model for control of systems with friction, IEEE
-    Trans. Automatic Control 40 (1995): the curve g of the steady friction may differ between the directions; here the
+    Trans. Automatic Control 40 (1995): the curve g of the steady friction may differ between the directions. Here the
     exponential of Tustin (1947). The mean E of both directions is `stribeck_track`: runs in one direction show their
-    sum. Far above ω_s it is absent, far below it is `directional_friction`; the part that grows with the speed is
+    sum. Far above ω_s it is absent, far below it is `directional_friction`. The part that grows with the speed is
     `directional_viscous`. Runs in both directions at low speed distinguish the three.
     """
 

@@ -1,6 +1,6 @@
 """Effects of a robot that turns: unequal sides, and resistance to the turn. Straight travel does not show them.
 
-The library for straight travel does not contain them; on tables of turns the loop tries them in addition to it.
+The library for straight travel does not contain them. On tables of turns the loop tries them in addition to it.
 Robot files accept them, and `calibrate` frees their amplitudes.
 """
 
@@ -81,7 +81,7 @@ class TurningResistance(Effect):
 
     Soil, carpet or tyres that are dragged sideways resist more at higher yaw rates.
 
-    Source: viscous drag in addition to Coulomb's friction; Wong and Chiang, A general theory for skid steering of
+    Source: viscous drag in addition to Coulomb's friction. Wong and Chiang, A general theory for skid steering of
     tracked vehicles on firm ground, Proc. IMechE D 215 (2001), for a turning moment that is not constant.
     """
 
@@ -104,7 +104,7 @@ class SideRadius(Effect):
     A worn belt, or a tyre of lower pressure or another size on one side: the robot turns at equal shaft speeds. The
     lever arm of the traction does not change, as for `rolling_radius`.
 
-    Source: eq. (32) with a separate radius for each side; unequal wheel diameters are the first of odometry's
+    Source: eq. (32) with a separate radius for each side. Unequal wheel diameters are the first of odometry's
     systematic errors in Borenstein and Feng, Measurement and correction of systematic odometry errors in mobile
     robots, IEEE Trans. Robotics and Automation 12 (1996) 869.
     """
@@ -127,7 +127,7 @@ class LateralGrip(Effect):
     Grousers dig in, or loose ground piles up at the tracks, more at higher lateral speed. The change of the lateral
     force, which matters only for the path in a settled turn, is left to the sliding.
 
-    Source: a ratio of frictions linear in the yaw rate; Wong, Theory of Ground Vehicles, chapter 6: the coefficient
+    Source: a ratio of frictions linear in the yaw rate. Wong, Theory of Ground Vehicles, chapter 6: the coefficient
     of lateral resistance is not constant. It differs from `turning_resistance` where contacts creep.
     """
 

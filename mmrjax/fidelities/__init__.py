@@ -20,7 +20,8 @@ class Option:
     """A number that a user may set for a fidelity.
 
     Attributes:
-        default: value if not set [unit]; most: largest allowed; all values above 0 up to it are allowed.
+        default: value if not set [unit].
+        most: largest allowed. All values above 0 up to it are allowed.
     """
 
     name: str
@@ -38,8 +39,9 @@ class Effort:
     rollouts.
 
     Attributes:
-        starts: searches from different start points; profiles: True to profile every parameter; blocks: True to refit
-            without each block of runs.
+        starts: searches from different start points.
+        profiles: True to profile every parameter.
+        blocks: True to refit without each block of runs.
     """
 
     starts: int
@@ -58,16 +60,16 @@ class Facts:
     Attributes:
         module: module that holds its `FIDELITY`.
         description: one line.
-        chunk: largest number of runs in one call; a pair if it differs on an accelerator.
+        chunk: largest number of runs in one call. A pair if it differs on an accelerator.
         effort: of a calibration with it.
         options: its options.
-        rollout: True if it integrates over time; searches with it run one at a time and end sooner.
+        rollout: True if it integrates over time. Searches with it run one at a time and end sooner.
         histories: True if it can return a run over time.
         computes: parameters of a configuration that it computes instead of reads, such as `track.guide_share`.
         resolves: prefixes of parameter names that only fidelities of this kind read.
         reverse: True if it supports derivatives in reverse mode (`jax.grad`) in addition to forward mode.
         slow: True if a batch takes long enough for a progress bar.
-        one_thread: True if XLA has to run on one thread; with two, runs have hung (docs/lab/figures.md).
+        one_thread: True if XLA has to run on one thread. With two, runs have hung (docs/lab/figures.md).
     """
 
     module: str
@@ -163,7 +165,7 @@ def fidelity_facts(name: str) -> Facts:
     """Facts about a fidelity that are known without importing it.
 
     Raises:
-        KeyError: no such fidelity; the message lists the valid names.
+        KeyError: no such fidelity. The message lists the valid names.
     """
     if name not in TABLE:
         raise KeyError(f"no fidelity {name}; there are {', '.join(TABLE)}")
@@ -184,6 +186,6 @@ def get_fidelity(name: str) -> Fidelity:
     """Imports and returns a fidelity by its name.
 
     Raises:
-        KeyError: no such fidelity; the message lists the valid names.
+        KeyError: no such fidelity. The message lists the valid names.
     """
     return importlib.import_module(fidelity_facts(name).module).FIDELITY

@@ -30,12 +30,13 @@ Progress = Callable[[float], None]
 
 
 class History(eqx.Module):
-    """Runs over time; fields have shape (runs, samples).
+    """Runs over time. Fields have shape (runs, samples).
 
     Attributes:
-        time: in the clock of tables [s]; the imposed quantity acts the rig's `delay` later than its column states.
+        time: in the clock of tables [s]. The imposed quantity acts the rig's `delay` later than its column states.
         distance: travelled along the slope [m].
-        signals: every signal; reading: readings [SI] by channel, of the channels that change in a history.
+        signals: every signal.
+        reading: readings [SI] by channel, of the channels that change in a history.
         reactions: loads inside the running gear of one side, if the fidelity computes them.
     """
 
@@ -76,7 +77,8 @@ def in_table_time(rig: Rig, time: Float[Array, "runs samples"], values: T) -> tu
     """Runs over time in the clock of tables, which the rig's `delay` shifts.
 
     Args:
-        time: since the imposed quantity acts [s]; values: at those instants, a tree of shape (runs, samples, ...).
+        time: since the imposed quantity acts [s].
+        values: at those instants, a tree of shape (runs, samples, ...).
 
     Returns:
         Instants of the tables' clock, and the values there (`Rig.clock`, `Rig.before`).
@@ -91,7 +93,7 @@ def in_table_time(rig: Rig, time: Float[Array, "runs samples"], values: T) -> tu
 
 @compiled
 def _shown(robot: Robot, signals: Signals, apart: bool = False) -> dict[str, Scalar]:
-    """Readings of the channels that change in a history; `apart`: from signals of left and right side."""
+    """Readings of the channels that change in a history. `apart`: from signals of left and right side."""
     every = balances.readings_of_sides(robot, signals) if apart else balances.sensor(robot, signals)
     return {c.name: every[c.name] for c in channels.EVERY if c.over_time}
 
@@ -112,7 +114,7 @@ class Run(eqx.Module):
 
     Attributes:
         result: of each run, shape (runs,).
-        columns: outputs that only this fidelity has, by column of `runs.csv`, in the column's unit; shape (runs,).
+        columns: outputs that only this fidelity has, by column of `runs.csv`, in the column's unit, shape (runs,).
         history: the runs over time, if requested.
     """
 
@@ -142,12 +144,12 @@ class Simulate(Protocol):
 
 @dataclasses.dataclass(frozen=True)
 class Implicit:
-    """Steady travel of one run, straight or turning, in two halves; a fit takes all derivatives from one evaluation.
+    """Steady travel of one run, straight or turning, in two halves. A fit takes all derivatives from one evaluation.
 
     Attributes:
-        solve: returns the unknowns, shape (unknowns,), and whether they were found; has no derivatives.
+        solve: returns the unknowns, shape (unknowns,), and whether they were found. Has no derivatives.
         shown: returns result and signals for given unknowns (differentiable in them and in the robot) and the
-            residuals of the equations, shape (unknowns,). A demand above the ground's limit counts as sliding; for a
+            residuals of the equations, shape (unknowns,). A demand above the ground's limit counts as sliding. For a
             fit it is out of reach in any case.
     """
 
@@ -169,14 +171,14 @@ class Fidelity:
 
     Attributes:
         name: its line in `fidelities.TABLE`.
-        settled: batch of conditions to results; pure, traceable, with numbers at any status if possible. Calibrations
+        settled: batch of conditions to results. Pure, traceable, with numbers at any status if possible. Calibrations
             differentiate it (forward).
-        implicit: the same in two halves; None if it is not the root of equations.
+        implicit: the same in two halves, None if it is not the root of equations.
         run: results of a batch, as in a sweep.
-        outputs: only the named outputs of a batch [SI], of `outputs.output_table`, and `status`; quicker than `run`.
+        outputs: only the named outputs of a batch [SI], of `outputs.output_table`, and `status`, quicker than `run`.
             None if it would not be. A fidelity with it has no options.
         columns: names of further columns of its runs (`Run.columns`).
-        histories: a batch from standstill over time; None for a fidelity without time.
+        histories: a batch from standstill over time, None for a fidelity without time.
         check: raises ValueError before the first simulation if it cannot compute some run of a batch.
         cautions: warnings about the steady readings of a calibrated robot, one sentence each.
     """

@@ -53,8 +53,8 @@ class Trajectory(eqx.Module):
 
     Attributes:
         time: [s], shape (times,).
-        distance: travelled along the slope; for a robot that turns, from its start [m], shape (times,).
-        signals: every signal at those times; each field has shape (times,).
+        distance: travelled along the slope. For a robot that turns, from its start [m], shape (times,).
+        signals: every signal at those times. Each field has shape (times,).
         result: the state at the end, with the run's status.
     """
 
@@ -84,7 +84,7 @@ moving = compiled(balances.moving_signals)
 def drive_rates(
     robot: Robot, conditions: Conditions, y: Float[Array, " unknowns"], way: Scalar | None = None
 ) -> Float[Array, " unknowns"]:
-    """Rates of the unknowns, in their units [1/s]; `way` as in `balances.moving_signals`, or `HELD`."""
+    """Rates of the unknowns, in their units [1/s]. `way` as in `balances.moving_signals`, or `HELD`."""
     held = jnp.asarray(False if way is None else way == HELD)
     signals = moving(
         robot, conditions, state_of_unknowns(robot, y), None if way is None else jnp.where(held, 0.0, way)
@@ -179,21 +179,21 @@ def drive(
     """Runs one robot from standstill (or rolling) under constant conditions and returns the given times.
 
     Args:
-        robot: any robot; its parameters may be tracers.
+        robot: any robot. Its parameters may be tracers.
         conditions: one run, scalar fields.
-        times: increasing, from 0 [s]; the last one ends the run.
+        times: increasing, from 0 [s]. The last one ends the run.
         tolerance: relative and (in units of 10 A, 1000 rad/s, 1 m/s) absolute error of a step.
         max_steps: integration steps after which a run has `failed`.
         rolling: True to start at the operating point of the steady fidelity, or with the sliding speed at V_s if it
-            would slide; derivatives pass through it. False: from standstill.
+            would slide. Derivatives pass through it. False: from standstill.
 
     Returns:
         The trajectory, with a status for the end of the run. `converged`: the speed changes by less than 0.1 % in a
-        tenth of a second; else `not_settled`. `reverses`, `rolls_back`: the same, with backward travel due to a
-        negative voltage or to gravity against the motors. `stalled`: the robot does not travel; from standstill it is
+        tenth of a second, else `not_settled`. `reverses`, `rolls_back`: the same, with backward travel due to a
+        negative voltage or to gravity against the motors. `stalled`: the robot does not travel. From standstill it is
         exactly at rest if friction holds it. `slides`: the movers slide beyond V_s and the robot loses speed or
-        stands; a robot that keeps its speed has `converged`, flagged `slips`. `battery_empty`: the charge is used up;
-        signals after that and the result's numbers are NaN. `failed`: the integrator gave up; the numbers are NaN.
+        stands. A robot that keeps its speed has `converged`, flagged `slips`. `battery_empty`: the charge is used up.
+        Signals after that and the result's numbers are NaN. `failed`: the integrator gave up. The numbers are NaN.
         Derivatives are forward (`jax.jvp`, `jax.jacfwd`).
     """
     if conditions.turns:
@@ -251,7 +251,9 @@ def _integrated(
     """The unknowns at those times, and whether the integrator reached the last of them.
 
     Args:
-        law: rates of the unknowns; size: norm of their error; moves: 0 for robots at rest, else 1.
+        law: rates of the unknowns.
+        size: norm of their error.
+        moves: 0 for robots at rest, else 1.
         currents: number of currents, the first of the unknowns.
     """
     import diffrax  # only here: the import takes half a second
@@ -281,7 +283,7 @@ def _integrated(
 def _turning(
     robot: Robot, conditions: Conditions, times: Array, tolerance: float, max_steps: int, rolling: bool
 ) -> Trajectory:
-    """`drive` for a robot with independently driven sides; its signals have a last axis of left and right side."""
+    """`drive` for a robot with independently driven sides. Its signals have a last axis of left and right side."""
     y0 = circling.turning_start(robot, conditions, rolling)
     parked = jnp.asarray(False) if rolling else circling.holds(robot, conditions)
     moves = jnp.where(parked, circling.changing_at_rest(y0), 1.0)

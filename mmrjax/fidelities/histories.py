@@ -81,9 +81,9 @@ def time_grid(
     """Instants from 0 to the last of `times` [s], including `times` and `changes`.
 
     Args:
-        changes: instants of changes of the motors' input [s]; sizes: their size relative to a usual change.
-            The first step after a smaller change is longer.
-        longest: longest step, if `STEPS` permit it [s]; an array: for each interval between `times`.
+        changes: instants of changes of the motors' input [s].
+        sizes: their size relative to a usual change. The first step after a smaller change is longer.
+        longest: longest step, if `STEPS` permit it [s]. An array: for each interval between `times`.
         start, change: first step and growth of the steps after the start and after changes.
         parts: number of equal steps in place of each.
     """
@@ -137,8 +137,8 @@ class LinearisedRun(eqx.Module):
 
     Attributes:
         begins, ends: unknowns at the beginning and end of every step, shape (steps, unknowns).
-        places: unknowns at both stages, where the equations are linearised, shape (steps, 2, unknowns); sides: see
-            `RunStates`.
+        places: unknowns at both stages, where the equations are linearised, shape (steps, 2, unknowns).
+        sides: see `RunStates`.
         clock: start of a step, and the times of its stages [s], shape (steps, 3).
     """
 
@@ -158,10 +158,11 @@ def _current(y: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:
 
 
 class Lag(eqx.Module):
-    """Excess of a current after a jump of its voltage; it decays within a step.
+    """Excess of a current after a jump of its voltage. It decays within a step.
 
     Attributes:
-        begin, end: of a step; decay: rate of the decay [1/s].
+        begin, end: of a step.
+        decay: rate of the decay [1/s].
         means: over the consecutive parts of a step that its stages weigh.
     """
 
@@ -172,13 +173,14 @@ class Lag(eqx.Module):
 
 
 class RunStep(eqx.Module):
-    """A step of a run; or all of them, with fields of shape (steps, ...).
+    """A step of a run, or all of them, with fields of shape (steps, ...).
 
     Attributes:
-        length: [s]; since: time from the last jump of the current's input to the start of the step [s].
-        begun: 0 before the first jump of a run from rest, which begins with one; else 1.
-        before, now: the changing conditions before that jump and in the step; before: None if no lag follows a
-            jump.
+        length: [s].
+        since: time from the last jump of the current's input to the start of the step [s].
+        begun: 0 before the first jump of a run from rest, which begins with one, else 1.
+        before, now: the changing conditions before that jump and in the step.
+        before: None if no lag follows a jump.
     """
 
     length: Array
@@ -267,7 +269,7 @@ def _limit(robot: Robot) -> Scalar:
 
 
 def _stage(law: Callable[[Array], Array], known: Array, guess: Array, h: Array, mean: Array, decay: Array) -> Array:
-    """Solves Y = known + γ h f(Y) for the unknowns without the lag; the lag acts by its mean."""
+    """Solves Y = known + γ h f(Y) for the unknowns without the lag. The lag acts by its mean."""
     known = known + _GAMMA * h * decay * mean
 
     def left(y: Array) -> Array:
@@ -294,9 +296,11 @@ class RunStates(eqx.Module):
     """A solved run, step by step.
 
     Attributes:
-        stages: unknowns at both stages of every step, without lags; ends: at its end.
-        sides: direction of a shaft (see `turning_way`) at the start and end of a step; they differ if it stops
-            within the step; before: time in such a step until rest [s].
+        stages: unknowns at both stages of every step, without lags.
+        ends: at its end.
+        sides: direction of a shaft (see `turning_way`) at the start and end of a step. They differ if it
+            stops within the step.
+        before: time in such a step until rest [s].
     """
 
     stages: Float[Array, "steps 2 unknowns"]
@@ -309,8 +313,10 @@ class _Part(eqx.Module):
     """A step, or its part before or after a shaft stops.
 
     Attributes:
-        turn: 0 for the whole step; 1 to `TURNS` for iterations of the part before rest; then the remaining part.
-        begin: unknowns at its start; lag: of the current there; length: [s].
+        turn: 0 for the whole step, 1 to `TURNS` for iterations of the part before rest. Then the remaining part.
+        begin: unknowns at its start.
+        lag: of the current there.
+        length: [s].
         side: direction in which a shaft turns.
         stages, end: see `RunStates`.
     """
@@ -378,7 +384,7 @@ def solve_states(robot: Robot, conditions: Conditions, times: Float[Array, " tim
 
 
 def _side(robot: Robot, conditions: Conditions, y: Array) -> Array:
-    """`turning_way` of a step; 0 if shafts and load stop separately."""
+    """`turning_way` of a step, 0 if shafts and load stop separately."""
     return shaft_direction(robot, conditions, state_of_unknowns(robot, y)) if robot.moves_as_one else jnp.zeros(())
 
 
@@ -387,7 +393,7 @@ def linearise_run(
 ) -> LinearisedRun:
     """A run and its equations linearised along it.
 
-    Args: as for `history_signals`; known: its states, if computed.
+    Args: as for `history_signals`, and `known`: its states, if computed.
     """
     run = solve_states(robot, conditions, times) if known is None else known
     steps, constant = run_steps(conditions, times)
@@ -472,13 +478,14 @@ def run_response(
     """Response of a run to small changes of its rates.
 
     Args:
-        conditions: as for `history_signals`; along: the run.
+        conditions: as for `history_signals`.
+        along: the run.
         source: (time, state, conditions, `way` of `balances.moving_signals`) → change of the rates, shape
             (unknowns, ...).
         seen: (time, state, its change, conditions) → quantity to return at the end of every step.
         begin: change of the state at the first instant.
 
-    Sources within a block of steps are computed together; the sequential part is one product per step.
+    Sources within a block of steps are computed together. The sequential part is one product per step.
     """
     steps, constant = run_steps(conditions, jnp.append(along.clock[:, 0], along.clock[-1, 2]))
 
@@ -506,7 +513,7 @@ def run_response(
 
 
 def _in_blocks(of_steps: T) -> T:
-    """Data of each step, arranged in blocks of steps; the last block is padded with the last step."""
+    """Data of each step, arranged in blocks of steps. The last block is padded with the last step."""
 
     def filled(x: Array) -> Array:
         x = jnp.concatenate([x, jnp.repeat(x[-1:], -len(x) % BLOCK, 0)])
@@ -545,11 +552,11 @@ def history_signals(
     Args:
         robot: its parameters may be tracers. Derivatives are forward, exact for these steps, and only with respect to
             the robot.
-        conditions: one run; each field scalar, or of shape (times,): the value of an instant acts until the next one,
+        conditions: one run. Each field scalar, or of shape (times,): the value of an instant acts until the next one,
             and the signals of that instant use it.
-        times: from 0 on, as from `time_grid` [s]; repeated instants are steps of no length.
+        times: from 0 on, as from `time_grid` [s]. Repeated instants are steps of no length.
         known: the run, from `linearise_run`, if computed.
-        at: indices of the instants to return; None: all.
+        at: indices of the instants to return. None: all.
 
     A run whose equations could not be solved is not finite from there on. Shafts and a load that move as one rest if
     friction holds them. For others friction at rest is smooth: gravity makes a resting robot creep, below a tenth of
@@ -585,10 +592,11 @@ def _shown(robot: Robot, conditions: Conditions, y: Array, way: Array) -> Signal
 
 
 class StepCourse(eqx.Module):
-    """Course of steps of a run between their instants; signals have fields of shape (steps,).
+    """Course of steps of a run between their instants. Signals have fields of shape (steps,).
 
     Attributes:
-        first: at the beginning; begin, end: ends of the line that the signals follow apart from a decaying lag.
+        first: at the beginning.
+        begin, end: ends of the line that the signals follow apart from a decaying lag.
         decays: exponent of that decay over the step, shape (steps,).
     """
 
@@ -616,9 +624,9 @@ def course_between_instants(
     known: LinearisedRun | None = None,
     at: Int[Array, " places"] | None = None,
 ) -> StepCourse:
-    """Course of one run between its instants; the run is that of `history_signals`.
+    """Course of one run between its instants. The run is that of `history_signals`.
 
-    Args: as for `history_signals`; at: steps to return, by the index of the instant at the start of each.
+    Args: as for `history_signals`, and `at`: steps to return, by the index of the instant at the start of each.
     """
     ys, sides = _nodes(robot, conditions, times, known)
     steps, constant = run_steps(conditions, times)

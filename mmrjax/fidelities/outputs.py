@@ -21,7 +21,7 @@ FURTHER = TABLE["run"]
 
 
 def output_table(shown: Iterable[Channel]) -> tuple[Quantity, ...]:
-    """Every output in the order of columns, the channels `shown` first; each is an attribute of `Result`."""
+    """Every output in the order of columns, the channels `shown` first. Each is an attribute of `Result`."""
     return (*shown, *FURTHER)
 
 
@@ -47,7 +47,7 @@ def output_columns(
 
 
 def status_words(status: Any, flags: Any) -> dict[str, np.ndarray]:
-    """Statuses and flags as words of `runs.csv`, in the shape of the codes; flags separated by semicolons."""
+    """Statuses and flags as words of `runs.csv`, in the shape of the codes. Flags separated by semicolons."""
     from mmrjax.model.signals import FLAGS, STATUSES
 
     bits = np.asarray(flags)

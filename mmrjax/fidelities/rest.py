@@ -46,7 +46,7 @@ def travel_direction(robot: Robot, conditions: Conditions) -> Array:
     """Direction in which a robot can travel, 1 forward or -1 backward, from the torque on its shafts at rest.
 
     The torque is that of the motors at stall current, within the driver's limit, less gravity's. Friction can hold
-    the robot but not reverse it. With an imposed motor speed, the direction of that speed; at speed 0, that in which
+    the robot but not reverse it. With an imposed motor speed, the direction of that speed. At speed 0, that in which
     the motors push against the load torque.
     """
     if conditions.motor_speed is not None:
@@ -116,12 +116,13 @@ def _carried(robot: Robot, conditions: Conditions, state: State, direction: Scal
 def standing_signals(robot: Robot, conditions: Conditions, state: State) -> Signals:
     """All signals of a robot that friction holds at rest, in static equilibrium.
 
-    The loads alone do not determine static friction. Traction is the pull of gravity along the slope; rolling
+    The loads alone do not determine static friction. Traction is the pull of gravity along the slope. Rolling
     resistance takes the part that neither shafts nor adhesion hold. The output torque is the smallest that keeps
     both motor side and track side at rest: friction acts as near as possible to the load it balances.
 
     Args:
-        conditions: voltage or current imposed, no speed; state: with the current that flows at rest.
+        conditions: voltage or current imposed, no speed.
+        state: with the current that flows at rest.
     """
     robot = robot.within(conditions.configuration)
     chassis, gear, still = robot.chassis(conditions.configuration), robot.gearbox, _still(state)
@@ -208,7 +209,7 @@ def shaft_direction(robot: Robot, conditions: Conditions, state: State) -> Array
 
     `HELD` if they rest and friction holds them by the test of `firmness`, both now and at the later current at rest.
     0 if friction holds them only now, so that they are about to leave rest, and their speed is below the resolution
-    of static friction. An imposed speed turns them in any case; 0 if it is 0.
+    of static friction. An imposed speed turns them in any case, 0 if it is 0.
     """
     motor_speed, load = jnp.asarray(state.speed_motor), robot.chassis(conditions.configuration)
     slow = jnp.abs(motor_speed) * load.radius / robot.gearbox.ratio < load.speed_still
@@ -228,10 +229,10 @@ def shaft_direction(robot: Robot, conditions: Conditions, state: State) -> Array
 
 
 def slides_in_place(robot: Robot, conditions: Conditions) -> Array:
-    """True if a robot slides, whose demand exceeds the limit of the ground; False if it stands.
+    """True if a robot slides, whose demand exceeds the limit of the ground, False if it stands.
 
     It slides down if gravity less rolling resistance exceeds the adhesion. It slides in place if the motors turn the
-    movers faster than V_s; up to V_s the traction of the ground increases with sliding speed.
+    movers faster than V_s. Up to V_s the traction of the ground increases with sliding speed.
     """
     chassis, sense = robot.chassis(conditions.configuration), travel_direction(robot, conditions)
     none = jnp.zeros_like(conditions.voltage)
@@ -271,11 +272,13 @@ def current_at_rest(robot: Robot, conditions: Conditions, state: State) -> Scala
 def is_at_rest(sense: Array, voltage: Scalar, theoretical: Scalar, speed: Scalar, rest: Scalar) -> Array:
     """True if a robot counts as at rest: slower than the resolution of static friction.
 
-    A robot driven by its motors travels if both shafts and robot move in the motors' direction; on a slope the creep
+    A robot driven by its motors travels if both shafts and robot move in the motors' direction. On a slope the creep
     of the contact can cancel slow shafts. A robot driven by gravity travels if either of them moves.
 
     Args:
-        sense: direction of possible travel, 1 or -1; voltage: at the motors at rest [V]; theoretical: r_k ω_k [m/s].
+        sense: direction of possible travel, 1 or -1.
+        voltage: at the motors at rest [V].
+        theoretical: r_k ω_k [m/s].
         rest: speed below which friction at rest is not resolved [m/s].
     """
     shafts, travel = sense * theoretical, sense * speed
@@ -287,11 +290,12 @@ def status_moving(robot: Robot, conditions: Conditions, end: Signals, voltage: S
     """Status of a run over time from its last instant, if friction does not hold the robot.
 
     Args:
-        conditions: at that instant; voltage: of the driver at that instant [V].
+        conditions: at that instant.
+        voltage: of the driver at that instant [V].
 
     Returns:
-        `not_settled` if the speed changes, or if the robot gains speed with movers sliding beyond V_s; `slides` if it
-        then loses speed or stands; `stalled` if it creeps; else the status of steady travel.
+        `not_settled` if the speed changes, or if the robot gains speed with movers sliding beyond V_s, `slides` if it
+        then loses speed or stands, `stalled` if it creeps, else the status of steady travel.
     """
     settling = jnp.abs(end.acceleration) * TIME > SHARE * jnp.abs(end.speed)
     status = jnp.where(settling, NOT_SETTLED, travel_status(end.speed, voltage))
@@ -310,7 +314,9 @@ def status_with_slip(
     A slipping robot is `not_settled` if it gains speed, and `slides` if it loses speed or stands.
 
     Args:
-        gain: acceleration of the robot [m/s²]; least: smallest that counts; stands: True if it does not travel.
+        gain: acceleration of the robot [m/s²].
+        least: smallest that counts.
+        stands: True if it does not travel.
     """
     loose = jnp.where(gain > least, NOT_SETTLED, jnp.where(jnp.asarray(gain < -least) | stands, SLIDES, status))
     return jnp.where(movers_slip(robot, signals), loose, status)

@@ -24,7 +24,7 @@ CURRENT_SMALL = 1e-3
 
 
 def result_of_signals(robot: Robot, signals: Signals, status: Int[Array, "..."]) -> Result:
-    """Readings, power chain of Fig. 4 and warnings of one instant; numbers with unknown parameters are NaN."""
+    """Readings, power chain of Fig. 4 and warnings of one instant. Numbers with unknown parameters are NaN."""
     sides = robot.sides
     power_supply = balances.power_drawn(robot, signals)
     power_motor = sides * signals.torque_motor * signals.speed_motor
@@ -110,16 +110,16 @@ def movers_slip(robot: Robot, signals: Signals) -> Array:
 
 
 def power_ratio(out: Scalar, into: Scalar) -> Array:
-    """Power out over power in [-]; 0 at rest and if power flows the other way."""
+    """Power out over power in [-], 0 at rest and if power flows the other way."""
     # Power returned on a descent has no efficiency of forward travel.
     forward = (out >= 0) & (into >= out)
     return jnp.where(forward, safe_quotient(out, into), 0.0)
 
 
 def withhold_numbers(answer: Result, valid: Array, sound: Array) -> Result:
-    """Sets every number of `answer` to NaN if `valid` is false; keeps mass and adhesion used if `sound`.
+    """Sets every number of `answer` to NaN if `valid` is false. Keeps mass and adhesion used if `sound`.
 
-    The flags of a withheld member are cleared; its status says why it has no numbers.
+    The flags of a withheld member are cleared. Its status says why it has no numbers.
     """
     blank = jax.tree.map(
         lambda x: jnp.where(valid, x, 0 if jnp.issubdtype(x.dtype, jnp.integer) else jnp.nan), answer

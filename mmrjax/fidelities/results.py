@@ -35,7 +35,9 @@ class Pending:
     """A checked batch that has not been computed.
 
     Attributes:
-        robot: concrete; conditions: of any shape, configurations resolved; fidelity: with `outputs`.
+        robot: concrete.
+        conditions: of any shape, configurations resolved.
+        fidelity: with `outputs`.
     """
 
     robot: Robot
@@ -80,7 +82,7 @@ T = TypeVar("T")
 def _in_chunks(fidelity: Fidelity, function: Callable[[Conditions], T], conditions: Conditions) -> T:
     """Returns the values of a function of conditions of shape (runs,), in the shape of the conditions.
 
-    Large batches are split into chunks of one size, which share a compilation; the last chunk ends
+    Large batches are split into chunks of one size, which share a compilation. The last chunk ends
     with the last run. Small batches are padded (`Facts.filled`) by NumPy, which compiles nothing. Dispatching JAX
     operations leaf by leaf took twenty times as long as the equations at 262 144 runs.
     """
@@ -128,7 +130,7 @@ def _rows(conditions: Conditions, first: np.ndarray, size: int) -> Conditions:
 
 @compiled
 def _joined(parts: list[T], runs: int) -> T:
-    """Joins chunks of one size; drops the part of the last chunk that repeats the previous one."""
+    """Joins chunks of one size. Drops the part of the last chunk that repeats the previous one."""
     return jax.tree.map(lambda *x: jnp.concatenate([*x[:-1], x[-1][(len(x) * len(x[-1]) - runs) :]]), *parts)
 
 
@@ -176,7 +178,7 @@ class StatusCodes(np.ndarray):
 
 
 def _codes(words: Any) -> Any:
-    """Codes of words of `STATUSES`; other values are returned unchanged.
+    """Codes of words of `STATUSES`. Other values are returned unchanged.
 
     Raises:
         UsageError: an unknown word.
@@ -191,10 +193,10 @@ def _codes(words: Any) -> Any:
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Results:
-    """Results of one run or a batch, of one fidelity; a pytree.
+    """Results of one run or a batch, of one fidelity, as a pytree.
 
     For `steady`, numbers are computed at first use and kept. One program computes the readings and statuses, another
-    all other numbers (and the results as a pytree). The two differ by rounding, about 1e-15 of a number; a number
+    all other numbers (and the results as a pytree). The two differ by rounding, about 1e-15 of a number. A number
     that has been read does not change.
 
     Every field of `Result`, every channel and every column that the fidelity adds is an attribute:
@@ -206,11 +208,11 @@ class Results:
         total_mass: of robot and payload [kg], stated or the robot's own.
         result: in SI units.
         further: outputs that only this fidelity has, by column, in the column's unit.
-        history: runs over time (`time`, `distance`, `signals`, `reading`), on their last axis; None if the fidelity
+        history: runs over time (`time`, `distance`, `signals`, `reading`), on their last axis, None if the fidelity
             has none or it was not requested.
         configurations: names of the robot's configurations, in the order of their indices.
         model: the fidelity.
-        mission: for runs over a profile, totals, segments and time history; None without a profile.
+        mission: for runs over a profile, totals, segments and time history, None without a profile.
         stated: conditions that the profile states, which replace those of the runs.
         channels: of the robot, in the order of columns.
     """
@@ -242,7 +244,7 @@ class Results:
         return results
 
     def on_host(self) -> Results:
-        """Same results with NumPy arrays; numbers not computed yet remain so."""
+        """Same results with NumPy arrays. Numbers not computed yet remain so."""
         batch = self.__dict__.get("_pending")
         if batch is None or "result" in self.__dict__:
             return jax.tree.map(np.asanyarray, self)
@@ -285,7 +287,7 @@ class Results:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Shape of the batch; () for one run."""
+        """Shape of the batch, () for one run."""
         return self.conditions.shape if "_pending" in self.__dict__ else self.result.status.shape
 
     @property
@@ -295,7 +297,7 @@ class Results:
 
     @property
     def statuses(self) -> np.ndarray:
-        """Statuses of the runs as words of `STATUSES`; `status` holds their codes."""
+        """Statuses of the runs as words of `STATUSES`. `status` holds their codes."""
         return np.array(STATUSES)[np.asarray(self.status)]
 
     def rows_table(self) -> dict[str, np.ndarray]:
@@ -303,9 +305,9 @@ class Results:
         return self.to_dict()
 
     def to_dict(self) -> dict[str, np.ndarray]:
-        """Conditions and outcomes by the columns of `runs.csv`, units in the names; arrays of the batch's shape.
+        """Conditions and outcomes by the columns of `runs.csv`, units in the names, arrays of the batch's shape.
 
-        Over a profile the outcomes are those of the mission; conditions that the profile states are NaN.
+        Over a profile the outcomes are those of the mission. Conditions that the profile states are NaN.
         """
         conditions, nan = self.conditions, np.full(self.shape, np.nan)
         as_table = {"voltage": "supply_voltage_V", "payload": "payload_kg", "slope_deg": "slope_deg"}
@@ -334,7 +336,7 @@ class Results:
         """Text table of the results, one line per run.
 
         Args:
-            columns: of `to_dict`; None: the conditions, the readings and a few more.
+            columns: of `to_dict`. None: the conditions, the readings and a few more.
             rows: largest number of lines.
         """
         content = {name: np.ravel(values) for name, values in self.to_dict().items()}

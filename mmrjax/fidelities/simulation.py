@@ -51,22 +51,22 @@ def simulate(
 ) -> Results:
     """Simulates one run or a batch.
 
-    Concrete values are checked; tracers pass, so that `jax.grad`, `jax.jacfwd`, `jax.vmap` and
-    `jax.jit` work. Forward mode works in all fidelities, reverse mode in `steady` and `track`; for reverse mode over
+    Concrete values are checked. Tracers pass, so that `jax.grad`, `jax.jacfwd`, `jax.vmap` and
+    `jax.jit` work. Forward mode works in all fidelities, reverse mode in `steady` and `track`. For reverse mode over
     time see `step`. The results of `steady` are computed when they are read (see `Results`).
 
     Args:
-        robot: any robot; its parameters may be tracers or, under `jax.vmap`, batches.
+        robot: any robot. Its parameters may be tracers or, under `jax.vmap`, batches.
         conditions: fields of one shape, configurations by name or index.
-        model: fidelity, one of `fidelities.NAMES`; default `steady`, or `drive` with a profile.
-        duration: of a run [s]; default 30 for `drive`, 1.5 for `track`.
-        step: of integration [s]; default 1e-4 for `track`.
-        history: True to return runs over time if the fidelity can; `track` then starts from standstill, else
+        model: fidelity, one of `fidelities.NAMES`. Default `steady`, or `drive` with a profile.
+        duration: of a run [s]. Default 30 for `drive`, 1.5 for `track`.
+        step: of integration [s]. Default 1e-4 for `track`.
+        history: True to return runs over time if the fidelity can. `track` then starts from standstill, else
             rolling at the steady speed.
-        profile: a mission that every run follows (`mmrjax.profile`), only with `drive`; the conditions supply what it
+        profile: a mission that every run follows (`mmrjax.profile`), only with `drive`. The conditions supply what it
             does not state. Results then have `mission`, and the columns of `missions.mission_batch.OUTPUTS`.
-            Derivatives are forward, also with respect to its values and times; with tracers state `history=False`.
-        start: state at the start of a mission; None: at rest at ambient temperature.
+            Derivatives are forward, also with respect to its values and times. With tracers state `history=False`.
+        start: state at the start of a mission. None: at rest at ambient temperature.
         options: of a further fidelity, by name.
 
     Returns:
@@ -238,7 +238,7 @@ def _resolved(robot: Robot, conditions: Conditions) -> Conditions:
 
 
 def check_conditions(robot: Robot, conditions: Conditions) -> Conditions:
-    """Conditions with configuration names replaced by indices; values are checked unless they are tracers.
+    """Conditions with configuration names replaced by indices. Values are checked unless they are tracers.
 
     Raises:
         UsageError: a configuration that the robot lacks, a value out of range or NaN, or values that contradict.
@@ -282,7 +282,7 @@ def _check_conditions(conditions: Conditions) -> None:
 
 
 def _ends(values: jax.Array | np.ndarray) -> tuple[float, float]:
-    """Least and greatest of some numbers, computed by the library that holds them; NaN if one of them is."""
+    """Least and greatest of some numbers, computed by the library that holds them, NaN if one of them is."""
     on_host = not isinstance(values, jax.Array) or all(device.platform == "cpu" for device in values.devices())
     numbers = np.asarray(values) if on_host else values
     least, most = jax.device_get((numbers.min(), numbers.max()))

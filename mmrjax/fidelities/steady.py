@@ -59,7 +59,7 @@ def _settled_at(
     """State and signals at given unknowns, and the residuals of the balances, all 0 at the operating point.
 
     The unknowns are speed, current and motor speed, in the order of elimination of the balances. For any robot the
-    slip determines the speed and the voltage the current; the torque then gives the motor speed. The current is the
+    slip determines the speed and the voltage the current. The torque then gives the motor speed. The current is the
     one that the duty alone would drive, see `Driver.admitted`. Where a clamp holds the output, the third unknown is
     the torque that the clamp carries, in place of the motor speed.
     """
@@ -141,9 +141,9 @@ def _start(robot: Robot, conditions: Conditions) -> Vector:
 
 
 def _root(robot: Robot, conditions: Conditions, large: bool = True) -> tuple[Vector, Array]:
-    """The root of the balances, and whether the search converged; derivatives are implicit.
+    """The root of the balances, and whether the search converged. Derivatives are implicit.
 
-    `large` selects the program for large batches; the other compiles sooner.
+    `large` selects the program for large batches. The other compiles sooner.
     """
     tolerance = float(jnp.finfo(jnp.result_type(conditions.voltage)).eps) ** 0.85
     sound = _sound(robot, conditions)[1]
@@ -176,7 +176,7 @@ def steady(robot: Robot, conditions: Conditions) -> Result:
     Derivatives are implicit (forward and reverse). Vmapped by `steady_batch`.
 
     Args:
-        robot: any robot; its parameters may be tracers.
+        robot: any robot. Its parameters may be tracers.
         conditions: one run, scalar fields.
 
     Returns:
@@ -246,7 +246,7 @@ def _operating_at(
     """`operating_state` at given unknowns, and the residuals of the balances there.
 
     Args:
-        stands: True to test whether a run beyond the limit of adhesion slides or stands; False: it `slides`.
+        stands: True to test whether a run beyond the limit of adhesion slides or stands. False: it `slides`.
     """
     given = jax.lax.stop_gradient((robot, conditions))  # nothing is stored for a loop that rarely runs
     robot = robot.within(conditions.configuration)
@@ -286,7 +286,7 @@ BLOCK = 32_768
 
 
 def _over_points(function: Callable[..., Any], *arguments: Any) -> Any:
-    """`function` of scalars, mapped over the leading axis of all arrays that have one; on a CPU block by block."""
+    """`function` of scalars, mapped over the leading axis of all arrays that have one. On a CPU block by block."""
     batched = jax.vmap(function, in_axes=_axes(arguments))
     leaves, tree = jax.tree.flatten(arguments)
     points = max((len(x) for x in leaves if jnp.ndim(x)), default=0)
@@ -334,10 +334,10 @@ def steady_outputs(robot: Robot, conditions: Conditions, names: tuple[str, ...])
         names: of `outputs.output_table`, `status` (code into `STATUSES`) and `flags` (bit mask over `FLAGS`).
 
     Returns:
-        Arrays of shape (points,) by name [SI]; NaN if a point has no such number, see `steady`.
+        Arrays of shape (points,) by name [SI], NaN if a point has no such number, see `steady`.
 
     Raises:
-        KeyError: an unknown name; the message lists the valid ones.
+        KeyError: an unknown name. The message lists the valid ones.
     """
     _check_outputs(names)
 

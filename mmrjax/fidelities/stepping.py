@@ -42,8 +42,8 @@ def initial_state(robot: Robot, conditions: Conditions | None = None, *, rolling
     """Returns the state of a robot at rest, or rolling at the speed that the fidelity `steady` finds.
 
     Args:
-        robot: any robot; its parameters may be tracers.
-        conditions: of one run, scalar fields; None: `Conditions()`. `discharge` is the charge taken from the battery
+        robot: any robot. Its parameters may be tracers.
+        conditions: of one run, scalar fields. None: `Conditions()`. `discharge` is the charge taken from the battery
             so far [C].
         rolling: True for a robot that already travels under the voltage and duty of the conditions.
 
@@ -58,7 +58,7 @@ def rates(robot: Robot, state: State, command: Command, conditions: Conditions |
     """Returns the time derivative of a state, as a state with the unit of each number per second.
 
     Args:
-        robot: any robot; its parameters may be tracers.
+        robot: any robot. Its parameters may be tracers.
         state: from `initial_state` or a step.
         command, conditions: as for `step`.
 
@@ -78,19 +78,19 @@ def step(robot: Robot, state: State, command: Command, dt: Scalar, conditions: C
     (tests/test_stepping.py). A robot that has stopped stays at rest as long as friction can hold it.
 
     Args:
-        robot: any robot, a vehicle or a shaft on a bench; its parameters may be tracers.
+        robot: any robot, a vehicle or a shaft on a bench. Its parameters may be tracers.
         state: from `initial_state` or an earlier step.
         command: duty of the driver, -1 to 1, or values by their names in `Conditions` that hold during the step, such
-            as `{"voltage": 24.0, "slope_deg": 5.0}`; None: the conditions alone.
-        dt: length of the step [s], above 0; 0.02 s or less. A step has no error control. In starts of the paper's
+            as `{"voltage": 24.0, "slope_deg": 5.0}`. None: the conditions alone.
+        dt: length of the step [s], above 0, 0.02 s or less. A step has no error control. In starts of the paper's
             robot, speeds are within 0.3 % at 0.02 s and at 0.05 s, and off by up to 6 % at 0.1 s. With a duty that
             jumps anywhere in its range at each step, they are within 3 % of the largest speed at 0.02 s.
-        conditions: of one run, scalar fields; None: `Conditions()`.
+        conditions: of one run, scalar fields. None: `Conditions()`.
 
     Raises:
-        UsageError: conditions of several runs; conditions that impose the motors' speed or drive the sides
-            independently; a value out of range or NaN; a configuration that the robot lacks; a command that is no
-            number or names no condition; a state of another robot; a `dt` that is not above 0. Tracers pass.
+        UsageError: conditions of several runs, conditions that impose the motors' speed or drive the sides
+            independently, a value out of range or NaN, a configuration that the robot lacks, a command that is no
+            number or names no condition, a state of another robot, a `dt` that is not above 0. Tracers pass.
     """
     robot, conditions = as_floats((robot, _commanded(robot, command, conditions)))
     y = _vector(robot, state)
@@ -106,7 +106,7 @@ def _begun(robot: Robot, conditions: Conditions, rolling: bool) -> Float[Array, 
 def _stepped(
     robot: Robot, conditions: Conditions, y: Float[Array, " unknowns"], dt: Scalar
 ) -> Float[Array, " unknowns"]:
-    """The unknowns of `drive` after a step; a robot that has stopped is held if friction at rest can hold it."""
+    """The unknowns of `drive` after a step. A robot that has stopped is held if friction at rest can hold it."""
     speeds = np.isin(np.arange(len(y)), (drive.MOTOR, drive.GROUND))
     drawn = np.isin(np.arange(len(y)), (drive.CURRENT, _DISCHARGE))
     held = holds(robot, conditions)
@@ -153,7 +153,7 @@ def _commanded(robot: Robot, command: Command, conditions: Conditions | None) ->
 
 
 def _shape(value: Any) -> tuple[int, ...] | None:
-    """Shape of a number or an array of numbers, tracers included; None of anything else."""
+    """Shape of a number or an array of numbers, tracers included. None of anything else."""
     if isinstance(value, jax.Array):
         return value.shape
     if value is None or isinstance(value, str):

@@ -61,9 +61,9 @@ class Trajectory(eqx.Module):
 
     Attributes:
         time: ends of the sample intervals [s], shape (samples,).
-        q, v: coordinates and velocities at those times (see `undercarriage`), shape (samples, 5); for a robot free to
+        q, v: coordinates and velocities at those times (see `undercarriage`), shape (samples, 5). For a robot free to
             turn those of `both_sides`, shape (samples, 10).
-        signals: means over each interval; each field has shape (samples,). For a robot free to turn they and the
+        signals: means over each interval. Each field has shape (samples,). For a robot free to turn they and the
             following have a last axis of left and right side: (samples, 2).
         reactions: loads at those times, of one side.
         steady: averages at the end of the run.
@@ -125,15 +125,16 @@ def track(
     Pure and traceable: differentiable forward and backward, vmappable over every argument's leaves.
 
     Args:
-        robot: any robot; its parameters may be tracers. Its `guide_share` is not used: it is an output.
+        robot: any robot. Its parameters may be tracers. Its `guide_share` is not used: it is an output.
         conditions: one run, scalar fields.
-        duration: of the run [s]; step, sample: intervals of integration and of the record [s].
-        rolling: True to start at the steady fidelity's speed, which settles sooner; False: from standstill.
+        duration: of the run [s].
+        step, sample: intervals of integration and of the record [s].
+        rolling: True to start at the steady fidelity's speed, which settles sooner. False: from standstill.
 
     Returns:
         The trajectory, with one of these statuses. `converged`: current and speeds change by less than 0.1 % from one
-        half of the averaging window to the other; else `not_settled`. `stalled`: the shafts do not turn forward.
-        `slides`: the movers slide beyond V_s and the robot loses speed or stands; in steady travel it has
+        half of the averaging window to the other, else `not_settled`. `stalled`: the shafts do not turn forward.
+        `slides`: the movers slide beyond V_s and the robot loses speed or stands. In steady travel it has
         `converged`, flagged `slips`. `tips`: the line of gravity passes outside the contacts, or the robot has turned
         over although gravity alone would not turn it (a resonance, a wild start). `battery_empty`. `failed`: the
         numbers are no longer finite, or the robot has left the ground. `failed` and `tips` withhold the result's
@@ -195,8 +196,8 @@ def check_track_runs(
     """Raises if the track model cannot compute some run of a batch.
 
     Raises:
-        ValueError: `sample` is not a whole number of steps or `duration` of samples; a lever reaches below the
-            ground; the step is above the largest stable one, which the message states; a load without ground, an
+        ValueError: `sample` is not a whole number of steps or `duration` of samples, a lever reaches below the
+            ground, the step is above the largest stable one, which the message states, a load without ground, an
             imposed motor speed, movers without inertia, parts with more mass or inertia than the robot.
     """
     if not robot.has_ground:
@@ -237,7 +238,7 @@ def track_batch(
     """`track` over a batch of conditions (leading axis of every field) for one robot, compiled once.
 
     Args:
-        progress: called with the finished share of the runs' time; between its calls the runs can be
+        progress: called with the finished share of the runs' time. Between its calls the runs can be
             interrupted. None: one call of XLA, which cannot be interrupted.
 
     Raises:
@@ -245,7 +246,16 @@ def track_batch(
     """
     check_track_runs(robot, conditions, duration=duration, step=step, sample=sample)
     if progress is not None:
-        return _in_parts(robot, conditions, duration, step, sample, rolling, progress)
+        # All parts have one length, to share a compilation; the excess of the last one is cut off.
+        samples = round(duration / sample)
+        length = math.ceil(samples / PARTS)
+        start = motion = _begin(robot, conditions, step, rolling)
+        records = []
+        for done in range(0, samples, length):
+            motion, record = jax.block_until_ready(_part(robot, conditions, motion, step, sample, length))
+            records.append(record)
+            progress(min((done + length) / samples, 1.0))
+        return _end(robot, conditions, start, records, step, sample, samples)
     return _batch(robot, conditions, duration, step, sample, rolling)
 
 
@@ -262,27 +272,6 @@ def _batch(
         return track(robot, conditions, duration=duration, step=step, sample=sample, rolling=rolling)
 
     return jax.vmap(one)(conditions)
-
-
-def _in_parts(
-    robot: Robot,
-    conditions: Conditions,
-    duration: float,
-    step: float,
-    sample: float,
-    rolling: bool,
-    progress: Progress,
-) -> Trajectory:
-    # All parts have one length, to share a compilation; the excess of the last one is cut off.
-    samples = round(duration / sample)
-    length = math.ceil(samples / PARTS)
-    start = motion = _begin(robot, conditions, step, rolling)
-    records = []
-    for done in range(0, samples, length):
-        motion, record = jax.block_until_ready(_part(robot, conditions, motion, step, sample, length))
-        records.append(record)
-        progress(min((done + length) / samples, 1.0))
-    return _end(robot, conditions, start, records, step, sample, samples)
 
 
 @compiled

@@ -38,10 +38,12 @@ class Axis:
 
     Attributes:
         name: dotted parameter, or condition.
-        unit: of its values; meaning: in words; bounds: least and greatest value allowed [unit].
-        value: the robot's, or the default of a condition [unit]; None: the robot's own mass plus the payload.
-        prior_sd: standard deviation of the parameter's prior around `value` [unit]; None for a condition.
-        spec: of the parameter's field; None for a condition.
+        unit: of its values.
+        meaning: in words.
+        bounds: least and greatest value allowed [unit].
+        value: the robot's, or the default of a condition [unit]. None: the robot's own mass plus the payload.
+        prior_sd: standard deviation of the parameter's prior around `value` [unit], None for a condition.
+        spec: of the parameter's field, None for a condition.
     """
 
     name: str
@@ -61,7 +63,7 @@ class Variation(eqx.Module):
         names: of what varies: dotted parameters as in `params.walk_parameters`, or conditions (`CONDITIONS`).
 
     Raises:
-        UsageError: an unknown name, or a name stated twice; the message suggests similar ones.
+        UsageError: an unknown name, or a name stated twice. The message suggests similar ones.
     """
 
     robot: Robot
@@ -100,10 +102,10 @@ class Variation(eqx.Module):
         return any(name not in CONDITIONS for name in self.names)
 
     def at(self, values: Float[Array, "... names"], conditions: Conditions) -> tuple[Robot, Conditions]:
-        """The robot and the conditions of a point, or of a batch; the leaves that vary have the shape of the batch.
+        """The robot and the conditions of a point, or of a batch. The leaves that vary have the shape of the batch.
 
         Args:
-            values: in the order of `names`, in the axes' units; `configuration` is an index, rounded.
+            values: in the order of `names`, in the axes' units. `configuration` is an index, rounded.
             conditions: values of the other conditions, names of configurations resolved.
         """
         given: dict[str, Any] = {name: values[..., k] for k, name in enumerate(self.names)}
@@ -133,15 +135,16 @@ def evaluate_points(
     Traceable. Parts that do not vary are arguments of the compiled program, not constants in it.
 
     Args:
-        fidelity: one of `fidelities.NAMES`; options: all of its options, from `Facts.resolved`.
+        fidelity: one of `fidelities.NAMES`.
+        options: all of its options, from `Facts.resolved`.
         values: one row per point, in the order of `variation.names`.
         conditions: the other conditions, of shape () or (points,), names of configurations resolved.
-        outputs: names of `outputs.output_table`, or of columns that the fidelity adds; also `flags`. Over a profile
+        outputs: names of `outputs.output_table`, or of columns that the fidelity adds, also `flags`. Over a profile
             columns of `missions.OUTPUTS`.
-        profile: a mission that every point follows, with the fidelity `missions.MODEL`; fields of shape (rows,).
+        profile: a mission that every point follows, with the fidelity `missions.MODEL`, fields of shape (rows,).
 
     Returns:
-        By name in SI units (a fidelity's own column in its unit), and `status`; arrays of shape (points,).
+        By name in SI units (a fidelity's own column in its unit), and `status`, arrays of shape (points,).
 
     Raises:
         UsageError: an output that the fidelity does not have.

@@ -1,8 +1,8 @@
 """Missions: the ODE of `drive` over a profile, with heat, standing still, and energy integrated as states.
 
-Friction holds a robot at rest until motors or gravity exceed it; neither smooth shaft friction nor the ground's law
-lets it creep. Stopping and breaking away are events that the steps land on;
-derivatives pass through their moments.
+Friction holds a robot at rest until motors or gravity exceed it. Neither smooth shaft friction nor the ground's law
+lets it creep. Stopping and breaking away are events that the steps land on.
+Derivatives pass through their moments.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Totals(eqx.Module):
 
     Attributes:
         time: duration [s].
-        of: integrals by the names of the law's `TOTALS`; `drawn` and `returned` belong to the source, the others are
+        of: integrals by the names of the law's `TOTALS`. `drawn` and `returned` belong to the source, the others are
             sinks.
         stored: rise of the energy in motion [J].
         given: net energy of the source [J]: of a battery from its charge at both ends, of a supply as integrated.
@@ -77,10 +77,11 @@ class Totals(eqx.Module):
 
 
 class Start(eqx.Module):
-    """The state at the start of a mission; by default at rest and at ambient temperature.
+    """The state at the start of a mission. By default at rest and at ambient temperature.
 
     Attributes:
-        speed: of the robot, its movers rolling [m/s]; current: of one motor [A].
+        speed: of the robot, its movers rolling [m/s].
+        current: of one motor [A].
         temperature_winding, temperature_housing: [°C], None: ambient.
     """
 
@@ -91,15 +92,17 @@ class Start(eqx.Module):
 
 
 class Course(eqx.Module):
-    """A mission over time: its accepted steps, shape (kept,); entries after the last step are NaN.
+    """A mission over time: its accepted steps, shape (kept,). Entries after the last step are NaN.
 
     Attributes:
-        time: since the start of the mission [s]; segment: index of the segment, -1 after the last.
+        time: since the start of the mission [s].
+        segment: index of the segment, -1 after the last.
         event: index into `MARKS` of the event at the end of a step, -1 for none.
-        distance: along the ground, forward less backward [m]; path: in both directions [m].
-        temperature_winding, temperature_housing: [°C]; for a robot that turns, of each side, shape (kept, 2).
+        distance: along the ground, forward less backward [m].
+        path: in both directions [m].
+        temperature_winding, temperature_housing: [°C]. For a robot that turns, of each side, shape (kept, 2).
         energy: net energy taken from the source [J].
-        signals: every signal; for a robot that turns, of left and right side, shape (kept, 2).
+        signals: every signal. For a robot that turns, of left and right side, shape (kept, 2).
     """
 
     time: Float[Array, " kept"]
@@ -117,14 +120,16 @@ class Mission(eqx.Module):
     """A robot's run over a profile.
 
     Attributes:
-        total: of the mission; segments: of each segment of each cycle, fields of shape (cycles, segments).
-        peaks: by the names of the law's `PEAKS` (`cell_low` is the lowest voltage of a cell); also of the segments.
-        status: of each segment at its end, flags: of each segment; shape (cycles, segments).
+        total: of the mission.
+        segments: of each segment of each cycle, fields of shape (cycles, segments).
+        peaks: by the names of the law's `PEAKS` (`cell_low` is the lowest voltage of a cell). Also of the segments.
+        status: of each segment at its end, flags: of each segment, shape (cycles, segments).
         result: the end of the mission, with its status and all flags. `converged`: the profile was followed to its
             end. `battery_empty`. `cut_off`: the cells stayed below their cut-off. `stalled`, `slides`, `rolls_back`
             or `tips`: status of the first segment with demanded motion that ends so. `failed`: the integrator gave
             up.
-        temperature_winding, temperature_housing: of the hottest side at the end [°C]; discharge: [C].
+        temperature_winding, temperature_housing: of the hottest side at the end [°C].
+        discharge: [C].
         steps: number of steps, and number of rejected ones.
         course: over time, if requested.
     """
@@ -212,13 +217,13 @@ def mission(
     """Runs one robot over a profile.
 
     Args:
-        robot: any robot; its parameters may be tracers.
-        conditions: one run, scalar fields; they supply what the profile does not state.
+        robot: any robot. Its parameters may be tracers.
+        conditions: one run, scalar fields. They supply what the profile does not state.
         profile: one mission.
-        start: state at its start; None: at rest, at ambient temperature.
+        start: state at its start. None: at rest, at ambient temperature.
         tolerance: relative, and in `UNITS` absolute, error of a step.
-        most_steps: of one segment; a mission that needs more has `failed`.
-        keep: largest number of accepted steps in the recorded course; 0 for no course.
+        most_steps: of one segment. A mission that needs more has `failed`.
+        keep: largest number of accepted steps in the recorded course, 0 for no course.
 
     Returns:
         The mission. Derivatives are forward (`jax.jvp`, `jax.jacfwd`), with respect to parameters, conditions, and
@@ -243,7 +248,7 @@ def mission(
 
 
 class _Segment(NamedTuple):
-    """A segment at its end, as in `Totals` and `Mission`; found: its last instant; kept: steps recorded so far."""
+    """A segment at its end, as in `Totals` and `Mission`, with its last instant and the steps recorded so far."""
 
     time: Array
     q: Array

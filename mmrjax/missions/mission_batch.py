@@ -33,7 +33,7 @@ OUTPUTS, OF_TURNS = TABLE["mission"], TABLE["mission of sides"]
 
 
 def mission_columns(turns: bool = False) -> tuple[str, ...]:
-    """Columns of a mission's numbers, in order; `turns`: of a mission with separate sides."""
+    """Columns of a mission's numbers, in order. `turns`: of a mission with separate sides."""
     return tuple(output.column for output in (*OUTPUTS, *(OF_TURNS if turns else ())))
 
 
@@ -45,7 +45,7 @@ USUAL = (
 
 
 def _quotient(part: Scalar, whole: Scalar) -> Array:
-    """part / whole; NaN with a finite derivative where `whole` is not above 0."""
+    """part / whole, NaN with a finite derivative where `whole` is not above 0."""
     positive = whole > 0
     return jnp.where(positive, part / jnp.where(positive, whole, 1.0), jnp.nan)
 
@@ -55,7 +55,7 @@ def _root(x: Scalar) -> Array:
 
 
 def mission_totals(found: Totals, peaks: Mapping[str, Array]) -> dict[str, Array]:
-    """Numbers [SI] by name that follow from totals and peaks of missions or segments; any shape.
+    """Numbers [SI] by name that follow from totals and peaks of missions or segments, any shape.
 
     A segment that was not reached has NaN.
     """
@@ -98,7 +98,7 @@ def mission_totals(found: Totals, peaks: Mapping[str, Array]) -> dict[str, Array
 
 
 def mission_numbers(robot: Robot, conditions: Conditions, found: Mission) -> dict[str, Array]:
-    """Numbers of missions [SI], by the names of `OUTPUTS`; any shape, NaN if a number does not apply.
+    """Numbers of missions [SI], by the names of `OUTPUTS`. Any shape, NaN if a number does not apply.
 
     State of charge, endurance and range refer to the on-board battery. Endurance is the time from the charge at the
     start of the mission to empty at the mission's mean current, range the distance in that time. Both are exact if
@@ -122,7 +122,7 @@ def mission_numbers(robot: Robot, conditions: Conditions, found: Mission) -> dic
 def cell_below_cutoff(
     robot: Robot, conditions: Conditions, profile: Profile, start: Start | None = None
 ) -> np.ndarray:
-    """Cell voltage at the start of missions on the battery [V] if it is below the cut-off, else NaN; shape (runs,).
+    """Cell voltage at the start of missions on the battery [V] if it is below the cut-off, else NaN, shape (runs,).
 
     Not traceable. The motors draw the current of the start, which is 0 at rest.
     """
@@ -145,11 +145,13 @@ def numbers_by_column(found: Mapping[str, Any]) -> dict[str, Any]:
 def missions_of_runs(
     robot: Robot, conditions: Conditions, profile: Profile, start: Start | None = None, *, history: bool = False
 ) -> Mission:
-    """Missions of a batch of runs; traceable.
+    """Missions of a batch of runs, traceable.
 
     Args:
-        conditions: shape (runs,); profile: fields of shape (rows,), or (runs, rows).
-        start: common start of all; history: True to record the missions over time, see `simulate_in_parts`.
+        conditions: shape (runs,).
+        profile: fields of shape (rows,), or (runs, rows).
+        start: common start of all.
+        history: True to record the missions over time, see `simulate_in_parts`.
     """
     if not history:
         return simulate_batch(robot, conditions, profile, start, 0)
@@ -164,7 +166,7 @@ def simulate_in_parts(
 ) -> Iterator[Mission]:
     """Missions of a batch of runs with recorded courses, in parts whose steps fit into memory.
 
-    A mission with more steps than fit is simulated again with more room, up to `MOST_KEPT`; the course of a longer
+    A mission with more steps than fit is simulated again with more room, up to `MOST_KEPT`. The course of a longer
     mission ends there.
     """
     (runs,) = conditions.shape
@@ -200,10 +202,10 @@ def simulate_batch(
     keep: int = 0,
     tolerance: Scalar = TOLERANCE,
 ) -> Mission:
-    """Missions of a batch in one call, compiled; see `missions_of_runs`.
+    """Missions of a batch in one call, compiled. See `missions_of_runs`.
 
     Args:
-        keep: largest number of steps in the recorded courses; 0 for no courses.
+        keep: largest number of steps in the recorded courses, 0 for no courses.
     """
     own = jax.tree.map(lambda x: 0 if x.ndim == 2 else None, profile)
 

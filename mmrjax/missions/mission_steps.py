@@ -49,8 +49,8 @@ FIRMLY = 1e-3
 class SegmentInputs(NamedTuple):
     """Inputs of the robot at an instant.
 
-    The robot with its other consumers; the conditions with the controller's duty; the rate of the controller's
-    integral [rad/s]; the error of the demand [rad/s]. For a robot that turns, duty, rate and error are per side.
+    The robot with its other consumers. The conditions with the controller's duty. The rate of the controller's
+    integral [rad/s]. The error of the demand [rad/s]. For a robot that turns, duty, rate and error are per side.
     """
 
     robot: Robot
@@ -65,14 +65,16 @@ class MotionLaw(Protocol):
     `found` is the result of `instant`: signals, and for a robot that turns also its motion.
 
     Attributes:
-        TOTALS: integrated quantities and their units; PEAKS: largest values of any instant and their units.
+        TOTALS: integrated quantities and their units.
+        PEAKS: largest values of any instant and their units.
         CLOCK, DISCHARGE, WINDING, HOUSING: positions among the unknowns of the time in the segment [s], the charge
             taken [C], and the temperatures [°C], for a robot that turns of both sides.
         CURRENT, MOTOR, GROUND, HEADING: positions of currents, motor speeds, speed and heading.
-        STOPS: positions of unknowns that are 0 at rest; AT_REST: module for standing robots of its kind (`rest`,
-            `turning`).
+        STOPS: positions of unknowns that are 0 at rest.
+        AT_REST: module for standing robots of its kind (`rest`, `turning`).
         RESULT: returns the result of a run at its end, from robot, instant and status.
-        UNITS: of the unknowns before the memories of effects; LONG: True if an instant takes long to compile.
+        UNITS: of the unknowns before the memories of effects.
+        LONG: True if an instant takes long to compile.
     """
 
     TOTALS: Mapping[str, str]
@@ -124,7 +126,7 @@ class MotionLaw(Protocol):
         ...
 
     def peaks(self, robot: Robot, found: Any) -> dict[str, Scalar]:
-        """Values of an instant that enter `PEAKS`; of the cell voltage the negative."""
+        """Values of an instant that enter `PEAKS`. Of the cell voltage the negative."""
         ...
 
     def peaks_within(self, robot: Robot, y: Array, tops: Array) -> dict[str, Scalar]:
@@ -215,7 +217,7 @@ def _top(before: Array, after: Array, rise: Array, fall: Array) -> Array:
 
 
 def _cell_above(law: MotionLaw, asked: SegmentInputs, y: Array, stands: Array) -> Scalar:
-    """Margin of a cell above its cut-off [V]; large on an external supply."""
+    """Margin of a cell above its cut-off [V]. Large on an external supply."""
     battery = asked.robot.battery
     cell = battery.voltage_cell(*law.drawn(asked, y, stands))
     return jnp.where(asked.conditions.battery > 0.5, cell - battery.voltage_cutoff, 10.0)
@@ -257,7 +259,7 @@ def _onto(
     The step carries the derivative of the event's moment (implicit function theorem: dt = -dg / (∂g/∂y y')).
 
     Returns:
-        Unknowns, integrals, whether the robot stands, whether the cells are below their cut-off; the event, and the
+        Unknowns, integrals, whether the robot stands, whether the cells are below their cut-off. The event, and the
         step in time [s].
     """
     _, dy, dq, _ = law.instant(robot, otherwise, segment, y, stands)
@@ -311,8 +313,11 @@ class _Tried(NamedTuple):
     """A step before it is accepted or rejected.
 
     Attributes:
-        y, q: unknowns and integrals at its end; h: its length [s]; last: True if it ends the segment or trips.
-        good: True if its error is small enough; grown: length that its error permits for the next step [s].
+        y, q: unknowns and integrals at its end.
+        h: its length [s].
+        last: True if it ends the segment or trips.
+        good: True if its error is small enough.
+        grown: length that its error permits for the next step [s].
     """
 
     y: Array
@@ -327,9 +332,13 @@ class _Landed(NamedTuple):
     """A step with the event at its end.
 
     Attributes:
-        y, q, stands, below, low: as in `Carry`, at its end; which: the event, -1 for none.
-        cut_off: True if the cells stayed below their cut-off; after: event functions at the end of the tried step.
-        taken: True if the step is accepted; event: True if it ends at an event; step: length of the next one [s].
+        y, q, stands, below, low: as in `Carry`, at its end.
+        which: the event, -1 for none.
+        cut_off: True if the cells stayed below their cut-off.
+        after: event functions at the end of the tried step.
+        taken: True if the step is accepted.
+        event: True if it ends at an event.
+        step: length of the next one [s].
     """
 
     y: Array
@@ -433,9 +442,14 @@ class _Leg(NamedTuple):
         tops = _top(c.y, y, h * c.slope, h * dy)
         within = law.peaks_within(robot, y, tops)
         highest = jnp.stack([jnp.where(taken, within.get(name, -jnp.inf), -jnp.inf) for name in law.PEAKS])
-        peaks = jnp.maximum(jnp.maximum(c.peaks, _peaks_of(law, robot, found)), highest)
+        each = law.peaks(robot, found)
+        peaks = jnp.maximum(
+            jnp.maximum(c.peaks, jnp.stack([jnp.asarray(each[name]) * jnp.ones(()) for name in law.PEAKS])), highest
+        )
         hot = taken & (within["temperature"] > robot.motor.temperature_limit)
-        flags = _flags(law, robot, found, cut_off) | flag_mask({"too_hot": hot})
+        over = law.exceeded(robot, found)
+        over.pop("slips")  # every start slips for an instant; for a segment, slip counts at its end
+        flags = flag_mask({**over, "cut_off": cut_off}) | flag_mask({"too_hot": hot})
         failed = c.failed | (~good & (h <= SHORTEST))
         ended = c.ended | cut_off | (landed.which == EMPTY) | failed
         now = (robot, otherwise, segment, y, stands, below)
@@ -458,18 +472,3 @@ def _stayed_below(robot: Robot, below: Array, low: Array) -> Array:
     """True if the cells have been below their cut-off longer than permitted."""
     rounding = 8 * jnp.finfo(low.dtype).eps
     return below & (low >= robot.battery.delay_cutoff * (1 - rounding))
-
-
-def _peaks_of(law: MotionLaw, robot: Robot, found: Any) -> Array:
-    each = law.peaks(robot, found)
-    return jnp.stack([jnp.asarray(each[name]) * jnp.ones(()) for name in law.PEAKS])
-
-
-def _flags(law: MotionLaw, robot: Robot, found: Any, cut_off: Array) -> Array:
-    """Limits exceeded at an instant.
-
-    A start exceeds the limits of the cells for an instant; only longer loads count.
-    """
-    over = law.exceeded(robot, found)
-    over.pop("slips")  # every start slips for an instant; for a segment, slip counts at its end
-    return flag_mask({**over, "cut_off": cut_off})

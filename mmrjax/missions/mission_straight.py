@@ -74,11 +74,14 @@ def driven(
     """Duty of a motor at an instant, and the state of its controller.
 
     Args:
-        mode: of the profile; demand: of this side [rad/s or m/s].
-        conditions: of this side; state: of this side; integral: of its controller [rad].
+        mode: of the profile.
+        demand: of this side [rad/s or m/s].
+        conditions: of this side.
+        state: of this side.
+        integral: of its controller [rad].
 
     Returns:
-        The duty [-], the rate of the controller's integral, and the error of the demand [rad/s]; for a ground speed,
+        The duty [-], the rate of the controller's integral, and the error of the demand [rad/s]. For a ground speed,
         in terms of the motor speed that it needs.
     """
     per_speed = robot.gearbox.ratio / robot.chassis(conditions.configuration).radius

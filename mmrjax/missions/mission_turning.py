@@ -1,4 +1,4 @@
-"""A mission of a robot with independently driven sides; counterpart of `mission_straight`.
+"""A mission of a robot with independently driven sides, counterpart of `mission_straight`.
 
 A demanded speed and yaw rate give the speed of each side, V_s = v - ω y_s, which its own controller follows. Equal
 sides give a mission of straight travel.

@@ -41,17 +41,22 @@ class Profile(eqx.Module):
     """A mission as rows in time, with a segment between two rows. All numbers differentiable and batchable.
 
     Attributes:
-        time: of the rows, increasing [s], shape (rows,); the last row ends the mission.
+        time: of the rows, increasing [s], shape (rows,). The last row ends the mission.
         mode: index into `MODES` of the segment that a row begins, shape (rows,).
         demand: motor speed [rad/s] or ground speed [m/s] for modes with a demand, else not used, shape (rows,).
-        voltage: of the external supply [V]; duty: share of the supply's voltage [-]; slope_deg: [deg]; payload: [kg];
-            adhesion, adhesion_lateral: as a ratio to the robot's surface, along and across [-]; load_torque: of a
-            brake on the output of each drive, for a load on a shaft [N·m]; current_other: of other consumers on the
-            battery [A]. Shape (rows,), or None: as in the conditions (for current_other, in the robot).
-        duty_left, duty_right: as `duty`, of each side; voltage_left, voltage_right: at the motors of each side [V],
-            as a share of the no-load voltage of the source; yaw_rate: demanded together with a ground speed, positive
-            to the left [rad/s]. Stating any of them makes the robot free to turn.
-        linear: True if values change linearly between rows; False if they hold until the next row.
+        voltage: of the external supply [V].
+        duty: share of the supply's voltage [-].
+        slope_deg: [deg].
+        payload: [kg].
+        adhesion, adhesion_lateral: as a ratio to the robot's surface, along and across [-].
+        load_torque: of a brake on the output of each drive, for a load on a shaft [N·m].
+        current_other: of other consumers on the battery [A]. Shape (rows,), or None: as in the conditions
+            (for current_other, in the robot).
+        duty_left, duty_right: as `duty`, of each side.
+        voltage_left, voltage_right: at the motors of each side [V], as a share of the no-load voltage of the source.
+        yaw_rate: demanded together with a ground speed, positive to the left [rad/s]. Stating any of them
+            makes the robot free to turn.
+        linear: True if values change linearly between rows, False if they hold until the next row.
         cycles: number of repetitions of the rows.
     """
 
@@ -86,7 +91,7 @@ class Profile(eqx.Module):
 
     @property
     def turns(self) -> bool:
-        """True if it drives the sides apart; the robot is then free to turn."""
+        """True if it drives the sides apart. The robot is then free to turn."""
         return any(getattr(self, name) is not None for name in APART)
 
     @property
@@ -99,7 +104,7 @@ class Profile(eqx.Module):
         return jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, k, 2), self)
 
     def at(self, elapsed: Scalar) -> Profile:
-        """Values of a profile of two rows `elapsed` seconds after the first; its fields are scalars."""
+        """Values of a profile of two rows `elapsed` seconds after the first. Its fields are scalars."""
         share = elapsed / (self.time[1] - self.time[0]) if self.linear else 0.0
 
         def value(x: Array) -> Array:
@@ -111,7 +116,7 @@ class Profile(eqx.Module):
         return dataclasses.replace(values, **still)
 
     def conditions(self, otherwise: Conditions) -> Conditions:
-        """The conditions of an instant, see `at`; from `otherwise` if the profile does not state them."""
+        """The conditions of an instant, see `at`. From `otherwise` if the profile does not state them."""
         stated = {name: getattr(self, name) for name in CONDITIONS if getattr(self, name) is not None}
         if "payload" in stated and otherwise.total_mass is not None:
             stated["total_mass"] = otherwise.total_mass + stated["payload"] - otherwise.payload
@@ -138,12 +143,14 @@ def profile(
     """A profile from plain numbers, each one for all rows or one per row.
 
     Args:
-        time: of the rows [s]; mode: of `MODES`, one or one per row.
-        demand, linear, cycles: see `Profile`; values: its other fields, by name.
+        time: of the rows [s].
+        mode: of `MODES`, one or one per row.
+        demand, linear, cycles: see `Profile`.
+        values: its other fields, by name.
 
     Raises:
-        UsageError: fewer than two rows; a time that does not increase; an unknown mode or field; a length that
-            differs from that of `time`; a value that is not finite; a duty beyond -1..1; cycles below 1.
+        UsageError: fewer than two rows, a time that does not increase, an unknown mode or field, a length that
+            differs from that of `time`, a value that is not finite, a duty beyond -1..1, cycles below 1.
     """
     rows = np.asarray(time, float)
     if rows.ndim != 1 or len(rows) < 2:
@@ -197,7 +204,9 @@ def sides_error(stated: Sequence[str], speed: bool, named: Callable[[str], str] 
     They do for one side without the other, two kinds at once, or a yaw rate without a demanded speed.
 
     Args:
-        stated: fields; speed: True if a ground speed is demanded; named: maps a field to its name in the input.
+        stated: fields.
+        speed: True if a ground speed is demanded.
+        named: maps a field to its name in the input.
     """
     for left, right in (pair for either in PAIRS for pair in (either, either[::-1])):
         if left in stated and right not in stated:

@@ -101,7 +101,7 @@ def duty_given(robot: Robot, conditions: Conditions) -> Scalar:
 
 
 def begin_signals(robot: Robot, conditions: Conditions, state: State, direction: Scalar | None = None) -> Signals:
-    """Kinematics and mass of the instant; `direction` None takes it from the speeds, smooth through rest."""
+    """Kinematics and mass of the instant. `direction` None takes it from the speeds, smooth through rest."""
     chassis = robot.chassis(conditions.configuration)
     speed_wheel = state.speed_motor * (1 / robot.gearbox.ratio)
     speed_theoretical = chassis.radius * speed_wheel
@@ -166,7 +166,7 @@ def power_drawn(robot: Robot, signals: Signals) -> Scalar:
 
 
 def charge_drawn(robot: Robot, conditions: Conditions, total_current: Scalar) -> Scalar:
-    """Battery current [A], which reduces its charge, eq. (11); 0 on an external supply."""
+    """Battery current [A], which reduces its charge, eq. (11), 0 on an external supply."""
     return robot.battery.current(total_current) * (conditions.battery > 0.5)
 
 
@@ -213,7 +213,7 @@ def opposing_torque(chassis: Shaft, signals: Signals) -> Scalar:
 
 
 def travel(robot: Robot, chassis: Load, signals: Signals) -> Signals:
-    """Forces along the slope that traction has to overcome [N]; for a shaft, its load torque over the radius."""
+    """Forces along the slope that traction has to overcome [N]. For a shaft, its load torque over the radius."""
     if isinstance(chassis, Shaft):
         demand = opposing_torque(chassis, signals) / chassis.radius
         none = jnp.zeros_like(demand)
@@ -237,9 +237,9 @@ def slip(robot: Robot, signals: Signals) -> Signals:
 
 
 def track(robot: Robot, chassis: Load, signals: Signals, guide: Scalar | None = None) -> Signals:
-    """Losses between pulley and ground, at the pulley; for a shaft the friction of its load [N·m].
+    """Losses between pulley and ground, at the pulley. For a shaft the friction of its load [N·m].
 
-    `guide` is the friction on the lower guide [N]; None applies (26) to the guides' stated share of the weight.
+    `guide` is the friction on the lower guide [N]. None applies (26) to the guides' stated share of the weight.
     """
     if isinstance(chassis, Shaft):
         loss = chassis.torque_loss(signals.speed_wheel, signals.direction) + effects_sum(robot, signals, "track")
@@ -265,7 +265,7 @@ def gearbox(
     the output and B the load without their own loss. That torque depends on their loss, so Newton's method finds it.
 
     Args:
-        mover: the mover's torque on the shaft in addition to the track losses [N·m]; None: the traction.
+        mover: the mover's torque on the shaft in addition to the track losses [N·m]. None: the traction.
         settled: True in steady travel: the torque at the output is B.
     """
     mover = chassis.radius * signals.traction if mover is None else mover
@@ -343,7 +343,7 @@ def moving_signals(robot: Robot, conditions: Conditions, state: State, way: Scal
     With an imposed motor speed, the current follows from the torque.
 
     Args:
-        way: direction of motion that dry friction opposes, ±1 [-]; None or 0: from the speeds, smooth through rest.
+        way: direction of motion that dry friction opposes, ±1 [-]. None or 0: from the speeds, smooth through rest.
     """
     if conditions.motor_speed is not None:
         state = dataclasses.replace(state, current=_current(robot, conditions, state, way))
@@ -515,7 +515,7 @@ def _drawn(robot: Robot, chassis: Chassis, signals: Signals, pull: Any) -> Signa
 def resolved_sides(
     robot: Robot, conditions: Conditions, motion: PlaneMotion, mover: Mover, inertia: Scalar
 ) -> tuple[Signals, Any]:
-    """Same as `resolved_signals` for a robot free to turn; left and right side are a leading axis of 2.
+    """Same as `resolved_signals` for a robot free to turn. Left and right side are a leading axis of 2.
 
     Signals, the normal loads of `mover` and its result have that axis.
     """
@@ -529,7 +529,7 @@ def resolved_sides(
 
 
 def driven_signals(robot: Robot, conditions: Conditions, state: State, direction: Scalar | None) -> Signals:
-    """Signals of an instant up to the voltage balance; direction: as in `begin_signals`."""
+    """Signals of an instant up to the voltage balance. `direction`: as in `begin_signals`."""
     robot = robot.within(conditions.configuration)
     return electrical(
         robot, conditions, supply(robot, conditions, begin_signals(robot, conditions, state, direction))
@@ -550,7 +550,7 @@ def settled_signals(
     """All signals of steady travel: traction is the demand.
 
     Args:
-        direction: of travel, 1 forward or -1 backward; friction acts against it, also at rest.
+        direction: of travel, 1 forward or -1 backward. Friction acts against it, also at rest.
 
     Returns:
         The signals, and the sliding speed that the friction law needs to carry the demand [m/s]. In steady travel
@@ -573,9 +573,10 @@ class Travel(eqx.Module):
     """All signals of one instant of a robot that turns.
 
     Attributes:
-        signals: of each side, a leading axis of 2: left, right; both hold totals and motion of the whole robot.
+        signals: of each side, a leading axis of 2: left, right. Both hold totals and motion of the whole robot.
         grip: forces of the ground on each side.
-        acceleration, acceleration_lateral: dv_x/dt and dv_y/dt [m/s²]; acceleration_yaw: dω/dt [rad/s²].
+        acceleration, acceleration_lateral: dv_x/dt and dv_y/dt [m/s²].
+        acceleration_yaw: dω/dt [rad/s²].
     """
 
     signals: Signals
@@ -631,7 +632,7 @@ def _both(x: Scalar) -> Array:
 
 
 def _begin_sides(robot: Robot, conditions: Conditions, own: Conditions, motion: PlaneMotion) -> Signals:
-    """`begin_signals` of left and right side, with motion in the plane; `own` are the conditions of each side."""
+    """`begin_signals` of left and right side, with motion in the plane. `own` are the conditions of each side."""
     chassis = robot.chassis(conditions.configuration)
     signals = jax.vmap(functools.partial(begin_signals, robot))(own, states_of_sides(robot, conditions, motion))
     return _fill(
@@ -705,7 +706,7 @@ def turning_signals(
 
 
 def sensor(robot: Robot, signals: Signals) -> dict[str, Scalar]:
-    """Ideal readings of every channel [SI], by channel name; NaN if a reading depends on an unknown parameter."""
+    """Ideal readings of every channel [SI], by channel name, NaN if a reading depends on an unknown parameter."""
     return {
         c.name: robot.rig.instrument(c.name).shows(c.read(robot, signals))
         + effects_sum(robot, signals, "sensor", c.name)
@@ -718,7 +719,7 @@ def sensor(robot: Robot, signals: Signals) -> dict[str, Scalar]:
 def readings_of_sides(robot: Robot, signals: Signals) -> dict[str, Scalar]:
     """Same as `sensor` for signals with a last axis of left and right side.
 
-    A channel of one side shows that side; the others show the mean.
+    A channel of one side shows that side. The others show the mean.
     """
     read = sensor(robot, signals)
     return {
@@ -728,10 +729,10 @@ def readings_of_sides(robot: Robot, signals: Signals) -> dict[str, Scalar]:
 
 
 def mean_of_sides(signals: Signals) -> Signals:
-    """Mean signals of both sides, as one motor's; totals follow as for equal sides."""
+    """Mean signals of both sides, as one motor's. Totals follow as for equal sides."""
     return jax.tree.map(lambda x: jnp.mean(x, axis=-1) if jnp.ndim(x) else x, signals)
 
 
 def signals_of(found: Signals | Travel) -> Signals:
-    """Signals of an instant; for a robot that turns, of left and right side."""
+    """Signals of an instant. For a robot that turns, of left and right side."""
     return found.signals if isinstance(found, Travel) else found

@@ -20,7 +20,8 @@ class Chassis(eqx.Module):
     Attributes:
         on_tracks: 1 on tracks, 0 on wheels [-].
         turning: parameters of the chassis that matter only in turns.
-        lacks: balances that it does not have; torque_constant, torque_gravity, backlash: of a `Shaft`, 0 here.
+        lacks: balances that it does not have.
+        torque_constant, torque_gravity, backlash: of a `Shaft`, 0 here.
     """
 
     lacks: ClassVar[frozenset[str]] = frozenset()

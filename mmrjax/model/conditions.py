@@ -34,7 +34,8 @@ class Named(eqx.Module):
     """Configurations by name: a pytree, so that conditions by name pass `jax.jit` and `jax.vmap`.
 
     Attributes:
-        index: of the name of each run among `names`; names: distinct ones.
+        index: of the name of each run among `names`.
+        names: distinct ones.
     """
 
     index: Int[Array, "..."] | np.ndarray
@@ -60,7 +61,7 @@ class Named(eqx.Module):
         """Position of each run's name in a sequence of names.
 
         Raises:
-            KeyError: a run has a name that is not in the sequence; if the conditions are traced, any name is missing.
+            KeyError: a run has a name that is not in the sequence, or any name if the conditions are traced.
         """
         places = np.array([names.index(name) if name in names else -1 for name in self.names], int)
         traced = isinstance(self.index, jax.core.Tracer)
@@ -71,37 +72,37 @@ class Named(eqx.Module):
 
 
 class Conditions(eqx.Module):
-    """The conditions of one run or of a batch; all fields broadcast to one shape.
+    """The conditions of one run or of a batch. All fields broadcast to one shape.
 
     Attributes:
-        configuration: which of the robot's configurations, its index; until `resolved` also by name (`Named`).
-        voltage: of the external supply [V]; not used with `battery`.
+        configuration: which of the robot's configurations, its index. Until `resolved` also by name (`Named`).
+        voltage: of the external supply [V]. Not used with `battery`.
         slope_deg: slope angle, positive uphill [deg].
         payload: additional load mass m_c [kg].
         battery: 0 external supply (Source Mode 2), 1 on-board battery (Source Mode 1), eq. (8).
         discharge: charge C_b already taken from the battery [C].
         adhesion: adhesion of this surface, as a ratio to that of the surface the robot's friction is stated for [-].
-        total_mass: weighed mass of robot and payload [kg]; None: the robot's own mass plus the payload.
-        order: place in the sequence of runs; what drifts from run to run depends on it [-].
-        duty: share of the supply voltage that the driver applies to the motors, negative backward [-]; None: 1.
-        open: 1 if the motors' circuit is open, so that they coast; -1 if the driver shorts it, so that they brake at
+        total_mass: weighed mass of robot and payload [kg]. None: the robot's own mass plus the payload.
+        order: place in the sequence of runs. What drifts from run to run depends on it [-].
+        duty: share of the supply voltage that the driver applies to the motors, negative backward [-]. None: 1.
+        open: 1 if the motors' circuit is open, so that they coast, -1 if the driver shorts it, so that they brake at
             any duty.
-        motor_speed: speed imposed on the motor shafts [rad/s]; the voltage follows. None: the voltage is imposed.
-        motor_acceleration: of an imposed speed [rad/s²]; None: 0.
-        motor_current: current imposed on each motor [A]; the voltage follows. None: the current follows.
-        begin: index of the history's beginning in `Rig.begins`; None: it starts from rest.
-        duty_left, duty_right: as `duty`, for each side; None: `duty`. Stating any condition of a side makes the robot
+        motor_speed: speed imposed on the motor shafts [rad/s]. The voltage follows. None: the voltage is imposed.
+        motor_acceleration: of an imposed speed [rad/s²]. None: 0.
+        motor_current: current imposed on each motor [A]. The voltage follows. None: the current follows.
+        begin: index of the history's beginning in `Rig.begins`. None: it starts from rest.
+        duty_left, duty_right: as `duty`, for each side. None: `duty`. Stating any condition of a side makes the robot
             free to turn.
-        open_left, open_right: as `open`, for each side; None: `open`.
-        motor_speed_left, motor_speed_right: as `motor_speed`, for each side; None: `motor_speed`.
-        heading_deg: at the start, from uphill, positive to the left [deg]; None: 0. It also frees the robot to turn.
-        adhesion_lateral: as `adhesion`, across the travel; None: `adhesion`.
-        levers_front_deg, levers_rear_deg: lever angles, 0 along the wheelbase outward, positive up, 180 folded [deg];
+        open_left, open_right: as `open`, for each side. None: `open`.
+        motor_speed_left, motor_speed_right: as `motor_speed`, for each side. None: `motor_speed`.
+        heading_deg: at the start, from uphill, positive to the left [deg]. None: 0. It also frees the robot to turn.
+        adhesion_lateral: as `adhesion`, across the travel. None: `adhesion`.
+        levers_front_deg, levers_rear_deg: lever angles, 0 along the wheelbase outward, positive up, 180 folded [deg].
             None: those of the running gear, folded as it states.
         load_torque: torque of a brake or load motor on the output of each drive [N·m]: positive against forward
-            rotation, in both directions of rotation. Only for a load on a shaft; None: 0.
-        held: 1 where a clamp holds the output of each drive at rest; `output_torque` is then what the clamp carries.
-            Only for a load on a shaft at an imposed voltage or current, in settled runs; None: 0.
+            rotation, in both directions of rotation. Only for a load on a shaft. None: 0.
+        held: 1 where a clamp holds the output of each drive at rest. `output_torque` is then what the clamp carries.
+            Only for a load on a shaft at an imposed voltage or current, in settled runs. None: 0.
     """
 
     configuration: Any  # Int[Array, "..."] | Named
@@ -194,7 +195,7 @@ class Conditions(eqx.Module):
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Shape of the batch; () for one run."""
+        """Shape of the batch, () for one run."""
         return self.voltage.shape
 
     @property
@@ -204,17 +205,17 @@ class Conditions(eqx.Module):
 
     @property
     def polarity(self) -> Array:
-        """Sign of a duty that drives forward, ±1: the sign of the supply voltage; 1 on the battery."""
+        """Sign of a duty that drives forward, ±1: the sign of the supply voltage, 1 on the battery."""
         return jnp.where((jnp.asarray(self.battery) < 0.5) & (jnp.asarray(self.voltage) < 0), -1.0, 1.0)
 
     @property
     def states_levers(self) -> bool:
-        """True if lever angles are stated; the robot then rests on the contacts that they leave."""
+        """True if lever angles are stated. The robot then rests on the contacts that they leave."""
         return self.levers_front_deg is not None or self.levers_rear_deg is not None
 
     @property
     def turns(self) -> bool:
-        """True if the sides are driven apart or the heading is not uphill; the robot is then free to turn."""
+        """True if the sides are driven apart or the heading is not uphill. The robot is then free to turn."""
         return any(getattr(self, name) is not None for name in OF_TURNS)
 
     def straight(self) -> Conditions:
@@ -241,7 +242,7 @@ class Conditions(eqx.Module):
         """Same conditions with configuration names replaced by their indices in `robot`.
 
         Raises:
-            KeyError: a name is no configuration of the robot; the message lists the robot's configurations.
+            KeyError: a name is no configuration of the robot. The message lists the robot's configurations.
         """
         if not isinstance(self.configuration, Named):
             return self
@@ -268,7 +269,7 @@ def sides_contradiction(stated: Collection[str]) -> str:
 
 
 def _number(name: str, x: Any, kind: type = float) -> Any:
-    """Array of numbers of that kind; NumPy input stays NumPy's, so that no JAX operation is compiled for it.
+    """Array of numbers of that kind. NumPy input stays NumPy's, so that no JAX operation is compiled for it.
 
     Raises:
         UsageError: words, dates, complex numbers, masked numbers, truth values of a quantity, or parts of a whole
@@ -287,7 +288,7 @@ def _number(name: str, x: Any, kind: type = float) -> Any:
 
 
 def _broadcast(x: Any, shape: tuple[int, ...]) -> Any:
-    """Array of that shape; NumPy input stays NumPy's if JAX computes in single precision, to keep its digits."""
+    """Array of that shape. NumPy input stays NumPy's if JAX computes in single precision, to keep its digits."""
     if isinstance(x, jax.Array):
         return jnp.broadcast_to(x, shape)
     return jax.device_put(np.broadcast_to(x, shape)) if is_double() else np.broadcast_to(x, shape)

@@ -30,8 +30,8 @@ def smooth_sign(speed: Scalar, speed_rest: Scalar) -> Scalar:
 class Friction(eqx.Module):
     """Friction coefficient over sliding speed, Fig. 7 (refs. [48, 49]).
 
-    μ = μ_s x (3 - x²) / 2 with x = v / V_s inside V_s; the cubic step from μ_s to μ_d between V_s and
-    V_d; μ_d beyond; odd in v. Static friction thus creeps: the demand sets the sliding speed.
+    μ = μ_s x (3 - x²) / 2 with x = v / V_s inside V_s, the cubic step from μ_s to μ_d between V_s and
+    V_d, and μ_d beyond. It is odd in v. Static friction thus creeps: the demand sets the sliding speed.
     """
 
     static: Scalar = parameter(
@@ -51,7 +51,7 @@ class Friction(eqx.Module):
 
     @property
     def speed_rest(self) -> Scalar:
-        """Speed below which a robot counts as at rest, a tenth of V_s [m/s]; directions are smoothed within it.
+        """Speed below which a robot counts as at rest, a tenth of V_s [m/s]. Directions are smoothed within it.
 
         Friction at rest is then resolved on the same scale as sliding.
         """
@@ -83,7 +83,7 @@ class Friction(eqx.Module):
         return jnp.where(slow, -self.static / (2 * self.speed_static**3), falling)
 
     def rise(self, speed: Scalar) -> Scalar:
-        """Derivative of the coefficient with respect to sliding `speed` [s/m]; negative between V_s and V_d."""
+        """Derivative of the coefficient with respect to sliding `speed` [s/m]. Negative between V_s and V_d."""
         size, width = jnp.abs(speed), self.speed_dynamic - self.speed_static
         u = jnp.clip((size - self.speed_static) / width, 0.0, 1.0)
         x = jnp.clip(speed / self.speed_static, -1.0, 1.0)
@@ -94,7 +94,7 @@ class Friction(eqx.Module):
         """Sliding speed [m/s] for a static friction coefficient: the inverse of the law below V_s.
 
         x (3 - x²) / 2 = sin 3θ for x = 2 sin θ, so v = 2 V_s sin(asin(μ/μ_s) / 3). A coefficient beyond ±μ_s has no
-        such speed; ±V_s is returned, with a zero derivative.
+        such speed. ±V_s is returned, with a zero derivative.
         """
         share = coefficient / self.static
         within = jnp.abs(share) < 1.0
@@ -114,9 +114,13 @@ def force_contact(
     """Contact force F_c [N], eqs. (27)-(29): max(0, c h^e - b_max q̇ step) for h = q_0 - q > 0, else 0.
 
     Args:
-        gap: distance q [m]; gap_rate: its rate q̇ [m/s]; gap_free: q_0 = r_1 + r_2 [m], eq. (29).
-        stiffness: c [N/m^e]; exponent: e [-]; damping: b_max [N·s/m]; depth: penetration d [m] for full damping
-            (cubic step of Fig. 9a, from 0 at q_0).
+        gap: distance q [m].
+        gap_rate: its rate q̇ [m/s].
+        gap_free: q_0 = r_1 + r_2 [m], eq. (29).
+        stiffness: c [N/m^e].
+        exponent: e [-].
+        damping: b_max [N·s/m].
+        depth: penetration d [m] for full damping (cubic step of Fig. 9a, from 0 at q_0).
     """
     h = gap_free - gap
     touching = h > 0
@@ -126,5 +130,5 @@ def force_contact(
 
 
 def damping_contact(force: Scalar, gap: Scalar, gap_free: Scalar, damping: Scalar, depth: Scalar) -> Scalar:
-    """Damping of a `force` from `force_contact`: its decrease with the gap's rate [N·s/m]; same arguments."""
+    """Damping of a `force` from `force_contact`: its decrease with the gap's rate [N·s/m], same arguments."""
     return jnp.where(force > 0, damping * cubic_step(gap_free - gap, 0.0, 0.0, depth, 1.0), 0.0)

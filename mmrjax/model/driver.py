@@ -24,7 +24,7 @@ DECAYS = SLOW, FAST = "slow", "fast"
 
 
 class Driver(eqx.Module):
-    """A bridge that applies the supply voltage in pulses; the duty D is their signed share of a period.
+    """A bridge that applies the supply voltage in pulses. The duty D is their signed share of a period.
 
     It is lossless and its ripple is not resolved: voltage and current are means over a period.
 
@@ -63,7 +63,7 @@ class Driver(eqx.Module):
         return dataclasses.replace(self, **without)
 
     def voltage(self, source: Scalar, duty: Scalar, pause: Scalar, back: Scalar) -> Scalar:
-        """Mean voltage at the motors [V]; `pause`: share of a period without pulses [-]; `back`: back-EMF E [V]."""
+        """Mean voltage at the motors [V]. `pause`: share of a period without pulses [-]. `back`: back-EMF E [V]."""
         pulses = duty * source
         return pulses + pause * back if self.decay == FAST else pulses
 
@@ -72,7 +72,7 @@ class Driver(eqx.Module):
         return jnp.sign(duty) if self.decay == FAST else duty
 
     def ripple(self, duty: Scalar) -> Scalar:
-        """Mean square of the current over the square of its mean [-]; 1 if no pulse drives a current."""
+        """Mean square of the current over the square of its mean [-], 1 if no pulse drives a current."""
         if self.decay != FAST:
             return 1.0
         pulsed = jnp.abs(duty) > LEAST_DUTY
@@ -95,15 +95,17 @@ class Driver(eqx.Module):
     def conducts(
         self, duty: Scalar, limited: Scalar, current: Scalar, excess: Scalar, open_circuit: Scalar
     ) -> Scalar:
-        """Share of time in which the driver's voltage is at the motors [-]; else they are free, at the back-EMF E.
+        """Share of time in which the driver's voltage is at the motors [-], else they are free, at the back-EMF E.
 
         An open circuit never conducts. A diode conducts current in the direction of the duty. It begins and ends
         smoothly within `CURRENT_DIODE` of 0, where a negative share drives a current through the diode back to 0. A
         limit that would reverse the duty opens the circuit instead, smoothly within `DUTY_DIODE` of 0.
 
         Args:
-            duty: demanded [-], with the sign of the voltage that it gives; limited: after the current limit [-].
-            current: of a motor [A]; excess: the driver's voltage less E [V].
+            duty: demanded [-], with the sign of the voltage that it gives.
+            limited: after the current limit [-].
+            current: of a motor [A].
+            excess: the driver's voltage less E [V].
         """
         closed = jnp.where(jnp.asarray(open_circuit) > 0.5, 0.0, 1.0)
         if self.returns_current:
@@ -122,7 +124,9 @@ class Driver(eqx.Module):
         Beyond, the current increases again. With a diode, the duty is not reversed and the current does not increase.
 
         Args:
-            wanted: any number; duty: as for `conducts`; most: |U_s|/R, or any number above 0 if it has no source [A].
+            wanted: any number.
+            duty: as for `conducts`.
+            most: |U_s|/R, or any number above 0 if it has no source [A].
         """
         if self.current_limit is None:
             return wanted, jnp.zeros_like(wanted)
@@ -143,7 +147,9 @@ class Driver(eqx.Module):
         U = C_E (ω* + K (e + 1/T ∫ e dt)).
 
         Args:
-            error: e, demanded less actual motor speed [rad/s]; integral: ∫ e dt [rad]; speed: ω*, demanded [rad/s];
-            constant: C_E [V·s/rad].
+            error: e, demanded less actual motor speed [rad/s].
+            integral: ∫ e dt [rad].
+            speed: ω*, demanded [rad/s].
+            `constant`: C_E [V·s/rad].
         """
         return constant * (speed + self.gain * (error + integral / self.time_reset))

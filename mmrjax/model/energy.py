@@ -19,7 +19,7 @@ from mmrjax.numerics.trigonometry import sine
 def source_power(robot: Robot, conditions: Conditions, signals: Signals) -> Scalar:
     """Power of the source [W], negative if it takes power back.
 
-    For the battery, its current times the no-load voltage; for the external supply, its output.
+    For the battery, its current times the no-load voltage. For the external supply, its output.
     """
     battery = robot.battery
     chemical = battery.cells * battery.voltage_no_load(signals.discharge) * battery.current(signals.total_current)

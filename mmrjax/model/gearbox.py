@@ -16,13 +16,13 @@ class Gearbox(eqx.Module):
     """M_r = i η_rm (M_d - M_rf_idle) with M_rf_idle = M_rf0 sign ω + K_fr ω.
 
     Driven from the output (overhauling), the load loss changes direction: M_r = (i / η_b) (M_d - M_rf_idle) with the
-    efficiency η_b of `efficiency_backward`. The paper leaves it out because its robot never coasts; without it a
+    efficiency η_b of `efficiency_backward`. The paper leaves it out because its robot never coasts, without it a
     descent would gain energy.
 
     Attributes:
-        mesh_theory: True: η_b = 2 - 1/η_rm, the theory of the mesh; False: η_b = η_rm.
-        speed_limit: at the input [rad/s]; torque_limit: continuous, at the driving wheel, where the total ratio ends
-            [N·m], None if not stated.
+        mesh_theory: True: η_b = 2 - 1/η_rm, the theory of the mesh. False: η_b = η_rm.
+        speed_limit: at the input [rad/s].
+        torque_limit: continuous, at the driving wheel, where the total ratio ends [N·m], None if not stated.
     """
 
     ratio: Scalar = parameter(
@@ -50,7 +50,7 @@ class Gearbox(eqx.Module):
         """Efficiency η_b with the load driving the motor [-]: η_rm, or 2 - 1/η_rm by the theory of the mesh.
 
         Bounded below by 0.02. A loss in proportion to the mesh force is (1/η - 1) of the power that leaves the mesh,
-        in both directions; a gear with η <= 1/2 is self-locking.
+        in both directions. A gear with η <= 1/2 is self-locking.
         """
         if not self.mesh_theory:
             return self.efficiency_load

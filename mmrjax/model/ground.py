@@ -27,7 +27,7 @@ class Ground(eqx.Module):
         return self.rolling_resistance * normal * direction
 
     def force_adhesion(self, normal: Scalar, adhesion: Scalar) -> Scalar:
-        """Largest traction φ R_z [N], eqs. (6), (7); `adhesion` is the surface's ratio [-]."""
+        """Largest traction φ R_z [N], eqs. (6), (7). `adhesion` is the surface's ratio [-]."""
         return self.friction.static * adhesion * normal
 
     def traction(self, speed_sliding: Scalar, normal: Scalar, adhesion: Scalar) -> Scalar:
@@ -50,5 +50,5 @@ def force_gravity(mass: Scalar, slope: Scalar, gravity: float) -> Scalar:
 
 
 def slip_ratio(speed: Scalar, speed_theoretical: Scalar) -> Scalar:
-    """s = 1 - V / V_theoretical [-], eq. (33); 0 at rest."""
+    """s = 1 - V / V_theoretical [-], eq. (33), 0 at rest."""
     return safe_quotient(speed_theoretical - speed, speed_theoretical)

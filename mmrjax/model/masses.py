@@ -48,7 +48,7 @@ class Masses(eqx.Module):
     def pitching(self, wheelbase: Scalar) -> Scalar:
         """Moment of inertia in pitch of all parts about the middle of the wheelbase [kg·m²].
 
-        Pulleys do not turn on their axles; their own inertia J about the axles is not included.
+        Pulleys do not turn on their axles. Their own inertia J about the axles is not included.
         """
         return self.inertia + self.chassis * (self.forward**2 + self.up**2) + self.pulley * wheelbase**2 / 2
 
@@ -77,7 +77,7 @@ def _together(parts: list[_Part]) -> _Part:
 
 
 def _belt(gear: RunningGear, radius: Scalar) -> _Part:
-    """A main track round its pulleys; its inertia is reduced by m r², which is in J_w and turns with the pulleys."""
+    """A main track round its pulleys. Its inertia is reduced by m r², which is in J_w and turns with the pulleys."""
     base, mass = gear.wheelbase, gear.belt_mass
     straights = 2 * base * (base**2 / 12 + radius**2)
     arcs = 2 * radius * (jnp.pi * base**2 / 4 + 2 * base * radius + jnp.pi * radius**2)
@@ -111,9 +111,9 @@ def _levers(gear: RunningGear, tracked: Scalar, front: Scalar, rear: Scalar) -> 
 def masses_of_parts(robot: Robot, conditions: Conditions, mass: Scalar) -> Masses:
     """Masses of half a robot whose total with payload is `mass` [kg], as `balances.begin_signals` gives it.
 
-    The body's mass is the rest after pulleys, wheels, tracks, levers and payload; it has its own radius of gyration.
+    The body's mass is the rest after pulleys, wheels, tracks, levers and payload. It has its own radius of gyration.
     The moment of inertia is summed over the parts at the lever angles. A robot may state the inertia of the whole
-    with folded levers and without payload (`inertia_tracked`, `inertia_wheeled`); the body's is then the difference.
+    with folded levers and without payload (`inertia_tracked`, `inertia_wheeled`). The body's is then the difference.
     """
     fixed, levers, body, pulley, inertia_pulley = _of_robot(robot, conditions, mass)
     return Masses(*_together([*fixed, *levers]), body, pulley, inertia_pulley)

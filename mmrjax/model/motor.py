@@ -22,7 +22,7 @@ _SHORT, _LONG = 1e-6, 1e6
 
 
 class Motor(eqx.Module):
-    """U_e = C_E ω + I R + L dI/dt; M_d = C_m I - (M_df0 sign ω + K_fd ω)."""
+    """U_e = C_E ω + I R + L dI/dt, M_d = C_m I - (M_df0 sign ω + K_fd ω)."""
 
     resistance: Scalar = parameter(
         0.611, "ohm", "terminal resistance R_rot, eq. (15)", (1e-3, 1e3), _SHEET, relative_sd=0.05
@@ -106,7 +106,7 @@ class Motor(eqx.Module):
     def temperature_settled(self, current: Scalar) -> Scalar:
         """Winding temperature after long running at `current` [°C], with the rise of its resistance.
 
-        T = T_a + R_th R I² (1 + α (T - 25 °C)). From R_th R I² α = 1 on the temperature runs away; inf is returned.
+        T = T_a + R_th R I² (1 + α (T - 25 °C)). It is inf from R_th R I² α = 1 on.
         """
         rise = self.resistance_thermal * self.resistance * current**2
         left = 1 - self.temperature_coefficient * rise
@@ -129,7 +129,8 @@ class Motor(eqx.Module):
         constants τ_w and τ_h: C_w = τ_w / R_wh and C_h = τ_h / R_ha (maxon, Key information on motor data).
 
         Args:
-            power: lost in the winding [W]; winding, housing: temperatures [°C].
+            power: lost in the winding [W].
+            winding, housing: temperatures [°C].
         """
         flow = (winding - housing) / self.resistance_thermal_winding
         out = (housing - self.temperature_ambient) / self.resistance_thermal_housing
@@ -161,7 +162,7 @@ class Motor(eqx.Module):
     def time_permissible(
         self, current: Scalar, winding: Scalar | None = None, housing: Scalar | None = None
     ) -> Scalar:
-        """Time for which a `current` [A] may flow before the winding reaches its limit [s]; inf: no end, 0: above it.
+        """Time for which a `current` [A] may flow before the winding reaches its limit [s]. inf: no end, 0: above it.
 
         Args:
             winding, housing: temperatures at the start [°C], None: ambient.

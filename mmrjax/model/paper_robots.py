@@ -95,10 +95,12 @@ _OF_A_SHEET, _ASSUMED = ("battery.", "motor.", "running_gear."), ("motor.tempera
 
 
 def blank_robot(configurations: Configurations, sides: float = 1.0, rig: Rig | None = None) -> Robot:
-    """A robot with known loads only: no losses in its drive and no limits; a rig's file adds what it states.
+    """A robot with known loads only: no losses in its drive and no limits. A rig's file adds what it states.
 
     Args:
-        configurations: its loads; sides: number of motors driven with the same input; rig: drive and measurement.
+        configurations: its loads.
+        sides: number of motors driven with the same input.
+        rig: drive and measurement.
     """
     motor = dataclasses.replace(Motor(), speed_limit=UNLIMITED, temperature_limit=UNLIMITED)
     gearbox = dataclasses.replace(Gearbox(), speed_limit=UNLIMITED, torque_limit=None)
@@ -111,7 +113,7 @@ def blank_robot(configurations: Configurations, sides: float = 1.0, rig: Rig | N
 
 
 def _simplified(track_torque: float) -> Robot:
-    """Constant losses as in Table A4; the wheeled chassis, which the table leaves out, in proportion."""
+    """Constant losses as in Table A4. The wheeled chassis, which the table leaves out, in proportion."""
     constant = {
         "motor.friction_coulomb": 4.2e-3,
         "motor.friction_viscous": 0.0,

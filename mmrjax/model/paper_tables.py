@@ -47,7 +47,7 @@ BENCH = "lacquered_wood"
 
 
 def adhesion_ratio(surface: str, on_tracks: bool) -> float:
-    """Adhesion of `surface` over that of the bench [-], Table 5; valid for friction stated on the bench's surface."""
+    """Adhesion of `surface` over that of the bench [-], Table 5. Valid for friction stated on the bench's surface."""
     here, bench = SURFACES[surface], SURFACES[BENCH]
     return here.tracked_x / bench.tracked_x if on_tracks else here.wheeled_x / bench.wheeled_x
 

@@ -28,8 +28,8 @@ class Spec:
     """Specification of a parameter field.
 
     `relative_sd` is the prior's standard deviation as a share of the prior mean, `sd` the absolute one
-    in the field's unit; one of the two is set. The prior mean is the nominal robot's value.
-    `bounds` are the values that a file may state and a fit may reach; constructors never check them.
+    in the field's unit. One of the two is set. The prior mean is the nominal robot's value.
+    `bounds` are the values that a file may state and a fit may reach. Constructors never check them.
     `scanned` is set if the misfit over the parameter may be a staircase or have several basins (a dead time, a phase,
     a gap). It is the least half width of a basin [the field's unit]. A fit of histories with a wider prior scans the
     misfit over the whole range in addition to following its gradient.
@@ -61,10 +61,10 @@ def parameter(
     amplitude: bool = False,
     scanned: float | None = None,
 ) -> Any:
-    """Declares a differentiable scalar of a component; see `Spec` for the arguments.
+    """Declares a differentiable scalar of a component. See `Spec` for the arguments.
 
     Args:
-        default: value of a component that does not state it; None: it has to.
+        default: value of a component that does not state it. None: it has to.
     """
     if (relative_sd is None) == (sd is None):
         raise ValueError("a parameter states either relative_sd or sd")
@@ -74,7 +74,7 @@ def parameter(
 
 
 def as_float(value: Any) -> Any:
-    """A number as a float array (`precision.as_array`); an array passes without its weak type."""
+    """A number as a float array (`precision.as_array`). An array passes without its weak type."""
     if isinstance(value, int | float):
         return as_array(value)
     # A weakly typed array, as from `jnp.asarray(0.5)`, would make every function compile another program. A tracer
@@ -115,7 +115,7 @@ def walk_parameters(component: eqx.Module, prefix: str = "") -> Iterator[Paramet
     """Yields every parameter below `component`, depth first, by dotted name.
 
     Parameters of a rig without a base robot do not mention the paper (`rig_spec`). A tuple of modules (the effects)
-    is walked by each member's `name`; a mapping of modules (the configurations) by its keys only: `6T2A.mass`.
+    is walked by each member's `name`. A mapping of modules (the configurations) by its keys only: `6T2A.mass`.
     """
     rig = getattr(component, "rig", None)
     if rig is None or rig.inherits:
@@ -145,7 +145,7 @@ def _walk(component: eqx.Module, prefix: str) -> Iterator[Parameter]:
 
 
 def parameter_table(component: eqx.Module) -> str:
-    """Every parameter with value and unit, one line for each part; for a batch or a tracer, its shape."""
+    """Every parameter with value and unit, one line for each part. For a batch or a tracer, its shape."""
     parts: dict[str, list[str]] = {}
     for p in walk_parameters(component):
         part, _, key = p.name.rpartition(".")
@@ -155,7 +155,7 @@ def parameter_table(component: eqx.Module) -> str:
 
 
 def number_text(value: Any) -> str:
-    """A number to six digits; for an array its shape."""
+    """A number to six digits. For an array its shape."""
     if isinstance(value, jax.core.Tracer) or not isinstance(value, jax.Array | np.ndarray | np.number | float | int):
         return str(value)
     return f"{float(value):.6g}" if np.ndim(value) == 0 else f"array{list(np.shape(value))}"
@@ -165,7 +165,7 @@ M = TypeVar("M", bound=eqx.Module)
 
 
 def replace(component: M, values: dict[str, Any]) -> M:
-    """Returns `component` with the named parameters replaced; values may be tracers or batches.
+    """Returns `component` with the named parameters replaced. Values may be tracers or batches.
 
     Replaced parameters of a rig count as known.
 
@@ -177,7 +177,7 @@ def replace(component: M, values: dict[str, Any]) -> M:
         A component of the same kind.
 
     Raises:
-        KeyError: a name is no parameter of `component`; the message suggests similar names.
+        KeyError: a name is no parameter of `component`. The message suggests similar names.
     """
     known = [p.name for p in walk_parameters(component)]
     unknown = sorted(set(values) - set(known))

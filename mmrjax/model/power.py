@@ -17,10 +17,10 @@ CAPACITY = 2200 * COULOMB_PER_MAH
 
 
 class Battery(eqx.Module):
-    """Cells in series, each with a parabola over the discharged share of its capacity; Tables 1 and A4.
+    """Cells in series, each with a parabola over the discharged share of its capacity. Tables 1 and A4.
 
     U_b = n (A q² + B q + U'_b0 - I_b R_b), eqs. (9), (12), (13), with I_b = I_s + I_p, eq. (10), and
-    q = C_b C_n / C. A and B belong to a cell of capacity C_n. The paper's cell has C = C_n, so q = C_b; a cell of
+    q = C_b C_n / C. A and B belong to a cell of capacity C_n. The paper's cell has C = C_n, so q = C_b. A cell of
     another capacity has the same voltage at the same share.
     """
 
@@ -76,7 +76,7 @@ class Battery(eqx.Module):
         return self.cells * per_charge * discharge
 
     def current(self, total_current: Scalar) -> Scalar:
-        """Load current of the battery I_b = I_s + I_p [A], eq. (10); also dC_b/dt, eq. (11)."""
+        """Load current of the battery I_b = I_s + I_p [A], eq. (10), also dC_b/dt, eq. (11)."""
         return total_current + self.current_other
 
     def voltage_cell(self, total_current: Scalar, discharge: Scalar) -> Scalar:
@@ -98,7 +98,7 @@ class Battery(eqx.Module):
 
 
 def cutoff_error(battery: Battery) -> str | None:
-    """Reason why no mission can start on a battery, without naming its place; None: one can. Not traceable."""
+    """Reason why no mission can start on a battery, without naming its place. None: one can. Not traceable."""
     full = float(battery.voltage_full)
     if battery.voltage_cutoff < full:
         return None
@@ -108,7 +108,7 @@ def cutoff_error(battery: Battery) -> str | None:
 
 
 def cutoff_remark(battery: Battery) -> str | None:
-    """Remark on a cut-off voltage below that of an empty cell; None for the assumed cut-off. Not traceable."""
+    """Remark on a cut-off voltage below that of an empty cell, None for the assumed cut-off. Not traceable."""
     cutoff, empty, resistance = battery.voltage_cutoff, float(battery.voltage_empty), float(battery.resistance)
     if cutoff >= empty or cutoff == Battery.voltage_cutoff:
         return None
@@ -117,7 +117,7 @@ def cutoff_remark(battery: Battery) -> str | None:
 
 
 def curve_remark(battery: Battery) -> str | None:
-    """Remark on a parabola (13) that rises before the battery is empty; None: it falls. Not traceable."""
+    """Remark on a parabola (13) that rises before the battery is empty. None: it falls. Not traceable."""
     if not bool(battery.rises(battery.capacity)):
         return None
     share = -float(battery.slope) / (2 * float(battery.curvature)) / battery.capacity_curve

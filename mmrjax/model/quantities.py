@@ -56,7 +56,7 @@ def unit_in_column(unit: str) -> str:
 
 
 def unit_at_end(text: str, known: Iterable[str]) -> str | None:
-    """Returns the unit among `known` that a column's name ends with, such as kNm of `torque_kNm` and `Torque [kN·m]`;
+    """Returns the unit among `known` that a column's name ends with, such as kNm of `torque_kNm` and `Torque [kN·m]`,
     None if there is none."""
     end = re.split(r"[\[(\s]", text.rstrip("])"))[-1]
     found = [unit for unit in known if unit and re.search(rf"(?:^|[^A-Za-z]){unit}$", unit_in_column(end))]
@@ -65,21 +65,21 @@ def unit_at_end(text: str, known: Iterable[str]) -> str | None:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Quantity:
-    """A number with its unit, its range and the rule for its sign; a row is equal to itself alone.
+    """A number with its unit, its range and the rule for its sign. A row is equal to itself alone.
 
     Attributes:
-        name: noun; with the unit, the name of its column.
+        name: noun. With the unit, the name of its column.
         unit: of its column.
         label: words of reports.
         range: least and greatest value [unit].
-        factor: the SI value of one unit, if its values are not in SI; by default the unit's.
+        factor: the SI value of one unit, if its values are not in SI. By default the unit's.
         resolution: digits after the point in reports [unit].
         written: unit as people write it, if it differs from `unit`.
         percent: True if per cent are accepted too.
         stem: start of the names of its columns, if it differs from `name`.
-        sign: what turns its sign: `TRAVEL` or `TURN`; empty: nothing does.
+        sign: what turns its sign: `TRAVEL` or `TURN`. Empty: nothing does.
         in_profiles: True if a mission's profile may state it.
-        rests_on: dotted names of the parameters that it depends on; it is unknown if one of them is.
+        rests_on: dotted names of the parameters that it depends on. It is unknown if one of them is.
         group: computation that gives it: a module of `mmrjax.derived`, or one of `requirements.GROUPS`.
         ignores: columns of conditions that it does not depend on, because its computation solves for them or sets
             them.
@@ -138,7 +138,7 @@ class Quantity:
 
     @functools.cached_property
     def sizes(self) -> dict[str, float]:
-        """SI value of each unit that its columns may state, its own first; no slope in per cent."""
+        """SI value of each unit that its columns may state, its own first. No slope in per cent."""
         alike: Mapping[str, float] = next((units for units in DIMENSIONS if self.unit in units), {})
         share = {PERCENT: 1e-2} if self.percent and self.unit != "deg" else {}
         return {self.unit: self.factor} | {u: size for u, size in alike.items() if u != self.unit} | share
@@ -178,13 +178,14 @@ class Condition(Quantity):
     """A quantity that is set from outside before a run starts.
 
     Attributes:
-        field: field of `Conditions`, by default its name; empty if there is none.
-        heading: of its column on pages, empty if no page shows it; shown: format of a number there.
+        field: field of `Conditions`, by default its name, empty if there is none.
+        heading: of its column on pages, empty if no page shows it.
+        shown: format of a number there.
         in_tables: True if a table of runs may state it, under its own column.
-        imposed: kinds of `rig.IMPOSED` whose tables may; empty: all of them.
-        acts: load on which it acts: `GROUND` or `SHAFT`; `VEHICLE`: on the ground too, and no other load has it;
-            empty: any.
-        usual: its value in a table that does not state it; None: none stands for it.
+        imposed: kinds of `rig.IMPOSED` whose tables may. Empty: all of them.
+        acts: load on which it acts: `GROUND` or `SHAFT`. `VEHICLE`: on the ground too, and no other load has it.
+            Empty: any.
+        usual: its value in a table that does not state it. None: none stands for it.
     """
 
     _: dataclasses.KW_ONLY
@@ -207,7 +208,7 @@ class Condition(Quantity):
 
     @functools.cached_property
     def sizes(self) -> dict[str, float]:
-        """SI value of each unit that its columns may state; of its own alone if no file may state it."""
+        """SI value of each unit that its columns may state. Of its own alone if no file may state it."""
         return super().sizes if self.in_tables or self.in_profiles else {self.unit: self.factor}
 
 
@@ -222,10 +223,10 @@ class Channel(Quantity):
         signal: reading of an ideal instrument [SI]: the field of `Signals`, by default of its name, or a function of
             robot and signals.
         zero_at_rest: True if it shows 0 until the robot moves.
-        sign: what turns it: the travel, or a turn; an angle counts on from its last value.
+        sign: what turns it: the travel, or a turn. An angle counts on from its last value.
         settled, over_time: True if settled runs and histories can show it.
-        zero_error: standard deviation of the instrument's zero [SI]; 0 for counters and clocks, which have none.
-        side: 0 or 1 for a channel of the left or right side; None: a channel of both together.
+        zero_error: standard deviation of the instrument's zero [SI], 0 for counters and clocks, which have none.
+        side: 0 or 1 for a channel of the left or right side. None: a channel of both together.
         where: place of the measurement, if the label does not give it.
     """
 
@@ -269,7 +270,7 @@ class Channel(Quantity):
 
     @property
     def misses_zero(self) -> bool:
-        """True if its instrument may have a zero error; the zero of a temperature is a convention."""
+        """True if its instrument may have a zero error. The zero of a temperature is a convention."""
         return self.zero_error > 0 and self.directed
 
     def of_side(self, side: int) -> Channel:

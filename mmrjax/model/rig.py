@@ -38,8 +38,8 @@ class Instrument:
 
     Attributes:
         channel: name of the channel.
-        signed: True if it shows the sign; False if it shows the magnitude; None: to be found from its table.
-        quantum: step of its readings [SI]; 0: none; None: to be found from its table.
+        signed: True if it shows the sign, False if it shows the magnitude. None: to be found from its table.
+        quantum: step of its readings [SI]. 0: none. None: to be found from its table.
     """
 
     channel: str
@@ -52,12 +52,12 @@ class Instrument:
         return self.signed is None or self.quantum is None
 
     def shows(self, value: Scalar) -> Scalar:
-        """Reading for a value [SI]; the step counts as noise, see `variance`."""
+        """Reading for a value [SI]. The step counts as noise, see `variance`."""
         return jnp.abs(value) if self.signed is False else value
 
     @property
     def variance(self) -> float:
-        """Error variance due to its step, Δ²/12 [SI²] (Bennett, Spectra of quantized signals, 1948); 0 if unknown."""
+        """Error variance due to its step, Δ²/12 [SI²] (Bennett, Spectra of quantized signals, 1948), 0 if unknown."""
         return (self.quantum or 0.0) ** 2 / 12
 
 
@@ -74,7 +74,7 @@ class Begin(eqx.Module):
 
 
 class Begins(eqx.Module):
-    """The beginnings of runs by name, in a fixed order; conditions hold an index."""
+    """The beginnings of runs by name, in a fixed order. Conditions hold an index."""
 
     names: tuple[str, ...] = eqx.field(static=True)
     members: tuple[Begin, ...]
@@ -87,7 +87,7 @@ class Begins(eqx.Module):
         return zip(self.names, self.members, strict=True)
 
     def of(self, index: Index) -> Begin:
-        """The beginning with this index; traceable."""
+        """The beginning with this index, traceable."""
         stacked = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v, float) for v in x]), *self.members)
         return jax.tree.map(lambda x: x[jnp.asarray(index)], stacked)
 
@@ -101,14 +101,14 @@ class Rig(eqx.Module):
         instruments: known properties of the instruments of some channels.
         delay: dead time between a value in the column and its action [s].
         columns: of tables: (column name in this program, column name in the file, factor from its unit).
-        priors: (parameter, mean, sd) [SI] stated in the file, which replace the parameters' own; sd 0: exactly known.
+        priors: (parameter, mean, sd) [SI] stated in the file, which replace the parameters' own. Sd 0: exactly known.
         start: of histories: `rest`, `measured` (by the first samples) or `free` (the same as prior means).
         begins: of histories that do not begin at rest, once their table is known.
-        between_rows: of histories, one of `BETWEEN`; an imposed speed is always interpolated linearly.
+        between_rows: of histories, one of `BETWEEN`. An imposed speed is always interpolated linearly.
         surfaces: (configuration, another configuration that differs only by its ground).
-        inherits: True if a packaged robot supplies what the file leaves open; False: nothing comes from another.
+        inherits: True if a packaged robot supplies what the file leaves open. False: nothing comes from another.
         unknown: parameters that nobody stated and that have no substitute. Their fields hold a packaged robot's value
-            to keep the equations computable; results that depend on them are not known (`Robot.knows`).
+            to keep the equations computable. Results that depend on them are not known (`Robot.knows`).
         loose: True if the load on the shaft has backlash, which histories then follow as a state.
     """
 
@@ -146,7 +146,8 @@ class Rig(eqx.Module):
         states.
 
         Args:
-            times: since the imposed quantity acts [s], increasing; at: instants of the tables' clock [s], any shape.
+            times: since the imposed quantity acts [s], increasing.
+            at: instants of the tables' clock [s], any shape.
         """
         wanted = at - self.delay
         k = jnp.clip(jnp.searchsorted(times, wanted, side="right") - 1, 0, times.shape[0] - 2)
@@ -157,7 +158,7 @@ class Rig(eqx.Module):
     def between(values: Array, k: Array, share: Array) -> Array:
         """Values, shape (times, ...), at the index and share that `before` returns, with their shape in front.
 
-        Linear between neighbouring instants; a quantity without values between rows keeps that of the row before.
+        Linear between neighbouring instants. A quantity without values between rows keeps that of the row before.
         """
         if not jnp.issubdtype(values.dtype, jnp.inexact):
             return values[k]
@@ -189,12 +190,12 @@ class Rig(eqx.Module):
 
     @property
     def exact(self) -> frozenset[str]:
-        """Parameters that the file states as exactly known; no fit changes them."""
+        """Parameters that the file states as exactly known. No fit changes them."""
         return frozenset(name for name, _, sd in self.priors if sd == 0)
 
     @property
     def scales_adhesion(self) -> bool:
-        """True if labels of Table 5 scale its adhesion to the bench's; else each surface is a ground of its own."""
+        """True if labels of Table 5 scale its adhesion to the bench's, else each surface is a ground of its own."""
         return self.inherits
 
     @property

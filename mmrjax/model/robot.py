@@ -33,10 +33,11 @@ Load = Chassis | Shaft
 
 
 class Configurations(eqx.Module):
-    """Loads by name, in a fixed order; conditions hold an index.
+    """Loads by name, in a fixed order. Conditions hold an index.
 
     Attributes:
-        names: in order; members: the loads, either all vehicles or all shafts.
+        names: in order.
+        members: the loads, either all vehicles or all shafts.
         chosen: the load of the current configuration, within equations of one run (`Robot.within`).
     """
 
@@ -51,7 +52,7 @@ class Configurations(eqx.Module):
         """Position of a configuration.
 
         Raises:
-            KeyError: no such configuration; the message lists the robot's configurations.
+            KeyError: no such configuration. The message lists the robot's configurations.
         """
         if name not in self.names:
             raise KeyError(f"no configuration {name}; the robot has {', '.join(self.names)}")
@@ -82,9 +83,9 @@ class Robot(eqx.Module):
     """Battery, one motor and gearbox per side, a load for each configuration, and effects.
 
     Attributes:
-        configurations: loads by name, at least one; given as a mapping.
-        effects: terms beyond the paper's model; an empty tuple gives the paper's model.
-        sides: number of motors driven with the same input; per-side quantities belong to one motor (assumption 3).
+        configurations: loads by name, at least one. Given as a mapping.
+        effects: terms beyond the paper's model. An empty tuple gives the paper's model.
+        sides: number of motors driven with the same input. Per-side quantities belong to one motor (assumption 3).
         running_gear: of one side, further parameters of the track model.
         driver: of the motors.
         rig: imposed inputs and instruments.
@@ -120,7 +121,7 @@ class Robot(eqx.Module):
         return channels.channels_named(self.rig.channels)
 
     def showing_turns(self, columns: Collection[str] | None = None) -> Robot:
-        """Same robot with instruments for both sides and yaw; with `columns`, only for columns of the table."""
+        """Same robot with instruments for both sides and yaw. With `columns`, only for columns of the table."""
         own = self.rig.channels
         read = [c for c in channels.OF_TURNS if (c.settled if columns is None else c.column in columns)]
         more = [c.name for c in read if c.name not in own]
@@ -128,7 +129,7 @@ class Robot(eqx.Module):
 
     @property
     def unlike(self) -> tuple[str, ...]:
-        """Names of its effects that make the sides differ; they have no meaning in runs without data of each side."""
+        """Names of its effects that make the sides differ. They have no meaning in runs without data of each side."""
         return tuple(effect.name for effect in self.effects if effect.unlike)
 
     @property
@@ -138,7 +139,7 @@ class Robot(eqx.Module):
 
     @property
     def has_ground(self) -> bool:
-        """True if a ground carries it; slope, payload and adhesion then act, and its movers can slip."""
+        """True if a ground carries it. Slope, payload and adhesion then act, and its movers can slip."""
         return "ground" not in self.lacks
 
     def unknown(self, names: Iterable[str]) -> tuple[str, ...]:
@@ -151,11 +152,11 @@ class Robot(eqx.Module):
 
     @property
     def current_continuous(self) -> Scalar:
-        """Continuous current of one motor that its winding permits [A]; inf if its thermal data are unknown."""
+        """Continuous current of one motor that its winding permits [A], inf if its thermal data are unknown."""
         return self.motor.current_continuous if self.knows(HEAT) else jnp.inf
 
     def heating(self, power: Scalar, winding: Scalar, housing: Scalar) -> tuple[Scalar, Scalar]:
-        """Rates of the temperatures of winding and housing [K/s], as in `Motor.heating`; 0 if unknown."""
+        """Rates of the temperatures of winding and housing [K/s], as in `Motor.heating`, 0 if unknown."""
         rates = self.motor.heating(power, winding, housing)
         return rates if self.knows(WARMING) else (jnp.zeros_like(rates[0]), jnp.zeros_like(rates[1]))
 
@@ -175,7 +176,7 @@ class Robot(eqx.Module):
         return not (self.loose or self.has_ground)
 
     def chassis(self, configuration: Index) -> Any:
-        """The load of the configuration with this index; traceable and batchable."""
+        """The load of the configuration with this index, traceable and batchable."""
         if self.configurations.chosen is not None:
             return self.configurations.chosen
         chosen, *others = self.configurations.members
@@ -185,7 +186,7 @@ class Robot(eqx.Module):
         return chosen
 
     def within(self, configuration: Index) -> Robot:
-        """Same robot in the configuration with this index; its load is selected once, here, for all equations."""
+        """Same robot in the configuration with this index. Its load is selected once, here, for all equations."""
         if self.configurations.chosen is not None:
             return self
         chosen = eqx.tree_at(
@@ -197,7 +198,7 @@ class Robot(eqx.Module):
     def radius_pulley(self) -> Scalar:
         """Pitch radius of the pulleys that carry the belts [m].
 
-        It is the rolling radius of the first configuration on tracks; without tracks, the radius of 48 teeth of 5 mm.
+        It is the rolling radius of the first configuration on tracks, without tracks, the radius of 48 teeth of 5 mm.
         """
         radius: Scalar = jnp.asarray(RADIUS_PULLEY)
         for chassis in reversed(self.configurations.members):

@@ -19,13 +19,15 @@ class Shaft(eqx.Module):
     """J dω/dt = M_r - (M_0 sign ω + K ω) - M_c - m g l sin(θ - θ_0), at the output of one drive.
 
     One law for bench, winch, screw, pendulum and carriage. A winch has M_c = m g r. A screw of lead p with a carriage
-    of mass m has J = m (p / 2π)² and travels p / 2π per radian. Newton's law for rotation; friction as for the
+    of mass m has J = m (p / 2π)² and travels p / 2π per radian. Newton's law for rotation. Friction as for the
     tracks, eq. (24).
 
     Attributes:
         speed_rest: of the output, within which friction is smoothed through rest [rad/s].
-        lacks: balances that it lacks, having no ground; on_tracks: 0, neither tracks nor wheels;
-            mass: of a robot, 0; speed_grip: 0, nothing slides.
+        lacks: balances that it lacks, having no ground.
+        on_tracks: 0, neither tracks nor wheels.
+        mass: of a robot, 0.
+        speed_grip: 0, nothing slides.
     """
 
     lacks: ClassVar[frozenset[str]] = frozenset({"ground", "slip", "mass"})
@@ -73,14 +75,15 @@ class Shaft(eqx.Module):
         return self.loss_coulomb * direction + self.loss_viscous * speed
 
     def torque_mesh(self, gap: Scalar, closing: Scalar, inertia_motor: Scalar) -> Scalar:
-        """Torque that the gear flanks carry [N·m]; 0 while they do not touch.
+        """Torque that the gear flanks carry [N·m], 0 while they do not touch.
 
         k s + d ds/dt over the compression s beyond half the backlash, never pulling (a dead zone with compliance:
         Nordin and Gutman, Controlling mechanical systems with backlash, Automatica 38 (2002) 1633). A rig's sampling
         does not resolve the flanks' stiffness: they oscillate at `MESH_FREQUENCY`, damped by `MESH_DAMPING`.
 
         Args:
-            gap: of the output's motor side ahead of the load, from the middle [rad]; closing: its rate [rad/s].
+            gap: of the output's motor side ahead of the load, from the middle [rad].
+            closing: its rate [rad/s].
             inertia_motor: of the motor side at the output [kg·m²].
         """
         inertia = inertia_motor * self.inertia / (inertia_motor + self.inertia)

@@ -37,7 +37,7 @@ class _Loop(NamedTuple):
         return self.kept(turned)
 
     def refilled(self, numbers: Any, batched: Any, size: int) -> Any:
-        """Returns the end of each of `size` members; a queued member replaces a finished one.
+        """Returns the end of each of `size` members. A queued member replaces a finished one.
 
         Args:
             numbers: of the members, with a leading axis where `batched`, a tree of booleans, is true.
@@ -93,17 +93,18 @@ def loop_until(
     kept: Callable[[T], Any] = lambda state: state,
     most: int | None = None,
 ) -> Any:
-    """The first state with `ended`, by repeated `turn` from `begun`; without derivatives.
+    """The first state with `ended`, by repeated `turn` from `begun`, without derivatives.
 
     A batch of `jax.lax.while_loop` takes the turns of its longest member for every member. This loop takes their
-    mean, plus those of the last `most` members; members that have ended at the start take none.
+    mean, plus those of the last `most` members. Members that have ended at the start take none.
 
     Args:
-        begun: state of arrays, from `own`; turn: the next state, from `own` and a state; ended: of a state. They
-            close over no traced number.
-        own: data of one member; its numbers may be batched.
-        kept: the part of the last state to return; most: number of members computed at a time, `LANES` if
-            None.
+        begun: state of arrays, from `own`.
+        turn: the next state, from `own` and a state.
+        ended: of a state. They close over no traced number.
+        own: data of one member. Its numbers may be batched.
+        kept: the part of the last state to return.
+        most: number of members computed at a time, `LANES` if None.
     """
     numbers, rest = eqx.partition(jax.lax.stop_gradient(own), eqx.is_array)
 
@@ -114,7 +115,7 @@ def loop_until(
     loop = _Loop(lambda x: begun(of(x)), lambda x, state: turn(of(x), state), ended, kept, lanes)
 
     def many(numbers: Any, batched: Any, size: int) -> T:
-        """The end of each of `size` members; if these are batched again, all members share the same lanes."""
+        """The end of each of `size` members. If these are batched again, all members share the same lanes."""
 
         @custom_vmap
         def each(numbers: Any) -> T:

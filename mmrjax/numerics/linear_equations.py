@@ -118,7 +118,7 @@ def inverse(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Float[Arr
 
 
 def solve(matrix: Float[Array, "n n"], b: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
-    """A⁻¹ b by Gauss-Jordan elimination, with row exchanges for the largest pivot; b may have columns.
+    """A⁻¹ b by Gauss-Jordan elimination, with row exchanges for the largest pivot. b may have columns.
 
     Not finite if A is singular.
     """
@@ -143,7 +143,7 @@ def invert(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 
 def solve_lower(matrix: Float[Array, "n n"], b: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
-    """L⁻¹ b with the lower Cholesky factor, L Lᵀ = matrix; NaN if it is not positive definite; b may have columns."""
+    """L⁻¹ b with the lower Cholesky factor, L Lᵀ = matrix, NaN if it is not positive definite. b may have columns."""
     n = matrix.shape[0]
     index = jnp.arange(n)
 

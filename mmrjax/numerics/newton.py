@@ -5,7 +5,7 @@ two cores it takes 29 ms of processor time (a loop of our own took 27 ms; median
 alternating in one run, 2026-11-28). optimistix's `Newton` takes 3.1 times as long, because it factorises by batched
 calls of LAPACK. The derivative is written here. A program with optimistix's derivative (`ImplicitAdjoint`) contains a
 host callback, through lineax, and JAX's cache never stores such a program. With `elimination` as lineax's solver it
-is as fast (0.5 ms for 4096 gradients); with `Newton` it takes seven times as long.
+is as fast (0.5 ms for 4096 gradients). With `Newton` it takes seven times as long.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ PATIENCE = 8
 def _linearised(fn: Function, y: Vector, args: Any, apart: bool) -> tuple[Matrix, Vector]:
     """∂f/∂y by its rows, and f.
 
-    `apart`: one unknown after another, so that rows that do not depend on it cost nothing; else all together, in a
+    `apart`: one unknown after another, so that rows that do not depend on it cost nothing, else all together, in a
     program of a third of the size.
     """
     if not apart:
@@ -65,7 +65,7 @@ def _linearised(fn: Function, y: Vector, args: Any, apart: bool) -> tuple[Matrix
 
 
 def _watched(value: Array, index: int, moved: set[int]) -> Array:
-    """`value`; while it is differentiated, `index` is added to `moved` if it has a derivative."""
+    """`value`. While it is differentiated, `index` is added to `moved` if it has a derivative."""
 
     @jax.custom_jvp
     def watched(x: Array) -> Array:
@@ -100,7 +100,9 @@ class Turning(eqx.Module):
     stays between the places where its equation was last below and above 0, with the other equations solved.
 
     Attributes:
-        y: the unknowns; solved: True once f is 0 at them; turns: number of linearisations.
+        y: the unknowns.
+        solved: True once f is 0 at them.
+        turns: number of linearisations.
         low, high: ends of the interval of the last unknown.
     """
 
@@ -133,8 +135,9 @@ class FewUnknowns(optx.AbstractRootFinder[Vector, Vector, Any, Turning]):
     A member is solved after a step whose square is below `atol`.
 
     Attributes:
-        atol: of f; rtol, norm: not read.
-        apart: True to compute ∂f/∂y one unknown after another, which is faster over large batches; False: all
+        atol: of f.
+        rtol, norm: not read.
+        apart: True to compute ∂f/∂y one unknown after another, which is faster over large batches. False: all
             together, a program of a third of the size.
     """
 
@@ -198,19 +201,19 @@ def root(
     """Solves f(y) = 0 by `FewUnknowns`, until every member of a batch has converged.
 
     Args:
-        residual: f, scaled to the order of one; pure, without differentiated data of its own. Equation k
+        residual: f, scaled to the order of one. Pure, without differentiated data of its own. Equation k
             determines unknown k (see `factorise`).
-        start: first guess; no derivative passes through it.
+        start: first guess. No derivative passes through it.
         shared, own: arguments of f other than y: data of all members of a batch and of each. Derivatives with respect
             to both are implicit, dy = -(∂f/∂y)⁻¹ (∂f/∂shared dshared + ∂f/∂own down), forward and reverse, zero if
             ∂f/∂y is singular. The program holds no host callback.
         tolerance, apart: as for `FewUnknowns`.
-        linear: f in its usual branches, where it is linear in y; None if it has none. Its root is computed first, so
+        linear: f in its usual branches, where it is linear in y, None if it has none. Its root is computed first, so
             that XLA fuses it over a batch with the code before and after. The search runs only for members in which
             that leaves |f| above the tolerance.
 
     Returns:
-        y, and whether it converged within `MAX_STEPS` turns; False for a residual that is not finite.
+        y, and whether it converged within `MAX_STEPS` turns, False for a residual that is not finite.
     """
     function: Any = _function(residual)
     own = jax.tree.map(jnp.asarray, own)
@@ -250,11 +253,11 @@ def _implicit(primals: tuple, tangents: tuple) -> tuple[tuple[Vector, Array], tu
 
 
 def implicit_slopes(slope: Float[Array, "rows outputs x_and_y"], left: Float[Array, "rows n x_and_y"]) -> Array:
-    """Derivatives of the outputs of rows with respect to x; the unknowns y of each row follow from f(x, y) = 0.
+    """Derivatives of the outputs of rows with respect to x. The unknowns y of each row follow from f(x, y) = 0.
 
     Args:
-        slope: ∂/∂x of the outputs, then ∂/∂y; left: the same for f, one equation for each of the n unknowns, in the
-            order of `root`.
+        slope: ∂/∂x of the outputs, then ∂/∂y.
+        left: the same for f, one equation for each of the n unknowns, in the order of `root`.
 
     Returns:
         Shape (rows, outputs, x): ∂/∂x - ∂/∂y (∂f/∂y)⁻¹ ∂f/∂x, without the second term if ∂f/∂y is singular.

@@ -13,21 +13,21 @@ from mmrjax.model.params import Scalar
 
 
 def clip(x: Scalar, low: Scalar, high: Scalar) -> Array:
-    """`x` limited to `low` and `high`; at both bounds the derivative is that of `x`."""
+    """`x` limited to `low` and `high`. At both bounds the derivative is that of `x`."""
     return jnp.where(x < low, low, at_most(x, high))
 
 
 def at_least(x: Scalar, low: Scalar) -> Array:
-    """The larger of `x` and `low`; if they are equal, the derivative is that of `x`."""
+    """The larger of `x` and `low`. If they are equal, the derivative is that of `x`."""
     return jnp.where(x < low, low, x)
 
 
 def at_most(x: Scalar, high: Scalar) -> Array:
-    """The smaller of `x` and `high`; if they are equal, the derivative is that of `x`."""
+    """The smaller of `x` and `high`. If they are equal, the derivative is that of `x`."""
     return jnp.where(x > high, high, x)
 
 
 def magnitude(x: Scalar, way: Scalar) -> Array:
-    """|x|; at 0 the derivative is that for `x` growing in the direction of `way`, of either sign."""
+    """|x|. At 0 the derivative is that for `x` growing in the direction of `way`, of either sign."""
     backward = (x < 0) | ((x == 0) & (way < 0))
     return jnp.where(backward, -x, x)

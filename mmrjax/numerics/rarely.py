@@ -19,7 +19,9 @@ def compute_rarely(needed: Bool[Array, ""], function: Callable[..., T], argument
     This is a loop of at most one turn: a batch runs it if one member needs it.
 
     Args:
-        function: pure; arguments: trees of arrays; otherwise: with the shapes and types of the result of `function`.
+        function: pure.
+        arguments: trees of arrays.
+        otherwise: with the shapes and types of the result of `function`.
     """
 
     def turn(state: tuple[Array, T]) -> tuple[Array, T]:

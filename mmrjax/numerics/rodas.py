@@ -1,4 +1,4 @@
-"""Rodas4 as a solver of diffrax; imported only for integrations, because diffrax takes long to import."""
+"""Rodas4 as a solver of diffrax. Imported only for integrations, because diffrax takes long to import."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ KINK = 1e-2
 
 
 def error_norm(error: Float[Array, " unknowns"], own: int, weight: float | np.ndarray = 1.0) -> Scalar:
-    """Root mean square of an error of the robot's `own` unknowns; memories add to it and never dilute it."""
+    """Root mean square of an error of the robot's `own` unknowns. Memories add to it and never dilute it."""
     return jnp.sqrt(jnp.sum(weight * error**2) / own)
 
 
@@ -64,7 +64,7 @@ def error_across_kink(
 
 
 def step_longest(robot: Robot, conditions: Conditions) -> Array | None:
-    """The longest step that resolves every effect with a memory [s]; None if no effect limits it."""
+    """The longest step that resolves every effect with a memory [s], None if no effect limits it."""
     limits = [jnp.asarray(effect.step_longest(robot, conditions)) for effect in robot.remembering]
     return jax.lax.stop_gradient(jnp.min(jnp.stack(limits))) if limits else None
 
@@ -85,7 +85,7 @@ def rosenbrock_stages(
         looped: True to include `rates` once for all stages but the first, in a program that compiles faster.
 
     Returns:
-        y and q at the end of the step, and the stages of both; the last stage estimates the error.
+        y and q at the end of the step, and the stages of both. The last stage estimates the error.
     """
 
     def both(y: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:

@@ -62,7 +62,7 @@ def cosine(angle: Float[Array, "..."]) -> Float[Array, "..."]:
 @jax.custom_jvp
 @jax.jit
 def sine_third(share: Float[Array, "..."]) -> Float[Array, "..."]:
-    """sin(asin(x) / 3), a root of 3 y - 4 y³ = x, for x within ±1, accurate to 2e-16; NaN beyond."""
+    """sin(asin(x) / 3), a root of 3 y - 4 y³ = x, for x within ±1, accurate to 2e-16, NaN beyond."""
     share = jnp.asarray(share)
     size = jnp.abs(share)
     small = size < 0.5

@@ -67,7 +67,7 @@ SMALL, SMALL_RATE, LONG, TURNS = 1e-9, 1e-7, 10.0, 200
 
 
 def _kept(robot: Robot, size: int) -> tuple[Effect, ...]:
-    """The effects with a memory among `size` unknowns: all that have one, or none; memories are then settled."""
+    """The effects with a memory among `size` unknowns: all that have one, or none. Memories are then settled."""
     return robot.remembering if size > len(_UNITS) else ()
 
 
@@ -88,7 +88,7 @@ _turning = compiled(balances.turning_signals)
 
 @compiled
 def turning_rates(robot: Robot, conditions: Conditions, y: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:
-    """Rates of the unknowns, in their units [1/s]; 0 for a motor whose speed is imposed."""
+    """Rates of the unknowns, in their units [1/s], 0 for a motor whose speed is imposed."""
     return _rates(robot, conditions, y, _turning(robot, conditions, motion_of(robot, y)))
 
 
@@ -153,9 +153,11 @@ class _Secant(eqx.Module):
     """A search for a settled turn by Broyden's method.
 
     Attributes:
-        y: the unknowns that settle, and the loads; rates: `_balance` at y.
+        y: the unknowns that settle, and the loads.
+        rates: `_balance` at y.
         inverse: of minus its Jacobian, as approximated so far.
-        looks: number of evaluations of `_balance`; solved: True once the search has converged.
+        looks: number of evaluations of `_balance`.
+        solved: True once the search has converged.
     """
 
     y: Float[Array, " 9"]
@@ -169,7 +171,9 @@ class _Linear(eqx.Module):
     """`_balance` linearised at the end of a search.
 
     Attributes:
-        jacobian: of `_balance`; sound: True if that is a turn, and a stable one; known: True once this is computed.
+        jacobian: of `_balance`.
+        sound: True if that is a turn, and a stable one.
+        known: True once this is computed.
     """
 
     jacobian: Float[Array, "9 9"]
@@ -181,8 +185,12 @@ class _Search(eqx.Module):
     """A search for a settled turn along a run.
 
     Attributes:
-        y: the unknowns that settle, and the loads; rates: `_balance` at y; jacobian: derivative of these.
-        step: length of the next step [s]; turns: steps taken; solved: True once it has converged.
+        y: the unknowns that settle, and the loads.
+        rates: `_balance` at y.
+        jacobian: derivative of these.
+        step: length of the next step [s].
+        turns: steps taken.
+        solved: True once it has converged.
     """
 
     y: Float[Array, " 9"]
@@ -236,12 +244,12 @@ def _loads(robot: Robot, conditions: Conditions, y: Float[Array, " 9"]) -> Float
 
 
 def _moves(conditions: Conditions) -> np.ndarray:
-    """True for the unknowns of a search, False for imposed speeds and their currents; shape (9,)."""
+    """True for the unknowns of a search, False for imposed speeds and their currents, shape (9,)."""
     return np.arange(SETTLING + len(SIDES)) >= (0 if conditions.of_sides().motor_speed is None else 4)
 
 
 def _begins(robot: Robot, conditions: Conditions) -> Float[Array, " 9"]:
-    """Initial unknowns of a search; imposed speeds keep these values."""
+    """Initial unknowns of a search. Imposed speeds keep these values."""
     return jnp.concatenate([_guess(robot, conditions)[:SETTLING], jnp.zeros(len(SIDES))])
 
 
@@ -274,7 +282,7 @@ def _still(conditions: Conditions) -> Float[np.ndarray, "9 9"]:
 
 
 def _around(robot: Robot, conditions: Conditions, y: Array) -> tuple[Array, Array]:
-    """The Jacobian of `_balance`, and its value; imposed unknowns have no equation."""
+    """The Jacobian of `_balance`, and its value. Imposed unknowns have no equation."""
     slope, found = jax.jacfwd(lambda y: (_balance(robot, conditions, y),) * 2, has_aux=True)(y)
     return jnp.where(_moves(conditions)[:, None], slope, _still(conditions)), found
 
@@ -369,7 +377,7 @@ def turn_results(
 
 
 def circling_signals(robot: Robot, conditions: Conditions) -> tuple[balances.Travel, PlaneMotion, Array]:
-    """Signals of a settled turn on level ground, and its status; with numbers at any status.
+    """Signals of a settled turn on level ground, and its status. With numbers at any status.
 
     Args:
         conditions: one run, scalar fields, on level ground.
@@ -377,7 +385,7 @@ def circling_signals(robot: Robot, conditions: Conditions) -> tuple[balances.Tra
     Returns:
         Signals of both sides, motion of the robot, and one of these statuses. `converged`. `stalled`: neither shafts
         nor robot move faster than the resolution of static friction. `tips`: no load is left on a side or at an end.
-        `battery_empty`. `not_settled`: no settled turn was found; possibly none exists, because friction falls with
+        `battery_empty`. `not_settled`: no settled turn was found. Possibly none exists, because friction falls with
         sliding.
     """
     unknowns, solved = _unknowns(robot, conditions)
@@ -496,7 +504,7 @@ def result_of(robot: Robot, travel: balances.Travel, status: Array) -> Result:
 
 
 def operating_point(robot: Robot, conditions: Conditions) -> tuple[Result, Array]:
-    """A settled turn, see `circling_signals`, and whether its conditions are sound; with numbers at any status."""
+    """A settled turn, see `circling_signals`, and whether its conditions are sound. With numbers at any status."""
     sound = jnp.asarray(True)
     for number in jax.tree.leaves(conditions):
         sound &= jnp.isfinite(number)
@@ -508,6 +516,6 @@ def operating_point(robot: Robot, conditions: Conditions) -> tuple[Result, Array
 
 
 def steady(robot: Robot, conditions: Conditions) -> Result:
-    """`steady` for a robot that turns: see `circling_signals`; NaN if it has no settled turn."""
+    """`steady` for a robot that turns: see `circling_signals`, NaN if it has no settled turn."""
     point, sound = operating_point(robot, conditions)
     return withhold_numbers(point, (point.status == CONVERGED) | (point.status == STALLED), sound)

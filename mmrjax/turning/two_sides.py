@@ -6,7 +6,7 @@ order left, right (leading axis 2), their contact lines at y = ±B/2. A contact 
     u_x = r ω_k,s - V_s - slip, V_s = v_x - ω y_s,    u_y = -v_y - ω x,
 
 and carries the force N μ(|u|) (u_x, λ^a u_y) / |(u_x, λ^(a-1) u_y)|, with μ the law of Fig. 7 and λ = φ_y / φ_x. At
-u_y = 0 this is the law of straight travel, and for any a it is on the friction ellipse; a is the rule of direction.
+u_y = 0 this is the law of straight travel, and for any a it is on the friction ellipse. A is the rule of direction.
 At a = 1 the force is along (φ_x u_x, φ_y u_y), at a = 2 it dissipates the most power that the ellipse allows. The
 rule is an assumption, as are the loads of a rigid robot in equilibrium at each instant.
 """
@@ -38,7 +38,7 @@ LOAD_STEPS = 3
 
 
 def _nodes(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Gauss-Legendre nodes on -1..1 and their weights; and the weights of two wheels at the ends.
+    """Gauss-Legendre nodes on -1..1 and their weights, and the weights of two wheels at the ends.
 
     The wheels use the first and the last node.
     """
@@ -83,10 +83,13 @@ class Stance(eqx.Module):
     """Position of a robot on its contacts.
 
     Attributes:
-        length: of the contact, or the wheelbase [m]; width: B [m].
-        height: of the centre of mass above the ground [m]; ahead: of it from the middle of the contact [m].
+        length: of the contact, or the wheelbase [m].
+        width: B [m].
+        height: of the centre of mass above the ground [m].
+        ahead: of it from the middle of the contact [m].
         on_tracks: 1 on tracks, whose contact is a line, 0 on wheels, with contacts only at its ends [-].
-        lateral: λ on this ground [-]; rule: a [-].
+        lateral: λ on this ground [-].
+        rule: a [-].
         nodes: of a track's contact, even. The width of a turn on the spot under dry friction has an error of 3e-5
             with 16 nodes and 1e-8 with 32.
     """
@@ -105,11 +108,12 @@ class Grip(eqx.Module):
     """Forces of the ground on each side, shape (2,): left, right.
 
     Attributes:
-        normal: load of a side [N]; ahead, aside: forces along x and y [N]; moment: of the lateral forces about the
-            centre of mass, positive to the left [N·m].
+        normal: load of a side [N].
+        ahead, aside: forces along x and y [N].
+        moment: of the lateral forces about the centre of mass, positive to the left [N·m].
         across: power that lateral sliding turns into heat [W].
-        moved: load transferred from the left side to the right one [N]; centre: of pressure, ahead of the middle
-            of the contact [m].
+        moved: load transferred from the left side to the right one [N].
+        centre: of pressure, ahead of the middle of the contact [m].
         lacking: excess of both over the values that these forces give: 0, except during a search for them [N, m].
     """
 
@@ -140,7 +144,8 @@ class Law(eqx.Module):
     """Data of a contact's law that all nodes share.
 
     Attributes:
-        friction: along; ratio: λ^(2a-2), the weight of lateral over longitudinal sliding in a direction [-].
+        friction: along.
+        ratio: λ^(2a-2), the weight of lateral over longitudinal sliding in a direction [-].
         on_tracks, nodes: see `Stance`.
     """
 
@@ -199,8 +204,9 @@ def law_moments(law: Law, sliding: Float[Array, " 2"], middle: Scalar, end: Scal
     They are taken about its middle and in units of half its length.
 
     Args:
-        sliding: longitudinal, of each side [m/s]; middle: lateral, at the middle of the contact [m/s]; end: its
-            increase to the front end [m/s].
+        sliding: longitudinal, of each side [m/s].
+        middle: lateral, at the middle of the contact [m/s].
+        end: its increase to the front end [m/s].
     """
     across = middle + end * law.places()
     return law.over(law.per_speed(sliding[:, None] ** 2, across**2), 3)
@@ -208,7 +214,7 @@ def law_moments(law: Law, sliding: Float[Array, " 2"], middle: Scalar, end: Scal
 
 @law_moments.def_jvp
 def _moments_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    """Tangents in closed form for the speeds, once for all directions; as computed for the law's own numbers."""
+    """Tangents in closed form for the speeds, once for all directions. As computed for the law's own numbers."""
     law, sliding, middle, end = primals
     across = middle + end * law.places()
     along = sliding[:, None] ** 2
@@ -252,15 +258,19 @@ def grip(
 ) -> Grip:
     """Forces and loads of both sides, which depend on each other.
 
-    The load moves to the outer side, T = h ΣF_y / B, and to the rear, N x_p = N x_c - h (ΣF_x - ΣR); the load of a
+    The load moves to the outer side, T = h ΣF_y / B, and to the rear, N x_p = N x_c - h (ΣF_x - ΣR). The load of a
     side is never negative.
 
     Args:
-        stance: of the robot; friction: of the ground; adhesion: the surface's ratio [-].
+        stance: of the robot.
+        friction: of the ground.
+        adhesion: the surface's ratio [-].
         load: normal to the ground, of both sides [N].
-        sliding: u_x of each side [m/s]; lateral_speed: v_y [m/s]; yaw_rate: ω [rad/s].
+        sliding: u_x of each side [m/s].
+        lateral_speed: v_y [m/s].
+        yaw_rate: ω [rad/s].
         resistance: rolling resistance over the normal load, with its sign, of each side [-].
-        loads: T [N] and x_p [m] if a larger search has them among its unknowns; None: found here.
+        loads: T [N] and x_p [m] if a larger search has them among its unknowns. None: found here.
     """
     given = _Given(stance, friction, adhesion, load, sliding, lateral_speed, yaw_rate, resistance)
     if loads is not None:
@@ -318,7 +328,7 @@ def _at_loads(loads: Array, even: Array | None, given: _Given) -> Grip:
     """Forces of the ground for a given load transfer and centre of pressure.
 
     The lateral speed of a contact is linear along it, and so is its load. Its forces and moments are therefore
-    sums of four moments of the law over a uniform load; `even` are these, if known.
+    sums of four moments of the law over a uniform load. `even` are these, if known.
     """
     (moved, centre), stance, adhesion, load = loads, given.stance, given.adhesion, given.load
     normal = jnp.maximum(load / 2 - 2 * SIDES * moved, 0.0)

@@ -37,12 +37,12 @@ class Path(eqx.Module):
 
     @property
     def length(self) -> Scalar:
-        """Length of the path 2 L_b + 2 π r [m]; 840 mm on the paper's robot."""
+        """Length of the path 2 L_b + 2 π r [m], 840 mm on the paper's robot."""
         return 2 * self.gear.wheelbase + 2 * jnp.pi * self.radius
 
     @property
     def pitch(self) -> Scalar:
-        """Pitch of the grousers S_g [m]; 35 mm on the paper's robot."""
+        """Pitch of the grousers S_g [m], 35 mm on the paper's robot."""
         return self.length / GROUSERS
 
     def weight(self, place: Float[Array, " n"]) -> Float[Array, " n"]:

@@ -221,7 +221,7 @@ def resistance(
 def dynamics(
     run: System, motion: Motion, armature: Float[Array, " 2"]
 ) -> tuple[Float[Array, "10 10"], Float[Array, " 10"]]:
-    """Mass matrix and bias of MJX; the mass matrix includes the rotors' `armature` at the driving shafts [kg·m²]."""
+    """Mass matrix and bias of MJX. The mass matrix includes the rotors' `armature` at the driving shafts [kg·m²]."""
     model = run.model.replace(dof_armature=jnp.zeros(COORDINATES).at[SHAFTS].set(armature))
     data = run.data.replace(qpos=motion.q, qvel=motion.v)
     data = mjx.com_pos(model, mjx.kinematics(model, data))
@@ -243,7 +243,7 @@ class _Forces(eqx.Module):
 
 
 def _forces(run: System, motion: Motion, stored: bool = False) -> _Forces:
-    """Forces of an instant; unless `stored`, XLA computes derivatives of contacts and signals again at each use."""
+    """Forces of an instant, unless `stored`, XLA computes derivatives of contacts and signals again at each use."""
 
     def found(x: Any) -> Any:
         return jax.lax.optimization_barrier(x) if stored else x
@@ -266,7 +266,7 @@ def advance(run: System, motion: Motion) -> tuple[Motion, balances.Travel, Float
     """One step, see `half_robot.advance`: (M + Δt K) Δv = Δt (Q - c).
 
     Returns:
-        The motion after it; all signals of the instant before it, with forces and accelerations of the step; the load
+        The motion after it. All signals of the instant before it, with forces and accelerations of the step. The load
         on each lower guide before it [N].
     """
     found = _forces(run, motion)
@@ -275,7 +275,7 @@ def advance(run: System, motion: Motion) -> tuple[Motion, balances.Travel, Float
 
 @advance.def_jvp
 def _differentiated(primals: tuple[System, Motion], tangents: tuple[Any, Any]) -> tuple[Any, Any]:
-    """See `half_robot.advance`; K enters only by its product with Δv."""
+    """See `half_robot.advance`. K enters only by its product with Δv."""
     found = _forces(*primals)
     solve = _solver(primals[0], found)
     gained = solve(found.push)
@@ -369,7 +369,7 @@ def _travel(run: System, motion: Motion, found: _Forces, gained: Float[Array, " 
 
 
 def stand(run: System) -> Motion:
-    """At rest on the ground, with the heading of the conditions; see `half_robot.stand`, on the slope along it.
+    """At rest on the ground, with the heading of the conditions. See `half_robot.stand`, on the slope along it.
 
     Load transfer to the lower side is not included yet.
     """
@@ -404,12 +404,12 @@ def loads(run: System, at: Touch, pulled: Pull) -> Reactions:
 
 
 def away(q: Array, reactions: Reactions) -> tuple[Array, Reactions | None]:
-    """See `half_robot.away`: distance from the start; a history has no loads of both sides."""
+    """See `half_robot.away`: distance from the start. A history has no loads of both sides."""
     return jnp.hypot(q[..., X], q[..., Y]), None
 
 
 def averaged(average: Average, travelled: Array, passed: balances.Travel, guided: Array) -> Steady:
-    """See `half_robot.averaged`; quantities of the whole robot are averaged over the periods of both sides."""
+    """See `half_robot.averaged`. Quantities of the whole robot are averaged over the periods of both sides."""
     both = jax.tree.map(lambda x: jnp.broadcast_to(x.reshape(*x.shape[:1], -1), (*x.shape[:1], 2)), passed)
     found, load, periods, changes = jax.vmap(average, in_axes=1)(jnp.abs(travelled), (both, guided))
     travel = jax.tree.map(lambda x, like: x if like.ndim > 1 else jnp.mean(x), found, passed)

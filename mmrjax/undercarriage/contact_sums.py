@@ -1,7 +1,7 @@
 """Sums over all contacts of one side, and their exact derivatives, one column for each input.
 
 A step of the track model needs a dozen sums over its contacts. Their derivatives are computed once per input and
-not once per parameter of a derivative; each tangent then costs only a small product.
+not once per parameter of a derivative. Each tangent then costs only a small product.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ ROWS = tuple(f.name for f in dataclasses.fields(Sums))
 
 
 def contact_inputs(path: Path, chassis: Chassis, adhesion: Any) -> dict[str, Any]:
-    """Inputs of the contacts other than the motion, by name; tangents have the same form (None: constant)."""
+    """Inputs of the contacts other than the motion, by name. Tangents have the same form (None: constant)."""
     gear, friction = path.gear, chassis.ground.friction
     return {
         "pulley": path.radius,
@@ -110,7 +110,7 @@ def _with(path: Path, chassis: Chassis, values: Mapping[str, Any]) -> tuple[Path
 def contact_shares(
     path: Path, chassis: Chassis, at: Touch, slip: Scalar, adhesion: Scalar, gained: Float[Array, " 5"]
 ) -> Float[Array, "sums contacts"]:
-    """Contribution of each contact to the `Sums`; `slip` shifts all sliding speeds [m/s], `gained` is Δv."""
+    """Contribution of each contact to the `Sums`. `slip` shifts all sliding speeds [m/s], `gained` is Δv."""
     sliding = -at.speed_x - slip
     ground = chassis.ground
     coefficient = ground.traction(sliding, 1.0, adhesion)
@@ -145,7 +145,8 @@ class Linearized(eqx.Module):
     """The sums and their derivatives with respect to motion, slip and selected inputs.
 
     Attributes:
-        values: the sums; slopes: their derivatives, a row for each of `names`.
+        values: the sums.
+        slopes: their derivatives, a row for each of `names`.
         at: values of the inputs of the rows.
     """
 
@@ -155,7 +156,7 @@ class Linearized(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
 
     def near(self, now: Mapping[str, Any]) -> Sums:
-        """The sums for inputs `now` to first order; inputs that it leaves out keep their values."""
+        """The sums for inputs `now` to first order. Inputs that it leaves out keep their values."""
         moved = [now[name] - self.at[name] if name in now else jnp.zeros(()) for name in self.names]
         return jax.tree.map(jnp.add, self.values, _sums(jnp.stack(moved) @ self.slopes))
 
@@ -208,7 +209,7 @@ def linearize(
 
 
 def _total(*products: tuple[Any, ...]) -> Any:
-    """Sum of products; those with a factor None are left out, which XLA would not do with zeros."""
+    """Sum of products. Those with a factor None are left out, which XLA would not do with zeros."""
     terms = [math.prod(factors[1:], start=factors[0]) for factors in products if all(f is not None for f in factors)]
     return sum(terms[1:], start=terms[0]) if terms else None
 
@@ -414,7 +415,7 @@ def _by_motion(
 
 
 class ContactForces(eqx.Module):
-    """Forces of the contacts at an instant, from their sums; see `undercarriage.Pull`."""
+    """Forces of the contacts at an instant, from their sums. See `undercarriage.Pull`."""
 
     traction: Scalar
     moment: Scalar

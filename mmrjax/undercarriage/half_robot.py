@@ -1,6 +1,6 @@
 """Half a robot in motion: its state, all its forces at an instant, one step, and the start of a run.
 
-MJX computes chassis and pulleys (5 degrees of freedom, `mjcf`); grousers or wheels, guides and belt
+MJX computes chassis and pulleys (5 degrees of freedom, `mjcf`). Grousers or wheels, guides and belt
 (`undercarriage`, `belt`) and the drive (`balances`) enter as generalized forces.
 """
 
@@ -85,7 +85,7 @@ class Steady(eqx.Module):
         signals: means.
         guide_share: share of the ground's normal reaction on the lower guides [-]: an output here, a
             parameter in the other fidelities.
-        periods: number of grouser periods averaged [-]; 0: the plain window, for a belt that barely moved.
+        periods: number of grouser periods averaged [-]. 0: the plain window, for a belt that barely moved.
         change: largest relative change of current, motor speed and speed between the window's halves [-].
         travel: means of `balances.Travel`, for a robot that turns.
     """
@@ -117,7 +117,7 @@ class System(eqx.Module):
 
 
 def half_robot_system(robot: Robot, conditions: Conditions, step: Scalar) -> System:
-    """Constants of one run (scalar fields), of half a robot or of a whole one; the robot may hold tracers."""
+    """Constants of one run (scalar fields), of half a robot or of a whole one. The robot may hold tracers."""
     zero = jnp.zeros_like(conditions.voltage)
     mass = balances.begin_signals(robot, conditions, State(zero, zero, zero, zero)).mass
     half = masses_of_parts(robot, conditions, mass)
@@ -159,7 +159,7 @@ def _resolved(
 def _losses(run: System, motion: Motion, mover: balances.Mover) -> tuple[Scalar, Scalar]:
     """Derivatives of the ground's resistance with respect to the robot's speed and of the drive's losses.
 
-    [N·s/m], and with respect to the speed of the driving shaft [N·m·s]; negative ones are set to 0.
+    [N·s/m], and with respect to the speed of the driving shaft [N·m·s]. Negative ones are set to 0.
     """
 
     def forward(speed: Scalar) -> Scalar:
@@ -189,7 +189,7 @@ def armature_inertia(run: System, signals: Signals) -> Scalar:
 def current_after(robot: Robot, conditions: Conditions, step: Scalar, signals: Signals) -> Scalar:
     """Motor current after one step [A]: exponential Euler, exact for a winding at constant speed.
 
-    L dI/dt = U_left(I); I + Δt U_left / L · (e^z - 1) / z with z = Δt U_left' / L. The electrical time
+    L dI/dt = U_left(I). I + Δt U_left / L · (e^z - 1) / z with z = Δt U_left' / L. The electrical time
     constant (0.2 ms) is of the order of the step, so the winding's own decay is integrated exactly. U_left'
     comes from the balances and includes a battery or an effect that changes the slope.
     """
@@ -209,7 +209,7 @@ def resistance(run: System, motion: Motion, signals: Signals, at: Touch, pulled:
 
     Friction rises with sliding and is proportional to the normal force, which falls with the rate of the gap:
     K = Σ k g gᵀ + d (μ g + h) hᵀ. Here g and h are the changes of a contact's speed along the ground and off it with
-    v. Friction that falls with sliding, beyond V_s, is an instability of the robot and not of the step; it is left
+    v. Friction that falls with sliding, beyond V_s, is an instability of the robot and not of the step. It is left
     out. The drive's losses and the resistance of the ground rise steeply from rest and are on K's diagonal.
     """
     losses = _losses(run, motion, _Mover(run.path, at, motion.q[1]))
@@ -316,7 +316,7 @@ def advance(run: System, motion: Motion) -> tuple[Motion, Signals, Scalar]:
     solve for the change of Δv.
 
     Returns:
-        The motion after it; the signals before it, with traction, normal load and acceleration of the step; the
+        The motion after it. The signals before it, with traction, normal load and acceleration of the step. The
         load on the lower guide before it [N].
     """
     step = _step(run, motion)
@@ -391,7 +391,7 @@ def _held(
 
 
 def tipping_margin(run: System) -> Scalar:
-    """Distance of the line of gravity inside the outermost contacts on the ground [m]; negative: the robot tips."""
+    """Distance of the line of gravity inside the outermost contacts on the ground [m]. Negative: the robot tips."""
     forward, up, _ = centre_of_mass(run)
     meets = forward - jnp.tan(run.conditions.slope) * (up + axle_height(run))
     return run.path.gear.wheelbase / 2 - jnp.abs(meets)
@@ -412,7 +412,7 @@ def stand(run: System, turned: Scalar = 0.0) -> Motion:
     """At rest on the ground, with its weight on the contacts: a root in height and pitch.
 
     The search starts with every contact that could carry load touching, because from there it does not overshoot.
-    `newton.root` takes 0.14 times the time of the 30 steps of a loop of our own (256 runs, 2026-11-28); optimistix's
+    `newton.root` takes 0.14 times the time of the 30 steps of a loop of our own (256 runs, 2026-11-28). Optimistix's
     `Newton` takes 0.22 times, and `LevenbergMarquardt` twice. A robot that tips starts level, its lowest contacts
     just touching.
 

@@ -45,7 +45,9 @@ class Bodies(NamedTuple):
 
     Attributes:
         names: of the bodies.
-        mass: [kg]; inertia: about its own centre by x, y, z [kg·m²]; centre: in its own frame [m].
+        mass: [kg].
+        inertia: about its own centre by x, y, z [kg·m²].
+        centre: in its own frame [m].
         place: of its frame in that of the chassis, whose origin is the middle of the wheelbase [m].
     """
 
@@ -62,7 +64,7 @@ def robot_bodies(robot: Robot, half: Masses, conditions: Conditions) -> Bodies:
     In the plane of travel only the moments about y count, and the others are set equal. The moment of yaw is
     `turning.inertia` of all parts about their centre, without payload as in the other fidelities. The moment of roll
     decides the speed of load transfer between the sides, not its size. It is summed over the parts: a uniform body as
-    wide as the distance of the tracks, and the parts of the sides at their positions; at least that of a flat robot
+    wide as the distance of the tracks, and the parts of the sides at their positions. At least that of a flat robot
     with this yaw and pitch.
     """
     zero, base = jnp.zeros_like(half.chassis), robot.running_gear.wheelbase
@@ -99,11 +101,12 @@ def robot_bodies(robot: Robot, half: Masses, conditions: Conditions) -> Bodies:
 def mjcf_text(robot: Robot, conditions: Conditions, mass: float, step: float = 1e-4) -> str:
     """MJCF of half a robot under some conditions (scalar fields), or of a whole one if they free it to turn.
 
-    The shapes are for display and show both sides; masses and inertias are stated, for half a robot those of one
+    The shapes are for display and show both sides. Masses and inertias are stated, for half a robot those of one
     side.
 
     Args:
-        mass: total [kg]; step: [s].
+        mass: total [kg].
+        step: [s].
     """
     gear = robot.running_gear
     parts = robot_bodies(robot, masses_of_parts(robot, conditions, jnp.asarray(mass)), conditions)
@@ -184,8 +187,11 @@ def step_impulse(
     Args:
         half, wheelbase: masses and distance of the pulleys.
         conditions: for the slope.
-        pitch: of the chassis [rad]; rate: its rate [rad/s]; rotating: the armature's inertia at its joint [kg·m²].
-        gained: Δv; step: Δt [s].
+        pitch: of the chassis [rad].
+        rate: its rate [rad/s].
+        rotating: the armature's inertia at its joint [kg·m²].
+        gained: Δv.
+        step: Δt [s].
     """
     cos, sin = cosine(pitch), sine(pitch)
     ahead = half.chassis * (half.forward * cos + half.up * sin)  # times the mass: the pulleys' parts cancel

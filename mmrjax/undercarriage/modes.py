@@ -34,7 +34,7 @@ class Mode(NamedTuple):
         frequency: damped natural frequency, mean over the positions that have the mode [Hz].
         low, high: its range over them [Hz].
         natural: undamped, |λ| / 2π, mean [Hz].
-        damping: ratio ζ = -Re λ / |λ|, mean [-]; negative: it is unstable.
+        damping: ratio ζ = -Re λ / |λ|, mean [-]. Negative: it is unstable.
         share: of the kinetic energy in the coordinate of its name, mean [-].
         positions: share of the positions that have the mode [-].
     """
@@ -73,7 +73,7 @@ def modes(robot: Robot, conditions: Conditions, positions: int = POSITIONS) -> l
 
     The robot rolls at the speed of the steady fidelity, with height and pitch in equilibrium. The derivative J of a
     step h with respect to the state gives dy/dt = (J - 1) y / h and its eigenvalues λ. J is also used for the largest
-    stable step; it includes friction, belt, motor and winding.
+    stable step. It includes friction, belt, motor and winding.
 
     Args:
         robot, conditions: a batch of runs.

@@ -1,4 +1,4 @@
-"""Pictures and video of the track model: the robot on its slope with running track and drawn forces; headless."""
+"""Pictures and video of the track model: the robot on its slope with running track and drawn forces, headless."""
 
 from __future__ import annotations
 
@@ -34,12 +34,17 @@ class Scene(NamedTuple):
     """Data for the pictures of one run, as plain arrays.
 
     Attributes:
-        slope: [rad]; name: of the configuration; wheeled: True on wheels; axle: half the wheelbase [m];
-            wheel: its radius [m].
-        path: of the belt; levers: tips in the chassis frame, empty on wheels.
+        slope: [rad].
+        name: of the configuration.
+        wheeled: True on wheels.
+        axle: half the wheelbase [m].
+        wheel: its radius [m].
+        path: of the belt.
+        levers: tips in the chassis frame, empty on wheels.
         time, q, total_current, speed, theoretical: over the run.
         place, normal, guided, support: reactions over the run, of one side.
-        traction, resistance: of one side [N]; weight: of half the robot [N].
+        traction, resistance: of one side [N].
+        weight: of half the robot [N].
     """
 
     slope: float
@@ -271,10 +276,10 @@ def _pixels(sheet: Any) -> np.ndarray:
 def frame_times(
     file: File, begin: float, end: float | None, slow: float, length: float, rate: int = RATE
 ) -> Float[np.ndarray, " frames"]:
-    """Times [s] that `render` draws for a run of `length` [s]; called before a run, it finds errors early.
+    """Times [s] that `render` draws for a run of `length` [s]. Called before a run, it finds errors early.
 
     Raises:
-        ValueError: the suffix is not one of `FORMATS`; no time of the run is between `begin` and `end`; the film
+        ValueError: the suffix is not one of `FORMATS`, no time of the run is between `begin` and `end`, the film
             has more than `FRAMES` pictures.
     """
     if file.suffix not in FORMATS:
@@ -302,8 +307,8 @@ def render(
     Args:
         view: from `scene`, of this module or of `render_above`.
         file: its suffix decides the format.
-        begin, end: part of the run to film [s]; None: to its end.
-        slow: slow-motion factor; a pitch lasts 36 ms at 1 m/s.
+        begin, end: part of the run to film [s]. None: to its end.
+        slow: slow-motion factor. A pitch lasts 36 ms at 1 m/s.
         rate: frames per second.
 
     Raises:

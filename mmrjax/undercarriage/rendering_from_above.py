@@ -28,13 +28,17 @@ _SIDES = ("#0072b2", "#d55e00")
 
 
 class Above(NamedTuple):
-    """Data for the pictures of one run, as plain arrays; a side axis of 2 is left, right.
+    """Data for the pictures of one run, as plain arrays. A side axis of 2 is left, right.
 
     Attributes:
-        name: of the configuration; slope: [rad]; length: wheelbase, width: between the contact lines [m].
+        name: of the configuration.
+        slope: [rad].
+        length: wheelbase, width: between the contact lines [m].
         time, q, v: over the run, see `both_sides`.
-        current: of each side's motor [A]; belt: speed of each side's movers [m/s].
-        along: of each contact ahead of the middle [m]; load: on it [N].
+        current: of each side's motor [A].
+        belt: speed of each side's movers [m/s].
+        along: of each contact ahead of the middle [m].
+        load: on it [N].
     """
 
     name: str

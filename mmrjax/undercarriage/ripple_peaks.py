@@ -1,6 +1,6 @@
 """Ripple of the running gear, its peaks over speed, and natural frequencies that a harmonic meets there.
 
-Computed from finished runs, in NumPy, member by member; not differentiable.
+Computed from finished runs, in NumPy, member by member, not differentiable.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Ripple(NamedTuple):
     Attributes:
         mean: [the signal's unit].
         amplitude: half of peak to peak over the mean [-].
-        period: of repetition [s]; NaN: no repetition within half the record.
+        period: of repetition [s]. NaN: no repetition within half the record.
     """
 
     mean: float
@@ -69,7 +69,7 @@ class Fluctuation(NamedTuple):
     Attributes:
         mean: [the signal's unit].
         deviation: standard deviation over the mean [-].
-        frequency: of the strongest line of its spectrum [Hz]; NaN: it is constant.
+        frequency: of the strongest line of its spectrum [Hz]. NaN: it is constant.
     """
 
     mean: float
@@ -99,14 +99,14 @@ def _vertex(values: Series, k: int) -> float:
 
 
 def period_pitch(pitch: float, speed_wheel: float, radius: float) -> float:
-    """T = S / (ω_k r_k) [s], eq. (34), with S_g for tracks, S_t for the tooth mesh; `radius` of the pulley."""
+    """T = S / (ω_k r_k) [s], eq. (34), with S_g for tracks, S_t for the tooth mesh. `radius` of the pulley."""
     return pitch / (speed_wheel * radius)
 
 
 def touchdowns(
     time: Series, grouser: Float[np.ndarray, "samples 24"], place: Float[np.ndarray, "samples 24"]
 ) -> Series:
-    """Times at which a grouser touches down, in order [s]; `place` distinguishes the front arc from the rear one.
+    """Times at which a grouser touches down, in order [s]. `place` distinguishes the front arc from the rear one.
 
     A grouser that lifts and returns in the middle of the run does not count: its place has to be in the second half
     of the path, or just at the start of it.
@@ -147,7 +147,9 @@ class Passing(NamedTuple):
     """Parts of the running gear that pass the chassis at a pitch.
 
     Attributes:
-        name: grousers or teeth; pitch: of the belt [m]; travel: of the robot from one to the next, without slip [m].
+        name: grousers or teeth.
+        pitch: of the belt [m].
+        travel: of the robot from one to the next, without slip [m].
     """
 
     name: str
@@ -156,7 +158,7 @@ class Passing(NamedTuple):
 
 
 def passing_parts(robot: Robot, configuration: int) -> Passing:
-    """Excitation of a configuration: the grousers S_g on tracks; on wheels the tooth mesh S_t."""
+    """Excitation of a configuration: the grousers S_g on tracks. On wheels the tooth mesh S_t."""
     chassis, radius = robot.configurations.members[configuration], float(robot.radius_pulley)
     if float(chassis.on_tracks) > 0.5:
         pitch = float(Path(robot.radius_pulley, robot.running_gear).pitch)
@@ -167,12 +169,13 @@ def passing_parts(robot: Robot, configuration: int) -> Passing:
 
 @dataclasses.dataclass(frozen=True)
 class Vibrations:
-    """Ripple in each run of a batch; NaN if it is not `read`.
+    """Ripple in each run of a batch, NaN if it is not `read`.
 
     Attributes:
         status: codes into `STATUSES`.
         read: True if the ripple is valid: the robot travels and at least `PERIODS` pitches passed.
-        speed: mean [m/s]; passing: frequency of grousers or teeth [Hz].
+        speed: mean [m/s].
+        passing: frequency of grousers or teeth [Hz].
         mean, deviation, frequency: of each of `SIGNALS`, see `Fluctuation`.
     """
 
@@ -216,13 +219,14 @@ class Peak(NamedTuple):
     """A peak of ripple over speed at one payload.
 
     Attributes:
-        signal: of `SIGNALS`; payload: [kg].
+        signal: of `SIGNALS`.
+        payload: [kg].
         speed, low, high: at the maximum, and limits of the range above 70 % of its rise [m/s].
         ripple: the highest, standard deviation over mean [-].
         rise: of the ripple over the higher of its two valleys [-].
-        order: strongest multiple of the passing frequency; 0: not a whole one.
+        order: strongest multiple of the passing frequency. 0: not a whole one.
         frequency: of the strongest line [Hz].
-        mode: natural vibration at that frequency, which confirms the crossing; empty: no such mode.
+        mode: natural vibration at that frequency, which confirms the crossing. Empty: no such mode.
     """
 
     signal: str
@@ -280,7 +284,7 @@ def confirm_peaks(found: Sequence[Peak], modes: Mapping[float, Sequence[Mode]]) 
     """The peaks, without their mode if they do not follow it over the payloads.
 
     If a mode's frequency changes with payload by more than `MOVES`, the lines of the peaks of one order have to
-    change in the same direction; a peak that moves against it only crosses its band.
+    change in the same direction. A peak that moves against it only crosses its band.
 
     Args:
         modes: by payload [kg].
@@ -301,8 +305,9 @@ class Crossing(NamedTuple):
     """A crossing of a harmonic of the passing frequency with a natural frequency.
 
     Attributes:
-        mode, order, payload: of the crossing [kg]; speed: at the mode's mean frequency [m/s].
-        signals: signals with a ripple peak there; empty: the crossing does not show.
+        mode, order, payload: of the crossing [kg].
+        speed: at the mode's mean frequency [m/s].
+        signals: signals with a ripple peak there. Empty: the crossing does not show.
     """
 
     mode: str
@@ -335,10 +340,13 @@ class Resonance(NamedTuple):
     """Peaks of one mode, order and signal over the payloads.
 
     Attributes:
-        mode: natural vibration that confirms them; empty: no such mode.
-        speeds: least and greatest speed of the peaks [m/s]; avoid: of their widths.
+        mode: natural vibration that confirms them. Empty: no such mode.
+        speeds: least and greatest speed of the peaks [m/s].
+        avoid: of their widths.
         frequencies: least and greatest of their lines [Hz].
-        payloads: of its peaks [kg]; ripple: the largest [-]; rise: the largest over its surroundings [-].
+        payloads: of its peaks [kg].
+        ripple: the largest [-].
+        rise: the largest over its surroundings [-].
     """
 
     mode: str

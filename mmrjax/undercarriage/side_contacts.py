@@ -5,7 +5,7 @@ wheelbase (axle line) over the ground, pitch θ [rad] nose down, angles φ_1, φ
 driven pulley, relative to the chassis. Velocities v are their rates. A wheel of 4W2T sits on its pulley's shaft.
 
 Contact pairs of one side: 24 grousers with the ground, 168 teeth with each of two guides (720 in all for
-6T2A); 2 wheels with the ground for 4W2T.
+6T2A), 2 wheels with the ground for 4W2T.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from mmrjax.model.masses import lever_angles
 from mmrjax.model.params import Scalar
 from mmrjax.model.signals import GRAVITY, Signals
 from mmrjax.numerics.trigonometry import cosine, sine
-from mmrjax.undercarriage.belt import Path, Runs, Tips, belt_runs, tension_along, tips_on_path
+from mmrjax.undercarriage.belt import Path, Runs, belt_runs, tension_along, tips_on_path
 from mmrjax.undercarriage.running_gear import GROUSERS, TEETH_BELT, WHEELS, RunningGear
 
 CONTACTS = GROUSERS + WHEELS  # with the ground, of one side; those of the other configuration carry no load
@@ -35,7 +35,7 @@ _END = np.where(WHEEL, np.where(np.arange(CONTACTS) == GROUSERS, 1.0, -1.0), 0.0
 
 
 class Touch(eqx.Module):
-    """Position, motion and load of the contacts at an instant; grousers first.
+    """Position, motion and load of the contacts at an instant, grousers first.
     Attributes:
         lever_x, lever_z: contact point from the middle of the wheelbase [m].
         rate_x, rate_z: its velocity per belt speed [-].
@@ -43,7 +43,8 @@ class Touch(eqx.Module):
         speed_x: its velocity over the ground, uphill [m/s].
         gap, gap_rate: height over the ground [m] and its rate [m/s].
         compliance: of the belt under it at its tension [m/N].
-        force: normal force R_z [N]; damped: its decrease with the gap's rate [N·s/m].
+        force: normal force R_z [N].
+        damped: its decrease with the gap's rate [N·s/m].
         guided: share of the force that passes to the lower guide [-].
         belt: tensions of the runs.
     """
@@ -76,23 +77,6 @@ def join_contacts(
     return jnp.where(WHEEL, wheels, jnp.pad(grousers, (0, WHEELS)))
 
 
-def _geometry(
-    path: Path, where: Tips, weight: Array, pitch: Scalar, radius_wheel: Scalar
-) -> tuple[Array, Array, Array, Array, Array]:
-    cos, sin = cosine(pitch), sine(pitch)
-    forward, up = join_contacts(where.forward, path.gear.wheelbase / 2 * _END), join_contacts(where.up)
-    ahead, rise = join_contacts(where.rate_forward), join_contacts(where.rate_up)
-    # The lowest point of a wheel is below its axle at any pitch of the robot.
-    below = jnp.where(WHEEL, radius_wheel, 0.0)
-    return (
-        forward * cos + up * sin,
-        up * cos - forward * sin - below,
-        ahead * cos + rise * sin - below / path.radius,
-        rise * cos - ahead * sin,
-        join_contacts(weight, jnp.where(_END < 0, 1.0, 0.0)),
-    )
-
-
 def bearing_contacts(chassis: Chassis) -> Float[Array, " contacts"]:
     """1 for contacts that carry load in this configuration, else 0 [-]."""
     return jnp.where(WHEEL, 1 - chassis.on_tracks, chassis.on_tracks)
@@ -118,7 +102,19 @@ def contact_state(path: Path, chassis: Chassis, q: Sequence[Scalar] | Array, v: 
     belt = belt_runs(path, (q[3], q[4]), (v[3], v[4]))
     place, weight = path.place(q[3], q[4])
     where = tips_on_path(path, place)
-    x, z, rate_x, rate_z, weight = _geometry(path, where, weight, q[2], chassis.radius)
+    pitch = q[2]
+    cos, sin = cosine(pitch), sine(pitch)
+    forward, up = join_contacts(where.forward, path.gear.wheelbase / 2 * _END), join_contacts(where.up)
+    ahead, rise = join_contacts(where.rate_forward), join_contacts(where.rate_up)
+    # The lowest point of a wheel is below its axle at any pitch of the robot.
+    below = jnp.where(WHEEL, chassis.radius, 0.0)
+    x, z, rate_x, rate_z, weight = (
+        forward * cos + up * sin,
+        up * cos - forward * sin - below,
+        ahead * cos + rise * sin - below / path.radius,
+        rise * cos - ahead * sin,
+        join_contacts(weight, jnp.where(_END < 0, 1.0, 0.0)),
+    )
     speed = path.radius * ((1 - weight) * v[3] + weight * v[4])
     gap = q[1] + z
     gap_rate = v[1] - v[2] * x + rate_z * speed
@@ -154,8 +150,8 @@ class Pull(eqx.Module):
         guide: friction of the teeth on the lower guide F'_t, against forward running [N], eq. (26).
         guided: load on the lower guide [N].
         load: of the belt, the ground and the guides on the driving shaft [N·m].
-        generalized: forces on (x, z, θ, φ_2) [N, N, N·m, N·m]; the shaft's own torque is the gearbox's.
-        aside: lateral force of each contact, to the left on a robot free to turn [N]; None: straight travel.
+        generalized: forces on (x, z, θ, φ_2) [N, N, N·m, N·m]. The shaft's own torque is the gearbox's.
+        aside: lateral force of each contact, to the left on a robot free to turn [N]. None: straight travel.
     """
 
     force: Float[Array, " contacts"]
@@ -172,7 +168,7 @@ class Pull(eqx.Module):
 
 
 def sliding_speeds(signals: Signals, at: Touch) -> Float[Array, " contacts"]:
-    """Backward sliding speed of each contact over the ground [m/s]; `speed_slip_terms` shifts it."""
+    """Backward sliding speed of each contact over the ground [m/s], `speed_slip_terms` shifts it."""
     return -at.speed_x - signals.speed_slip_terms
 
 
@@ -192,10 +188,10 @@ def contact_forces(
     Args:
         path: the belt's path.
         chassis: friction and guide coefficients.
-        signals: those up to `balances.slip`; `speed_slip_terms` shifts the sliding of every contact.
+        signals: those up to `balances.slip`. `speed_slip_terms` shifts the sliding of every contact.
         at: the contacts.
         height: of the axle line over the ground [m].
-        force: traction of each contact if contacts slide laterally too [N]; None: by Fig. 7.
+        force: traction of each contact if contacts slide laterally too [N]. None: by Fig. 7.
     """
     if force is None:
         force = jnp.asarray(chassis.ground.traction(sliding_speeds(signals, at), at.force, signals.adhesion))
@@ -236,7 +232,7 @@ class Reactions(eqx.Module):
     def teeth(self, path: Path) -> tuple[Float[Array, "... 168"], Float[Array, "... 168"]]:
         """Load R_g of the lower and of the upper guide on each tooth [N].
 
-        A grouser's load on the lower guide spreads evenly over the teeth of its pitch; the upper guide
+        A grouser's load on the lower guide spreads evenly over the teeth of its pitch. The upper guide
         carries the weight of the belt on it.
         """
         lower = jnp.repeat(self.guided / TEETH_GROUSER, TEETH_GROUSER, axis=-1)

@@ -70,7 +70,7 @@ def largest_step(robot: Robot, conditions: Conditions) -> Float[np.ndarray, " ru
     """Largest stable step [s] of each run of a batch of `conditions`.
 
     Three quarters of the step that, linearised about the robot standing and rolling, would make a small disturbance
-    grow; the quarter is for the ripple of the contacts. A small V_s is no limit: friction is implicit in a step, and
+    grow. The quarter is for the ripple of the contacts. A small V_s is no limit: friction is implicit in a step, and
     its remaining chatter stays within V_s. For a robot free to turn, the step of straight travel is reduced by the
     ratio of the frequencies of rolling and bouncing on its contacts.
     """
@@ -105,7 +105,7 @@ def check_track_step(robot: Robot, conditions: Conditions, step: float, sample: 
         step, sample: intervals of integration and of the record [s].
 
     Raises:
-        ValueError: a lever reaches below the ground, or the step is too large for the stiffness; the message
+        ValueError: a lever reaches below the ground, or the step is too large for the stiffness. The message
             then suggests a smaller step that divides `sample`.
     """
     on_tracks = np.array([float(chassis.on_tracks) for chassis in robot.configurations.members])

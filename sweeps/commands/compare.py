@@ -30,7 +30,7 @@ HISTORIES, OVER = "drive", {"time_s": "time [s]"}
 
 
 def execute(config: configuration.Compare, beside: configuration.ComparedRuns) -> int:
-    """Simulate the runs of a table, compare them with its readings, write a run folder; returns the exit code."""
+    """Simulate the runs of a table, compare them with its readings, write a run folder. Returns the exit code."""
     file = load_robot(config)
     stated = runs = read_runs(
         beside.data, file.robot, columns=config.columns, measured=True, series=True, of_turns=True
@@ -43,8 +43,8 @@ def execute(config: configuration.Compare, beside: configuration.ComparedRuns) -
     robot = instruments.with_inferred_instruments(file.robot, runs)
     if beside.own_mass:
         runs = dataclasses.replace(runs, columns={k: v for k, v in runs.columns.items() if k != "total_mass_kg"})
-    said = sentences(check_ranges(runs, robot))
-    drawn = None if config.posterior is None else beside_robot(file)
+    remarks = sentences(check_ranges(runs, robot))
+    posterior = None if config.posterior is None else beside_robot(file)
     with open_folder("compare", config, robot, beside, runs) as folder:
         table = run.evaluate_runs(robot, runs, config, folder)
         comparison, summary = compare_readings(stated, table, robot)
@@ -53,10 +53,10 @@ def execute(config: configuration.Compare, beside: configuration.ComparedRuns) -
             comparison = add_second_robot(
                 comparison, stated.channels, run.evaluate_runs(other, runs, config, folder=None)
             )
-        notes = (*missing_readings_notes(comparison, stated.channels), *said)
+        notes = (*missing_readings_notes(comparison, stated.channels), *remarks)
         of_draws: list[str] = []
-        if drawn is not None and config.posterior is not None:
-            spread = uncertainty.simulate_draws(robot, drawn, runs, config, config.posterior, folder)
+        if posterior is not None and config.posterior is not None:
+            spread = uncertainty.simulate_draws(robot, posterior, runs, config, config.posterior, folder)
             of_draws = uncertainty.interval_ranges(table, spread)
             table |= spread.columns
             ends = (uncertainty.SD, uncertainty.LOWER, uncertainty.UPPER)
@@ -64,11 +64,11 @@ def execute(config: configuration.Compare, beside: configuration.ComparedRuns) -
                 f"simulated_{key}": table[key] for c in robot.channels for e in ends if (key := c.column + e)
             }
         folder.write_table("comparison.csv", comparison)
-        found = Comparison(
+        result = Comparison(
             comparison, summary, stated.channels, Path(runs.source).name, config.model, capabilities.shown_name(file),
             fit_of(file, runs), notes=(*notes, *of_draws), against=_name_of(config, file, second),
         )  # fmt: skip
-        return _written(folder, config, dataclasses.replace(file, robot=robot), runs, table, found, notes)
+        return _written(folder, config, dataclasses.replace(file, robot=robot), runs, table, result, notes)
 
 
 def _over_time(
@@ -99,11 +99,11 @@ def _over_time(
             *missing_readings_notes(comparison, runs.channels),
             *sentences((*ready.checked, *ready.begins, *ready.weighed)),
         )
-        found = Comparison(
+        result = Comparison(
             comparison, summary, runs.channels, Path(runs.source).name, HISTORIES, capabilities.shown_name(file),
             fit_of(file, runs), OVER, notes, _name_of(config, file, second),
         )  # fmt: skip
-        return _written(folder, config, dataclasses.replace(file, robot=ready.robot), runs, table, found, notes)
+        return _written(folder, config, dataclasses.replace(file, robot=ready.robot), runs, table, result, notes)
 
 
 def _written(
@@ -115,12 +115,12 @@ def _written(
     found: Comparison,
     notes: Names,
 ) -> int:
-    """Print a comparison and write its folder, with these notes in `result.json`; returns the exit code."""
-    shown = print_report(comparison_report.comparison_document(found), file)
+    """Print a comparison and write its folder, with these notes in `result.json`. Returns the exit code."""
+    document = print_report(comparison_report.comparison_document(found), file)
     answer = comparison_report.comparison_answer(found)
     further = {"statement": answer, "errors": found.summary, "notes": [*file.remarks, *notes]}
     result = run.SimulationResult("compare", found.model, file.robot, runs, table, further)
-    return run.write_run_folder(folder, config, result, shown)
+    return run.write_run_folder(folder, config, result, document)
 
 
 def _second_robot(config: configuration.Compare, file: RobotFile) -> RobotFile | None:
@@ -138,7 +138,7 @@ def _second_robot(config: configuration.Compare, file: RobotFile) -> RobotFile |
 
 
 def _name_of(config: configuration.Compare, file: RobotFile, second: RobotFile | None) -> str:
-    """Name of the second robot, with its folder if both files have the same name; "" for none."""
+    """Name of the second robot, with its folder if both files have the same name, "" for none."""
     if second is None:
         return ""
     name = capabilities.shown_name(second)

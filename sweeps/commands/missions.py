@@ -1,4 +1,4 @@
-"""The command `simulate` over a profile: every run follows one mission; its numbers, segments, course as tables."""
+"""The command `simulate` over a profile: every run follows one mission. Its numbers, segments, course as tables."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _LASTING = MARKS.index("battery_empty")  # events from here on are kept in histo
 
 
 def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> int:
-    """Simulate runs of a file, or one of options, over a profile; returns the exit code.
+    """Simulate runs of a file, or one of options, over a profile. Returns the exit code.
 
     Raises:
         BadConfiguration: a condition that both the options and the profile state, a battery that is empty or below
@@ -66,7 +66,16 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
     source = profiles.read_profile(config.profile)
     for note in source.notes:
         print_message(note)
-    _check_acting(robot, source)
+    ground, shaft = (
+        [f"{source.source}, {column}" for column in columns if column in source.stated]
+        for columns in (("slope_deg", "payload_kg", "surface"), ON_SHAFT)
+    )
+    imposed.check_acting(robot, ground, shaft)
+    if "speed" in source.modes and not robot.shows_travel:
+        raise BadConfiguration(
+            f"{source.source}, speed_mm_s: the robot's load is a shaft, so no channel shows a distance; state "
+            "motor_speed_rpm or duty"
+        )
     source.check_source(config.battery)
     for column in source.stated:
         if column in beside.stated:
@@ -83,28 +92,14 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
     _check_turning(robot, runs, source)
     _check_cutoff(robot, runs, source, config)
     with open_folder("simulate", config, robot, beside, runs) as folder:
-        found = run_missions(robot, runs, source, config)
-        folder.write_table("segments.csv", capabilities.without_idle(robot, found.segments))
-        folder.write_table("history.csv", capabilities.without_idle(robot, found.course))
-        if not found.whole:
+        ended = run_missions(robot, runs, source, config)
+        folder.write_table("segments.csv", capabilities.without_idle(robot, ended.segments))
+        folder.write_table("history.csv", capabilities.without_idle(robot, ended.course))
+        if not ended.whole:
             print_message("history.csv ends before the mission does, which has taken more steps than are kept")
-        result = run.SimulationResult("simulate", config.model, robot, runs, found.table, found.to_json())
+        result = run.SimulationResult("simulate", config.model, robot, runs, ended.table, ended.to_json())
         return run.write_run_folder(
-            folder, config, result, print_report(mission_report.missions_document(file, found), file)
-        )
-
-
-def _check_acting(robot: Robot, source: ProfileTable) -> None:
-    """Refuse a profile that states what does not act on the robot's load."""
-    ground, shaft = (
-        [f"{source.source}, {column}" for column in columns if column in source.stated]
-        for columns in (("slope_deg", "payload_kg", "surface"), ON_SHAFT)
-    )
-    imposed.check_acting(robot, ground, shaft)
-    if "speed" in source.modes and not robot.shows_travel:
-        raise BadConfiguration(
-            f"{source.source}, speed_mm_s: the robot's load is a shaft, so no channel shows a distance; state "
-            "motor_speed_rpm or duty"
+            folder, config, result, print_report(mission_report.missions_document(file, ended), file)
         )
 
 
@@ -124,7 +119,7 @@ def _check_turning(robot: Robot, runs: records.Runs, source: ProfileTable) -> No
 
 
 def _commanded(robot: Robot, runs: records.Runs, source: ProfileTable, config: configuration.Simulate) -> Conditions:
-    """Conditions of the runs; of robots that turn with the lateral adhesion of a stated surface."""
+    """Conditions of the runs. Of robots that turn with the lateral adhesion of a stated surface."""
     conditions = run.conditions_of_runs(robot, runs, config)
     if not source.turns or not runs.has(profiles.SURFACE) or source.surface is not None:
         return conditions
@@ -168,21 +163,24 @@ def run_missions(robot: Robot, runs: records.Runs, source: ProfileTable, config:
     courses: list[Columns] = []
     done, whole = 0, True
     with progress_bar(len(runs), quiet=False) as advance:
-        for found in mission_batch.simulate_in_parts(robot, conditions, profile, source.start):
-            count = len(found.steps)
-            own = slice(done, done + count)
-            at = jax.tree.map(lambda x, own=own: x[own], conditions)
-            numbers = jax.device_get(mission_batch.mission_numbers(robot, at, found))
+        for batch in mission_batch.simulate_in_parts(robot, conditions, profile, source.start):
+            count = len(batch.steps)
+            rows_done = slice(done, done + count)
+            conditions_of_batch = jax.tree.map(lambda x, own=rows_done: x[own], conditions)
+            numbers = jax.device_get(mission_batch.mission_numbers(robot, conditions_of_batch, batch))
             tables.append(
                 {
                     **mission_batch.numbers_by_column(numbers),
-                    **outputs.status_words(found.result.status, found.result.flags),
+                    **outputs.status_words(batch.result.status, batch.result.flags),
                 }
             )
-            segments.append(_segments(robot, at, source, found, names[own]))
-            courses += [_course(robot, at, source, found, k, str(names[done + k]), rows) for k in range(count)]
-            assert found.course is not None  # it was asked for
-            whole &= bool((found.steps - found.rejected <= found.course.time.shape[-1]).all())
+            segments.append(_segments(robot, conditions_of_batch, source, batch, names[rows_done]))
+            courses += [
+                _course(robot, conditions_of_batch, source, batch, k, str(names[done + k]), rows)
+                for k in range(count)
+            ]
+            assert batch.course is not None  # it was asked for
+            whole &= bool((batch.steps - batch.rejected <= batch.course.time.shape[-1]).all())
             done += count
             advance(count)
     about = _conditions(robot, runs, source, config)
@@ -247,7 +245,7 @@ def _segments(
 
 
 def _segment_of(found: Mission, k: int) -> np.ndarray:
-    """Segment of each kept step of a run; those after the last are of one beyond the end."""
+    """Segment of each kept step of a run. Those after the last are of one beyond the end."""
     assert found.course is not None  # it was asked for
     segment = np.asarray(found.course.segment[k])
     return np.where(segment < 0, np.iinfo(segment.dtype).max, segment)
@@ -257,8 +255,10 @@ def rows_to_keep(segment: np.ndarray, current: np.ndarray, most: int, marked: np
     """Rows of a course to keep, in order: the peak of current of each segment, marked rows, evenly spread ones.
 
     Args:
-        segment: of each row, not decreasing; current: of each row; most: rows to keep at most; marked: rows to keep,
-            of many the last ones.
+        segment: of each row, not decreasing.
+        current: of each row.
+        most: rows to keep at most.
+        marked: rows to keep, of many the last ones.
     """
     if len(segment) <= most:
         return np.arange(len(segment))

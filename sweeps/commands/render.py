@@ -24,19 +24,19 @@ from sweeps.store import DONE, SOLVER_FAILED
 
 
 def execute(config: configuration.Render, picture: configuration.Picture) -> int:
-    """Draw one run from standstill, or a climb of a folder, as a picture or a film; returns the exit code.
+    """Draw one run from standstill, or a climb of a folder, as a picture or a film. Returns the exit code.
 
-    0 also where the run has not settled; 3 where it ends otherwise.
+    0 also where the run has not settled. 3 where it ends otherwise.
     """
     file, begin, end, slow = picture.file, picture.begin, picture.end, picture.slow
     if picture.climb is not None:
         if config != configuration.Render() or picture.stated:
             raise BadConfiguration("--climb: not allowed with options of a run of the track model; give one of them")
         _check_free(picture)
-        found = Seen.read(picture.climb)
+        climb = Seen.read(picture.climb)
         from sweeps.pages import climb_figures
 
-        _write(file, lambda aside: climb_figures.render_climb(found, aside, begin, end, slow))
+        _write(file, lambda aside: climb_figures.render_climb(climb, aside, begin, end, slow))
         print_output(str(file))
         return DONE
     still, given = file.suffix == ".png", picture.stated
@@ -57,9 +57,11 @@ def execute(config: configuration.Render, picture: configuration.Picture) -> int
     conditions = run.conditions_of_runs(robot, one_run(robot, given, config.battery), config)
     run.check_runs_bearable(robot, conditions, config)
     with progress_bar(1, quiet=False) as advance:
-        told = scale.share_counter(advance, 1)
-        trajectory = track_batch(robot, conditions, duration=options["duration"], step=options["step"], progress=told)
-        told(1.0)
+        counter = scale.share_counter(advance, 1)
+        trajectory = track_batch(
+            robot, conditions, duration=options["duration"], step=options["step"], progress=counter
+        )
+        counter(1.0)
     trajectory, conditions = jax.tree.map(lambda x: x[0], (trajectory, conditions))
 
     def draw(aside: Path) -> None:

@@ -14,7 +14,7 @@ from sweeps.store import finish_run_folder, open_folder
 
 
 def execute(config: configuration.Reproduce, beside: configuration.FolderPart) -> int:
-    """Write the paper's figures and tables for a robot into a run folder; returns the exit code."""
+    """Write the paper's figures and tables for a robot into a run folder. Returns the exit code."""
     file = load_robot(config)
     robot = file.robot
     imposed.check_on_ground(robot, "reproduce")

@@ -32,16 +32,20 @@ WIDTHS = {
 
 @dataclasses.dataclass(frozen=True)
 class JointNumbers:
-    """Numbers of a joint and of what it moves [SI]; None where the model has none.
+    """Numbers of a joint and of what it moves [SI], None where the model has none.
 
     Attributes:
-        file, joint: names; rolls: True if the joint turns a wheel of a body that is free to move.
-        mass: of the whole model; sides: joints that are equal, as a wheel on the other side.
-        inertia: of what turns with the joint, about its axis, without `armature`; radius: of the wheel.
+        file, joint: names.
+        rolls: True if the joint turns a wheel of a body that is free to move.
+        mass: of the whole model.
+        sides: joints that are equal, as a wheel on the other side.
+        inertia: of what turns with the joint, about its axis, without `armature`.
+        radius: of the wheel.
         ratio: turns of the motor for one of the joint.
         friction, damping, armature: at the joint.
-        weight: largest torque of gravity; angle: of the load at rest under gravity.
-        drive: numbers of the motor by dotted name; they replace what follows from the others.
+        weight: largest torque of gravity.
+        angle: of the load at rest under gravity.
+        drive: numbers of the motor by dotted name. They replace what follows from the others.
     """
 
     file: str
@@ -74,11 +78,11 @@ class JointNumbers:
 
     def numbers(self, kind: str) -> dict[str, Stated]:
         """Lines of a rig's file of a kind, by dotted name."""
-        found: dict[str, Stated] = {}
+        by_name: dict[str, Stated] = {}
 
         def put(name: str, unit: str, key: str, number: Found | None, source: str = "") -> None:
             if number is not None:
-                found[name] = Stated(number[0], unit, f"{self.file}, {number[1]}{source}", WIDTHS.get(key, ""))
+                by_name[name] = Stated(number[0], unit, f"{self.file}, {number[1]}{source}", WIDTHS.get(key, ""))
 
         moving = kind in VEHICLES
         losses = "load.track" if moving else "load"
@@ -89,7 +93,7 @@ class JointNumbers:
             put("load.torque_gravity", "N·m", "weight", self.weight)
             put("load.angle_zero", "rad", "angle", self.angle)
         if self.sides is not None:
-            found["sides"] = Stated(int(self.sides[0]), "-", f"{self.file}, {self.sides[1]}")
+            by_name["sides"] = Stated(int(self.sides[0]), "-", f"{self.file}, {self.sides[1]}")
         put(f"{losses}.loss_coulomb", "N·m", "friction", self.friction)
         put(f"{losses}.loss_viscous", "N·m·s", "damping", self.damping)
         put("gearbox.ratio", "-", "ratio", self.ratio)
@@ -99,9 +103,9 @@ class JointNumbers:
             put("motor.inertia", "kg·m^2", "armature", rotor, " / ratio²")
         elif self.armature is not None:
             inertia = (inertia[0] + self.armature[0], f"{inertia[1]}, and armature")
-            found["motor.inertia"] = Stated(0.0, "kg·m^2", "no ratio found, so the load's inertia contains it")
+            by_name["motor.inertia"] = Stated(0.0, "kg·m^2", "no ratio found, so the load's inertia contains it")
         put("load.inertia", "kg·m^2", "inertia", inertia)
-        return found | {name.replace("load.loss", f"{losses}.loss"): number for name, number in self.drive.items()}
+        return by_name | {name.replace("load.loss", f"{losses}.loss"): number for name, number in self.drive.items()}
 
 
 def free_unstated_losses(kind: str, numbers: Mapping[str, Stated]) -> dict[str, Stated]:
@@ -111,9 +115,9 @@ def free_unstated_losses(kind: str, numbers: Mapping[str, Stated]) -> dict[str, 
     motor constants and ratio, or without the voltage U for the constant loss, the template's line is kept, and 0 is
     held.
     """
-    found = dict(numbers)
+    freed = dict(numbers)
     constant, resistance, ratio, limit = (
-        found[name].value if name in found else 0.0
+        freed[name].value if name in freed else 0.0
         for name in ("motor.torque_constant", "motor.resistance", "gearbox.ratio", "motor.voltage_limit")
     )
     torque = UNSTATED * constant * ratio / resistance if resistance > 0 else 0.0  # [N·m/V]
@@ -123,18 +127,18 @@ def free_unstated_losses(kind: str, numbers: Mapping[str, Stated]) -> dict[str, 
         ("loss_viscous", "N·m·s", torque * constant * ratio),
     ):
         name, reason = f"{losses}.{key}", f"not in the model; ± is {100 * UNSTATED:g} % of the stall torque"
-        if name in found and found[name].value != 0:
+        if name in freed and freed[name].value != 0:
             continue
         if width > 0:
-            found[name] = Stated(0.0, unit, reason, f"{width:.2g}")
-        elif name in found:
-            held = f'{found[name].source}; 0 is held at 0, "0.0 ± 0.01" frees it'
-            found[name] = dataclasses.replace(found[name], source=held)
-    return found
+            freed[name] = Stated(0.0, unit, reason, f"{width:.2g}")
+        elif name in freed:
+            held = f'{freed[name].source}; 0 is held at 0, "0.0 ± 0.01" frees it'
+            freed[name] = dataclasses.replace(freed[name], source=held)
+    return freed
 
 
 def hanging_torque_and_angle(torque: float, torque_quarter: float) -> tuple[float, float] | None:
-    """Largest torque of gravity M and angle θ_0 where it hangs, of -M sin(θ - θ_0) [N·m], [rad]; None: no weight.
+    """Largest torque of gravity M and angle θ_0 where it hangs, of -M sin(θ - θ_0) [N·m], [rad]. None: no weight.
 
     Args:
         torque, torque_quarter: of gravity about the axis at θ = 0 and at a quarter turn [N·m].
@@ -148,8 +152,9 @@ def is_round(centre: np.ndarray, axis: np.ndarray, radius: float, along: np.ndar
     """True if a cylinder or sphere turns about its own axis.
 
     Args:
-        centre: from a point of the joint's axis; axis: of the joint; along: of the cylinder, None: a sphere. Axes are
-            unit vectors, shape (3,).
+        centre: from a point of the joint's axis.
+        axis: of the joint.
+        along: of the cylinder, None: a sphere. Axes are unit vectors, shape (3,).
     """
     off = np.linalg.norm(np.cross(axis, centre))
     tilted = 0.0 if along is None else np.linalg.norm(np.cross(axis, along))

@@ -51,7 +51,10 @@ def new_rig_text(kind: str | None, source: Path | None, joint: str | None, sheet
     """Text of a rig's file, with the numbers of a joint and of a data sheet in their lines.
 
     Args:
-        kind: None: what the joint moves, else `USUAL`; source: a model; joint: by name; sheet: numbers by name.
+        kind: None: what the joint moves, else `USUAL`.
+        source: a model.
+        joint: by name.
+        sheet: numbers by name.
 
     Raises:
         BadConfiguration: as `joint_of` and `rig_from_sheet.read_data_sheet`.
@@ -59,10 +62,10 @@ def new_rig_text(kind: str | None, source: Path | None, joint: str | None, sheet
     numbers: dict[str, Stated] = {}
     origins = []
     if source is not None:
-        found = joint_of(source, joint)
-        kind = found.kind(kind)
-        numbers |= found.numbers(kind)
-        origins.append(f"joint {found.joint} of {found.file}")
+        joint_model = joint_of(source, joint)
+        kind = joint_model.kind(kind)
+        numbers |= joint_model.numbers(kind)
+        origins.append(f"joint {joint_model.joint} of {joint_model.file}")
     if sheet is not None:
         from sweeps.commands import rig_from_sheet
 
@@ -85,7 +88,7 @@ def write_new_rig(
     joint: str | None = None,
     sheet: Mapping[str, str] | None = None,
 ) -> int:
-    """Write a rig's file to fill in, or one with the numbers of a model or data sheet; returns 0.
+    """Write a rig's file to fill in, or one with the numbers of a model or data sheet. Returns 0.
 
     Args:
         kind, source, joint, sheet: as of `new_rig_text`.

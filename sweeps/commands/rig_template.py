@@ -32,7 +32,10 @@ _HEADER = re.compile(r"(?:# )?\[([\w.]+)\]$")
 class Stated:
     """A number for a line of a rig's file.
 
-    Attributes: value: in `unit`; source: file and element; width: text after ±, empty: none.
+    Attributes:
+        value: in `unit`.
+        source: file and element.
+        width: text after ±, empty: none.
     """
 
     value: float
@@ -42,7 +45,7 @@ class Stated:
 
     @property
     def text(self) -> str:
-        """The number as the file has it; 0 has no share of itself as its width."""
+        """The number as the file has it. 0 has no share of itself as its width."""
         number = repr(self.value if isinstance(self.value, int) else float(f"{self.value:.12g}"))
         exact = not self.width or (self.value == 0 and self.width.endswith("%"))
         return number if exact else f'"{number} ± {self.width}"'
@@ -59,11 +62,12 @@ def fill_rig_template(kind: str, numbers: Mapping[str, Stated], heading: str) ->
     A number whose line the template lacks is added at the end of its table.
 
     Args:
-        numbers: by dotted name, `load.` for the table of the load; heading: sentence for the first line.
+        numbers: by dotted name, `load.` for the table of the load.
+        heading: sentence for the first line.
     """
     lines = rig_template(kind).splitlines()
-    at = next(k for k, line in enumerate(lines) if line.startswith("load = "))
-    load = lines[at - 1].strip("[]")
+    load_line = next(k for k, line in enumerate(lines) if line.startswith("load = "))
+    load = lines[load_line - 1].strip("[]")
     for name, number in numbers.items():
         table, _, key = re.sub(rf"^{LOAD}\.", f"{load}.", name).rpartition(".")
         _put(lines, table, key, f"{key} = {number.text}  # [{number.unit}] {_one_line(number.source)}")
@@ -80,9 +84,9 @@ def _put(lines: list[str], table: str, key: str, line: str) -> None:
         lines += ["", f"[{table}]"]
     start = lines.index(f"[{table}]") + 1 if table else 0
     end = next((k for k in range(start, len(lines)) if _HEADER.match(lines[k])), len(lines))
-    known = [k for k in range(start, end) if re.match(rf"(# )?{key} = ", lines[k])]
-    if known:
-        lines[known[0]] = line
+    key_lines = [k for k in range(start, end) if re.match(rf"(# )?{key} = ", lines[k])]
+    if key_lines:
+        lines[key_lines[0]] = line
         return
     while end > start and (not lines[end - 1] or lines[end - 1].startswith("#")):
         end -= 1  # comments below belong to the next table
@@ -91,10 +95,10 @@ def _put(lines: list[str], table: str, key: str, line: str) -> None:
 
 def example_numbers(text: str) -> Names:
     """Returns names and units of the numbers that are still those of an example, as `motor.resistance [ohm]`."""
-    found, table = [], ""
+    examples, table = [], ""
     for line in text.splitlines():
         if not line.startswith("#") and (header := _HEADER.match(line)):
             table = f"{header[1]}."
         if EXAMPLE in line and (key := re.match(r"(\w+) = .*?# (\[[^\]]*\])?", line)):
-            found.append(f"{table}{key[1]} {key[2] or ''}".rstrip())
-    return tuple(found)
+            examples.append(f"{table}{key[1]} {key[2] or ''}".rstrip())
+    return tuple(examples)

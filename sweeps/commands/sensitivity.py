@@ -55,9 +55,9 @@ AXES = {
 
 
 def execute(config: configuration.Sensitivity, beside: configuration.FolderPart) -> int:
-    """Study a robot and leave a run folder; returns the exit code.
+    """Study a robot and leave a run folder. Returns the exit code.
 
-    0 done; 3 done, but the solver failed at some operating points.
+    0 done. 3 done, but the solver failed at some operating points.
     """
     file = load_robot(config)
     if config.method not in METHODS:
@@ -77,45 +77,45 @@ def execute(config: configuration.Sensitivity, beside: configuration.FolderPart)
         robot, inputs, Points.of(runs), outputs, config.model, config.options, supply, in_words(print_message)
     )
     with open_folder("sensitivity", config, robot, beside, runs) as folder:
-        found = analyse_sensitivity(study, config.method, config.evaluations, config.seed, candidates)
-        folder.write_json("result.json", found.to_json())
-        for name, table in found.tables().items():
+        result = analyse_sensitivity(study, config.method, config.evaluations, config.seed, candidates)
+        folder.write_json("result.json", result.to_json())
+        for name, table in result.tables().items():
             folder.write_table(name, table)
-        shown = print_report(sensitivity_report.sensitivity_document(found, file), file)
-        manifest = {"seed": found.seed, "statuses": found.statuses}
+        document = print_report(sensitivity_report.sensitivity_document(result, file), file)
+        manifest = {"seed": result.seed, "statuses": result.statuses}
         return finish_run_folder(
             folder,
             config,
             manifest,
             robot=file.robot,
             note="the robot of this study",
-            solved=found.solved,
-            page=shown,
+            solved=result.solved,
+            page=document,
             runs=runs,
         )
 
 
 def _ranges(vary: Names) -> dict[str, tuple[float, float]]:
     """`name=low:high` of every varied condition."""
-    found: dict[str, tuple[float, float]] = {}
+    ranges: dict[str, tuple[float, float]] = {}
     for text in vary:
         name, _, ends = text.partition("=")
         low, _, high = ends.partition(":")
-        if name in found:
+        if name in ranges:
             raise BadConfiguration(f"--vary {name}: given twice; give it once")
         try:
-            found[name] = float(low), float(high)
+            ranges[name] = float(low), float(high)
         except ValueError:
             raise BadConfiguration(
                 f"--vary: got {text}; expected name=low:high with numbers, such as voltage=22:26"
             ) from None
-    return found
+    return ranges
 
 
 def _operating_points(
     config: configuration.Sensitivity, robot: Robot, ranges: dict[str, tuple[float, float]]
 ) -> Runs:
-    """The grid of operating points; an axis that varies has one value, the middle of its range."""
+    """The grid of operating points. An axis that varies has one value, the middle of its range."""
     layout = Layout.of(robot)
     if layout.imposed == "motor_current":
         raise BadConfiguration(
@@ -177,7 +177,7 @@ def _inputs(
 
 
 def _candidates(config: configuration.Sensitivity, robot: Robot, points: Runs, turns: bool) -> Candidates:
-    """Runs of a table, or of Table 8 in every configuration; of a rig, and of turns, its operating points."""
+    """Runs of a table, or of Table 8 in every configuration. Of a rig, and of turns, its operating points."""
     if config.candidates:
         runs = read_runs(config.candidates, robot, columns=config.columns, measured=False)
         source = runs.source

@@ -43,10 +43,11 @@ PROBED = 64
 
 
 def execute(config: Campaign | Sweep, options: StoreOptions) -> int:
-    """Simulate a design and leave a run folder, of a grid of up to `TABLE` runs with a table; returns the exit code.
+    """Simulate a design and leave a run folder, of a grid of up to `TABLE` runs with a table. Returns the exit code.
 
     Args:
-        config: the configuration; options: of a store; with any of them a small grid leaves one too.
+        config: the configuration.
+        options: of a store. With any of them a small grid leaves one too.
     """
     file = load_robot(config)
     if not isinstance(config, Sweep):
@@ -69,17 +70,17 @@ def execute(config: Campaign | Sweep, options: StoreOptions) -> int:
 def _into_table(config: Sweep, file: RobotFile, options: StoreOptions) -> int:
     robot = file.robot
     runs = grid.grid_conditions(config, robot, config.battery)
-    drawn = None if config.posterior is None else beside_robot(file)
+    posterior = None if config.posterior is None else beside_robot(file)
     with open_folder("sweep", config, robot, options) as folder:
         table = run.evaluate_runs(robot, runs, config, folder)
         notes: list[str] = []
-        if drawn is not None and config.posterior is not None:
-            found = uncertainty.simulate_draws(robot, drawn, runs, config, config.posterior, folder)
-            notes = uncertainty.interval_ranges(table, found)
-            table |= found.columns
+        if posterior is not None and config.posterior is not None:
+            draws = uncertainty.simulate_draws(robot, posterior, runs, config, config.posterior, folder)
+            notes = uncertainty.interval_ranges(table, draws)
+            table |= draws.columns
         result = run.SimulationResult("sweep", config.model, robot, runs, table)
-        shown = print_report(sweep_report.sweep_document(file, config.model, table, notes), file)
-        return run.write_run_folder(folder, config, result, shown)
+        document = print_report(sweep_report.sweep_document(file, config.model, table, notes), file)
+        return run.write_run_folder(folder, config, result, document)
 
 
 def _into_store(config: Campaign, file: RobotFile, options: StoreOptions) -> int:
@@ -128,7 +129,7 @@ def _into_store(config: Campaign, file: RobotFile, options: StoreOptions) -> int
 
 
 def dry_run(job: scale.Job, layout: Layout, path: Path) -> None:
-    """Say how many points, chunks and bytes a sweep is, and how long it would take; nothing is written."""
+    """Report the points, chunks and bytes of a sweep, and its expected time. Nothing is written."""
     compiled = scale.Compiled(job)
     blocks, slow = job.blocks, job.task.slow
     if slow and blocks.points > PROBED:
@@ -174,7 +175,8 @@ def _refuse_without_space(size: int, share: float, path: Path) -> None:
     """Refuse a sweep whose results would not fit.
 
     Args:
-        size: of the whole store [bytes]; share: of it that is still to be written.
+        size: of the whole store [bytes].
+        share: of it that is still to be written.
     """
     needed, free = math.ceil(size * share) + MARGIN, _free(path)
     if needed > free:
@@ -215,17 +217,17 @@ def simulate_chunks(store: SweepStore, job: scale.Job, options: StoreOptions, po
     """Compute and write the chunks of this process's share that are not done.
 
     Raises:
-        BadConfiguration: no room on the disk, before anything is computed, or in the middle; the scheduler's workers
+        BadConfiguration: no room on the disk, before anything is computed, or in the middle. The scheduler's workers
             are lost for good.
     """
     store.begin(options.share)
     done = store.done()
-    mine = chunks_of_shard(options.share, len(job.blocks))
-    left = [k for k in mine if k not in done]
+    own_chunks = chunks_of_shard(options.share, len(job.blocks))
+    left = [k for k in own_chunks if k not in done]
     _refuse_without_space(store.layout.size, len(left) / len(job.blocks), store.path)
     if not left:
         return
-    total = sum(job.blocks.count(k) for k in mine)
+    total = sum(job.blocks.count(k) for k in own_chunks)
     before = total - sum(job.blocks.count(k) for k in left)
     if before:
         print_message(f"{store.partial}: goes on after {before:,} of {total:,} points")
@@ -254,20 +256,20 @@ class DiskFull(InputError):
 def finish_sweep(
     store: SweepStore, config: Campaign, file: RobotFile, job: scale.Job, same: Identity, options: StoreOptions
 ) -> int:
-    """Write what a whole sweep leaves, and move it into place; say how far it is where it is not whole."""
+    """Write the files of a complete sweep and move it into place. Report the progress of an incomplete one."""
     left = False
     if not store.finished:
         with store.last() as left:
             if left:
                 # Write all files of a run folder except the store, then move the store into place
-                found = sweep_summary(store.layout, job, store.done().values())
-                store.write_json("result.json", found)
+                summary = sweep_summary(store.layout, job, store.done().values())
+                store.write_json("result.json", summary)
                 manifest = {
-                    "statuses": found["statuses"],
+                    "statuses": summary["statuses"],
                     "seed": config.samples.get("seed", 0),
                     "hashes": same["data"],
                 }
-                document = campaign_report.campaign_document(file, store.layout, found, store.partial / STORE)
+                document = campaign_report.campaign_document(file, store.layout, summary, store.partial / STORE)
                 finish_run_folder(
                     store,
                     config,
@@ -310,15 +312,15 @@ def sweep_summary(layout: Layout, job: scale.Job, done: Iterable[Done]) -> Json:
         "outputs": {
             name: {
                 "unit": units[name],
-                "least": min((low for low, _ in found), default=None),
-                "greatest": max((high for _, high in found), default=None),
+                "least": min((low for low, _ in extremes), default=None),
+                "greatest": max((high for _, high in extremes), default=None),
             }
-            for name, found in ranges.items()
+            for name, extremes in ranges.items()
         },
     }
 
 
 def points_by_status(done: Iterable[Done]) -> dict[str, int]:
-    """Number of points by status; every status is included."""
+    """Number of points by status. Every status is included."""
     total = np.sum([d.statuses for d in done], axis=0, dtype=int)
     return dict(zip(STATUSES, np.broadcast_to(total, len(STATUSES)).tolist(), strict=True))

@@ -31,11 +31,11 @@ def export(
     """Export a robot's drive as the actuator of one joint in another simulator, compared with the native model.
 
     Args:
-        robot: a robot, the name of a packaged one, or its TOML file; the posterior next to it is read.
+        robot: a robot, the name of a packaged one, or its TOML file. The posterior next to it is read.
         to: `mujoco`, `jax`, `onnx`, `mjlab`, `table` or `randomization` (docs/howto/export.md).
-        out: folder for the files and `LAW.md`, made if it does not exist; None: no files are written.
-        data: runs to compare with, or the file of a table or log; None: a grid of operating points.
-        configuration: which of the robot's; None: its first.
+        out: folder for the files and `LAW.md`, made if it does not exist. None: no files are written.
+        data: runs to compare with, or the file of a table or log. None: a grid of operating points.
+        configuration: which of the robot's. None: its first.
         joint: name of the joint in the simulator's model, for `mujoco`.
         posterior: of a robot that comes from no file, as a calibration or the loop returns it.
         draws, seed: of `randomization`.
@@ -48,11 +48,11 @@ def export(
         BadData: a table that is refused.
     """
     file = RobotFile(robot, "robot") if isinstance(robot, Robot) else robot_file.find_robot_file(str(robot))
-    found = export_format(
+    exported = export_format(
         file, to, configuration=configuration, data=data, at=joint, draws=draws, seed=seed, posterior=posterior
     )
-    texts = {**found.files, "LAW.md": export_words.law_text(found)}
-    found = dataclasses.replace(found, files=texts)
+    texts = {**exported.files, "LAW.md": export_words.law_text(exported)}
+    exported = dataclasses.replace(exported, files=texts)
     if out is not None:
         folder = Path(out)
         if taken := next((folder / name for name in texts if (folder / name).exists()), None):
@@ -61,4 +61,4 @@ def export(
         for name, content in texts.items():
             with naming_file(folder / name):
                 (folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
-    return found
+    return exported

@@ -43,10 +43,14 @@ class Part:
     """One equation of the law.
 
     Attributes:
-        name: a word; balance: which it enters, or what it is; unit: of its value.
+        name: a word.
+        balance: which it enters, or what it is.
+        unit: of its value.
         equation, meaning: in words, from the docstring of what it is made of.
-        value: as an expression; slope: its derivative by the variable `by`; rate, rate_slope: of its memory.
-        effect: name of the effect that it is of; empty: of the robot's base.
+        value: as an expression.
+        slope: its derivative by the variable `by`.
+        rate, rate_slope: of its memory.
+        effect: name of the effect that it is of. Empty: of the robot's base.
     """
 
     name: str
@@ -67,7 +71,8 @@ class Joint:
     """A drive as the actuator of a joint.
 
     Attributes:
-        file: the robot and what its file stated; configuration: name of its load.
+        file: the robot and what its file stated.
+        configuration: name of its load.
         robot: with this configuration and the effects inside alone.
         inside, outside: effects that enter the balances of a joint, and the others.
         idle: names of effects that do not act on this configuration.
@@ -96,7 +101,7 @@ class Joint:
 
     @property
     def limit(self) -> float | None:
-        """Largest current of one motor that the driver lets flow [A]; None: no limit."""
+        """Largest current of one motor that the driver lets flow [A]. None: no limit."""
         limit = float(self.robot.driver.current_limit)
         return limit if limit < UNLIMITED else None
 
@@ -120,17 +125,17 @@ class Joint:
         return tuple(p for p in self.parts if p.balance == balance)
 
     def with_robot(self, robot: Robot) -> Joint:
-        """The same joint of a robot with other numbers; its parts are expressions of names and stay."""
+        """The same joint of a robot with other numbers. Its parts are expressions of names and stay."""
         return dataclasses.replace(self, robot=robot, inside=robot.effects)
 
     def parameters(self) -> dict[str, params.Parameter]:
         """Parameters that the law depends on, by dotted name."""
-        known = {p.name: p for p in params.walk_parameters(self.robot)}
+        by_name = {p.name: p for p in params.walk_parameters(self.robot)}
         used = [n for part in self.parts for n in names_of(*_symbols(part))]
         further = ["gearbox.ratio", "motor.inertia", "gearbox.efficiency_load"]
         further += ["driver.current_limit"] * (self.limit is not None)
         further += [f"{self.configuration}.inertia"] * self.accelerates
-        return {n: known[n] for n in dict.fromkeys((*further, *used)) if n in known}
+        return {n: by_name[n] for n in dict.fromkeys((*further, *used)) if n in by_name}
 
     def surroundings(self) -> Names:
         """Signals of the joint's surroundings that the law depends on, such as the normal load."""
@@ -146,10 +151,10 @@ def joint_of_robot(file: RobotFile, configuration: str | None = None) -> Joint:
     """Returns the drive of a robot as the actuator of one joint.
 
     Args:
-        configuration: its name; None: the robot's first.
+        configuration: its name. None: the robot's first.
 
     Raises:
-        BadConfiguration: no such configuration; a drive that is not one joint or that no voltage drives; an effect
+        BadConfiguration: no such configuration. A drive that is not one joint or that no voltage drives. An effect
             whose equation has no closed form.
     """
     robot = file.robot
@@ -179,8 +184,8 @@ def joint_of_robot(file: RobotFile, configuration: str | None = None) -> Joint:
     inside = tuple(e for e in acting if e.balance in INSIDE and not e.needs_battery and e.balance not in robot.lacks)
     outside = tuple(e for e in acting if e not in inside)
     one = dataclasses.replace(one, effects=inside)
-    found = Joint(file, name, one, inside, outside, idle, ())
-    return dataclasses.replace(found, parts=tuple(_parts(found)))
+    joint = Joint(file, name, one, inside, outside, idle, ())
+    return dataclasses.replace(joint, parts=tuple(_parts(joint)))
 
 
 def _acts(robot: Robot, effect: Effect) -> bool:
@@ -207,7 +212,7 @@ class _Tracer:
         ]
 
     def __call__(self, function: Callable[[Robot, Signals], Any], what: str, balance: str, by: str = "") -> Symbol:
-        """Expression of a function of robot and signals; of its derivative by a variable, where `by` names one."""
+        """Expression of a function of robot and signals. Of its derivative by a variable, where `by` names one."""
         self.at_wheel = balance != "gearbox"
 
         def value(*numbers: Any) -> Any:
@@ -215,8 +220,8 @@ class _Tracer:
 
         def slope(*numbers: Any) -> Any:
             k = self.names.index(by)
-            at = lambda x: jnp.asarray(value(*numbers[:k], x, *numbers[k + 1 :]))  # noqa: E731
-            return jax.jvp(at, (numbers[k],), (jnp.ones_like(numbers[k]),))[1]
+            function = lambda x: jnp.asarray(value(*numbers[:k], x, *numbers[k + 1 :]))  # noqa: E731
+            return jax.jvp(function, (numbers[k],), (jnp.ones_like(numbers[k]),))[1]
 
         return trace_function(slope if by else value, self.names, what)
 
@@ -329,13 +334,13 @@ def memory_grows(part: Part) -> bool:
 
 
 def mean_surroundings(signals: Signals, names: Sequence[str]) -> dict[str, float]:
-    """Mean of signals of the surroundings over runs [SI], by name; 0 if unknown."""
-    found: dict[str, float] = {}
+    """Mean of signals of the surroundings over runs [SI], by name, 0 if unknown."""
+    means: dict[str, float] = {}
     for name in names:
         value = np.asarray(getattr(signals, name.removeprefix("surroundings.")), float)
         mean = float(np.nanmean(value)) if np.isfinite(value).any() else 0.0
-        found[name] = mean
-    return found
+        means[name] = mean
+    return means
 
 
 def channels_of(joint: Joint) -> tuple[Any, ...]:
@@ -344,5 +349,5 @@ def channels_of(joint: Joint) -> tuple[Any, ...]:
     A rig without any, such as a servo whose angle alone is read, is compared by current and speed of the motor.
     """
     settled = [c for c in EVERY if c.settled]
-    shown = tuple(c for c in settled if c.name in joint.file.robot.rig.channels)
-    return shown or tuple(c for c in settled if c.name in ("motor_current", "motor_speed"))
+    own_channels = tuple(c for c in settled if c.name in joint.file.robot.rig.channels)
+    return own_channels or tuple(c for c in settled if c.name in ("motor_current", "motor_speed"))

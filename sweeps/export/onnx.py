@@ -41,7 +41,7 @@ def step_of(joint: Joint, constants: Sequence[Constant]) -> tuple[Any, list[str]
     """Returns the step as a function of arrays, and the names of its inputs and outputs.
 
     Inputs are the state, the command, position and velocity of the joint, each of shape (joints,), and the step's
-    length, of shape (1,); outputs are torque, state, voltage taken and power.
+    length, of shape (1,). Outputs are torque, state, voltage taken and power.
     """
     module = module_from_source(jax_source(joint, constants))
     states = joint.states
@@ -82,9 +82,9 @@ def difference_from_jax(joint: Joint, constants: Sequence[Constant], model: byte
     with _single():
         expected = [np.asarray(x) for x in jax.jit(step)(*given)]
     session = runtime.InferenceSession(model, providers=["CPUExecutionProvider"])
-    found = session.run(None, dict(zip(inputs, given, strict=True)))
+    outputs = session.run(None, dict(zip(inputs, given, strict=True)))
     sizes = [float(np.sqrt(np.mean(np.square(x)))) or 1.0 for x in expected]
-    return max(float(np.max(np.abs(a - b))) / s for a, b, s in zip(found, expected, sizes, strict=True))
+    return max(float(np.max(np.abs(a - b))) / s for a, b, s in zip(outputs, expected, sizes, strict=True))
 
 
 def random_states(joint: Joint, inputs: int) -> list[np.ndarray]:

@@ -31,10 +31,11 @@ LOADS = (0.0, 1 / 6, 1 / 3, 1 / 2)
 
 @dataclasses.dataclass(frozen=True)
 class AtJoint:
-    """Current and speed of a drive in each run, by one model; arrays of shape (runs,).
+    """Current and speed of a drive in each run, by one model, arrays of shape (runs,).
 
     Attributes:
-        current: of one motor [A]; speed: of the joint [rad/s].
+        current: of one motor [A].
+        speed: of the joint [rad/s].
     """
 
     current: np.ndarray
@@ -46,11 +47,16 @@ class Situation:
     """Runs of one configuration, and the native model in them.
 
     Attributes:
-        joint: the drive; source: of the runs, in words; runs: the table, its rows chosen.
-        conditions: of all rows of the table; kept: True for compared rows.
+        joint: the drive.
+        source: of the runs, in words.
+        runs: the table, its rows chosen.
+        conditions: of all rows of the table.
+        kept: True for compared rows.
         signals: of the joint's own model, with the effects inside alone, of shape (runs,).
-        native: readings of the whole model [SI], shape (runs, channels); measured: likewise, NaN if missing.
-        command: mean voltage at the driver's output [V]; load: torque that the joint has to give at the wheel [N·m].
+        native: readings of the whole model [SI], shape (runs, channels).
+        measured: likewise, NaN if missing.
+        command: mean voltage at the driver's output [V].
+        load: torque that the joint has to give at the wheel [N·m].
     """
 
     joint: Joint
@@ -105,8 +111,8 @@ class Situation:
             speed_theoretical=speed * radius,
             speed=speed * radius,
         )
-        shown = jax.vmap(lambda s: balances.sensor(robot, s))(signals)
-        return np.stack([np.asarray(shown[c.name]) for c in channels_of(self.joint)], -1)
+        sensor_readings = jax.vmap(lambda s: balances.sensor(robot, s))(signals)
+        return np.stack([np.asarray(sensor_readings[c.name]) for c in channels_of(self.joint)], -1)
 
 
 def _absent(joint: Joint, names: Names = ()) -> Robot:
@@ -147,8 +153,8 @@ def situation_of_joint(joint: Joint, data: Runs | str | None) -> Situation:
     moves, whole = _solved(robot, conditions)
     turns, signals = _solved(_absent(joint), conditions) if joint.outside else (moves, whole)
     channels = channels_of(joint)
-    shown = jax.vmap(lambda s: balances.sensor(robot, s))(whole)
-    native = np.stack([np.asarray(shown[c.name]) for c in channels], -1)
+    sensor_readings = jax.vmap(lambda s: balances.sensor(robot, s))(whole)
+    native = np.stack([np.asarray(sensor_readings[c.name]) for c in channels], -1)
     kept = moves & turns & np.asarray(np.abs(signals.speed_motor) > 0) & (np.asarray(conditions.open) < 0.5)
     if not kept.any():
         raise BadData(f"{source}: the model settles in none of its runs, so there is nothing to compare with")
@@ -189,18 +195,18 @@ def stall_torque(joint: Joint, voltage: np.ndarray) -> np.ndarray:
     """Load at which a shaft's motor stalls [N·m], without effects, within the limits of driver and gearbox."""
     motor, gear, load = joint.robot.motor, joint.robot.gearbox, joint.load
     current = np.minimum(voltage / float(motor.resistance), float(joint.robot.driver.current_limit))
-    made = float(motor.torque_constant) * current - float(motor.friction_coulomb + gear.friction_coulomb)
-    given = float(gear.ratio * gear.efficiency_load) * made - float(load.loss_coulomb)
+    torque = float(motor.torque_constant) * current - float(motor.friction_coulomb + gear.friction_coulomb)
+    given = float(gear.ratio * gear.efficiency_load) * torque - float(load.loss_coulomb)
     return np.clip(given, 0.0, np.inf if gear.torque_limit is None else gear.torque_limit)
 
 
 def _measured(runs: Runs, channels: tuple[Any, ...]) -> np.ndarray:
-    known = {c.name: runs.measured()[:, k] for k, c in enumerate(runs.channels)}
-    return np.stack([known.get(c.name, np.full(len(runs), np.nan)) for c in channels], -1)
+    by_name = {c.name: runs.measured()[:, k] for k, c in enumerate(runs.channels)}
+    return np.stack([by_name.get(c.name, np.full(len(runs), np.nan)) for c in channels], -1)
 
 
 def _table(data: Runs | str, joint: Joint) -> Runs:
-    """Runs of a table in the joint's configuration; of a log its settled stretches."""
+    """Runs of a table in the joint's configuration. Of a log its settled stretches."""
     robot = joint.file.robot
     runs = read_runs(data, robot, measured=True, series=True) if isinstance(data, str) else data.of(robot)
     if runs.turns:

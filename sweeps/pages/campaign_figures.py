@@ -63,7 +63,8 @@ def draw_output_spread(output: np.ndarray, label: str, varied: Mapping[str, Vari
     """Histogram of an output, its median over the two names that it follows most, and over both together.
 
     Args:
-        output: of the points that settled; label: with its unit.
+        output: of the points that settled.
+        label: with its unit.
         varied: by name, at these points.
     """
     names = sorted(varied, key=lambda name: -variance_share(varied[name].values, output))[:2]
@@ -76,9 +77,9 @@ def draw_output_spread(output: np.ndarray, label: str, varied: Mapping[str, Vari
         quantiles = np.array([np.quantile(output[which == k], (0.05, 0.5, 0.95)) for k in range(len(middles))])
         axes.fill_between(middles, quantiles[:, 0], quantiles[:, 2], color=BLUE, alpha=0.2, linewidth=0)
         axes.plot(middles, quantiles[:, 1], color=BLUE)
-        found = variance_share(values, output)
-        if found > by_chance(values):
-            corner_note(axes, f"{100 * found:.0f} % of the variance")
+        shares = variance_share(values, output)
+        if shares > by_chance(values):
+            corner_note(axes, f"{100 * shares:.0f} % of the variance")
         axes.set(xlabel=varied[name].label, ylabel=label, title=f"over {short_name(name)}")
         _ticks(axes.xaxis, varied[name])
     if len(names) == 2:
@@ -87,10 +88,13 @@ def draw_output_spread(output: np.ndarray, label: str, varied: Mapping[str, Vari
 
 
 def draw_verdicts(codes: np.ndarray, names: Sequence[str], values: np.ndarray, layout: Layout, first: str) -> Figure:
-    """Verdicts of climbs over an axis and the size of the obstacle; of other axes at their first values.
+    """Verdicts of climbs over an axis and the size of the obstacle. Of other axes at their first values.
 
     Args:
-        codes: of the points; names: of the codes; values: of what varies, shape (points, names); first: of the axis.
+        codes: of the points.
+        names: of the codes.
+        values: of what varies, shape (points, names).
+        first: of the axis.
     """
     design = layout.design
     rest = [k for k, n in enumerate(design.names) if n not in (SIZE, first)]
@@ -103,7 +107,8 @@ def draw_grid_statuses(codes: np.ndarray, names: Sequence[str], across: Varied, 
     """Status of the points of a grid over two of its axes.
 
     Args:
-        codes: of the points; names: of the codes.
+        codes: of the points.
+        names: of the codes.
     """
     fig, axes = new_figure(1, 1, 4.2)
     ax = axes[0, 0]
@@ -147,7 +152,7 @@ def variance_share(values: np.ndarray, output: np.ndarray) -> float:
 def by_chance(values: np.ndarray) -> float:
     """Share of the variance that lies between the bins of a name without effect in one of 100 samples at most [-].
 
-    Of normal outputs the share is then a beta variable; 0 for a single bin, 1 where every value has a bin of its own.
+    Of normal outputs the share is then a beta variable, 0 for a single bin, 1 where every value has a bin of its own.
     """
     within, between = len(values) - (used := len(np.unique(bin_values(values)[0]))), used - 1
     return float(scipy.stats.beta.ppf(0.99, between / 2, within / 2)) if within and between else float(within == 0)
@@ -173,8 +178,8 @@ def _map(
     numbers, first = np.unique(cell[order], return_index=True)
     for number, values in zip(numbers, np.split(output[order], first[1:]), strict=True):
         cells.flat[number] = np.median(values)
-    drawn = axes.pcolormesh(across, along, cells, shading="nearest", cmap="viridis", rasterized=True)
-    colour_bar(fig, drawn, axes, label=f"median {label}")
+    mesh = axes.pcolormesh(across, along, cells, shading="nearest", cmap="viridis", rasterized=True)
+    colour_bar(fig, mesh, axes, label=f"median {label}")
     axes.set(xlabel=one.label, ylabel=other.label, title="over both")
     _ticks(axes.xaxis, one)
     _ticks(axes.yaxis, other)

@@ -27,17 +27,19 @@ from sweeps.pages.figure_style import (
 
 def draw_export_readings(compared: Comparison) -> Figure:
     """Readings of the exported drive over those of the reference, a panel for each channel."""
-    at = compared.situation
-    shown = [(k, c) for k, c in enumerate(channels_of(at.joint)) if c.name in compared.errors[0].percent]
-    reference = at.measured if at.is_measured else at.native
-    fig, grid = new_figure(1, max(len(shown), 1), 3.4)
-    for axes, (k, channel) in zip(grid[0], shown, strict=False):
+    situation = compared.situation
+    channel_places = [
+        (k, c) for k, c in enumerate(channels_of(situation.joint)) if c.name in compared.errors[0].percent
+    ]
+    reference = situation.measured if situation.is_measured else situation.native
+    fig, grid = new_figure(1, max(len(channel_places), 1), 3.4)
+    for axes, (k, channel) in zip(grid[0], channel_places, strict=False):
         size = 1 / channel.factor
         given = reference[:, k] * size
         ends = np.nanmin(given), np.nanmax(given)
         axes.plot(ends, ends, color=FAINT, lw=1)
-        if at.is_measured:
-            axes.plot(given, at.native[:, k] * size, "o", color=BLUE, ms=5, mfc="none", label="native")
+        if situation.is_measured:
+            axes.plot(given, situation.native[:, k] * size, "o", color=BLUE, ms=5, mfc="none", label="native")
         axes.plot(given, compared.readings[:, k] * size, ".", color=VERMILION, ms=5, label="exported")
         axes.set_xlabel(f"{compared.reference}: {channel.label} [{channel.unit}]", color=INK)
         axes.set_ylabel(f"{channel.label} [{channel.unit}]", color=INK)
@@ -46,7 +48,7 @@ def draw_export_readings(compared: Comparison) -> Figure:
 
 
 def draw_parity(table: Columns, channels: Sequence[Channel], band: bool = True) -> Figure:
-    """Simulated over measured, one panel a channel; a reading that is missing is not drawn.
+    """Simulated over measured, one panel a channel. A reading that is missing is not drawn.
 
     Args:
         band: whether ±5 % are shaded.
@@ -88,7 +90,7 @@ def errors_over(
 
     Args:
         beside: further columns than conditions, with their words, where errors are in units.
-        in_units: errors in the unit of the channel instead, with a band of two sds where they are known; over those
+        in_units: errors in the unit of the channel instead, with a band of two sds where they are known. Over those
             conditions that vary.
     """
     every = {
@@ -135,5 +137,5 @@ def errors_over(
 
 
 def _dots(axes: Axes, x: np.ndarray, y: np.ndarray, marker: str, **look: Any) -> None:
-    """Readings of a configuration; very many of them as a picture."""
+    """Readings of a configuration. Very many of them as a picture."""
     axes.plot(x, y, marker, ms=5, mec="white", mew=0.5, rasterized=len(x) > 500, **look)

@@ -86,7 +86,7 @@ LINE = 0.2
 
 @contextmanager
 def figure_settings(width: float = WIDTH) -> Iterator[None]:
-    """The settings of every figure, for as long as the block lasts; at the width `NARROW` panels are stacked.
+    """The settings of every figure, for as long as the block lasts. At the width `NARROW` panels are stacked.
 
     Matplotlib reads a file `matplotlibrc` of the working folder, which could change figures or run LaTeX.
     """
@@ -126,7 +126,7 @@ def new_figure(rows: int, columns: int, height: float, **keywords: Any) -> tuple
 
 
 def legend_columns(labels: Iterable[str], most: int = 99) -> int:
-    """Columns of a legend: all labels in one line, or `most`; in a narrow figure as many as fit into its width."""
+    """Columns of a legend: all labels in one line, or `most`. In a narrow figure as many as fit into its width."""
     lengths = [len(label) for label in labels]
     if not is_narrow():
         return max(min(len(lengths), most), 1)
@@ -146,12 +146,12 @@ def can_stack(fig: Figure) -> bool:
 
 
 def colour_bar(fig: Any, drawn: ScalarMappable, axes: Any, **keywords: Any) -> Any:
-    """Scale of colours next to axes; below them in a narrow figure."""
+    """Scale of colours next to axes. Below them in a narrow figure."""
     return fig.colorbar(drawn, ax=axes, location="bottom" if is_narrow() else "right", **keywords)
 
 
 def fit_for_phones(fig: Figure) -> Figure:
-    """A narrow figure with wrapped labels and titles; stacked panels have the labels that they shared.
+    """A narrow figure with wrapped labels and titles. Stacked panels have the labels that they shared.
 
     Legends next to their axes are above them.
     """
@@ -188,7 +188,7 @@ def _broken_name(name: str) -> str:
 
 
 def has_colour_scale(fig: Figure) -> bool:
-    """True if colours of the figure encode numbers; a dark page must not invert them."""
+    """True if colours of the figure encode numbers. A dark page must not invert them."""
     return bool(fig.findobj(lambda artist: isinstance(artist, AxesImage | QuadMesh)))
 
 
@@ -198,7 +198,7 @@ LEAST, LEAST_NARROW, CONTRAST = 8.5, 10.0, 4.6
 
 
 def figure_as_svg(fig: Figure) -> str:
-    """The figure as an SVG document that refers to nothing outside itself; its text is text.
+    """The figure as an SVG document that refers to nothing outside itself. Its text is text.
 
     `data-axes` of the document says where its axes are and what they run over, so that a page can show values.
     """
@@ -235,7 +235,7 @@ def figure_as_svg(fig: Figure) -> str:
 
 
 def _wrap(fig: Figure) -> bool:
-    """Break horizontal texts that reach beyond the figure; True if there is any."""
+    """Break horizontal texts that reach beyond the figure, True if there is any."""
     width, wrapped = 72 * fig.get_figwidth(), False
     for written in fig.findobj(lambda artist: isinstance(artist, Text) and artist.get_visible()):
         assert isinstance(written, Text)
@@ -250,7 +250,7 @@ def _wrap(fig: Figure) -> bool:
 
 
 def _give_names_room(fig: Figure) -> bool:
-    """Enlarge the figure to separate names at y axes, and turn names at x axes upright; True if any changed."""
+    """Enlarge the figure to separate names at y axes, and turn names at x axes upright, True if any changed."""
     more, turned = 0.0, False
     for axes in filter(Axes.get_visible, fig.axes):
         for axis, low, high in ((axes.xaxis, "x0", "x1"), (axes.yaxis, "y0", "y1")):
@@ -345,12 +345,12 @@ def _has_names(axis: Axis) -> bool:
 def _run(axis: Axis) -> Json:
     """The ends of an axis, whether it is logarithmic, and its names where its ticks have any."""
     ends = [float(f"{end:.6g}") for end in axis.get_view_interval()]
-    known: Json = {"ends": ends, "log": axis.get_scale() == "log"}
+    axis_facts: Json = {"ends": ends, "log": axis.get_scale() == "log"}
     if _has_names(axis):
         names = [(float(t.get_loc()), t.label1.get_text() or t.label2.get_text()) for t in axis.get_major_ticks()]
         if names and all(name for _, name in names):
-            known["names"] = names
-    return known
+            axis_facts["names"] = names
+    return axis_facts
 
 
 def label_end(axes: Axes, x: np.ndarray, y: np.ndarray, words: str, colour: str, **keywords: Any) -> None:

@@ -35,8 +35,12 @@ class Gear:
     """One run of the track model.
 
     Attributes:
-        name: heading; on_tracks: or on wheels; status; radius: of the pulleys [m].
-        time: [s]; signals, reactions: over it; guide_share: on average at the end [-].
+        name: heading.
+        on_tracks: or on wheels, status.
+        radius: of the pulleys [m].
+        time: [s].
+        signals, reactions: over it.
+        guide_share: on average at the end [-].
     """
 
     name: str
@@ -63,7 +67,7 @@ class Gear:
 
     @property
     def period(self) -> float:
-        """Eq. (34) [s], at the mean speed of the driving pulley; the belt runs on the pulley on wheels too."""
+        """Eq. (34) [s], at the mean speed of the driving pulley. The belt runs on the pulley on wheels too."""
         speed = float(self.signals.speed_wheel[self.tail(TAIL)].mean())
         return ripple_peaks.period_pitch(PITCH_GROUSER if self.on_tracks else PITCH_TOOTH, speed, self.radius)
 
@@ -79,9 +83,11 @@ def members_with_gear(
     """Members of a batch of runs whose running gear is resolved.
 
     Args:
-        history: time, signals and reactions of the batch; status: codes of how its members ended.
+        history: time, signals and reactions of the batch.
+        status: codes of how its members ended.
         guide_share: of each member [-].
-        which: index of each member's configuration in `robot`; names: headings of the members.
+        which: index of each member's configuration in `robot`.
+        names: headings of the members.
     """
     import jax
 
@@ -98,15 +104,15 @@ def members_with_gear(
 def ripple_numbers(gear: Gear) -> Json:
     """What ripples in a run, by how much and how often."""
     tail, signals = gear.tail(TAIL), gear.signals
-    drawn, travel, reaction = (
+    line, travel, reaction = (
         ripple_peaks.ripple(gear.time[tail], x[tail]) for x in (signals.total_current, signals.speed, signals.normal)
     )
     return {
         "configuration": gear.name,
         "pitch": "grousers, S_g = 35 mm" if gear.on_tracks else "teeth, S_t = 5 mm",
-        "period_ms": 1e3 * drawn.period,
+        "period_ms": 1e3 * line.period,
         "equation_ms": 1e3 * gear.period,
-        "current_percent": 100 * drawn.amplitude,
+        "current_percent": 100 * line.amplitude,
         "speed_percent": 100 * travel.amplitude,
         "reaction_percent": 100 * reaction.amplitude,
         "guide_percent": 100 * gear.guide_share if gear.on_tracks else None,

@@ -49,18 +49,20 @@ class Album:
         """Draw one figure, and a narrow one for phones if its panels stand side by side.
 
         Args:
-            draw: returns the figure, alone or followed by numbers, which are returned; or an overlay over time.
+            draw: returns the figure, alone or followed by numbers, which are returned, or an overlay over time.
         """
         with figure_settings():
-            drawn = draw()
-            if isinstance(drawn, TimeOverlay):
-                return self.add_overlay(name, drawn)
-            figure, *numbers = drawn if isinstance(drawn, tuple) else (drawn,)
+            figure_drawn = draw()
+            if isinstance(figure_drawn, TimeOverlay):
+                return self.add_overlay(name, figure_drawn)
+            figure, *numbers = figure_drawn if isinstance(figure_drawn, tuple) else (figure_drawn,)
             text, narrow = figure_as_svg(figure), ""
         if can_stack(figure):
             with figure_settings(NARROW):
-                drawn = draw()
-                narrow = figure_as_svg(fit_for_phones(drawn[0] if isinstance(drawn, tuple) else drawn))
+                figure_drawn = draw()
+                narrow = figure_as_svg(
+                    fit_for_phones(figure_drawn[0] if isinstance(figure_drawn, tuple) else figure_drawn)
+                )
         write_text(self.folder / f"{name}.svg", printable(text))
         looks = "scale " * has_colour_scale(figure)
         picture = _inline(text, name, looks + ("wide" if narrow else "only"))
@@ -79,7 +81,7 @@ class Album:
 
 
 def _inline(svg: str, name: str, looks: str) -> str:
-    """An SVG document as an element of a page, with the classes `looks`; ids that are referred to are its own."""
+    """An SVG document as an element of a page, with the classes `looks`. Ids that are referred to are its own."""
     element = re.sub(r' xmlns(?::\w+)?="[^"]*"', "", svg[svg.index("<svg") :])
     element = element.replace("<svg ", f'<svg class="{looks}" ', 1)
     wanted = set(re.findall(r'(?:href="|url\()#([^")]+)', element))
@@ -121,7 +123,7 @@ def _section(file: RobotFile, nominal: Robot) -> Section:
 
 
 def printed_number(value: Any, form: str = "{:.2f}") -> str:
-    """A number as a page prints it, nothing without a sign; what is not finite is a dash."""
+    """A number as a page prints it, nothing without a sign. What is not finite is a dash."""
     if isinstance(value, int | float | np.number):
         text = form.format(float(value)) if math.isfinite(float(value)) else "–"
         return re.sub(r"^-(?=0\.?0*$)", "", text)
@@ -169,7 +171,7 @@ def render_page(folder: Path, template: str, album: Album, **known: Any) -> Path
 
 
 def _beside(folder: Path, meanings: dict[str, str]) -> dict[str, str]:
-    """Files that a run folder has, or is about to have, with what they are; what is known first."""
+    """Files that a run folder has, or is about to have, with what they are. What is known first."""
     files = {p.name + "/" * p.is_dir() for p in folder.iterdir()} | {"manifest.json"}
     files = {name for name in files if name in meanings or "." in name} - {"report.html"}  # no locks, no chunks
     return {

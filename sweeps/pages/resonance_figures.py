@@ -35,7 +35,7 @@ _UNREAD = {"slides": ">", "failed": "x", "tips": "^", "stalled": "_", "too_slow"
 
 
 def resonance_map(found: ResonanceResult) -> Figure:
-    """Natural frequencies against harmonics of what passes; below, ripple at every speed and payload."""
+    """Natural frequencies against harmonics of what passes. Below, ripple at every speed and payload."""
     rows = len(found.modes)
     heights = [4.4, *(0.5 + 0.2 * rows for _ in MAPS)]
     fig, grid = new_figure(4, 1, sum(heights) + 0.6, sharex=True, height_ratios=heights)
@@ -52,8 +52,8 @@ def _top(found: ResonanceResult) -> float:
     """Greatest frequency drawn [Hz]."""
     bands = [m.high for modes in found.modes.values() for m in modes if m.resonant]
     lines = [found.table[f"{name}_frequency_Hz"][found.read] for name in _MARKS]
-    seen = float(np.nanpercentile(np.concatenate(lines), 90)) if found.read.any() else 0.0
-    return 1.15 * max([seen, *bands, 10.0])
+    top = float(np.nanpercentile(np.concatenate(lines), 90)) if found.read.any() else 0.0
+    return 1.15 * max([top, *bands, 10.0])
 
 
 def draw_campbell_diagram(axes: Axes, found: ResonanceResult) -> None:
@@ -127,12 +127,12 @@ def _bands(axes: Axes, found: ResonanceResult) -> None:
 
 
 def ripple_map(axes: Axes, found: ResonanceResult, name: str) -> None:
-    """Ripple of one signal over speed, a row for each payload; bars where a peak is to be avoided."""
+    """Ripple of one signal over speed, a row for each payload. Bars where a peak is to be avoided."""
     table, payloads = found.table, list(found.modes)
     ripple = table[f"{name}_ripple_percent"]
     settled = found.read & (table["status"] == "converged")
-    shown = ripple[settled] if settled.any() else ripple[found.read]
-    most = float(np.nanmax(shown)) or 1.0
+    shown_ripple = ripple[settled] if settled.any() else ripple[found.read]
+    most = float(np.nanmax(shown_ripple)) or 1.0
     norm = colors.Normalize(0, most)
     guess = found.travel
     for row, payload in enumerate(payloads):

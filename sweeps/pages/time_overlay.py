@@ -26,7 +26,7 @@ class TimeOverlay:
     Attributes:
         table: columns of the measured channels, of their simulations and `time_s`, each of shape (rows,).
         channels: channels to show.
-        simulated: prefix of the columns of a simulation → its name in the legend; the first one has the residuals.
+        simulated: prefix of the columns of a simulation → its name in the legend. The first one has the residuals.
         rows: rows of each run in the order of time.
     """
 
@@ -121,7 +121,7 @@ class TimeOverlay:
 
 
 def _numbers(values: np.ndarray) -> list[float | None]:
-    """Numbers with six digits; None for a missing one."""
+    """Numbers with six digits, None for a missing one."""
     return [float(f"{v:.6g}") if np.isfinite(v) else None for v in values]
 
 
@@ -130,10 +130,10 @@ def time_overlay(table: Columns, channels: Sequence[Channel], simulated: Mapping
 
     Args:
         table: with `time_s`, `run_id` where there are several runs, measured and simulated columns.
-        channels: channels to show; those without any reading are left out.
+        channels: channels to show. Those without any reading are left out.
         simulated: prefixes of the simulated columns and their names, as in `TimeOverlay`.
     """
     runs = Runs("a table", {name: table[name] for name in ("run_id", "time_s") if name in table})
-    shown = [c for c in channels if np.isfinite(table[c.column]).any()]
+    shown_channels = [c for c in channels if np.isfinite(table[c.column]).any()]
     rows = {str(name): runs.in_order(name) for name in dict.fromkeys(runs.run_names.tolist())}
-    return TimeOverlay(table, shown, simulated, rows)
+    return TimeOverlay(table, shown_channels, simulated, rows)

@@ -72,10 +72,11 @@ def draw_turn_circle(robot: Robot, row: Json) -> Figure:
 def path_arcs(
     x: np.ndarray, y: np.ndarray, yaw: np.ndarray
 ) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, " points"]]:
-    """A path between places, each stretch at a speed and yaw rate of its own: an arc; steps of a run may be long.
+    """A path between places, each stretch at a speed and yaw rate of its own: an arc. Steps of a run may be long.
 
     Args:
-        x, y: places [m]; yaw: there, counted on over a turn [rad]; shape (rows,).
+        x, y: places [m].
+        yaw: there, counted on over a turn [rad], shape (rows,).
     """
     place, turned = x + 1j * y, np.diff(yaw)
     pieces = np.ceil(np.abs(turned) / BEND).clip(1, 100).astype(int)

@@ -1,6 +1,6 @@
 """Chunks of a sweep on the workers of a dask scheduler: one worker a device, lost workers' chunks computed again.
 
-Workers send their chunks to the process that was started by hand, which alone writes; so they need no disk in common.
+Workers send their chunks to the process that was started by hand, which alone writes, so they need no disk in common.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ GONE = "--scheduler: it has gone away; start it again, and the same command goes
 
 
 class LostWorkers(InputError):
-    """The workers were lost for good; the sweep can be taken up again."""
+    """The workers were lost for good. The sweep can be resumed."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,7 +41,8 @@ class Pool:
     """A scheduler with its workers.
 
     Attributes:
-        client: of dask; device: kind of the workers' devices.
+        client: of dask.
+        device: kind of the workers' devices.
     """
 
     client: Any
@@ -52,7 +53,7 @@ class Pool:
         self.client.close()
 
     def produce(self, job: Job, chunks: Iterable[int]) -> Produced:
-        """Chunks as the workers finish them; a chunk is computed again where its worker is lost.
+        """Chunks as the workers finish them. A chunk is computed again where its worker is lost.
 
         Raises:
             LostWorkers: a chunk's workers were lost too often, none was left for a minute, or the scheduler is gone.
@@ -76,7 +77,7 @@ class Pool:
             return future
 
         def fill() -> None:
-            """Submit enough work for the present workers; some may have joined later."""
+            """Submit enough work for the present workers. Some may have joined later."""
             room = max(self._workers(), 1) * (1 + AHEAD) - len(numbers)
             for chunk in itertools.islice(left, max(room, 0)):
                 under_way.add(submit(chunk))
@@ -114,18 +115,18 @@ class Pool:
             raise LostWorkers(GONE) from error
 
     def _next(self, under_way: Any) -> Any:
-        """Next finished future; waits as long as at least one worker is connected.
+        """Next finished future. Waits as long as at least one worker is connected.
 
         Raises:
             TimeoutError: no worker for `WORKER` seconds.
             LostWorkers: the scheduler is gone.
         """
-        found: list[Any] = []
+        finished: list[Any] = []
         failed: list[BaseException] = []
 
         def wait() -> None:
             try:
-                found.append(next(under_way))
+                finished.append(next(under_way))
             except BaseException as error:
                 failed.append(error)
 
@@ -137,10 +138,10 @@ class Pool:
                 self.client.wait_for_workers(1, timeout=WORKER)
         if failed:
             raise failed[0]
-        return found[0]
+        return finished[0]
 
     def _result(self, future: Any) -> Any:
-        """Result of a finished future; if its worker is lost before the fetch, another worker recomputes it.
+        """Result of a finished future. If its worker is lost before the fetch, another worker recomputes it.
 
         Raises:
             TimeoutError, LostWorkers: as `_next`.
@@ -157,13 +158,15 @@ def _packed(job: Job) -> bytes:
     """A job as bytes, with the source of effects that are the user's own: workers need none of the user's files."""
     import cloudpickle
 
-    own = {sys.modules[type(e).__module__] for e in job.robot.effects if not type(e).__module__.startswith("mmrjax.")}
-    for module in own:
+    own_modules = {
+        sys.modules[type(e).__module__] for e in job.robot.effects if not type(e).__module__.startswith("mmrjax.")
+    }
+    for module in own_modules:
         cloudpickle.register_pickle_by_value(module)
     try:
         return bytes(cloudpickle.dumps(job))
     finally:
-        for module in own:
+        for module in own_modules:
             cloudpickle.unregister_pickle_by_value(module)
 
 
@@ -208,12 +211,12 @@ def _client(address: str) -> Any:
     """
     import distributed
 
-    found: list[Any] = []
+    clients: list[Any] = []
     failed: list[BaseException] = []
 
     def ask() -> None:
         try:
-            found.append(distributed.Client(address, timeout=ANSWER, name="mmrjax sweep", set_as_default=False))
+            clients.append(distributed.Client(address, timeout=ANSWER, name="mmrjax sweep", set_as_default=False))
         except BaseException as error:  # whatever comes of talking to something that is no scheduler
             failed.append(error)
 
@@ -221,8 +224,8 @@ def _client(address: str) -> Any:
         asking = threading.Thread(target=ask, daemon=True)
         asking.start()
         asking.join(ANSWER + 0.5)
-    if found:
-        return found[0]
+    if clients:
+        return clients[0]
     reason = (str(failed[0]).split("\n")[0] or type(failed[0]).__name__) if failed else "silence"
     raise BadConfiguration(
         f"--scheduler: got {address}; no scheduler answers there within {ANSWER:g} s ({reason}); expected the "
@@ -274,10 +277,12 @@ def introduce_worker() -> tuple[dict[str, dict[str, str]], str]:
 
 
 def compute_on_worker(work: bytes, name: str, chunk: int, expected: Json) -> Columns:
-    """A chunk on this worker's devices; a job is unpacked and compiled once.
+    """A chunk on this worker's devices. A job is unpacked and compiled once.
 
     Args:
-        work: the job, packed; name: of it; expected: program and device of the other workers.
+        work: the job, packed.
+        name: of it.
+        expected: program and device of the other workers.
 
     Raises:
         BadConfiguration: this worker, which has come later than the others, is not like them.

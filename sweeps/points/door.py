@@ -33,13 +33,17 @@ def sweep(
     model: str = "steady",
     **options: Any,
 ) -> Results:
-    """Simulate every combination of a grid, slope varying fastest; Table 8 where nothing is stated.
+    """Simulate every combination of a grid, slope varying fastest. The default is Table 8.
 
     Args:
-        configurations: names, all by default; voltages [V], or for a rig that imposes it motor_speeds_rpm [rpm]
-            or motor_currents_A [A].
-        payloads: [kg]; slopes_deg: [deg]; surface: of Table 5; load_torques: of a load on a shaft [N·m].
-        battery: whether the on-board battery feeds the motors; discharge: charge already taken from it [C].
+        configurations: names, all by default.
+        voltages: [V], or for a rig that imposes it motor_speeds_rpm [rpm] or motor_currents_A [A].
+        payloads: [kg].
+        slopes_deg: [deg].
+        surface: of Table 5.
+        load_torques: of a load on a shaft [N·m].
+        battery: True if the on-board battery feeds the motors.
+        discharge: charge already taken from it [C].
         model, options: as for `simulate`.
 
     Returns:

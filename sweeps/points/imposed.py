@@ -44,7 +44,7 @@ SAID = {
 
 
 def imposed_limit(robot: Robot) -> float | None:
-    """Largest value to impose: supply voltage [V] or motor speed [rpm]; None: not stated, as for a current."""
+    """Largest value to impose: supply voltage [V] or motor speed [rpm]. None: not stated, as for a current."""
     if robot.rig.imposed == "motor_current":
         return None
     if robot.rig.imposed == "voltage":
@@ -60,7 +60,7 @@ def _digits(value: float) -> float:
 
 
 def imposed_default(robot: Robot, option: str) -> float:
-    """Default of the imposed quantity of a single run: the limit; for the paper's robot `VOLTAGE`.
+    """Default of the imposed quantity of a single run: the limit. For the paper's robot `VOLTAGE`.
 
     Raises:
         BadConfiguration: the file states none.
@@ -74,7 +74,7 @@ def imposed_default(robot: Robot, option: str) -> float:
 
 
 def imposed_example(robot: Robot) -> float:
-    """Imposed value of an example; `imposed_default` if the file states a limit [V, rpm]."""
+    """Imposed value of an example, `imposed_default` if the file states a limit [V, rpm]."""
     try:
         return imposed_default(robot, "")
     except BadConfiguration:
@@ -95,11 +95,11 @@ def imposed_levels(robot: Robot, option: str, notes: list[str] | None = None) ->
     most = imposed_limit(robot)
     if most is None:
         raise BadConfiguration(_missing(robot, option, SAID[robot.rig.imposed].several))
-    found = tuple(_digits(share * most) for share in SHARES)
+    levels = tuple(_digits(share * most) for share in SHARES)
     if notes is not None:
-        shown = ",".join(f"{v:g}" for v in found)
-        notes.append(f"{option}: not stated; thirds of the {_of(robot)} of the robot's file are taken: {shown}")
-    return found
+        level_text = ",".join(f"{v:g}" for v in levels)
+        notes.append(f"{option}: not stated; thirds of the {_of(robot)} of the robot's file are taken: {level_text}")
+    return levels
 
 
 def _of(robot: Robot) -> str:
@@ -118,9 +118,9 @@ def _missing(robot: Robot, option: str, example: str) -> str:
 
 def option_refusal(robot: Robot, option: str, instead: str) -> str:
     """Why an option of what is not imposed is refused."""
-    said = SAID[robot.rig.imposed]
+    reason = SAID[robot.rig.imposed]
     if robot.rig.imposed != "voltage":
-        return f"{option}: the {said.words} is imposed on this robot; state {instead} [{said.unit}]"
+        return f"{option}: the {reason.words} is imposed on this robot; state {instead} [{reason.unit}]"
     return f"{option}: the voltage is imposed on this robot, and its motors' speed follows; state {instead} [V]"
 
 
@@ -178,7 +178,8 @@ def check_turning(robot: Robot, stated: Collection[str], names: Iterable[str], w
     """Refuse conditions that free a robot to turn which cannot, or that leave open what drives a side.
 
     Args:
-        stated: names of conditions; names: of the configurations that are simulated.
+        stated: names of conditions.
+        names: of the configurations that are simulated.
     """
     if not (freed := [name for name in OF_TURNS if name in stated]):
         return

@@ -45,11 +45,14 @@ PARTS = 4
 
 @dataclasses.dataclass(frozen=True)
 class SimulationResult:
-    """Result of a simulating command; all its files are written from it.
+    """Result of a simulating command. All its files are written from it.
 
     Attributes:
-        command: that simulated; model: fidelity; robot: that was simulated.
-        runs: what was simulated; table: their conditions and outcomes, a column each as in `runs.csv`.
+        command: that simulated.
+        model: fidelity.
+        robot: that was simulated.
+        runs: what was simulated.
+        table: their conditions and outcomes, a column each as in `runs.csv`.
         further: what the command adds to `result.json`.
     """
 
@@ -62,7 +65,7 @@ class SimulationResult:
 
     @property
     def statuses(self) -> dict[str, int]:
-        """Number of runs by status; every status is included."""
+        """Number of runs by status. Every status is included."""
         return {status: int(np.sum(self.table["status"] == status)) for status in STATUSES}
 
     @property
@@ -101,7 +104,7 @@ def check_runs_bearable(robot: Robot, conditions: Conditions, config: FidelityPa
 
 
 def conditions_of_runs(robot: Robot, runs: Runs, config: Part) -> Conditions:
-    """The conditions of the runs, fed as the configuration says; without a say by the external supply."""
+    """The conditions of the runs, with the supply of the configuration, by default the external one."""
     if not isinstance(config, SupplyPart):
         return runs.conditions(robot)
     return runs.conditions(robot, battery=float(config.battery), discharge=config.discharge_mAh * COULOMB_PER_MAH)
@@ -117,23 +120,23 @@ def compute_chunks(
     """Kept outputs of all chunks of a job, in order.
 
     Args:
-        folder: holds chunks under this name; chunks left by an interrupted command are not computed again.
+        folder: holds chunks under this name. Chunks left by an interrupted command are not computed again.
         kept: selects from the outputs of a chunk, by default all: in the units of tables, shape (points,).
     """
     chunks = range(len(job.blocks))
     files = [f"{name}-{k:06d}" for k in chunks]
-    found = {} if folder is None else {k: part for k in chunks if (part := folder.chunk(files[k])) is not None}
-    left, times = [k for k in chunks if k not in found], scale.Times()
-    advance(sum(map(job.blocks.count, found)))
+    stored = {} if folder is None else {k: part for k in chunks if (part := folder.chunk(files[k])) is not None}
+    left, times = [k for k in chunks if k not in stored], scale.Times()
+    advance(sum(map(job.blocks.count, stored)))
 
     def keep(chunk: int, arrays: Table, _: Any) -> None:
-        found[chunk] = kept(arrays)
+        stored[chunk] = kept(arrays)
         if folder is not None:
-            folder.keep_chunk(files[chunk], found[chunk])
+            folder.keep_chunk(files[chunk], stored[chunk])
 
     if left:
         scale.write_chunks(keep, job, scale.produce_chunks(scale.Compiled(job), left, times, advance), advance, times)
-    every = [found.pop(k) for k in chunks]
+    every = [stored.pop(k) for k in chunks]
     return {column: np.concatenate([part.pop(column) for part in every]) for column in tuple(every[0])}
 
 
@@ -165,19 +168,19 @@ def evaluate_runs(
     Chunks already in the folder (of an interrupted run of the same configuration) are not simulated again.
 
     Args:
-        advance: called with the number of runs done since its last call; of a chunk under way, its share. None:
+        advance: called with the number of runs done since its last call. Of a chunk under way, its share. None:
             a bar on stderr where it takes long.
     """
     job = job_of(robot, runs, config)
     slow = fidelities.fidelity_facts(config.model).slow or len(job.blocks) > 1
-    with bar(len(runs), quiet=not slow or advance is not None) as own:
-        found = compute_chunks(job, folder, "chunk", advance or own)
-    columns = {row.column: found[row.name] for row in outputs.output_table(robot.channels)}
-    further = {name: found[name] for name in fidelities.get_fidelity(config.model).columns}
+    with bar(len(runs), quiet=not slow or advance is not None) as progress_bar:
+        chunks = compute_chunks(job, folder, "chunk", advance or progress_bar)
+    columns = {row.column: chunks[row.name] for row in outputs.output_table(robot.channels)}
+    further = {name: chunks[name] for name in fidelities.get_fidelity(config.model).columns}
     return {
         **condition_table(robot, runs),
         **columns,
-        **outputs.status_words(found[STATUS], found[FLAGS_CODE]),
+        **outputs.status_words(chunks[STATUS], chunks[FLAGS_CODE]),
         **further,
     }
 
@@ -188,16 +191,17 @@ def follow_histories(robot: Robot, runs: Runs, model: str | None) -> Table:
     Its steps are finer than those of fits, which use the grid up to thousands of times.
 
     Args:
-        robot: prepared for the table; model: requested fidelity; None: the fidelity for histories.
+        robot: prepared for the table.
+        model: requested fidelity. None: the fidelity for histories.
 
     Raises:
         BadConfiguration: a fidelity that cannot follow them.
     """
-    seen = jax.device_get(
+    histories = jax.device_get(
         _observed(observers.Histories.of(runs, robot, model, PARTS), params.without_weak_types(robot))
     )
-    columns = {c.column: seen.reading[:, k] / c.factor for k, c in enumerate(robot.channels)}
-    return {**condition_table(robot, runs), **columns, **outputs.status_words(seen.status, seen.flags)}
+    columns = {c.column: histories.reading[:, k] / c.factor for k, c in enumerate(robot.channels)}
+    return {**condition_table(robot, runs), **columns, **outputs.status_words(histories.status, histories.flags)}
 
 
 @compiled
@@ -209,8 +213,8 @@ def condition_table(robot: Robot, runs: Runs) -> Columns:
     """The condition columns of a table, with the robot's total mass if the table has none."""
     columns = dict(runs.columns)
     if "total_mass_kg" in runs.layout.axes and "total_mass_kg" not in columns:
-        own = np.array([float(chassis.mass) for chassis in robot.configurations.members])
-        columns["total_mass_kg"] = own[runs.configurations(robot)] + runs["payload_kg"]
+        own_mass = np.array([float(chassis.mass) for chassis in robot.configurations.members])
+        columns["total_mass_kg"] = own_mass[runs.configurations(robot)] + runs["payload_kg"]
     shown = ("configuration", *dict.fromkeys((*runs.layout.axes, *runs.axes)), "surface", "run_id")
     return {key: columns[key] for key in shown if key in columns}
 
@@ -226,10 +230,12 @@ def write_run_folder(
     result: SimulationResult,
     page: Page,
 ) -> int:
-    """Write what every simulating command leaves, and move the folder into place; returns the exit code.
+    """Write what every simulating command leaves, and move the folder into place. Returns the exit code.
 
     Args:
-        folder: of the command; config: its configuration, with the robot's name; page: its page.
+        folder: of the command.
+        config: its configuration, with the robot's name.
+        page: its page.
     """
     folder.write_table("runs.csv", capabilities.without_idle(result.robot, result.table))
     folder.write_json("result.json", result.to_json())

@@ -54,9 +54,12 @@ class Samples:
     """A sampled design over some names.
 
     Attributes:
-        design: one of `DESIGNS`; number: of points; seed: of everything random.
-        marginals: quantile function of each name, from (0, 1) to its unit; names: theirs.
-        joint: further names that are sampled together, a posterior; they take the design's last dimensions.
+        design: one of `DESIGNS`.
+        number: of points.
+        seed: of everything random.
+        marginals: quantile function of each name, from (0, 1) to its unit.
+        names: theirs.
+        joint: further names that are sampled together, a posterior. They take the design's last dimensions.
     """
 
     design: str
@@ -71,7 +74,7 @@ class Samples:
         return (*self.marginals, *(self.joint.names if self.joint is not None else ()))
 
     def values(self, first: int, count: int) -> Float[np.ndarray, "names points"]:
-        """Values of `count` points from number `first` on, a row a name; many are made on all processors."""
+        """Values of `count` points from number `first` on, a row a name. Many are made on all processors."""
         if count <= PART:
             return self._values(first, count)
         starts = range(first - first % PART, first + count, PART)
@@ -97,7 +100,8 @@ class Drawn:
     """Sampled points that are at hand.
 
     Attributes:
-        names: what is sampled; table: its values, a row a name.
+        names: what is sampled.
+        table: its values, a row a name.
     """
 
     names: Names
@@ -133,7 +137,7 @@ class Design:
     """Every combination of the axes' values, each crossed with every sampled point.
 
     Attributes:
-        axes: values of each name, in order; the last varies fastest, the samples faster still.
+        axes: values of each name, in order. The last varies fastest, the samples faster still.
         samples: None for a plain grid.
     """
 
@@ -161,20 +165,20 @@ class Design:
         return math.prod(self.shape)
 
     def block(self, box: tuple[slice, ...]) -> Float[np.ndarray, "points names"]:
-        """Values of the points of a box, a row a point, in the order of `names`; laid out a column a name."""
+        """Values of the points of a box, a row a point, in the order of `names`. Laid out a column a name."""
         sizes = tuple(b.stop - b.start for b in box)
         values = np.empty((len(self.names), *sizes))
         for k, axis in enumerate(self.axes.values()):
             along = (slice(None),) + (None,) * (len(sizes) - k - 1)
             values[k] = axis[box[k]][along]
         if self.samples is not None:
-            drawn = self.samples.values(box[-1].start, sizes[-1])
-            for k, row in enumerate(drawn, len(self.axes)):
+            samples = self.samples.values(box[-1].start, sizes[-1])
+            for k, row in enumerate(samples, len(self.axes)):
                 values[k] = row
         return values.reshape(len(self.names), -1).T
 
     def at(self, numbers: Int[np.ndarray, " points"]) -> Float[np.ndarray, "points names"]:
-        """Values of single points by their number, the last dimension fastest; for few points."""
+        """Values of single points by their number, the last dimension fastest, for few points."""
         places = np.array(np.unravel_index(np.asarray(numbers), self.shape)).T
         return np.concatenate([self.block(tuple(slice(i, i + 1) for i in map(int, place))) for place in places])
 
@@ -184,7 +188,8 @@ class Blocks:
     """The chunks of a sweep: equal boxes of consecutive points, those at the end of the split axis smaller.
 
     Attributes:
-        shape: of all points; size: of one box, 1 along the axes before the split one and whole along those after.
+        shape: of all points.
+        size: of one box, 1 along the axes before the split one and whole along those after.
     """
 
     shape: tuple[int, ...]
@@ -226,8 +231,8 @@ class Blocks:
 
     def box(self, number: int) -> tuple[slice, ...]:
         """The points of a chunk along each axis."""
-        at = zip(self.place(number), self.size, self.shape, strict=True)
-        return tuple(slice(k * s, min((k + 1) * s, n)) for k, s, n in at)
+        places = zip(self.place(number), self.size, self.shape, strict=True)
+        return tuple(slice(k * s, min((k + 1) * s, n)) for k, s, n in places)
 
     def count(self, number: int) -> int:
         """Points of a chunk."""
@@ -280,8 +285,8 @@ CACHED = 65_536
 def keyed_permutation(key: int, number: int, points: UInt64[np.ndarray, " points"]) -> UInt64[np.ndarray, " points"]:
     """A keyed pseudo-random permutation of 0 .. number - 1 at some points.
 
-    A Feistel network on a x b >= number with additions modulo a and b in turn (Black and Rogaway 2002, FE2-like);
-    what falls outside walks the cycle until it is inside, which less than 2 / sqrt(number) of the points do.
+    A Feistel network on a x b >= number with additions modulo a and b in turn (Black and Rogaway 2002, FE2-like).
+    What falls outside walks the cycle until it is inside, which less than 2 / sqrt(number) of the points do.
     """
     if number == 1:
         return np.zeros_like(points)

@@ -1,6 +1,6 @@
 """The engine of every sweep: chunks of one compiled shape over all local devices, kept while the next is computed.
 
-A grid, a plan, the rows of a table and draws of a posterior are designs of points; a Zarr store and the chunks of a
+A grid, a plan, the rows of a table and draws of a posterior are designs of points. A Zarr store and the chunks of a
 run folder keep what comes out.
 """
 
@@ -53,8 +53,11 @@ class Job:
     """All that is needed to compute any chunk of a sweep, here or in another process.
 
     Attributes:
-        robot: that is varied; task: what every point does.
-        outputs: names; storage: type that they are stored in; profile: that every point follows, if any.
+        robot: that is varied.
+        task: what every point does.
+        outputs: names.
+        storage: type that they are stored in.
+        profile: that every point follows, if any.
     """
 
     robot: Robot
@@ -69,7 +72,7 @@ class Job:
 @dataclasses.dataclass
 class Times:
     """Seconds spent by what overlaps: waiting for points and starting to compute them (on processors that is all of
-    computing); waiting for what is computed, fetching it from the device, writing it; and the whole."""
+    computing). Waiting for what is computed, fetching it from the device, writing it, and the whole."""
 
     points: float = 0.0
     start: float = 0.0
@@ -130,7 +133,7 @@ class Compiled:
     def __call__(
         self, values: Float[np.ndarray, "points names"], told: Callable[[float], None] | None = None
     ) -> dict[str, Array]:
-        """Start computing; returns arrays of the compiled shape that may not be there yet.
+        """Start computing. Returns arrays of the compiled shape that may not be there yet.
 
         Args:
             told: called with the share that is done, where `in_parts`.
@@ -140,15 +143,17 @@ class Compiled:
             which, values = values[:, 0].astype(int), values[:, 1:]
             conditions = jax.tree.map(lambda x: jax.device_put(np.asarray(x)[which], self._split), rows)
         names = [name for name in self.job.plan.design.names if name != ROW]
-        own = [k for k, name in enumerate(names) if name in self.job.task.axes]
-        placed = jax.device_put(np.delete(values, own, axis=1) if own else values, self._split)
+        own_places = [k for k, name in enumerate(names) if name in self.job.task.axes]
+        placed = jax.device_put(np.delete(values, own_places, axis=1) if own_places else values, self._split)
         if self.in_parts:
             conditions = _wide(_on_surface(self._variation, conditions, placed, self._asked.surface), len(values))
             run = self.job.task.run or self._run
-            sizes = values[:, own[0]] if own else None
+            sizes = values[:, own_places[0]] if own_places else None
             return _stored(run(self._variation, conditions, placed, sizes, told or _not_told), self._asked)
-        found: dict[str, Array] = self._program(self._variation, conditions, placed, self._asked, self.job.profile)
-        return found
+        values_by_name: dict[str, Array] = self._program(
+            self._variation, conditions, placed, self._asked, self.job.profile
+        )
+        return values_by_name
 
     def _run(self, variation: Variation, conditions: Conditions, values: Array, _: Any, told: Advance) -> Any:
         """A run of the fidelity."""
@@ -186,8 +191,8 @@ def _on_surface(
     """Conditions of points with the adhesion of their configurations on a surface, if one is stated."""
     if surface is None:
         return conditions
-    _, at = variation.at(values, conditions)
-    ratio = jnp.asarray(surface)[jnp.broadcast_to(at.configuration, values.shape[:1])]
+    _, conditions_there = variation.at(values, conditions)
+    ratio = jnp.asarray(surface)[jnp.broadcast_to(conditions_there.configuration, values.shape[:1])]
     return dataclasses.replace(_wide(conditions, len(values)), adhesion=ratio)
 
 
@@ -197,8 +202,8 @@ def _one_device(
     """Outputs of points as they are stored."""
     conditions = _on_surface(variation, conditions, values, asked.surface)
     names = tuple(name for name, _ in asked.factors)
-    found = evaluate_points(variation, asked.model, values, conditions, dict(asked.options), names, profile)
-    return _stored(found, asked)
+    values_by_name = evaluate_points(variation, asked.model, values, conditions, dict(asked.options), names, profile)
+    return _stored(values_by_name, asked)
 
 
 _one_device_kept = compiled(_one_device)
@@ -239,8 +244,10 @@ class Piece:
     """A chunk under way.
 
     Attributes:
-        chunk: its number; arrays: by variable, which may be on a device still.
-        values: of its points, a row each, where they are at hand; told: points of it that count as done already.
+        chunk: its number.
+        arrays: by variable, which may be on a device still.
+        values: of its points, a row each, where they are at hand.
+        told: points of it that count as done already.
     """
 
     chunk: int
@@ -278,16 +285,16 @@ def _started(
 ) -> Piece:
     start = time.perf_counter()
     values = points.result()
-    made = time.perf_counter()
+    begin = time.perf_counter()
     if compiled.in_parts and advance is not None:
         count = compiled.job.blocks.count(chunk)
-        told = share_counter(advance, count)
-        piece = Piece(chunk, compiled(values, told), values, count)
-        told(1.0)
+        counter = share_counter(advance, count)
+        piece = Piece(chunk, compiled(values, counter), values, count)
+        counter(1.0)
     else:
         piece = Piece(chunk, compiled(values), values)
-    times.points += made - start
-    times.start += time.perf_counter() - made
+    times.points += begin - start
+    times.start += time.perf_counter() - begin
     return piece
 
 
@@ -309,7 +316,7 @@ def fetch_values(arrays: Json, count: int) -> Columns:
 
 
 def drawn_samples(job: Job, piece: Piece) -> Float[np.ndarray, "names points"] | None:
-    """Sample values along a chunk, a row a name; None if another chunk writes them."""
+    """Sample values along a chunk, a row a name, None if another chunk writes them."""
     design, samples = job.plan.design, job.plan.design.samples
     if samples is None or any(job.blocks.place(piece.chunk)[:-1]):
         return None
@@ -323,10 +330,11 @@ def write_chunks(keep: Keep, job: Job, chunks: Produced, advance: Advance, times
     """Write chunks as they come, in a thread of its own, so that the next is computed meanwhile.
 
     Args:
-        keep: writes one; advance: called with the points of each chunk that is done.
+        keep: writes one.
+        advance: called with the points of each chunk that is done.
 
     Raises:
-        OSError: the disk is full, or the store cannot be written; chunks written before are kept.
+        OSError: the disk is full, or the store cannot be written. Chunks written before are kept.
     """
     waiting: queue.Queue[Piece | None] = queue.Queue(WAITING)
     stop, failures = threading.Event(), list[BaseException]()

@@ -1,6 +1,6 @@
 """The store of a sweep: a Zarr group whose chunks are whole or absent, and the record of finished chunks.
 
-Arrays are laid out in the Zarr format 3; each chunk is a file, written under another name and moved into place, so
+Arrays are laid out in the Zarr format 3. Each chunk is a file, written under another name and moved into place, so
 that no file is ever partial. A chunk of the sweep counts as done when its line in a journal is complete. That line
 is written last and has a checksum of each file, which detects later damage.
 """
@@ -62,7 +62,9 @@ def job_identity(config: Part, robot: Robot, files: Iterable[str], device: str) 
     """Sections, each of words by key: configuration, data, code, versions, device.
 
     Args:
-        config: of the sweep, chunk and outputs resolved; files: that it reads; device: kind of the devices.
+        config: of the sweep, chunk and outputs resolved.
+        files: that it reads.
+        device: kind of the devices.
 
     Raises:
         BadConfiguration: a file that cannot be read.
@@ -103,28 +105,28 @@ def _hash(file: str) -> str:
 
 
 def _flat(content: Json, prefix: str) -> dict[str, str]:
-    found: dict[str, str] = {}
+    flat: dict[str, str] = {}
     for key, value in content.items():
         if isinstance(value, dict):
-            found |= _flat(value, f"{prefix}{key}.")
+            flat |= _flat(value, f"{prefix}{key}.")
         else:
-            found[f"{prefix}{key}"] = repr(value)
-    return found
+            flat[f"{prefix}{key}"] = repr(value)
+    return flat
 
 
 def identity_differences(
     stored: Mapping[str, Mapping[str, str]], now: Mapping[str, Mapping[str, str]], most: int = 3
 ) -> str:
-    """In which sections two identities differ, with the first keys; empty where they do not."""
-    said = []
+    """In which sections two identities differ, with the first keys, empty where they do not."""
+    differences = []
     for section in dict.fromkeys((*now, *stored)):
         old, new = stored.get(section, {}), now.get(section, {})
         keys = [key for key in dict.fromkeys((*new, *old)) if old.get(key) != new.get(key)]
         if keys:
-            shown = [f"{key}{_change(old.get(key), new.get(key), section)}" for key in keys[:most]]
+            changes = [f"{key}{_change(old.get(key), new.get(key), section)}" for key in keys[:most]]
             more = f" and {len(keys) - most} more" if len(keys) > most else ""
-            said.append(f"{section} ({', '.join(shown)}{more})")
-    return "; ".join(said)
+            differences.append(f"{section} ({', '.join(changes)}{more})")
+    return "; ".join(differences)
 
 
 def _change(old: str | None, new: str | None, section: str) -> str:
@@ -147,7 +149,9 @@ class Variable:
     """An array of a store.
 
     Attributes:
-        name: of the array; dtype: in NumPy's words; attributes: units, long_name and the like.
+        name: of the array.
+        dtype: in NumPy's words.
+        attributes: units, long_name and the like.
     """
 
     name: str
@@ -160,9 +164,13 @@ class Layout:
     """Layout of a store.
 
     Attributes:
-        design: the points; blocks: its chunks; variables: outputs, of all dimensions of the design.
-        coordinates: units and long names of the varied names; labels: words of an axis in place of its numbers.
-        attributes: of the group; compression: `none` or `zstd`.
+        design: the points.
+        blocks: its chunks.
+        variables: outputs, of all dimensions of the design.
+        coordinates: units and long names of the varied names.
+        labels: words of an axis in place of its numbers.
+        attributes: of the group.
+        compression: `none` or `zstd`.
     """
 
     design: Design
@@ -181,13 +189,13 @@ class Layout:
         each = sum(_on_disk(np.dtype(v.dtype).itemsize * points) for v in self.variables) * len(self.blocks)
         outputs = each + BLOCK * folders * len(self.variables)
         names = () if self.design.samples is None else self.design.samples.names
-        drawn = len(names) * counts[-1] * _on_disk(8 * self.blocks.size[-1])
+        sample_size = len(names) * counts[-1] * _on_disk(8 * self.blocks.size[-1])
         axes = sum(_on_disk(8 * len(values)) for values in self.design.axes.values())
         arrays = len(self.variables) + len(names) + len(self.design.axes)
         widest = {v.name: (-1.2345678901234567e-300,) * 2 for v in self.variables}
         checks = dict.fromkeys([*widest, *names], 2**32 - 1)
         line = _line(Done(len(self.blocks), (points,) * len(STATUSES), widest, checks))
-        return outputs + drawn + axes + arrays * (3 * BLOCK + METADATA) + _on_disk(len(line) * len(self.blocks))
+        return outputs + sample_size + axes + arrays * (3 * BLOCK + METADATA) + _on_disk(len(line) * len(self.blocks))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -195,8 +203,9 @@ class Done:
     """Journal entry of a finished chunk.
 
     Attributes:
-        chunk: its number; statuses: number of points by status; ranges: least and greatest finite value of
-            each output that has one.
+        chunk: its number.
+        statuses: number of points by status.
+        ranges: least and greatest finite value of each output that has one.
         checks: checksum of the chunk's file of each array, CRC-32.
     """
 
@@ -244,7 +253,7 @@ class SweepStore(Folder):
             raise
 
     def _enter(self, force: bool) -> bool:
-        """Begin the store or take it up; False where another process has removed it while this one waited for it."""
+        """Begin the store or take it up, False where another process has removed it while this one waited for it."""
         try:
             self.partial.mkdir(parents=True, exist_ok=True)
             self._lock = (self.partial / LOCK).open("a")
@@ -350,8 +359,8 @@ class SweepStore(Folder):
         with tempfile.TemporaryDirectory() as place:
             create_store(Path(place) / STORE, self.layout)
             whole = {p.relative_to(place): p.read_bytes() for p in Path(place).rglob("*") if p.is_file()}
-        found = {folder / name: content for name, content in whole.items()}
-        return {p: content for p, content in found.items() if not p.is_file() or p.read_bytes() != content}
+        contents = {folder / name: content for name, content in whole.items()}
+        return {p: content for p, content in contents.items() if not p.is_file() or p.read_bytes() != content}
 
     def _mend_layout(self) -> None:
         """Write what is damaged of metadata and axes anew, with a note."""
@@ -377,7 +386,7 @@ class SweepStore(Folder):
     # --- chunks -----------------------------------------------------------------------------------
 
     def begin(self, shard: tuple[int, int] = (1, 1)) -> None:
-        """Open the journal of a share of the chunks; from now on no other process may work on it.
+        """Open the journal of a share of the chunks. From now on no other process may work on it.
 
         Raises:
             BadConfiguration: another process does, or has removed the store or begun another one in its place.
@@ -402,7 +411,7 @@ class SweepStore(Folder):
             self._journal.flush()
 
     def _at_work(self) -> str | None:
-        """Share that another process is computing; None: no such share. Call within `_locked`."""
+        """Share that another process is computing. None: no such share. Call within `_locked`."""
         return share_at_work(self.partial, self._share)
 
     def _busy(self, name: str) -> BadConfiguration:
@@ -412,7 +421,7 @@ class SweepStore(Folder):
         )
 
     def done(self) -> dict[int, Done]:
-        """Finished chunks by number, whose files are as they were written; a damaged one is reported once."""
+        """Finished chunks by number, whose files are as they were written. A damaged one is reported once."""
         for chunk, records in self._records().items():
             if chunk in self._sound:
                 continue
@@ -426,17 +435,17 @@ class SweepStore(Folder):
 
     def _records(self) -> dict[int, list[Done]]:
         """Lines of all journals that are whole, by chunk."""
-        found: dict[int, list[Done]] = {}
+        records: dict[int, list[Done]] = {}
         folder = self.path if self.finished else self.partial
         for file in sorted((folder / JOURNAL).glob("*.jsonl")):
             for line in file.read_text(encoding="utf-8", errors="replace").splitlines():
                 record = _record(line)
                 if record is not None and 0 <= record.chunk < len(self.layout.blocks):
-                    found.setdefault(record.chunk, []).append(record)
-        return found
+                    records.setdefault(record.chunk, []).append(record)
+        return records
 
     def _wrong_file(self, record: Done) -> Path | None:
-        """File of a chunk that is not as it was written; None if all are."""
+        """File of a chunk that is not as it was written, None if all are."""
         store = (self.path if self.finished else self.partial) / STORE
         for name, file in self._files(record.chunk).items():
             try:
@@ -449,17 +458,17 @@ class SweepStore(Folder):
     def _files(self, chunk: int) -> dict[str, Path]:
         """Files of a chunk within the store, by array: those of the samples at the beginning of all other axes."""
         place, samples = self.layout.blocks.place(chunk), self.layout.design.samples
-        found = {v.name: Path(v.name, "c", *map(str, place)) for v in self.layout.variables}
+        files = {v.name: Path(v.name, "c", *map(str, place)) for v in self.layout.variables}
         if samples is not None and not any(place[:-1]):
-            found |= {name: Path(name, "c", *map(str, place[-1:])) for name in samples.names}
-        return found
+            files |= {name: Path(name, "c", *map(str, place[-1:])) for name in samples.names}
+        return files
 
     def write(self, chunk: int, arrays: Columns, drawn: np.ndarray | None) -> Done:
         """Write a chunk and count it as done.
 
         Args:
-            arrays: by variable, a value a point of its box; drawn: values of the samples there, a row a name, written
-                by the chunks at the beginning of all axes.
+            arrays: by variable, a value a point of its box.
+            drawn: values of the samples there, a row a name, written by the chunks at the beginning of all axes.
         """
         layout, files = self.layout, self._files(chunk)
         box = layout.blocks.box(chunk)
@@ -484,7 +493,7 @@ class SweepStore(Folder):
         return record
 
     def _chunk(self, file: Path, values: np.ndarray, size: tuple[int, ...], empty: Any) -> int:
-        """Write the chunk of an array; returns its checksum."""
+        """Write the chunk of an array. Returns its checksum."""
         if values.shape != size:  # chunks at the end of an axis are filled up, as the format wants
             full = np.full(size, empty, values.dtype)
             full[tuple(slice(n) for n in values.shape)] = values
@@ -507,7 +516,7 @@ class SweepStore(Folder):
             yield not self.finished and len(self.done()) == len(self.layout.blocks)
 
     def move_into_place(self) -> Path:
-        """The finished folder, where it is to appear; to be called within `last`.
+        """The finished folder, where it is to appear. To be called within `last`.
 
         The folder that it replaces goes into the new one first, and is deleted there: after a kill between any two
         steps the same command does the rest.
@@ -581,8 +590,8 @@ def create_store(path: Path, layout: Layout) -> None:
     compressors = None if layout.compression == "none" else [ZstdCodec(**ZSTD)]
     group = zarr.create_group(path, zarr_format=3, attributes=dict(layout.attributes))
     design, blocks = layout.design, layout.blocks
-    drawn = design.samples.names if design.samples is not None else ()
-    further = {"coordinates": " ".join(drawn)} if drawn else {}
+    sampled_names = design.samples.names if design.samples is not None else ()
+    further = {"coordinates": " ".join(sampled_names)} if sampled_names else {}
     for v in layout.variables:
         group.create_array(
             v.name, shape=design.shape, chunks=blocks.size, dtype=v.dtype, fill_value=fill_value(v),
@@ -595,7 +604,7 @@ def create_store(path: Path, layout: Layout) -> None:
             dimension_names=(name,), attributes=dict(layout.coordinates[name]),
         )  # fmt: skip
         array[:] = np.array([words[int(k)] for k in values], object) if words else values
-    for name in drawn:
+    for name in sampled_names:
         group.create_array(
             name, shape=design.shape[-1:], chunks=blocks.size[-1:], dtype="float64", fill_value=math.nan,
             compressors=compressors, dimension_names=(SAMPLE,), attributes=dict(layout.coordinates[name]),
@@ -635,7 +644,7 @@ def _line(record: Done) -> str:
 
 
 def _record(line: str) -> Done | None:
-    """A line of a journal; None where it is not whole."""
+    """A line of a journal, None where it is not whole."""
     check, _, body = line.partition(" ")
     if not body or f"{zlib.crc32(body.encode()):08x}" != check:
         return None

@@ -22,22 +22,25 @@ def _content() -> Json:
 def _entry(name: str) -> Json:
     """Words of a figure, table or note, `report.name` of the catalogue."""
     room, _, key = name.partition(".")
-    found: Json = _content()[room][key]
-    return found
+    entry: Json = _content()[room][key]
+    return entry
 
 
 def text(name: str, *words: Any) -> str:
     """A text of the catalogue, with values in it."""
-    said: str = _entry(name).get("text", "")
-    return said.format(*words) if words else said
+    sentence: str = _entry(name).get("text", "")
+    return sentence.format(*words) if words else sentence
 
 
 def figure(name: str, *drawn: Any, finding: str = "", words: Sequence[Any] = (), more: str = "") -> Figure:
-    """A figure of the catalogue; what draws it is imported when it is drawn, as matplotlib costs half a second.
+    """A figure of the catalogue. What draws it is imported when it is drawn, as matplotlib costs half a second.
 
     Args:
-        name: in the catalogue, `report.name`; drawn: arguments of the function that draws it.
-        finding: in words, if it depends on the result; words: values in the caption; more: end of the caption.
+        name: in the catalogue, `report.name`.
+        drawn: arguments of the function that draws it.
+        finding: in words, if it depends on the result.
+        words: values in the caption.
+        more: end of the caption.
     """
     entry = _entry(name)
     module, _, function = entry["draws"].partition(".")
@@ -52,7 +55,8 @@ def table(name: str, rows: Sequence[Sequence[Any]], *more: Column | str, **field
     """A table of the catalogue.
 
     Args:
-        name: in the catalogue, `report.name`; more: columns, or their titles, in the place of "..." there.
+        name: in the catalogue, `report.name`.
+        more: columns, or their titles, in the place of "..." there.
     """
     entry = _entry(name)
     heads: list[Column] = []

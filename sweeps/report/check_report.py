@@ -30,7 +30,9 @@ class CheckResult:
     """Requirements and their outcomes for one robot.
 
     Attributes:
-        asked: the requirements; robot: compared with them; outcomes: one for each requirement, in order.
+        asked: the requirements.
+        robot: compared with them.
+        outcomes: one for each requirement, in order.
         drawn: the robot in the posture of each geometric requirement, see `posture_results.of_requirements`.
     """
 
@@ -67,24 +69,24 @@ class CheckResult:
 
 
 def _share(outcome: Outcome) -> float:
-    """Margin as a share of the limit [-]; the least for a requirement without a value."""
+    """Margin as a share of the limit [-]. The least for a requirement without a value."""
     return -math.inf if outcome.margin is None else outcome.margin / max(abs(requirement_limit(outcome)), 1e-12)
 
 
 def requirement_label(outcome: Outcome) -> str:
     """Name of a requirement, with its duty."""
-    at = outcome.at
+    point = outcome.at
     duty = ""
-    if "duty" in at:
-        duty = f" {at['duty']}" + (f" {100 * at['share']:g} % of the time" if at["share"] else " still")
+    if "duty" in point:
+        duty = f" {point['duty']}" + (f" {100 * point['share']:g} % of the time" if point["share"] else " still")
     return f"{outcome.requirement.quantity.label}{duty}"
 
 
 def requirement_limit(outcome: Outcome) -> float:
     """Required value, or the rating of the part."""
-    found = outcome.requirement.limit
-    assert found is not None
-    return found
+    limit = outcome.requirement.limit
+    assert limit is not None
+    return limit
 
 
 def required_value_text(outcome: Outcome) -> str:
@@ -133,7 +135,7 @@ SHOWN = 3
 
 
 def check_document(found: CheckResult, robot_name: str, changes: bool = True) -> Document:
-    """The report; `changes`: True where changes were searched for."""
+    """The report. `changes`: True where changes were searched for."""
     lead = f"Robot: **{robot_name}**. Requirements: **{found.asked.source}**."
     margins = catalogue.figure("check.margins", found, finding=found.statement())
     sections = [

@@ -54,7 +54,9 @@ class Along:
     """Variables of derivatives.
 
     Attributes:
-        names, units: of the values; values, widths: in these units; given: the run that such values make.
+        names, units: of the values.
+        values, widths: in these units.
+        given: the run that such values make.
     """
 
     names: Names
@@ -87,15 +89,15 @@ class Seen:
             BadConfiguration: it is none.
         """
         try:
-            found = json.loads((folder / "result.json").read_text("utf-8"))
-            ground = found["terrain"]
+            content = json.loads((folder / "result.json").read_text("utf-8"))
+            ground = content["terrain"]
             with (folder / "history.csv").open(newline="", encoding="utf-8") as stream:
                 rows = list(csv.DictReader(stream))
             table = {name: np.array([float(row[name]) for row in rows]) for name in (*COORDINATES, *FILMED)}
             lengths = (jnp.asarray(ground[name]) / 1000 for name in ("points_mm", "nose_mm", "finish_mm"))
             return Seen(
                 robot_file.find_robot_file(str(folder / "robot.toml")).robot,
-                found["configuration"], found["obstacle"], Terrain(*lengths), table,
+                content["configuration"], content["obstacle"], Terrain(*lengths), table,
             )  # fmt: skip
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise BadConfiguration(f"--climb: {folder} cannot be read; expected a folder of mmrjax climb") from error
@@ -106,11 +108,13 @@ class ClimbResult:
     """Result of `climb`.
 
     Attributes:
-        robot, configuration, obstacle: of the run; the last in words.
-        terrain: of the run that is shown; climb: that run, alone.
+        robot, configuration, obstacle: of the run. The last in words.
+        terrain: of the run that is shown.
+        climb: that run, alone.
         radius: of the pulleys [m].
-        tried: sizes [mm] and verdicts of a search; largest: that it got over [mm], None: no search or none.
-        sought: name of the searched size; empty: no search.
+        tried: sizes [mm] and verdicts of a search.
+        largest: that it got over [mm], None: no search or none.
+        sought: name of the searched size. Empty: no search.
         along, derivatives: if requested, else None.
     """
 
@@ -172,23 +176,25 @@ class ClimbResult:
 
     @property
     def margins(self) -> dict[str, float]:
-        """Margins of the run, shares by the names of `OUTPUTS`; none of a run without numbers."""
+        """Margins of the run, shares by the names of `OUTPUTS`. None of a run without numbers."""
         if self.verdict == "failed":
             return {}
-        found = outputs_of_run(self.robot, self.terrain, self.climb, 0)
-        return {name: float(value) for name, value in found.items() if name.startswith("margin_")}
+        run_outputs = outputs_of_run(self.robot, self.terrain, self.climb, 0)
+        return {name: float(value) for name, value in run_outputs.items() if name.startswith("margin_")}
 
     @property
     def slopes(self) -> list[Json] | None:
-        """Derivatives, a row an output and value that it is derived by; None: not asked for."""
-        along, found = self.along, self.derivatives
-        if along is None or found is None:
+        """Derivatives, a row an output and value that it is derived by. None: not asked for."""
+        along, derivatives = self.along, self.derivatives
+        if along is None or derivatives is None:
             return None
         by = ("by", "by_unit", "by_value", "by_width")
         names = ("output", "unit", "value", *by, "derivative", "slope", "slope_sd")
-        found_by = {name: (found.by[name], found.slope[name], found.slope_sd[name]) for name in OUTPUTS}
+        found_by = {
+            name: (derivatives.by[name], derivatives.slope[name], derivatives.slope_sd[name]) for name in OUTPUTS
+        }
         return [
-            dict(zip(names, (n, unit, found.found[n], *row, *(float(x[k]) for x in found_by[n])), strict=True))
+            dict(zip(names, (n, unit, derivatives.found[n], *row, *(float(x[k]) for x in found_by[n])), strict=True))
             for n, (unit, _) in OUTPUTS.items()
             for k, row in enumerate(along.rows)
         ]

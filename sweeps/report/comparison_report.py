@@ -31,11 +31,14 @@ class Comparison:
     Attributes:
         table: conditions, `<column>` measured, `simulated_<column>`, `error_<channel>_percent`, `status`.
         summary: errors of all rows and of each configuration.
-        channels: of the readings; source: name of the table; model: fidelity; robot_name: of the simulated robot.
+        channels: of the readings.
+        source: name of the table.
+        model: fidelity.
+        robot_name: of the simulated robot.
         fit: `these` if the robot was fitted to these rows, `others` if to other rows, "" if no fit is recorded.
         over: further columns of histories for the axes of the errors, with their headings.
         notes: sentences on the table.
-        against: name of a second robot, "" for none; its readings are the columns `against_<column>` of the table.
+        against: name of a second robot, "" for none. Its readings are the columns `against_<column>` of the table.
     """
 
     table: Columns
@@ -116,14 +119,14 @@ _FITS = {
 
 def comparison_document(found: Comparison) -> Document:
     """The report of a comparison."""
-    known = found.table, found.channels
+    table = found.table, found.channels
     lead = (
         f"Robot: **{found.robot_name}**. Fidelity: **{found.model}**. Measured: **{found.source}**, "
         f"{count_noun(len(found.table['status']), 'row')}."
     )
     parity = catalogue.figure(
         "comparison.parity",
-        *known,
+        *table,
         False,
         finding="Simulated less measured, on average: "
         + "; ".join(
@@ -132,13 +135,23 @@ def comparison_document(found: Comparison) -> Document:
             if np.isfinite(e := found.table[f"error_{c.name}_percent"]).any()
         ),
     )
-    errors = catalogue.figure("comparison.errors", *known, True, found.over, finding=_trend(found))
+    errors = catalogue.figure("comparison.errors", *table, True, found.over, finding=_trend(found))
+    status = found.table["status"]
     return Document(
         f"{found.robot_name} against {found.source}",
         comparison_answer(found),
         (
             Note(lead, "lead"),
-            *(Note(text, "warn", terminal=True) for text in _unsolved(found)),
+            *(
+                Note(
+                    f"{words.short_status(name).capitalize()}: {count} of {len(status)} rows; "
+                    f"{words.status_meaning(name)}.",
+                    "warn",
+                    terminal=True,
+                )
+                for name, count in Counter(map(str, status)).items()
+                if name not in words.SETTLED
+            ),
             _errors_table(found),
             *([_both_robots(found)] if found.against else []),
             catalogue.note("comparison.errors-note"),
@@ -154,7 +167,7 @@ def comparison_document(found: Comparison) -> Document:
 
 
 def _over_time(found: Comparison) -> tuple[Section, ...]:
-    """The section with readings over time of a log; none for a table of settled runs."""
+    """The section with readings over time of a log. None for a table of settled runs."""
     if found.over is None:
         return ()
     lines = {"simulated_": found.robot_name, "against_": found.against}
@@ -176,8 +189,8 @@ def comparison_answer(found: Comparison) -> str:
     what = f"{rows} of {total} rows" if rows < total else count_noun(total, "row")
     if found.over is not None:
         what = f"{_seconds(found):.3g} s of log"
-    said = f"{what}: rms error {errors} (worst reading {worst:.1f} %). {_FITS[found.fit]}".rstrip()
-    return said if not found.against else f"{said} {_second_robot(found)}"
+    sentence = f"{what}: rms error {errors} (worst reading {worst:.1f} %). {_FITS[found.fit]}".rstrip()
+    return sentence if not found.against else f"{sentence} {_second_robot(found)}"
 
 
 def _second_robot(found: Comparison) -> str:
@@ -205,16 +218,6 @@ def _seconds(found: Comparison) -> float:
     return float(sum(np.ptp(time[runs == name]) for name in np.unique(runs)))
 
 
-def _unsolved(found: Comparison) -> list[str]:
-    """A sentence for each status that gives no operating point."""
-    status = found.table["status"]
-    return [
-        f"{words.short_status(name).capitalize()}: {count} of {len(status)} rows; {words.status_meaning(name)}."
-        for name, count in Counter(map(str, status)).items()
-        if name not in words.SETTLED
-    ]
-
-
 def _errors_table(found: Comparison) -> Table:
     rows = []
     for group, by_channel in found.summary.items():
@@ -226,10 +229,10 @@ def _errors_table(found: Comparison) -> Table:
 
 
 def _rows(found: Comparison) -> Table:
-    table, shown = found.table, condition_formats(found.table, mass=True)
-    heads = [Column("configuration"), *(Column(heading, form=form) for heading, form in shown.values())]
+    table, formats = found.table, condition_formats(found.table, mass=True)
+    heads = [Column("configuration"), *(Column(heading, form=form) for heading, form in formats.values())]
     heads.append(Column("status"))
-    cells: list[Any] = [table["configuration"], *(table[c] for c in shown)]
+    cells: list[Any] = [table["configuration"], *(table[c] for c in formats)]
     cells.append([_status(str(s)) for s in table["status"]])
     for c in found.channels:
         measured, simulated = table[c.column], table[f"simulated_{c.column}"]

@@ -33,7 +33,8 @@ class Note:
     Attributes:
         text: the paragraph, or a tuple of items.
         kind: its look on the page: "", `lead`, `key`, or `warn` for a warning.
-        name: of the element on the page; terminal: True if the terminal prints it too.
+        name: of the element on the page.
+        terminal: True if the terminal prints it too.
     """
 
     text: str | Names
@@ -47,8 +48,11 @@ class Column:
     """One column of a table.
 
     Attributes:
-        heading: its words; unit: unit of its numbers; group: heading above it and its neighbours of the same group.
-        form: format of its numbers, "" for a column of text; terminal: True if the terminal shows it too.
+        heading: its words.
+        unit: unit of its numbers.
+        group: heading above it and its neighbours of the same group.
+        form: format of its numbers, "" for a column of text.
+        terminal: True if the terminal shows it too.
     """
 
     heading: str
@@ -68,7 +72,7 @@ class Column:
         return f"{self.group}: {self.title}" if self.group and self.heading else self.group or self.title
 
     def text(self, cell: Any) -> str:
-        """Text of a cell, the same on page and terminal; a missing number is a dash."""
+        """Text of a cell, the same on page and terminal. A missing number is a dash."""
         value = cell.value if isinstance(cell, Cell) else cell
         if is_missing(value):
             return DASH
@@ -80,17 +84,17 @@ class Column:
 def columns(*titles: str) -> tuple[Column, ...]:
     """Columns from titles such as `speed > error [%] | +.1f`: heading in a group, unit, and format of numbers.
 
-    Without ` | ` a column has text, with nothing behind it texts of numbers; `~` marks a column for the page only.
+    Without ` | ` a column has text, with nothing behind it texts of numbers. `~` marks a column for the page only.
     """
-    found = []
+    columns_so_far = []
     for title in titles:
         name, bar, form = title.removeprefix("~").partition(" |")
         group, _, heading = name.rpartition(" > ")
         heading, _, unit = heading.removesuffix("]").partition(" [")
         form = form.strip()
         form = form if "{" in form or not bar else f"{{:{form}}}"
-        found.append(Column(heading, unit, form, group, not title.startswith("~")))
-    return tuple(found)
+        columns_so_far.append(Column(heading, unit, form, group, not title.startswith("~")))
+    return tuple(columns_so_far)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,13 +110,17 @@ class Cell:
 
 @dataclasses.dataclass(frozen=True)
 class Table:
-    """A table; the page offers it as a CSV file.
+    """A table. The page offers it as a CSV file.
 
     Attributes:
-        name: of the element and its CSV file; columns: its columns; rows: values or `Cell`s, one for each column.
-        title: for the terminal; file: of the run folder with all rows, named where the table is cut.
-        wide: True for small print on the page; terminal: True if the terminal shows it too.
-        brief: numbers of the rows that the terminal shows; None for all.
+        name: of the element and its CSV file.
+        columns: its columns.
+        rows: values or `Cell`s, one for each column.
+        title: for the terminal.
+        file: of the run folder with all rows, named where the table is cut.
+        wide: True for small print on the page.
+        terminal: True if the terminal shows it too.
+        brief: numbers of the rows that the terminal shows, None for all.
         sideways: True if a few rows are shown side by side, each under the text of its first cell.
     """
 
@@ -128,7 +136,7 @@ class Table:
 
     @property
     def turned(self) -> Table:
-        """The first rows side by side, if the table is `sideways`; else the table itself."""
+        """The first rows side by side, if the table is `sideways`, else the table itself."""
         if not self.sideways:
             return self
         first, *others = self.columns
@@ -142,18 +150,18 @@ class Table:
 
     @property
     def groups(self) -> list[tuple[str, int]]:
-        """Headings above the columns, each with its number of columns; all empty for a table without groups."""
-        found: list[tuple[str, int]] = []
+        """Headings above the columns, each with its number of columns. All empty for a table without groups."""
+        group_widths: list[tuple[str, int]] = []
         for column in self.columns:
-            if found and column.group and found[-1][0] == column.group:
-                found[-1] = column.group, found[-1][1] + 1
+            if group_widths and column.group and group_widths[-1][0] == column.group:
+                group_widths[-1] = column.group, group_widths[-1][1] + 1
             else:
-                found.append((column.group, 1))
-        return found
+                group_widths.append((column.group, 1))
+        return group_widths
 
     @property
     def csv(self) -> str:
-        """The table as CSV with numbers in full; missing ones are empty cells."""
+        """The table as CSV with numbers in full. Missing ones are empty cells."""
         stream = io.StringIO()
         writer = csv.writer(stream, lineterminator="\n")
         writer.writerow(cell_text(plain_text(column.full_title)) for column in self.columns)
@@ -169,8 +177,10 @@ class Figure:
     """A figure of the page.
 
     Attributes:
-        name: of its element and file; alternative: its finding in words, for who does not see it; caption: how to
-            read it; draw: returns the matplotlib figure.
+        name: of its element and file.
+        alternative: its finding in words, for who does not see it.
+        caption: how to read it.
+        draw: returns the matplotlib figure.
     """
 
     name: str
@@ -184,7 +194,7 @@ Block = Note | Table | Figure
 
 @dataclasses.dataclass(frozen=True)
 class Section:
-    """Blocks under a heading; `name`: of the heading's element; `level`: of the heading.
+    """Blocks under a heading. `name`: of the heading's element. `level`: of the heading.
 
     `folded`: words of a line that unfolds them, if they are hidden.
     """
@@ -201,8 +211,11 @@ class Document:
     """The report of a command.
 
     Attributes:
-        title: of the page; answer: the result in a sentence or two; blocks: what follows it before the first heading.
-        sections: the rest, in order; page_sections: makes those that only the page has, before them.
+        title: of the page.
+        answer: the result in a sentence or two.
+        blocks: what follows it before the first heading.
+        sections: the rest, in order.
+        page_sections: makes those that only the page has, before them.
     """
 
     title: str

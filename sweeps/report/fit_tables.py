@@ -25,7 +25,8 @@ class Change(NamedTuple):
     """Change of the readings of the runs by an effect of the robot that is written.
 
     Attributes:
-        channel: with the largest change; rms: of the change [% of the channel's measured rms].
+        channel: with the largest change.
+        rms: of the change [% of the channel's measured rms].
         without, with_it: simulated without and with the effect, otherwise the same [SI], shape (rows,).
     """
 
@@ -80,7 +81,8 @@ def rows_section(
     """The rows with their conditions, readings, and the error of the last kind of readings.
 
     Args:
-        kinds: words of each kind of readings by the prefix of its columns; more: `first` and `last` columns, by name.
+        kinds: words of each kind of readings by the prefix of its columns.
+        more: `first` and `last` columns, by name.
         sized: True if errors are in the channel's unit, and not in per cent.
     """
     conditions = condition_formats(dict(table))

@@ -38,7 +38,8 @@ def loop_document(found: DiscoveryResult, robot_name: str, changes: Mapping[str,
     """The report of a pass of the loop.
 
     Args:
-        robot_name: name or file of the robot that it began with; changes: of settled runs by each effect.
+        robot_name: name or file of the robot that it began with.
+        changes: of settled runs by each effect.
     """
     missing = found.verdict not in ("none", "undescribed")
     moved = list(moved_parameters(found))
@@ -78,7 +79,13 @@ def _findings(found: DiscoveryResult, changes: Mapping[str, Change]) -> Iterable
             size += f", which changes the {changes[e.name].channel.label} by {changes[e.name].rms:.2g} %"
         or_else = f" Or {other}." if other else ""
         kinds = ", or ".join(e.families)
-        yield f"**{kinds}** (`{e.name}`): {size}; {loop_words.how_sure(found, e)}.{or_else}"
+        sure = f"{_noise_alone(found).lower()}{loop_words.how_sure(found, e)}"
+        yield f"**{kinds}** (`{e.name}`): {size}; {sure}.{or_else}"
+
+
+def _noise_alone(found: DiscoveryResult) -> str:
+    """Opening of a claim that does not hold at every noise tried; "" for one that does."""
+    return "" if found.headline.level == found.verdict else "At 1 times the noise alone: "
 
 
 def moved_parameters(found: DiscoveryResult) -> Iterable[str]:
@@ -135,8 +142,8 @@ def held_out_table(found: DiscoveryResult) -> Table:
         for c in both[0]:
             texts = [f"{e[c]['rms_percent']:.1f}" if e[c]["rows"] else "-" for e in both[: 1 + many]]
             change = both[1][c]["rms_percent"] - both[0][c]["rms_percent"] if many else 0.0
-            shown = np.inf if c in worse else change if not kind or change < 0 else 0.0
-            cells.append(_marked(" → ".join(texts), shown))
+            change_shown = np.inf if c in worse else change if not kind or change < 0 else 0.0
+            cells.append(_marked(" → ".join(texts), change_shown))
         reached = max(int(e["rows"]) for e in both[0].values())
         what = f"unseen: another {blocks.kind_in_words(kind)}" if kind else "seen by the fit"
         rows.append((what, *cells, f"{reached} of {total}"))
@@ -145,15 +152,6 @@ def held_out_table(found: DiscoveryResult) -> Table:
             what = f"unseen: another {blocks.kind_in_words(kind)}"
             rows.append((what, *["-"] * len(found.channels), "not predictable from the others"))
     return catalogue.table("loop.errors", rows, *(f"{c.label} |" for c in found.channels))
-
-
-def check_first(found: DiscoveryResult) -> list[str]:
-    """Points to check before use: the reading with the largest weight, repeated values, contradictions."""
-    far = [describe(note) for note in with_codes(found.remarks, "far_from_prior", "repeats", "copied")]
-    against = [note for note in found.remarks if isinstance(note, str)]
-    said = [loop_words.largest_share(found), *far, *against[:1]]
-    # a sentence begins with a capital, a parameter's name does not
-    return [f"{text if '.' in text.split()[0] else text[0].upper() + text[1:]}." for text in said if text]
 
 
 def _advice(found: DiscoveryResult) -> Table:
@@ -165,9 +163,22 @@ def _advice(found: DiscoveryResult) -> Table:
         tells = f" Tells {', '.join(after.separates)}; expected separation {after.expected_sigma:.1f} σ."
         undecided = " Some pairs stay undecided." if found.headline.level == "class" and not after.settles else ""
         next_step = f"**{after.name}**: {after.description}.{tells * bool(after.separates)}{undecided}"
+    far = [describe(note) for note in with_codes(found.remarks, "far_from_prior", "repeats", "copied")]
+    against = [note for note in found.remarks if isinstance(note, str)]
+    sentences = [
+        loop_words.largest_share(found),
+        *far,
+        *against[:1],
+    ]  # a sentence begins with a capital, a parameter does not
     rows = [
         ("use it?", " ".join(loop_words.use_it(found)) or "No runs could be held out."),
-        ("check first", " ".join(check_first(found)) or "Nothing unusual."),
+        (
+            "check first",
+            " ".join(
+                [f"{text if '.' in text.split()[0] else text[0].upper() + text[1:]}." for text in sentences if text]
+            )
+            or "Nothing unusual.",
+        ),
         ("do next", next_step),
     ]
     return catalogue.table("loop.advice", rows)
@@ -254,9 +265,8 @@ def _certain(found: DiscoveryResult, missing: bool) -> Iterable[Section]:
     noise = loop_words.at_other_noise(found.sensitivity) if found.sensitivity else ""
     noises = {name: (n["median_percent"], n["source"]) for name, n in found.noise.items()}
     notes = [*found.notes, noise, fit_tables.noise_sentence(noises, found.channels)]
-    at = "" if found.headline.level == found.verdict else "At 1 times the noise alone: "
     blocks = [
-        Note(f"{at}{found.verdict_statement}", name="statement", terminal=True),
+        Note(f"{_noise_alone(found)}{found.verdict_statement}", name="statement", terminal=True),
         *([Note(loop_words.cluster_sentence(found.cluster), name="cluster")] if found.cluster else []),
         *(Note(text, name=name, terminal=True) for name, text in reasons.items() if text),
         *remarks(also, "also"),
@@ -319,9 +329,9 @@ def _where_missing(found: DiscoveryResult, table: Columns, changes: Mapping[str,
         more = catalogue.text("loop.unresolved", names) if names else ""
         yield catalogue.figure("loop.series", detail, found.channels, verdict, words=numbers, more=more)
     else:
-        drawn = table, verdict, sized
+        figure_input = table, verdict, sized
         yield catalogue.figure(
-            "loop.defects", *drawn, words=(_closed(found, table) if sized else catalogue.text("loop.three"),)
+            "loop.defects", *figure_input, words=(_closed(found, table) if sized else catalogue.text("loop.three"),)
         )
     if found.unnamed is not None:
         curve = found.unnamed
@@ -382,8 +392,8 @@ def _named(values: Mapping[str, float]) -> str:
     return ", ".join(f"{name} {value:.3g}" for name, value in values.items())
 
 
-def would_be_seen(found: DiscoveryResult) -> list[tuple[str, str, str, float]]:
-    """From what size each effect of the library would have been noticed, the first in its typical sizes first."""
+def _looked_for(found: DiscoveryResult) -> Iterable[Block]:
+    yield catalogue.note("loop.seen-above")
     level, listed = found.before.kinds["single"].threshold, []
     for s in found.scores:
         if s.name in BY_NAME and s.sigmas_per_prior_sd > 0:
@@ -391,12 +401,7 @@ def would_be_seen(found: DiscoveryResult) -> list[tuple[str, str, str, float]]:
             times = level / s.sigmas_per_prior_sd
             size = f"{times * spec.prior_sd(0.0):.2g} {spec.unit}"
             listed.append((f"`{s.name}`", BY_NAME[s.name].family(), size, times))
-    return sorted(listed, key=lambda row: row[-1])
-
-
-def _looked_for(found: DiscoveryResult) -> Iterable[Block]:
-    yield catalogue.note("loop.seen-above")
-    yield catalogue.table("loop.would_be_seen", would_be_seen(found))
+    yield catalogue.table("loop.would_be_seen", sorted(listed, key=lambda row: row[-1]))
     unseen = {
         "cannot_see": found.cannot_see, "needs_series": found.needs_histories, "needs_reverse": found.needs_reverse
     }  # fmt: skip

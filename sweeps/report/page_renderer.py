@@ -12,7 +12,7 @@ from sweeps.report.document import Document, Figure
 
 
 def write_report_page(folder: Path, document: Document, file: RobotFile | None = None) -> Path:
-    """Write `report.html` and `figures/` of a document; returns the path of the page.
+    """Write `report.html` and `figures/` of a document. Returns the path of the page.
 
     Args:
         file: of the robot that the page is about: its parameters are the last section.

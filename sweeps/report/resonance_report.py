@@ -43,8 +43,10 @@ class ResonanceResult:
     """Result of `resonance`.
 
     Attributes:
-        configuration, slope_deg, surface: of the map; passing: source of the excitation; robot: that was simulated.
-        table: a row a run, as in `points.csv`; the grid's first, then further points of Table 8.
+        configuration, slope_deg, surface: of the map.
+        passing: source of the excitation.
+        robot: that was simulated.
+        table: a row a run, as in `points.csv`. The grid's first, then further points of Table 8.
         modes: by payload [kg].
         peaks, crossings: at every payload.
     """
@@ -61,7 +63,7 @@ class ResonanceResult:
 
     @property
     def resonances(self) -> list[Resonance]:
-        """Peaks over the payloads; those without a mode are confirmed by none."""
+        """Peaks over the payloads. Those without a mode are confirmed by none."""
         return group_resonances(self.peaks)
 
     @property
@@ -77,24 +79,24 @@ class ResonanceResult:
 
     @property
     def speeds(self) -> tuple[float, float]:
-        """Least and greatest speed read [m/s]; NaN without a reading."""
+        """Least and greatest speed read [m/s], NaN without a reading."""
         speed = self.table["speed_mean_mm_s"][self.read] * MM
         return (float(speed.min()), float(speed.max())) if len(speed) else (float("nan"), float("nan"))
 
     @property
     def statuses(self) -> dict[str, int]:
-        """Number of runs by status; every status is included."""
+        """Number of runs by status. Every status is included."""
         return {s: int(np.sum(self.table["status"] == s)) for s in (*STATUSES, SLOW)}
 
     @property
     def avoid(self) -> list[tuple[float, float, list[Resonance]]]:
         """Ranges of speed to avoid [m/s], lowest first, each of one mode and order, with what shows it."""
-        found: dict[tuple[str, int], list[Resonance]] = {}
+        by_mode: dict[tuple[str, int], list[Resonance]] = {}
         for r in strongest_resonances(self.resonances):
-            found.setdefault((r.mode, r.order), []).append(r)
+            by_mode.setdefault((r.mode, r.order), []).append(r)
         ranges = [
             (min(r.avoid[0] for r in members), max(r.avoid[1] for r in members), members)
-            for members in found.values()
+            for members in by_mode.values()
         ]
         return sorted(ranges, key=lambda x: x[0])
 
@@ -114,7 +116,7 @@ class ResonanceResult:
 
     @property
     def travel(self) -> np.ndarray:
-        """Speed of every run [mm/s]; where it has none, as its voltage has it in the others (NaN: in none)."""
+        """Speed of every run [mm/s]. Where it has none, as its voltage has it in the others (NaN: in none)."""
         speed, voltage = self.table["speed_mean_mm_s"], self.table["supply_voltage_V"]
         if self.read.sum() < 2:
             return speed
@@ -192,11 +194,13 @@ class ResonanceResult:
         rows = np.flatnonzero(self.table["table8"] & self.read)
         inside = []
         for voltage in np.unique(self.table["supply_voltage_V"][rows]):
-            found = rows[self.table["supply_voltage_V"][rows] == voltage]
-            hit = [k for k in found if self.shaken(k)]
+            table_rows = rows[self.table["supply_voltage_V"][rows] == voltage]
+            hit = [k for k in table_rows if self.shaken(k)]
             if hit:
                 loads = ", ".join(f"{self.table['payload_kg'][k]:g}" for k in hit)
-                inside.append(f"{voltage:g} V with {'every payload' if len(hit) == len(found) else loads + ' kg'}")
+                inside.append(
+                    f"{voltage:g} V with {'every payload' if len(hit) == len(table_rows) else loads + ' kg'}"
+                )
         return (
             f"Of Table 8 at {self.slope_deg:g}°, affected at their own payload: {'; '.join(inside)}."
             if inside
@@ -257,13 +261,13 @@ class ResonanceResult:
 
 def _merged(ranges: Iterable[tuple[float, float]]) -> list[tuple[float, float]]:
     """Ranges as few that do not overlap, lowest first."""
-    found: list[tuple[float, float]] = []
+    merged: list[tuple[float, float]] = []
     for low, high in sorted(ranges):
-        if found and low <= found[-1][1]:
-            found[-1] = found[-1][0], max(found[-1][1], high)
+        if merged and low <= merged[-1][1]:
+            merged[-1] = merged[-1][0], max(merged[-1][1], high)
         else:
-            found.append((low, high))
-    return found
+            merged.append((low, high))
+    return merged
 
 
 def ripple_percent(value: float) -> str:
@@ -272,7 +276,7 @@ def ripple_percent(value: float) -> str:
 
 
 def _listed(ranges: list[tuple[float, float, list[Resonance]]], what: str) -> str:
-    """Ranges to avoid, the lowest speed first; only the strongest if there are many."""
+    """Ranges to avoid, the lowest speed first. Only the strongest if there are many."""
     most = sorted(ranges, key=lambda r: -max(x.rise for x in r[2]))[:SAID]
     texts = []
     for low, high, members in sorted(most, key=lambda r: r[0]):

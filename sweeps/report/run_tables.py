@@ -33,7 +33,7 @@ def imposed_column(runs: Iterable[str]) -> str:
 
 
 def _column(condition: Condition) -> str:
-    """Column of a condition; that of its channel for an imposed speed or current."""
+    """Column of a condition. That of its channel for an imposed speed or current."""
     return next((c.column for c in channels.EVERY if c.name == condition.name), condition.column)
 
 
@@ -48,8 +48,8 @@ def condition_formats(table: Columns, *, mass: bool = False) -> dict[str, tuple[
         mass: True to include the total mass.
     """
     readings = {c for c in table if f"simulated_{c}" in table or f"after_{c}" in table}
-    shown = {c: about for c, about in CONDITIONS.items() if c in table and c not in readings}
-    return {c: about for c, about in shown.items() if mass or c != "total_mass_kg"}
+    formats = {c: about for c, about in CONDITIONS.items() if c in table and c not in readings}
+    return {c: about for c, about in formats.items() if mass or c != "total_mass_kg"}
 
 
 #: Quantities by column, of several of one column that of runs.
@@ -85,7 +85,7 @@ def quantity_column(name: str, **options: Any) -> Column:
 
 
 def quantity_cells(table: Columns, name: str) -> list[Any]:
-    """Cells of a column, each with its standard deviation if the table has one; infinite numbers in words."""
+    """Cells of a column, each with its standard deviation if the table has one. Infinite numbers in words."""
     values, spread = table[name], table.get(name + uncertainty.SD)
     if spread is not None:
         digits = _REGISTERED[name].resolution
@@ -104,12 +104,15 @@ def quantity_table(name: str, table: Columns, names: Iterable[str], **options: A
     """The quantities `names` that a table of runs has numbers of, a row for each run.
 
     Args:
-        name: of the table; options: further fields of it, and its `first` columns with their cells.
+        name: of the table.
+        options: further fields of it, and its `first` columns with their cells.
     """
     first: Sequence[tuple[Column, Sequence[Any]]] = options.pop("first", ())
-    shown = [n for n in dict.fromkeys(names) if n in table and (n == "supply_voltage_V" or not _is_empty(table[n]))]
-    heads = (*(column for column, _ in first), *map(quantity_column, shown))
-    cells = [*(cells for _, cells in first), *(quantity_cells(table, n) for n in shown)]
+    shown_names = [
+        n for n in dict.fromkeys(names) if n in table and (n == "supply_voltage_V" or not _is_empty(table[n]))
+    ]
+    heads = (*(column for column, _ in first), *map(quantity_column, shown_names))
+    cells = [*(cells for _, cells in first), *(quantity_cells(table, n) for n in shown_names)]
     return Table(name, heads, list(zip(*cells, strict=True)), **options)
 
 
@@ -118,7 +121,7 @@ def _is_empty(values: np.ndarray) -> bool:
 
 
 def reading_text(value: Any, channel: Channel) -> str:
-    """A reading with one digit less than its channel's resolution; a dash for a missing one."""
+    """A reading with one digit less than its channel's resolution. A dash for a missing one."""
     return Column("", form=f"{{:.{max(channel.resolution - 1, 0)}f}}").text(value)
 
 
@@ -157,7 +160,9 @@ def endings_table(
     """How runs or points ended: statuses that occurred, in words, with their number.
 
     Args:
-        counts: by status; meanings: of statuses that are no fidelity's; more: further columns, each by status.
+        counts: by status.
+        meanings: of statuses that are no fidelity's.
+        more: further columns, each by status.
     """
     total, reached = sum(counts.values()), [s for s, n in counts.items() if n]
     further = (f"~{name.replace('_', ' ')}" for name in more)
@@ -185,7 +190,8 @@ def use_of_limits(asked: Iterable[tuple[str, Any, Any, str]], ambient: float) ->
     A winding has the share of its permissible temperature rise.
 
     Args:
-        asked: words, value, limit, and format with the unit; NaN: unknown; ambient: temperature [°C].
+        asked: words, value, limit, and format with the unit. NaN: unknown.
+        ambient: temperature [°C].
     """
     return [
         {

@@ -26,9 +26,12 @@ class SizeResult:
     """Designs for some requirements.
 
     Attributes:
-        asked: the requirements; robot: where the search started; sizing: its result; objectives: minimised numbers.
-        outcomes: results of `check` for the best design; empty without one.
-        charts: limits over payload and slope of the best design, if any, and of `robot`; empty without a page.
+        asked: the requirements.
+        robot: where the search started.
+        sizing: its result.
+        objectives: minimised numbers.
+        outcomes: results of `check` for the best design, empty without one.
+        charts: limits over payload and slope of the best design, if any, and of `robot`, empty without a page.
     """
 
     asked: Requirements
@@ -76,7 +79,7 @@ class SizeResult:
 
 
 def design_verdict(found: SizedDesign, unmeetable: Names) -> str:
-    """Verdict on a design; `unmeetable`: requirements that no choice of parts meets, which were dropped."""
+    """Verdict on a design. `unmeetable`: requirements that no choice of parts meets, which were dropped."""
     return "misses" if not found.feasible else "meets the others" if unmeetable else "meets"
 
 

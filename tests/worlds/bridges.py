@@ -1,4 +1,4 @@
-"""Settled runs behind a driver with a current limit or a diode, by bisection in NumPy; nothing of mmrjax.
+"""Settled runs behind a driver with a current limit or a diode, by bisection in NumPy, nothing of mmrjax.
 
 Equation numbers are the paper's. Of a vehicle or of a shaft on a bench, many runs at once: an outer bisection over
 the motor speed and an inner one over the current, whose balances fall in their unknowns.
@@ -54,7 +54,8 @@ def current_at(
     """Current of a motor [A] at its speed [rad/s].
 
     Args:
-        source: voltage of the supply at a current that all motors draw; way_supply: its sign.
+        source: voltage of the supply at a current that all motors draw.
+        way_supply: its sign.
     """
     R, back = motor["R"], motor["C"] * speed
 
@@ -117,8 +118,9 @@ def started(
     """Current [A] and motor speed [rad/s] of a dyno from rest at `times`, by Radau.
 
     Args:
-        motor: as for `settled`, with L and the inertias J of the motor and J_l of the load, its friction dry and
-            viscous; rest: speed of the load within which friction is smooth [rad/s].
+        motor: as for `settled`, with L and the inertias J of the motor and J_l of the load, its friction dry
+            and viscous.
+        rest: speed of the load within which friction is smooth [rad/s].
     """
     i, eta = motor["i"], motor["eta"]
 

@@ -1,6 +1,6 @@
 """Drives through events by SciPy: stretches without an event, and between them its own root finder.
 
-Plain physics of one motor, gear and load in SI, without a line of the simulator. Friction jumps at rest; a load that
+Plain physics of one motor, gear and load in SI, without a line of the simulator. Friction jumps at rest. A load that
 friction holds stands until the motor turns it. Of a load behind a backlash friction goes over smoothly within 0.01
 rad/s at the output, as the simulator states for loads whose moments of rest are apart.
 """
@@ -95,7 +95,7 @@ def _event(function, direction: float):
 def through(
     bench: Bench, volts: np.ndarray, changes: np.ndarray, times: np.ndarray
 ) -> tuple[np.ndarray, dict[float, str]]:
-    """Current [A] and motor speed [rad/s] from rest at `times`, which begin at 0; and its events by their times.
+    """Current [A] and motor speed [rad/s] from rest at `times`, which begin at 0, and its events by their times.
 
     Args:
         volts: that act from `changes` on, the first of which is 0.

@@ -3,7 +3,7 @@
 `FOREIGN` shows in settled runs, `FOREIGN_SERIES` in histories from standstill. Signs are those of `laws`:
 a positive term takes away (voltage, torque, force, speed), a sensor's adds to its reading. Every law stays
 finite at rest, off the ground (N = P = 0) and downhill. Sizes and bounds of shapes are judgements for a robot
-of 12 to 21 kg with small motors, not measurements. Sources are cited from memory; none was looked up again.
+of 12 to 21 kg with small motors, not measurements. Sources are cited from memory. None was looked up again.
 """
 
 from __future__ import annotations

@@ -91,7 +91,7 @@ def teeth(flow: Any, d: Any, eta: Any) -> Any:
 
 
 def runge_kutta(rates: Callable[[float, np.ndarray], np.ndarray], y: np.ndarray, h: float) -> np.ndarray:
-    """A step of the classical method; rates are of the share of the step, 0 to 1, and the state."""
+    """A step of the classical method. Rates are of the share of the step, 0 to 1, and the state."""
     a = rates(0.0, y)
     b = rates(0.5, y + h / 2 * a)
     d = rates(0.5, y + h / 2 * b)
@@ -106,7 +106,7 @@ ROUNDS = 12
 def rates(
     time: float, y: np.ndarray, c: Conditions, battery: Any, p: Mapping[str, Any], terms: Sequence[Term]
 ) -> np.ndarray:
-    """d/dt of STATES, shape (9, runs); `p` as from `settled.of_rows`."""
+    """d/dt of STATES, shape (9, runs). `p` as from `settled.of_rows`."""
 
     def extra(balance: str) -> Any:
         return laws.total(terms, balance, s)
@@ -161,7 +161,7 @@ def histories(
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Times (instants,) [s], and I_Σ [A], w [rad/s], V [m/s] of runs from standstill, shape (3, runs, instants).
 
-    `every` is a multiple of `step`; values of `p`, amplitudes and shapes may be arrays of shape (runs,).
+    `every` is a multiple of `step`. Values of `p`, amplitudes and shapes may be arrays of shape (runs,).
     """
     battery = np.broadcast_to(battery, c.U.shape)
     y = np.zeros((len(STATES), len(c.U)))
@@ -184,13 +184,15 @@ def histories(
 
 @dataclasses.dataclass(frozen=True)
 class SeriesWorld:
-    """What a set of histories is measured in; as `tables.World`.
+    """What a set of histories is measured in, as `tables.World`.
 
     Attributes:
-        conditions: of each run; design: duration [s] and sampling [in base] of each; base: finest sampling [s].
+        conditions: of each run.
+        design: duration [s] and sampling [in base] of each.
+        base: finest sampling [s].
         dropped: share of samples that no row tells of.
-        stated: constants that the analyst fits with TOLERANCES as priors; none: those of the fields.
-        step: of the integration [s]; None: as the fastest rate needs it. battery: whether one drives, 0 or 1.
+        stated: constants that the analyst fits with TOLERANCES as priors. None: those of the fields.
+        step: of the integration [s]. None: as the fastest rate needs it. battery: whether one drives, 0 or 1.
     """
 
     stratum: str
@@ -308,7 +310,7 @@ def simulated(
 
 
 def samples(w: SeriesWorld) -> np.ndarray:
-    """Which instants of `simulated` each run shows, shape (runs, instants); of those that are dropped the pattern is
+    """Which instants of `simulated` each run shows, shape (runs, instants). Of those that are dropped the pattern is
     the same in every set, the first and the last stay."""
     count = round(max(d for d, _ in w.design) / w.base) + 1
     shown = np.zeros((len(w.design), count), bool)
@@ -398,7 +400,7 @@ def case(
     Args:
         names: of effects: EVERY or EVENTS.
         sigmas: that each leaves after a refit of the constants, with the analyst's priors, and of the others, estimated
-            at a tenth of their ordinary size; none is larger than LARGEST.
+            at a tenth of their ordinary size. None is larger than LARGEST.
     """
     rng = np.random.default_rng([78, seed])
     wanted = [float(sigmas)] * len(names) if np.ndim(sigmas) == 0 else [float(x) for x in sigmas]
@@ -450,7 +452,7 @@ def _made(
 
 
 def _faults(w: SeriesWorld, shown: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Which readings are in the table, and which of them are gross, shape (3, runs, instants); the first samples of a
+    """Which readings are in the table, and which of them are gross, shape (3, runs, instants). The first samples of a
     run are as they should be, for a history has to start at rest."""
     share = rng.random((2, 3, *shown.shape))
     later = shown.copy()
@@ -474,7 +476,7 @@ def shown_by(
 
 def signatures(w: SeriesWorld, terms: Sequence[Term], good: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Whitened change of the good readings by each term alone, shape (terms, readings), and by one sd of the analyst's
-    prior of each constant, shape (readings, constants); one batch of robots.
+    prior of each constant, shape (readings, constants). One batch of robots.
 
     Args:
         good: which readings count, shape (3, runs, instants).

@@ -1,7 +1,7 @@
 """Laws of effects, each written once: those of the library by their equations, variants of them, and others.
 
-A law is written in the signals of `settled` or `histories`; `d` is the direction in which parts turn, 1 or -1, softened
-about rest in histories. Sizes and shapes are of the paper's robot; those of a rig (`RIGS`) follow from its `scale`, which
+A law is written in the signals of `settled` or `histories`. `d` is the direction in which parts turn, 1 or -1, softened
+about rest in histories. Sizes and shapes are of the paper's robot. Those of a rig (`RIGS`) follow from its `scale`, which
 holds the largest size of each signal over its rows, `torque` [N·m] at the output, `current` [A] of one motor, and `rated`
 [A], 0.3 of that at stall.
 """
@@ -28,11 +28,11 @@ class Law:
     """One undeclared effect: what it adds to its balance per unit of amplitude.
 
     Attributes:
-        cls: name of the library's effect whose place it takes; "" outside the library.
+        cls: name of the library's effect whose place it takes, "" outside the library.
         balance: where it enters, or the channel whose reading it changes.
         of: (signals, shapes) → term per unit amplitude, shape (rows,).
-        size: amplitude of ordinary size, which sets its sign and the step of differences; of RIGS, scale → size.
-        shapes: bounds from which each shape parameter is drawn, uniformly; of RIGS, scale → bounds.
+        size: amplitude of ordinary size, which sets its sign and the step of differences. Of RIGS, scale → size.
+        shapes: bounds from which each shape parameter is drawn, uniformly. Of RIGS, scale → bounds.
         either: whether amplitudes of both signs occur.
         needs: which rigs (`rigs.About`) can have it and show something of it.
     """
@@ -58,7 +58,7 @@ class Law:
 
 @dataclasses.dataclass(frozen=True)
 class Term:
-    """An amplitude of a law with its shape parameters; `law` is the one of FORMS under its name where none is given."""
+    """An amplitude of a law with its shape parameters. `law` is the one of FORMS under its name where none is given."""
 
     name: str
     amplitude: Any
@@ -90,7 +90,7 @@ def shaped(name: str, rng: np.random.Generator, law: Law) -> Term:
 
 
 def draw(name: str, rng: np.random.Generator, law: Law | None = None) -> Term:
-    """The same with the sign drawn where both occur; `law`: else the one of FORMS."""
+    """The same with the sign drawn where both occur. `law`: else the one of FORMS."""
     law = law or FORMS[name]
     sign = float(rng.choice((-1.0, 1.0))) if law.either else 1.0
     return dataclasses.replace(shaped(name, rng, law), amplitude=sign)

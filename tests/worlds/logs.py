@@ -1,6 +1,6 @@
 """Logs over time of random rigs with undeclared effects: one drive and a load on a shaft, from plain NumPy physics.
 
-The voltage, the current or the speed of the motor is imposed; four runs of 200 rows. Shares nothing with mmrjax. Many
+The voltage, the current or the speed of the motor is imposed. Four runs of 200 rows. Shares nothing with mmrjax. Many
 perturbed rigs go through the classical Runge-Kutta method at once, with steps of the winding's time constant.
 """
 
@@ -59,12 +59,15 @@ class Rig:
     """A rig with its truth, what its file states, and what is imposed.
 
     Attributes:
-        p: true constants [SI]; stated: those of the file; ratio, supply [V], rated [A], torque [N·m], w_k [rad/s]: sizes.
-        every: sampling step [s]; inputs: of each run at each row [SI], shape (runs, rows); delay: of the readings [s].
+        p: true constants [SI].
+        stated: those of the file. Ratio, supply [V], rated [A], torque [N·m], w_k [rad/s]: sizes.
+        every: sampling step [s].
+        inputs: of each run at each row [SI], shape (runs, rows).
+        delay: of the readings [s].
         sd: of each channel [unit of the column].
-        load_torque: of a brake at each row, held until the next [N·m], shape (runs, rows); None: none.
+        load_torque: of a brake at each row, held until the next [N·m], shape (runs, rows). None: none.
         alone: True if the output's angle is the only reading (with a voltage or a current imposed).
-        steps: of the readings of coarse instruments [unit of the column]; `sd` then includes their rounding.
+        steps: of the readings of coarse instruments [unit of the column]. `sd` then includes their rounding.
     """
 
     imposed: str
@@ -104,10 +107,11 @@ class Rig:
 def rig(
     rng: np.random.Generator, imposed: str, every: float | None = None, *, alone: bool = False, coarse: bool = False
 ) -> Rig:
-    """A random rig; its readings' noise is set by what they show without effects.
+    """A random rig. Its readings' noise is set by what they show without effects.
 
     Args:
-        every: sampling step [s]; None: a random one; alone: as of `Rig`, unless a speed is imposed.
+        every: sampling step [s]. None: a random one.
+        alone: as of `Rig`, unless a speed is imposed.
         coarse: True for instruments with steps.
     """
     supply, fast = float(rng.choice([6.0, 12.0, 24.0, 48.0])), rng.uniform(300.0, 800.0)
@@ -161,7 +165,8 @@ def histories(r: Rig, members: Sequence[Mapping[str, float]], terms: Sequence[Se
     """Readings of each channel for each member, a dictionary each of shape (runs, rows) [units of the columns].
 
     Args:
-        members: constants of each; terms: of each.
+        members: constants of each.
+        terms: of each.
     """
     count, per = len(members), round(r.every / STEP)
     p = {n: np.repeat([m[n] for m in members], RUNS) for n in r.p}
@@ -247,7 +252,8 @@ def _step(rates: Any, y: np.ndarray, way: np.ndarray, h: float) -> tuple[np.ndar
     holds begins to move when it holds no longer, with a torque that then rises on a line.
 
     Args:
-        rates: (way, share of the step, y) → rates; y: its second row are speeds.
+        rates: (way, share of the step, y) → rates.
+        y: its second row are speeds.
         way: in which friction acts as of motion, 0 where it holds.
     """
 
@@ -306,7 +312,7 @@ class Case(Sealed):
 
 
 def slopes(r: Rig, p: Mapping[str, float], terms: Sequence[Term], also: Sequence[Sequence[Term]] = ()):
-    """Whitened readings, their change by one sd of each constant and by each of `also`'s further terms; each of shape
+    """Whitened readings, their change by one sd of each constant and by each of `also`'s further terms. Each of shape
     (runs, readings)."""
     members = [p, *(moved(p, n, 1e-2) for n in r.names), *[p] * len(also)]
     every = [
@@ -321,7 +327,8 @@ def oracle(r: Rig, term: Term, y: np.ndarray, columns: np.ndarray) -> dict[str, 
     [σ], each with the amplitude and, of a few, the shapes that explain most of it.
 
     Args:
-        y: whitened readings without it; columns: slopes by the constants, shape (readings, constants).
+        y: whitened readings without it.
+        columns: slopes by the constants, shape (readings, constants).
     """
     tried = []
     for name, law in LAWS.items():
@@ -339,8 +346,8 @@ def oracle(r: Rig, term: Term, y: np.ndarray, columns: np.ndarray) -> dict[str, 
 
 
 def case(r: Rig, name: str, sigmas: float, seed: int, *, stated: bool = True) -> Case:
-    """A case; `name` empty is a clean one. Effects are sized so that a linear refit of the constants leaves `sigmas`;
-    the label says how many a refit really leaves.
+    """A case. `name` empty is a clean one. Effects are sized so that a linear refit of the constants leaves `sigmas`.
+    The label says how many a refit really leaves.
 
     Args:
         stated: True for a table with the sds of its readings.
@@ -424,8 +431,10 @@ class Fit:
     """The best that a search has found.
 
     Attributes:
-        at: constants in their sds, then the term's amplitude in a tenth of its size; cost: what is left of readings
-            inside and priors, squared; left: the same one by one, slopes: by the unknowns; off: of all readings.
+        at: constants in their sds, then the term's amplitude in a tenth of its size.
+        cost: what is left of readings inside and priors, squared.
+        left: the same one by one, slopes: by the unknowns.
+        off: of all readings.
     """
 
     at: np.ndarray
@@ -441,7 +450,8 @@ def _fits(
     """Fits by Levenberg and Marquardt, which go through the simulation together.
 
     Args:
-        start: constants from which they begin, means of their priors; measured: whitened, shape (runs, readings).
+        start: constants from which they begin, means of their priors.
+        measured: whitened, shape (runs, readings).
         jobs: of each fit the runs that it sees, and the terms (one at most) whose amplitude is one more unknown.
     """
     count = len(r.names)

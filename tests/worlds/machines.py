@@ -1,6 +1,6 @@
 """Robots that are not the paper's: drawn constants that fit together, the file that states them, a scale for laws.
 
-Inside they bear the names of the paper's configurations, `6T2A` for tracks and `4W2T` for wheels; `Machine.names`
+Inside they bear the names of the paper's configurations, `6T2A` for tracks and `4W2T` for wheels. `Machine.names`
 says what their files and tables call them.
 """
 
@@ -35,8 +35,10 @@ class Machine:
     Attributes:
         constants: nominal values by the generator's names.
         names: configurations that it has, and what its file calls them.
-        supply: highest voltage [V]; payload: heaviest [kg].
-        instruments: that suit it; toml: its file, None for the paper's robot.
+        supply: highest voltage [V].
+        payload: heaviest [kg].
+        instruments: that suit it.
+        toml: its file, None for the paper's robot.
     """
 
     constants: Mapping[str, float]
@@ -84,7 +86,7 @@ PAPER = Machine(NOMINAL, {TRACKS: TRACKS, WHEELS: WHEELS}, 33.0, 8.0, Instrument
 
 
 def _chassis(rng: np.random.Generator, role: str, mass: float, radius: float, speed_wheel: float) -> dict[str, float]:
-    """A configuration; losses are shares of the torque that carries its weight, m/2 g r_k."""
+    """A configuration. Losses are shares of the torque that carries its weight, m/2 g r_k."""
     tracks = role == TRACKS
     whole = mass / SIDES * G * radius
     found = {
@@ -107,7 +109,7 @@ def _chassis(rng: np.random.Generator, role: str, mass: float, radius: float, sp
 
 
 def _drawn(rng: np.random.Generator, roles: Sequence[str]) -> tuple[dict[str, float], float, float] | None:
-    """Constants, supply and payload of a robot; None where they make no robot."""
+    """Constants, supply and payload of a robot, None where they make no robot."""
     mass, ratio, radius = between(rng, 2, 60), between(rng, 10, 120), between(rng, 0.02, 0.15)
     supply, no_load = float(rng.choice(SUPPLIES)), between(rng, 300, 1250)
     if not SLOWEST < radius * no_load / ratio < FASTEST:

@@ -85,7 +85,7 @@ NOMINAL: dict[str, float] = {
 def battery_voltage(I_s, C_b, A, B, U0, R_b, I_p, C=1.0, C_n=1.0):
     """U_b [V], eqs. (9), (10), (12), (13), after the charge C_b [C] at motor current I_s [A].
 
-    A and B are of a cell of capacity C_n; one of capacity C falls as far over its own.
+    A and B are of a cell of capacity C_n. One of capacity C falls as far over its own.
     """
     I_b = I_s + I_p
     C_b = C_b / C * C_n
@@ -311,7 +311,7 @@ class Side:
         return [0.1 * U / self.R, w / 1000, self.r * w / self.i]
 
     def steady(self, tolerance=1e-13):
-        """I [A], ω [rad/s], V [m/s] of steady travel; None where the movers slide."""
+        """I [A], ω [rad/s], V [m/s] of steady travel, None where the movers slide."""
         if abs(self.roll + self.pull) > self.mu_s * self.N:
             return None
         found = root(self.steady_residual, self.start(), tol=tolerance)

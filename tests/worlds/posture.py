@@ -16,7 +16,7 @@ BODY_UP, PAYLOAD_UP = 5e-3, 73e-3
 
 
 def centre(front: float, rear: float, payload: float = 0.0) -> np.ndarray:
-    """Centre of mass from the middle of the wheelbase [m]; angles of the levers outward [rad]."""
+    """Centre of mass from the middle of the wheelbase [m]. Angles of the levers outward [rad]."""
     masses = [BODY, payload, 2 * LEVER_MASS, 2 * LEVER_MASS]
     at = [
         (0.0, BODY_UP),

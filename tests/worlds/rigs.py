@@ -1,6 +1,6 @@
 """Random rigs, one drive or six on wheels, tracks or a bench, with tables of settled runs, from plain NumPy physics.
 
-Shares nothing with mmrjax. Equation numbers are the paper's, symbols too; friction at the ground is Fig. 7's law, loads
+Shares nothing with mmrjax. Equation numbers are the paper's, symbols too. Friction at the ground is Fig. 7's law, loads
 on a shaft are Newton's law. A case is made in five steps: draw a rig as its owner states it, draw its true constants
 from the tolerances that its file states, solve the balances, draw an effect that the file does not state and size it so
 that it leaves the wanted number of sigmas after a refit of the constants, read the instruments. `Case.write` leaves
@@ -75,15 +75,20 @@ class Rig:
     """A rig as its owner states it.
 
     Attributes:
-        kind: of KINDS; imposed: of IMPOSED; channels: names, in the order of CHANNELS.
-        name: of its configuration; sides: motors driven alike; supply: nominal voltage [V]; no_load: speed there
-            [rad/s].
-        stated: constants by name, those of the load without its configuration; tolerances: relative sds of those that
-            are not known exactly.
+        kind: of KINDS.
+        imposed: of IMPOSED.
+        channels: names, in the order of CHANNELS.
+        name: of its configuration.
+        sides: motors driven alike.
+        supply: nominal voltage [V].
+        no_load: speed there [rad/s].
+        stated: constants by name, those of the load without its configuration.
+        tolerances: relative sds of those that are not known exactly.
         written: what the file of a linear unit states in their place, by its keys.
-        reverse: whether it has rows backward; downhill: whether slopes go down too.
-        signed: of each channel, False where its instrument shows the magnitude alone; quantum: steps of readings
-            [unit of the column], 0 for none.
+        reverse: whether it has rows backward.
+        downhill: whether slopes go down too.
+        signed: of each channel, False where its instrument shows the magnitude alone.
+        quantum: steps of readings [unit of the column], 0 for none.
     """
 
     kind: str
@@ -215,7 +220,7 @@ def rig(
 
     Args:
         like: another one, which it has in common with that its equations, channels and their signs and directions are
-            the same; its constants are its own.
+            the same. Its constants are its own.
     """
     if like is None:
         return _any_rig(rng, kind, imposed)
@@ -280,7 +285,7 @@ def truth(rng: np.random.Generator, r: Rig) -> tuple[dict[str, float], dict[str,
 
 
 def moved(name: str, value: float, by: float) -> float:
-    """A constant moved by a share of its value, or of its logarithm; within what efficiencies and shares can be."""
+    """A constant moved by a share of its value, or of its logarithm. Within what efficiencies and shares can be."""
     u = value * (1 + by) if name in NORMAL else value * float(np.exp(by))
     return float(np.clip(u, 0.02, 0.98)) if name in ("gearbox.efficiency_load", "track.guide_share") else u
 
@@ -290,8 +295,8 @@ def moved(name: str, value: float, by: float) -> float:
 
 @dataclasses.dataclass(frozen=True)
 class Conditions:
-    """One array a column, shape (rows,), in the order of measuring: supply [V] and duty [-], or motor speed [rad/s];
-    slope [rad], payload [kg]; the direction of travel, 1 or -1; and torque of a brake on a shaft [N·m]."""
+    """One array a column, shape (rows,), in the order of measuring: supply [V] and duty [-], or motor speed [rad/s].
+    Slope [rad], payload [kg]. The direction of travel, 1 or -1, and torque of a brake on a shaft [N·m]."""
 
     supply: np.ndarray
     duty: np.ndarray
@@ -353,7 +358,7 @@ def _scales(r: Rig, p: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray]:
 def solve(
     r: Rig, c: Conditions, p: Mapping[str, float], terms: Sequence[Term] = ()
 ) -> tuple[SimpleNamespace, np.ndarray]:
-    """Every quantity of all rows at their operating points, by Newton's method; and which rows are sound: they move as
+    """Every quantity of all rows at their operating points, by Newton's method, and which rows are sound: they move as
     they are driven, do not slide and travel more than a third of what they roll."""
     size, left = _scales(r, p)
     given = SimpleNamespace(
@@ -384,8 +389,8 @@ def solve(
 
 @dataclasses.dataclass(frozen=True)
 class About:
-    """What of a rig decides which effects it can have and show: whether it is a vehicle; what is imposed, its channels;
-    whether it has rows backward, and at least three rows whose load drives the motor; how many slopes and payloads."""
+    """What of a rig decides which effects it can have and show: whether it is a vehicle. What is imposed, its channels.
+    Whether it has rows backward, and at least three rows whose load drives the motor. How many slopes and payloads."""
 
     vehicle: bool
     imposed: str
@@ -456,7 +461,7 @@ class World:
         return np.stack(columns, 1)
 
     def signature(self, terms: Sequence[Term]) -> np.ndarray:
-        """Whitened change of all readings by the terms, shape (readings,); NaN where a row is lost."""
+        """Whitened change of all readings by the terms, shape (readings,), NaN where a row is lost."""
         (with_them, a), (without, b) = self.readings(terms), self.readings()
         return np.where(a & b, (with_them - without) / self.stated, np.nan).ravel()
 
@@ -498,10 +503,11 @@ def world(
     like: Rig | None = None,
     rows: tuple[int, int] = ROWS,
 ) -> World:
-    """A rig with its truth and conditions all of whose rows are sound; instruments that suit its readings.
+    """A rig with its truth and conditions all of whose rows are sound. Instruments that suit its readings.
 
     Args:
-        kind, imposed, like: see `rig`; rows: fewest and most.
+        kind, imposed, like: see `rig`.
+        rows: fewest and most.
     """
     for _ in range(2000):
         r = rig(rng, kind, imposed, like)
@@ -567,7 +573,7 @@ def left_over(w: World, terms: Sequence[Term], slopes: np.ndarray) -> float:
 def sized(w: World, term: Term, sigmas: float, slopes: np.ndarray) -> tuple[Term, float]:
     """The term with the amplitude at which `sigmas` are left after a refit of the constants, and how many really are.
 
-    Secant steps from a hundredth of its ordinary size, at first by the linear remainder; fewer sigmas come back where
+    Secant steps from a hundredth of its ordinary size, at first by the linear remainder. Fewer sigmas come back where
     rows would be lost.
     """
     amplitude = 0.01 * term.law.size * np.sign(term.amplitude)
@@ -626,7 +632,7 @@ def case(w: World, name: str = "", sigmas: float = 8.0, seed: int = 0) -> Case:
     """A case of a world.
 
     Args:
-        name: of an effect of FORMS that the rig's file does not state; empty makes a clean table.
+        name: of an effect of FORMS that the rig's file does not state. Empty makes a clean table.
         sigmas: that it leaves after a refit of the constants with their tolerances.
         seed: of shapes, sign and noise.
     """
@@ -715,8 +721,11 @@ class Log:
     """A log.
 
     Attributes:
-        table: its columns; level: index of the level of each row; settled: readings of each level without noise [unit],
-            shape (levels, channels); channels: names; sd: noise of a sample [unit], by channel.
+        table: its columns.
+        level: index of the level of each row.
+        settled: readings of each level without noise [unit], shape (levels, channels).
+        channels: names.
+        sd: noise of a sample [unit], by channel.
     """
 
     table: dict[str, np.ndarray]
@@ -746,10 +755,14 @@ def log(
     """A log that goes through the rows of a world's table.
 
     Args:
-        hold: of each level [s]; rate: samples a second; lag: time constant of the transitions [s].
-        noise: of a sample, over the sd that the world has of settled readings; jitter: sd of the clock, over a step.
+        hold: of each level [s].
+        rate: samples a second.
+        lag: time constant of the transitions [s].
+        noise: of a sample, over the sd that the world has of settled readings.
+        jitter: sd of the clock, over a step.
         terms: effects that the rig's file does not state (`case`).
-        delay: of the readings against what is imposed [s]; step: of the instruments, over the sd of a sample.
+        delay: of the readings against what is imposed [s].
+        step: of the instruments, over the sd of a sample.
     """
     shown, sound = w.readings(terms)
     assert sound.all()

@@ -1,6 +1,6 @@
 """Settled motion in plain NumPy: the balances of drives and what they move, shared by robots and rigs, nothing of mmrjax.
 
-Equation numbers are the paper's, symbols too; friction at the ground is Fig. 7's law, loads on a shaft are Newton's law.
+Equation numbers are the paper's, symbols too. Friction at the ground is Fig. 7's law, loads on a shaft are Newton's law.
 Newton's method goes over all rows at once. Here too are the paper's robot as its analyst knows it, the conditions of its
 tables, and what a refit of constants leaves of an effect.
 """
@@ -46,7 +46,7 @@ def write_table(table: Mapping[str, np.ndarray], path: Path) -> Path:
 
 
 def robot_toml(tables: Mapping[str, Mapping[str, Any]]) -> str:
-    """A robot's file as its owner writes it: of each table keys and values; the first is of the top."""
+    """A robot's file as its owner writes it: of each table keys and values. The first is of the top."""
 
     def written(x: Any) -> str:
         if isinstance(x, bool):
@@ -65,8 +65,9 @@ class Sealed:
     """A table, what an analyst gets of it, and its label.
 
     Attributes:
-        table: columns of a CSV, NaN where a reading is missing; label: truth, for the scorer alone.
-        toml: the robot's file; None for the paper's.
+        table: columns of a CSV, NaN where a reading is missing.
+        label: truth, for the scorer alone.
+        toml: the robot's file, None for the paper's.
     """
 
     table: dict[str, np.ndarray]
@@ -161,7 +162,7 @@ def table8(
     voltages: Sequence[float] = (15.0, 24.0, 33.0),
     configurations: Sequence[int] = (0, 1),
 ) -> Conditions:
-    """A grid like Table 8; by default 90 rows, with six payloads 180."""
+    """A grid like Table 8. By default 90 rows, with six payloads 180."""
     axes = np.meshgrid(configurations, slopes, payloads, voltages, indexing="ij")
     w, s, m, u = (a.ravel() for a in axes)
     return conditions(w, u, s, m, p)
@@ -176,10 +177,11 @@ def instant(
     """Every quantity of settled motion at x = (I [A], ω [rad/s], V [m/s]), shape (3, rows).
 
     Args:
-        given: of each row: sides; supply [V] and duty, or motor_speed [rad/s] where that is imposed, else None;
-            direction d; slope [rad], payload [kg]; mass [kg] of what travels on the ground, None for a load on a shaft,
+        given: of each row: sides. Supply [V] and duty, or motor_speed [rad/s] where that is imposed, else None,
+            direction d. Slope [rad], payload [kg]. Mass [kg] of what travels on the ground, None for a load on a shaft,
             which may have a load_torque [N·m] of a brake.
-        p: constants, of the load without its configuration, a number or one a row; channels: whose readings are shown.
+        p: constants, of the load without its configuration, a number or one a row.
+        channels: whose readings are shown.
     """
 
     def extra(balance: str) -> Any:
@@ -292,7 +294,7 @@ def _left(s: SimpleNamespace) -> np.ndarray:
 
 
 def solve(c: Conditions, p: Mapping[str, Any], terms: Sequence[Term] = ()) -> tuple[SimpleNamespace, np.ndarray]:
-    """Every quantity of all rows at their operating points, these as `x` of shape (3, rows); and which are sound."""
+    """Every quantity of all rows at their operating points, these as `x` of shape (3, rows), and which are sound."""
     at = balances(c, p, terms)
     no_load = 0.9 * c.U / p["motor.torque_constant"]
     radius = np.where(c.wheeled > 0.5, p["4W2T.radius"], p["6T2A.radius"])
@@ -305,7 +307,7 @@ def solve(c: Conditions, p: Mapping[str, Any], terms: Sequence[Term] = ()) -> tu
 
 
 def readings(c: Conditions, p: Mapping[str, Any], terms: Sequence[Term] = ()) -> tuple[np.ndarray, np.ndarray]:
-    """Total current [A], motor speed [rad/s], speed [m/s], shape (3, rows), without noise; and sound rows."""
+    """Total current [A], motor speed [rad/s], speed [m/s], shape (3, rows), without noise, and sound rows."""
     s, sound = solve(c, p, terms)
     return s.shown, sound
 
@@ -336,7 +338,7 @@ def base_slopes(
     names: Sequence[str] = tuple(TOLERANCES),
     sds: Mapping[str, float] | None = None,
 ) -> np.ndarray:
-    """Whitened change of the readings for one sd of each constant, shape (3 rows, names); `sds`: else tolerances."""
+    """Whitened change of the readings for one sd of each constant, shape (3 rows, names). `sds`: else tolerances."""
     x = solve(c, p)[0].x
     f0 = _left(balances(c, p)(x))
     inverse = np.linalg.inv(differences(lambda x: _left(balances(c, p)(x)), x, f0, _SCALE))
@@ -363,7 +365,7 @@ def remainder(signature: np.ndarray, slopes: np.ndarray) -> np.ndarray:
 def signature(
     c: Conditions, p: Mapping[str, Any], terms: Sequence[Term], instruments: Instruments, others: Sequence[Term] = ()
 ) -> np.ndarray:
-    """Whitened change of all readings by the terms over others of them, shape (3 rows,); NaN where a row is lost."""
+    """Whitened change of all readings by the terms over others of them, shape (3 rows,), NaN where a row is lost."""
     with_them, a = readings(c, p, terms)
     without, b = readings(c, p, others)
     change = np.where(a & b, (with_them - without) * SHOWN / instruments.stated[:, None], np.nan)
@@ -382,7 +384,7 @@ _SHOWS = {"shunt": 0, "zero current": 0, "strobe": 1, "timing": 2}
 
 
 def _act(name: str, at: np.ndarray, p: Mapping[str, float], terms: Sequence[Term]) -> np.ndarray:
-    """What an instrument shows of true values `at`; of the scales' mass the stated one is taken away."""
+    """What an instrument shows of true values `at`. Of the scales' mass the stated one is taken away."""
     if name == "weigh":  # configuration and payload
         c = conditions(at[:, 0], 0.0, 0.0, at[:, 1], p)
         s = SimpleNamespace(M=c.mass, wheeled=c.wheeled)
@@ -431,10 +433,10 @@ def _free(
 
 
 def carried_out(experiment: Any, p: Mapping[str, float], terms: Sequence[Term] = ()) -> tuple[np.ndarray, np.ndarray]:
-    """What an experiment shows without noise [SI], row by row and in each row channel by channel; and what is sound.
+    """What an experiment shows without noise [SI], row by row and in each row channel by channel, and what is sound.
 
     Args:
-        experiment: of the menu, an act or a run with its conditions; nothing but these is read of it.
+        experiment: of the menu, an act or a run with its conditions. Nothing but these is read of it.
     """
     if hasattr(experiment, "at"):
         y = _act(experiment.name, np.array(experiment.at, float), p, terms)

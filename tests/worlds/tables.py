@@ -1,7 +1,7 @@
 """Synthetic tables under the wide conditions of the field: any surface, any robot, poor instruments, gaps, drifts.
 
 A `World` is what a table is measured in: a robot, true constants, conditions in the order of measuring, instruments
-and their faults. `case` puts effects into it, each as strong as wanted beside the others; `coverage` draws the truth
+and their faults. `case` puts effects into it, each as strong as wanted beside the others. `coverage` draws the truth
 from the analyst's priors.
 """
 
@@ -56,7 +56,7 @@ SOFTNESS = 0.05  # sds over which a bound is rounded
 
 
 def spread(name: str) -> float:
-    """Sd of the log of a constant that the analyst knows as a scale; configurations by any name."""
+    """Sd of the log of a constant that the analyst knows as a scale. Configurations by any name."""
     return float(np.sqrt(np.log1p((RELATIVE.get(name) or RELATIVE[name.split(".", 1)[1]]) ** 2)))
 
 
@@ -113,9 +113,14 @@ class World:
     """What a table is measured in.
 
     Attributes:
-        stratum: of STRATA; constants: true ones; conditions: in the order of measuring; shuffled: that order.
-        outliers, missing: shares of readings; noise: true sd over the stated one.
-        law: of NOISES; stated: whether the table states sds.
+        stratum: of STRATA.
+        constants: true ones.
+        conditions: in the order of measuring.
+        shuffled: that order.
+        outliers, missing: shares of readings.
+        noise: true sd over the stated one.
+        law: of NOISES.
+        stated: whether the table states sds.
         z: where the truth is in the analyst's priors, where it was drawn from them.
     """
 
@@ -145,7 +150,7 @@ class World:
 
 
 def gripping(c: Conditions, p: dict[str, float], y: np.ndarray) -> bool:
-    """Whether no row's movers roll four times as far as it travels; y are its readings, shape (3, rows)."""
+    """Whether no row's movers roll four times as far as it travels. y are its readings, shape (3, rows)."""
     rolled = y[1] * np.where(c.wheeled > 0.5, p["4W2T.radius"], p["6T2A.radius"]) / p["gearbox.ratio"]
     return bool((y[2] > 0.25 * rolled).all())
 
@@ -154,7 +159,7 @@ def world(
     rng: np.random.Generator, stratum: str = "plain", *, shuffled: bool | None = None, noise: float = 1.0,
     from_priors: bool = False, law: str = "normal", stated: bool = True,
 ) -> World:  # fmt: skip
-    """A world of a stratum, or of `few` rows (see `World` for `law` and `stated`); `from_priors`: the truth is drawn
+    """A world of a stratum, or of `few` rows (see `World` for `law` and `stated`). `from_priors`: the truth is drawn
     from the analyst's priors.
 
     Rows are in the order of the grid, or shuffled, as it comes, where `shuffled` does not say.
@@ -254,7 +259,7 @@ EVERY: dict[str, Law] = {**FORMS, **DRIFTS, **foreign.FOREIGN}
 
 
 def _signature(w: World, terms: Sequence[Term], k: int) -> np.ndarray:
-    """Whitened change of all readings by the k-th of the terms, beside the others; NaN where a row is lost."""
+    """Whitened change of all readings by the k-th of the terms, beside the others, NaN where a row is lost."""
     others = [t for j, t in enumerate(terms) if j != k]
     return signature(w.conditions, w.constants, terms, w.instruments, others)
 
@@ -285,7 +290,8 @@ def left_of(
     """Sigmas that the k-th of the terms leaves after a refit of the constants and of the others.
 
     Args:
-        seen: whether a reading is in the table, shape (3 rows,); lost: the change of a row that no longer runs.
+        seen: whether a reading is in the table, shape (3 rows,).
+        lost: the change of a row that no longer runs.
     """
     change = np.nan_to_num(_signature(w, terms, k), nan=lost)
     if not np.isfinite(change).all():
@@ -298,7 +304,7 @@ def sized(
     w: World, terms: Sequence[Term], sigmas: Sequence[float], seen: np.ndarray, slopes: np.ndarray
 ) -> tuple[list[Term], list[float]]:
     """Terms with amplitudes at which each leaves so many sigmas after a refit of the constants and of the others, and
-    how many really are; fewer where the robot would no longer run.
+    how many really are. Fewer where the robot would no longer run.
 
     Args:
         seen: whether a reading is in the table, shape (3 rows,).
@@ -337,7 +343,7 @@ def sized_alone(
 ) -> tuple[Term, float]:
     """The term with the amplitude at which `sigmas` are left after refitting, and how many really are.
 
-    Secant steps from a tenth of its ordinary size; fewer sigmas come back where the robot would no longer run.
+    Secant steps from a tenth of its ordinary size. Fewer sigmas come back where the robot would no longer run.
     """
     amplitude = 0.1 * term.law.size * np.sign(term.amplitude)
     best = (dataclasses.replace(term, amplitude=amplitude), 0.0)
@@ -364,7 +370,8 @@ class Case(Sealed):
     for whoever leaves implausible ones out), shapes and sigmas.
 
     Attributes:
-        conditions, constants, terms: what it was made from; world: too, None of the paper's robot on a stated surface.
+        conditions, constants, terms: what it was made from.
+        world: too, None of the paper's robot on a stated surface.
     """
 
     conditions: Conditions
@@ -420,7 +427,7 @@ def table_of(
     c: Conditions, y: np.ndarray, sound: np.ndarray, show: Instruments, rng: np.random.Generator,
     w: World | None = None, missing: Any = False, odd: Any = False,
 ) -> dict[str, np.ndarray]:  # fmt: skip
-    """Columns of what the instruments show of readings y [SI], of sound rows; a world's have its noise and names.
+    """Columns of what the instruments show of readings y [SI], of sound rows. A world's have its noise and names.
 
     Args:
         missing, odd: which readings are not there, and which are gross, shape (3, rows).
@@ -454,7 +461,7 @@ def settings(c: Conditions, names: Mapping[str, str]) -> dict[str, np.ndarray]:
 
 
 def _deviates(law: str, y: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Noise of unit variance over all rows [sd]; y are the readings, shape (3, rows)."""
+    """Noise of unit variance over all rows [sd]. y are the readings, shape (3, rows)."""
     if law == "heavy":
         return rng.standard_t(TAIL, y.shape) * np.sqrt(1 - 2 / TAIL)
     if law == "uneven":
@@ -484,7 +491,7 @@ def narrow(
     """One sealed case of the paper's robot on a surface that is known.
 
     Args:
-        names: effects of `FORMS`; none makes a clean table.
+        names: effects of `FORMS`. None makes a clean table.
         sigmas: that each effect alone leaves after a refit of the `free` constants.
         seed: of constants, shape parameters, signs and noise.
         compensating: of two effects, size the second to hide as much of the first as it can.
@@ -526,7 +533,7 @@ def case(
     """One sealed table of a world.
 
     Args:
-        names: of effects: EVERY or CLUSTERS; none makes a clean table.
+        names: of effects: EVERY or CLUSTERS. None makes a clean table.
         sigmas: that each leaves after a refit of the constants, with the analyst's priors, and of the others.
         seed: of shapes, signs, noise and faults.
         amplitudes: by name, in place of sizes.

@@ -1,24 +1,24 @@
 # ruff: noqa: E741 (symbols as in the paper)
 """A robot of two sides that turns, a second implementation in NumPy and SciPy: nothing here comes from mmrjax.
 
-Constants and the laws of one side are those of `paper` (the paper's); what is new is what two sides do together.
+Constants and the laws of one side are those of `paper` (the paper's). What is new is what two sides do together.
 SI throughout. What is assumed:
 
 Axes.  Robot's frame at the middle of the wheelbase, on the ground below the centre of mass: x forward, y to the LEFT,
 z up. ω > 0 turns to the left (counter-clockwise from above). Sides are (left, right) at y_s = (+B/2, -B/2).
-Ground: X up the slope, Y to the left of who looks up it; ψ from X, positive to the left. ψ = 0 heads uphill, π/2
+Ground: X up the slope, Y to the left of who looks up it. ψ from X, positive to the left. ψ = 0 heads uphill, π/2
 across with the uphill side on the right, π downhill. Ẋ = v_x cos ψ - v_y sin ψ, Ẏ = v_x sin ψ + v_y cos ψ.
 Gravity along the ground, in the robot's frame: m g sin α (-cos ψ, +sin ψ). W = m g cos α.
 
 Motion.  m (v̇_x - ω v_y) = ΣF_x - ΣR_s - m g sin α cos ψ, m (v̇_y + ω v_x) = ΣF_y + m g sin α sin ψ,
-J_ψ ω̇ = Σ(x F_y - y F_x) + Σ y_s R_s. J_ψ is the whole robot's about its centre; a payload adds none (it is over
+J_ψ ω̇ = Σ(x F_y - y F_x) + Σ y_s R_s. J_ψ is the whole robot's about its centre. A payload adds none (it is over
 the middle). The centre of mass is in the middle of the wheelbase and of the track. m is the mass of everything.
 
 Rolling resistance  R_s = f N_s σ(v_s), against the motion of the chassis over that side, v_s = v_x - ω y_s (not of
-the mover, as in straight travel); σ is `paper.soft_sign` within V_s/10. It acts at y_s, so it has a yaw moment
+the mover, as in straight travel). σ is `paper.soft_sign` within V_s/10. It acts at y_s, so it has a yaw moment
 (on the spot: against the turn). It does not act sideways, and does not count toward the ellipse of friction.
 
-Contact.  A contact at (x, y_s) slides over the ground by the reverse of u, u = (r ω_k,s - v_x + ω y_s, -v_y - ω x); the force
+Contact.  A contact at (x, y_s) slides over the ground by the reverse of u, u = (r ω_k,s - v_x + ω y_s, -v_y - ω x). The force
 on the robot is  p μ̂(|u|) (φ_x^a u_x, φ_y^a u_y) / |(φ_x^(a-1) u_x, φ_y^(a-1) u_y)|, so always on the ellipse of
 semi-axes p φ_x μ̂, p φ_y μ̂, and F·u ≥ 0. a = `rule`: 1 is the issue's (φ_x u_x, φ_y u_y)/|u|, 2 is maximum
 dissipation. μ̂ is Fig. 7 with μ_s = 1, μ_d/μ_s of the surface, and of |u| for both rules (isotropic V_s, V_d).
@@ -26,22 +26,22 @@ Turning (spin) of a single wheel or grouser about the vertical has no moment: wh
 
 Loads.  Quasi-static: no roll or pitch of the chassis, no inertia of it. All forces of the ground, resistances
 included, act at height 0 and the centre of mass at h:  N_right = W/2 + h ΣF_y / B, N_left = W - N_right, each at least 0
-(a side at 0: `tips`); ΣF_y = m (v̇_y + ω v_x) - m g sin α sin ψ is what the contacts give, so forces and loads are
+(a side at 0: `tips`). ΣF_y = m (v̇_y + ω v_x) - m g sin α sin ψ is what the contacts give, so forces and loads are
 solved together. x_p = -h (ΣF_x - ΣR_s) / W, the same on both sides (twisting of the chassis is not resolved).
 Track of length L: p = (N_s/L)(1 + 12 x_p x/L²) while |x_p| ≤ L/6, beyond that a triangle over the length
-3 (L/2 - |x_p|) at the loaded end; nodes cover the loaded length, so sum and moment of the loads are exact.
+3 (L/2 - |x_p|) at the loaded end. Nodes cover the loaded length, so sum and moment of the loads are exact.
 Wheels: two points at ±L/2 with N_s (1/2 ± x_p/L), each at least 0. Nodes: `gauss` (Gauss-Legendre) or `uniform`
 (middles of equal lengths, e.g. one a grouser).
 
 Drive of a side.  Motor, gearbox and mover exactly as `paper.Side.rates`: σ_s of losses by r ω_k,s within V_s/10,
 load efficiency by the direction of the torque that reaches the teeth, guide friction r μ_t s N_s σ_s with the side's own
-load N_s. The shaft bears r ΣF_x of its own contacts; R_s acts on the chassis.
+load N_s. The shaft bears r ΣF_x of its own contacts. R_s acts on the chassis.
 A side is driven by `voltage` [V, signed], `duty` (of one supply, -1 to 1: U_s = D_s U_e), `speed` (r ω_k,s imposed [m/s];
 its current is what the balances then take), or `open` (no current: coasting, dead). Braked is voltage 0.
 Supply: U_e external, or the battery's at I_Σ = Σ D_s I_s (signed; 'voltage' sides count as D_s = U_s/U_e only for the
 external supply; a battery wants duty). I_Σ < 0 is taken back by the battery or supply here, and flagged (`returns`).
 
-Energy.  In: ΣU_s I_s. Sinks: I² R; motor and idle loss; teeth; track and guide; rolling; friction ΣF·u over the contacts.
+Energy.  In: ΣU_s I_s. Sinks: I² R. Motor and idle loss, teeth, track and guide, rolling. Friction ΣF·u over the contacts.
 Stored: ½ m v² + ½ J_ψ ω² + Σ(½ J_w ω_k² + ½ J_d ω_d² + ½ L_d I²) + m g sin α X.
 
 Steady.  `circling` is a zero of the same rates on level ground (with the same soft signs, so an inner side that hardly
@@ -88,10 +88,15 @@ class Robot:
 
     Attributes:
         sides: left and right, each with its own constants (`paper.Side`; its voltage and slope are not used).
-        ratio: φ_y/φ_x; rule: a of the direction rule.
-        width: B [m]; length: L [m]; height: h [m]; inertia: J_ψ [kg·m²].
-        wheels: points at ±L/2, else a track over L; nodes, scheme: of its quadrature.
-        f: of the resistance; mass: of everything [kg].
+        ratio: φ_y/φ_x.
+        rule: a of the direction rule.
+        width: B [m].
+        length: L [m].
+        height: h [m].
+        inertia: J_ψ [kg·m²].
+        wheels: points at ±L/2, else a track over L.
+        nodes, scheme: of its quadrature.
+        f: of the resistance. Mass: of everything [kg].
     """
 
     sides: tuple[Side, Side]
@@ -122,7 +127,7 @@ def paper_robot(
     wheeled: bool = False, surface: str = "wood", payload: float = 0.0, battery: bool = False,
     left: dict[str, float] | None = None, right: dict[str, float] | None = None, **changes,
 ) -> Robot:  # fmt: skip
-    """The paper's robot on a surface of Table 5; `left`, `right`: constants of one side by their names."""
+    """The paper's robot on a surface of Table 5. `left`, `right`: constants of one side by their names."""
     role = "4W2T" if wheeled else "6T2A"
     phi_x, phi_y = SURFACES[surface][2:] if wheeled else SURFACES[surface][:2]
     ground = {f"{role}.ground.friction.static": phi_x, f"{role}.ground.friction.dynamic": 0.8 * phi_x}
@@ -144,7 +149,8 @@ class Inputs:
     Attributes:
         left, right: by `kind`, each a number or a function of time [s].
         kind: `voltage`, `duty`, `speed` or `open`, of both sides or (left, right).
-        slope: α [rad]; supply: U_e of the external supply, for duties [V].
+        slope: α [rad].
+        supply: U_e of the external supply, for duties [V].
     """
 
     left: float | Callable[[float], float]
@@ -220,7 +226,7 @@ def ground(robot: Robot, v_x: float, v_y: float, omega: float, rolled: Sequence[
     push = robot.height / robot.width
 
     def at(x_p: float) -> Ground:
-        """With the loads' centre at x_p; what it would have to be stands in the result."""
+        """With the loads' centre at x_p. What it would have to be stands in the result."""
         x, share = places(robot, x_p)
         u_x = (np.asarray(rolled) - v_x + omega * robot.y)[:, None] + 0 * x
         u_y = np.broadcast_to(-v_y - omega * x, u_x.shape)
@@ -419,7 +425,7 @@ def alone(side: Side, voltage: float, slope: float = 0.0, heading: float = 0.0) 
 class Circling:
     """Steady circling on level ground: v_x, v_y [m/s], ω [rad/s], per side I [A], motor speed w [rad/s].
 
-    `residual` is the largest of the scaled balances; radius and places of the instantaneous centre [m]; `width` is the effective
+    `residual` is the largest of the scaled balances. Radius and places of the instantaneous centre [m]. `width` is the effective
     track width (r ω_k,right - r ω_k,left)/ω [m].
     """
 
@@ -447,10 +453,10 @@ class Circling:
 
 
 def circling(robot: Robot, inputs: Inputs, guess: Sequence[float] | None = None) -> Circling | None:
-    """Steady circling; None where no root is found.
+    """Steady circling, None where no root is found.
 
     Args:
-        guess: v_x, v_y, ω; else several from rolling, with the effective width 1, 1.5, 2.5 and 5 times the true one.
+        guess: v_x, v_y, ω, else several from rolling, with the effective width 1, 1.5, 2.5 and 5 times the true one.
     """
     assert inputs.slope == 0, "on a slope the heading turns"
     value, kinds = inputs.at(0.0), inputs.kinds
@@ -505,7 +511,7 @@ def circling(robot: Robot, inputs: Inputs, guess: Sequence[float] | None = None)
 
 @dataclasses.dataclass
 class Straight:
-    """Straight travel at a constant heading: v_x, v_y [m/s], I [A], w [rad/s]; `steer` is what the right side gets
+    """Straight travel at a constant heading: v_x, v_y [m/s], I [A], w [rad/s]. `steer` is what the right side gets
     more and the left side less than the mean that was asked for [V, or m/s], else the robot would turn."""
 
     v_x: float
@@ -518,7 +524,7 @@ class Straight:
 
 
 def straight(robot: Robot, mean: float, slope: float, heading: float, kind: str = "voltage") -> Straight | None:
-    """Steady straight travel on a slope; None where no root is found (it slides, or has no such travel)."""
+    """Steady straight travel on a slope, None where no root is found (it slides, or has no such travel)."""
     speed = kind == "speed"
     side = robot.sides[0]
 
@@ -558,7 +564,7 @@ def spot_creep(L: float, B: float, ratio: float, wheels: bool) -> float:
 
 
 def spot_coulomb(L: float, B: float, ratio: float = 1.0, drag: float = 0.0, rule: float = 1.0) -> float | None:
-    """v_w/(ω B/2) of a uniform track on the spot under Coulomb friction; drag is f/(μ φ_x). None: it cannot turn.
+    """v_w/(ω B/2) of a uniform track on the spot under Coulomb friction. Drag is f/(μ φ_x). None: it cannot turn.
 
     Rule 1: moments per μ φ_x N of a side, with u = v_w/ω - b: b u ∫dx/√(u²+x²) - ratio ∫x²dx/√(u²+x²) = 2 a b drag.
     """

@@ -1,7 +1,7 @@
 """Tables of settled turns by the second implementation of a robot that turns, with what nobody declares planted.
 
 A table holds turns of the paper's robot on tracks at duties and voltages drawn at random, with noisy readings. The truth
-is narrower and grips more aside than the nominal robot; what is planted is a law of one side or of the turn, in the
+is narrower and grips more aside than the nominal robot. What is planted is a law of one side or of the turn, in the
 second implementation's own words. Nothing is read from mmrjax but the names and units of columns.
 """
 
@@ -33,9 +33,10 @@ class Planted:
     Attributes:
         left, right: constants of one side, by their names, over the nominal ones.
         duty: what a side gets of the duty that its column states, left and right.
-        grip: φ_y/φ_x at a yaw rate [rad/s]; None: constant.
+        grip: φ_y/φ_x at a yaw rate [rad/s]. None: constant.
         moment: against the turn, over load and yaw rate [m·s].
-        named: effects that are its name; family: equation that an answer without a name has to be in.
+        named: effects that are its name.
+        family: equation that an answer without a name has to be in.
     """
 
     left: dict[str, float] = dataclasses.field(default_factory=dict)
@@ -60,7 +61,7 @@ CASES = {
 
 
 def _circling(planted: Planted, drive: world.Inputs) -> world.Circling | None:
-    """A settled turn of the truth with what is planted; None where none was found."""
+    """A settled turn of the truth with what is planted, None where none was found."""
     kept = world.ground
 
     def ground(robot: world.Robot, v_x: float, v_y: float, omega: float, *rest: object) -> world.Ground:

@@ -1,7 +1,7 @@
 # ruff: noqa: E741 (symbols as in the paper)
 """The steady balances over whole arrays in plain NumPy: a closed form, and Newton's method with four effects.
 
-What somebody who sweeps without this project would write; nothing here comes from mmrjax. It holds where the robot
+What somebody who sweeps without this project would write. Nothing here comes from mmrjax. It holds where the robot
 drives forward on an external supply, is not driven by its load and does not slide, and asks nothing of a point.
 Symbols and numbers as in `reference`.
 """
@@ -29,7 +29,7 @@ def _tables(p):
 
 
 class Loads:
-    """What the slope and the load ask of one side; every field an array over the points."""
+    """What the slope and the load ask of one side. Every field an array over the points."""
 
     def __init__(self, wheeled, slope_deg, payload, p=NOMINAL):
         t = _tables(p)
@@ -110,7 +110,7 @@ def newton(
 ):
     """The three numbers with `series_resistance`, `churning`, `winding_heating` and `nonlinear_slip` of these sizes.
 
-    The torque gives the current, the slip the speed, both in closed form; what is left is one equation in the motor
+    The torque gives the current, the slip the speed, both in closed form. What is left is one equation in the motor
     speed, the voltage, of which every point makes each step until the last is within `tolerance` times 10 V.
     """
     load = Loads(wheeled, slope_deg, payload, p)

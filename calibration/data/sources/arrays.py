@@ -25,7 +25,7 @@ COMPRESSED = 15
 
 
 def of_npz(path: Path, name: str) -> tuple[Signal, ...]:
-    """Signals of an .npz archive; arrays of Python objects are never loaded.
+    """Signals of an .npz archive. Arrays of Python objects are never loaded.
 
     Raises:
         BadData: a member whose path leads out of the archive.
@@ -74,7 +74,7 @@ def _member(archive: zipfile.ZipFile, member: str) -> Callable[[], np.ndarray]:
 
 
 def of_matlab(path: Path, name: str) -> tuple[Signal, ...]:
-    """Signals of a MATLAB file up to version 7; fields of structures are named by path, `log.motor.speed`."""
+    """Signals of a MATLAB file up to version 7. Fields of structures are named by path, `log.motor.speed`."""
     from scipy import io
 
     _check_matlab(path, name)
@@ -92,7 +92,7 @@ def of_matlab(path: Path, name: str) -> tuple[Signal, ...]:
 
 
 def _check_matlab(path: Path, name: str) -> None:
-    """Refuses a file whose variables need more memory than is free; reading one of them loads all.
+    """Refuses a file whose variables need more memory than is free. Reading one of them loads all.
 
     Raises:
         BadData: they do.
@@ -116,7 +116,7 @@ def _variable(loaded: Callable[[], Columns], name: str) -> Callable[[], np.ndarr
 
 
 def _fields(path: str, value: np.ndarray) -> list[tuple[str, np.ndarray]]:
-    """Arrays of a structure by path; of an array of structures each has its index."""
+    """Arrays of a structure by path. Of an array of structures each has its index."""
     if value.dtype.names is None:
         return [(path, value)]
     found: list[tuple[str, np.ndarray]] = []
@@ -166,7 +166,7 @@ def _walk(
     h5py: Any,
     seen: set[int],
 ) -> None:
-    """Adds the arrays and units of a group; a group with several paths is read under its first."""
+    """Adds the arrays and units of a group. A group with several paths is read under its first."""
     place = h5py.h5o.get_info(group.id).addr
     if place in seen:
         return

@@ -74,7 +74,7 @@ def of_bag(path: Path, name: str) -> tuple[Signal, ...]:
 
 
 def _unit(kind: str, field: str) -> str:
-    """Unit of a field by its type of message; empty if the type states none."""
+    """Unit of a field by its type of message, empty if the type states none."""
     known = UNITS.get(kind, {})
     return next((unit for start, unit in known.items() if field.startswith(start)), "")
 

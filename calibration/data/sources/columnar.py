@@ -74,7 +74,7 @@ def of_table(table: Any) -> tuple[Signal, ...]:
 
 
 def _signals(field: Any, rows: int, load: Callable[[], np.ndarray], read: Callable[[list[str]], Any]) -> list[Signal]:
-    """Signals of a column; of a column of lists, one signal for each element, `name[0]`."""
+    """Signals of a column. Of a column of lists, one signal for each element, `name[0]`."""
     import pyarrow.types as kinds
 
     kind = field.type

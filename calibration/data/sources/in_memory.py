@@ -33,7 +33,17 @@ def of_object(source: Any) -> tuple[str, tuple[Signal, ...]]:
     library = type(source).__module__.partition(".")[0]
     kind = type(source).__name__
     if library == "pandas" and kind == "DataFrame":
-        return "the DataFrame", _of_pandas(source)
+        found = []
+        for level in range(source.index.nlevels):
+            index = source.index.get_level_values(level)
+            named = index.name is not None or index.dtype.kind in "mM"
+            if named:
+                found.append(_of_series(str(index.name or "time"), index, len(source)))
+        found += [
+            _of_series(_column_name(column), source.iloc[:, j], len(source))
+            for j, column in enumerate(source.columns)
+        ]
+        return "the DataFrame", tuple(found)
     if library == "polars" and kind in ("DataFrame", "LazyFrame"):
         try:
             frame = source.collect() if kind == "LazyFrame" else source
@@ -64,19 +74,6 @@ def _called(source: Any) -> str:
     return kind.__name__ if kind.__module__ == "builtins" else f"{kind.__module__.partition('.')[0]} {kind.__name__}"
 
 
-def _of_pandas(frame: Any) -> tuple[Signal, ...]:
-    found = []
-    for level in range(frame.index.nlevels):
-        index = frame.index.get_level_values(level)
-        named = index.name is not None or index.dtype.kind in "mM"
-        if named:
-            found.append(_of_series(str(index.name or "time"), index, len(frame)))
-    found += [
-        _of_series(_column_name(column), frame.iloc[:, j], len(frame)) for j, column in enumerate(frame.columns)
-    ]
-    return tuple(found)
-
-
 def _column_name(column: Any) -> str:
     return ".".join(str(part) for part in column if str(part)) if isinstance(column, tuple) else str(column)
 
@@ -105,7 +102,7 @@ def _words(series: Any) -> Callable[[], np.ndarray]:
 
 
 def _of_xarray(dataset: Any) -> tuple[Signal, ...]:
-    """Signals of a Dataset; if its variables have several dimensions of time, each variable has its own clock."""
+    """Signals of a Dataset. If its variables have several dimensions of time, each variable has its own clock."""
     dimensions = {d for v in dataset.data_vars.values() for d in v.dims}
     several = len({dataset.sizes[d] for d in dimensions if dataset.sizes[d] > 1}) > 1 and len(dimensions) > 1
     found: list[Signal] = []

@@ -134,7 +134,7 @@ def _unfolded(value: Mapping[str, Any]) -> Mapping[str, Any] | list[Any]:
 
 
 def _records(records: Sequence[Mapping[str, Any]], at: str, arrays: Columns, name: str) -> None:
-    """Columns of records; a missing entry is a missing reading."""
+    """Columns of records. A missing entry is a missing reading."""
     if (episodes := _episodes(records)) is not None:
         arrays.update({f"{at}.{key}" if at else key: values for key, values in episodes.items()})
         return
@@ -151,7 +151,7 @@ def _records(records: Sequence[Mapping[str, Any]], at: str, arrays: Columns, nam
 
 
 def _episodes(records: Sequence[Mapping[str, Any]]) -> Columns | None:
-    """Columns of records that each hold lists of numbers of one length, a run each; None for other records.
+    """Columns of records that each hold lists of numbers of one length, a run each, None for other records.
 
     A text that differs in every record names the runs, else their number does.
     """
@@ -183,7 +183,7 @@ def _leaves(record: Mapping[str, Any], at: str, name: str, depth: int) -> Iterab
 
 
 def _array(values: Sequence[Any]) -> np.ndarray:
-    """An array of numbers, NaN for a missing number, or of words; otherwise of objects."""
+    """An array of numbers, NaN for a missing number, or of words, otherwise of objects."""
     kinds = {type(value) for value in values}
     if kinds <= {int, float, bool, type(None)}:
         return np.array([np.nan if value is None else value for value in values], dtype=float)

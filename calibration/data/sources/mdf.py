@@ -15,7 +15,7 @@ from calibration.data.sources.recorded_signals import Clock, Signal
 
 
 def of_mdf(path: Path, name: str) -> tuple[Signal, ...]:
-    """Signals of an MDF file by channel; where groups have channels of one name, `group/channel`."""
+    """Signals of an MDF file by channel. Where groups have channels of one name, `group/channel`."""
     found: list[Signal] = []
     with _opened(path) as file:
         count = collections.Counter(c.name for g in file.groups for c in g.channels)
@@ -33,12 +33,11 @@ def of_mdf(path: Path, name: str) -> tuple[Signal, ...]:
     clocks = {id(s.clock) for s in found}
     if len(clocks) == 1 and found and found[0].clock is not None:  # a table
         time = found[0].clock
-        found = [Signal("time_s", found[0].length, time.load, "s"), *(_in_table(s) for s in found)]
+        found = [
+            Signal("time_s", found[0].length, time.load, "s"),
+            *(Signal(s.path, s.length, s.load, s.unit) for s in found),
+        ]
     return tuple(found)
-
-
-def _in_table(signal: Signal) -> Signal:
-    return Signal(signal.path, signal.length, signal.load, signal.unit)
 
 
 @contextlib.contextmanager
@@ -57,7 +56,7 @@ def _opened(path: Path) -> Any:
 
 
 def _close_half_made(error: BaseException) -> None:
-    """Marks the object of a file that could not be opened as closed; closing it would print an error on stderr."""
+    """Marks the object of a file that could not be opened as closed. Closing it would print an error on stderr."""
     frame = error.__traceback__
     while frame is not None:
         for held in frame.tb_frame.f_locals.values():

@@ -27,8 +27,10 @@ class Elapsed(NamedTuple):
     """Times of a clock.
 
     Attributes:
-        time: since its first sample [s], shape (n,); first: that sample by the clock [s].
-        unit: of its numbers, empty for dates; period: of a counter that wraps, else 0.
+        time: since its first sample [s], shape (n,).
+        first: that sample by the clock [s].
+        unit: of its numbers, empty for dates.
+        period: of a counter that wraps, else 0.
     """
 
     time: np.ndarray
@@ -91,14 +93,16 @@ def on_one_grid(
     """Returns time [s] from the first row, values of each signal at these times, and notes on the resampling.
 
     The grid is the time stamps of the densest measured signal, or of the stated clock. Signals on its clock stay as
-    they are. A command has the value of its last sample; rows before the first sample of a command are left out. A
+    they are. A command has the value of its last sample. Rows before the first sample of a command are left out. A
     reading is used once: in the row nearest to each of its samples, at the value of the straight line between samples
-    there; other rows have none.
+    there. Other rows have none.
 
     Args:
-        name: of the source; chosen: signals by the name of their column, each with a clock.
-        is_held: True for a column whose values are held; is_measured: True for a column of readings.
-        grid: name of a clock that is the grid; empty: the densest.
+        name: of the source.
+        chosen: signals by the name of their column, each with a clock.
+        is_held: True for a column whose values are held.
+        is_measured: True for a column of readings.
+        grid: name of a clock that is the grid. Empty: the densest.
 
     Raises:
         BadData: a clock that goes back, or clocks that have no time in common.
@@ -173,10 +177,11 @@ def on_one_grid(
 
 
 def used_once(rows: np.ndarray, time: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Readings in the rows nearest to their samples, on the straight line between these; NaN in other rows.
+    """Readings in the rows nearest to their samples, on the straight line between these, NaN in other rows.
 
     Args:
-        rows: time of the rows [s], shape (rows,); time, values: of the samples, shape (samples,).
+        rows: time of the rows [s], shape (rows,).
+        time, values: of the samples, shape (samples,).
     """
     own = np.asarray(values, float)
     sound = np.isfinite(own)
@@ -195,7 +200,7 @@ def used_once(rows: np.ndarray, time: np.ndarray, values: np.ndarray) -> np.ndar
 
 
 def _order(time: np.ndarray) -> np.ndarray | None:
-    """Order of samples by their stamps if some were recorded slightly late; None if they are in order, or if the
+    """Order of samples by their stamps if some were recorded slightly late, None if they are in order, or if the
     clock was set back."""
     step = np.diff(time)
     if not (step < 0).any() or step.min() < -LATE * float(np.median(np.abs(step))):

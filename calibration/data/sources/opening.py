@@ -31,8 +31,10 @@ class Format:
     """A format of files.
 
     Attributes:
-        kind: name of a file of this format; module, reader: the function that lists its signals.
-        library: the required library; extra: of this package that installs the library.
+        kind: name of a file of this format.
+        module, reader: the function that lists its signals.
+        library: the required library.
+        extra: extra of this package that installs it.
     """
 
     kind: str
@@ -97,7 +99,7 @@ def unreadable_file(name: str, kind: str, error: BaseException) -> BadData:
 
 
 def split_source(source: str) -> tuple[Path, str]:
-    """Path of a file, and path of signals in it; empty if it is not stated."""
+    """Path of a file, and path of signals in it, empty if it is not stated."""
     if Path(source).exists():
         return Path(source), ""
     file, _, within = source.partition(WITHIN)
@@ -105,7 +107,7 @@ def split_source(source: str) -> tuple[Path, str]:
 
 
 def files_of_group(source: str) -> list[Path]:
-    """Files that match a pattern such as `runs/*.csv`, in order; empty if it is a file's name, or none matches."""
+    """Files that match a pattern such as `runs/*.csv`, in order, empty if it is a file's name, or none matches."""
     path = Path(source)
     if not set("*?[") & {*source} or path.exists():
         return []
@@ -114,7 +116,7 @@ def files_of_group(source: str) -> list[Path]:
 
 
 def format_of(path: Path, name: str) -> Format | None:
-    """Format of a file or of a bag's folder; None: text in columns.
+    """Format of a file or of a bag's folder. None: text in columns.
 
     Raises:
         BadData: a pipe, a device, a folder that is no bag, or a file that the system does not open.
@@ -154,10 +156,11 @@ def open_signals(path: Path, within: str, name: str, form: Format) -> Source:
     """The signals of a file of a format other than text.
 
     Args:
-        within: path of signals in it, empty for all; name: of the file, for messages.
+        within: path of signals in it, empty for all.
+        name: of the file, for messages.
 
     Raises:
-        BadData: as `Format.signals`; no signal, or none below `within`.
+        BadData: as `Format.signals`. No signal, or none below `within`.
     """
     if path.is_dir():
         check_folder(path, name)
@@ -202,7 +205,7 @@ def checked_source(
 
 def _guarded(signals: Sequence[Signal], name: str, kind: str) -> tuple[Signal, ...]:
     """Signals that raise `BadData` if they are refused, too large for the memory, or if their library cannot read
-    their values; shared clocks stay shared."""
+    their values. Shared clocks stay shared."""
 
     def guarded(
         load: Callable[[], np.ndarray], path: str, signal: Signal, refused: str = ""

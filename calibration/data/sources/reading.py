@@ -41,7 +41,8 @@ class Reading:
     """Columns of a source, with their names in this program.
 
     Attributes:
-        arrays: the columns; mapped: columns that have other names in the source.
+        arrays: the columns.
+        mapped: columns that have other names in the source.
     """
 
     arrays: NamedArrays
@@ -55,7 +56,7 @@ def read_columns(source: Any, layout: Layout, columns: Preset | None = None, bet
         source: a path, perhaps with `::` and the path of signals in the file, or a table in memory
             (`in_memory.EXPECTED`). A pattern such as `runs/*.csv` names files that are a run each.
         layout: of the table's robot.
-        columns: names of the source's columns, in addition to the robot's; they win over these.
+        columns: names of the source's columns, in addition to the robot's. They win over these.
         between: `linear` if the imposed quantity follows straight lines between samples, as in `Rig.between_rows`.
 
     Raises:
@@ -78,7 +79,7 @@ def read_columns(source: Any, layout: Layout, columns: Preset | None = None, bet
 
 
 def _of_group(readings: Sequence[Reading], name: str) -> Reading:
-    """Tables of several files as one; each file is a run, named after it.
+    """Tables of several files as one. Each file is a run, named after it.
 
     Raises:
         BadData: files with different columns or units.
@@ -111,10 +112,10 @@ def _of_group(readings: Sequence[Reading], name: str) -> Reading:
 
 
 def read_whole_table(path: Path, within: str = "") -> NamedArrays | None:
-    """Returns every column of a table in a file, unchanged; None for text, whose comments have a meaning.
+    """Returns every column of a table in a file, unchanged, None for text, whose comments have a meaning.
 
     Raises:
-        BadData: as `read_columns`; signals with separate clocks, which do not form one table.
+        BadData: as `read_columns`. Signals with separate clocks, which do not form one table.
     """
     name = path.name or str(path)
     form = opening.format_of(path, name)
@@ -276,7 +277,7 @@ def _extras(source: Source, chosen: Mapping[str, Signal], own: Sequence[Signal])
 
 
 def _in_rows(source: Source, signals: Mapping[str, Signal], rows: int = 0) -> Columns:
-    """Values of the columns of a table; a single value applies to every row."""
+    """Values of the columns of a table. A single value applies to every row."""
     lengths = {column: s.length for column, s in signals.items()}
     rows = rows or max(lengths.values(), default=0)
     for column, length in lengths.items():

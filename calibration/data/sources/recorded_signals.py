@@ -33,8 +33,9 @@ class Clock:
     """Time stamps that several signals share.
 
     Attributes:
-        name: path of the time stamps, for messages; load: returns them, shape (n,), numbers or `datetime64`.
-        unit: of the numbers, a key of `UNITS`; empty if the recording does not state it.
+        name: path of the time stamps, for messages.
+        load: returns them, shape (n,), numbers or `datetime64`.
+        unit: of the numbers, a key of `UNITS`, empty if the recording does not state it.
     """
 
     name: str
@@ -47,12 +48,14 @@ class Signal:
     """One signal of a recording.
 
     Attributes:
-        path: its name in the recording; length: number of its samples.
+        path: its name in the recording.
+        length: number of its samples.
         load: returns the values, shape (length,): numbers, words or `datetime64`.
         unit: as stated by the recording, empty if it states none.
-        clock: its own; None: its samples are rows of a table.
-        words: True if the values are text; refused: reason why it cannot be read, empty if it can.
-        size: memory that `load` takes [bytes]; 0: that of `length` numbers.
+        clock: its own. None: its samples are rows of a table.
+        words: True if the values are text.
+        refused: reason why it cannot be read, empty if it can.
+        size: memory that `load` takes [bytes]. 0: that of `length` numbers.
     """
 
     path: str
@@ -81,7 +84,7 @@ def encodable_text(text: str) -> str:
 
 
 def refused_type(dtype: np.dtype) -> str:
-    """Reason why values of a type cannot be read; empty if they can."""
+    """Reason why values of a type cannot be read, empty if they can."""
     if dtype.kind in "biufUSMm":
         return ""
     kinds = {"O": "objects", "c": "complex numbers", "V": "raw bytes"}
@@ -153,7 +156,7 @@ def suggested_paths(name: str, paths: Sequence[str]) -> str:
 
 
 def unit_of_clock(name: str) -> str | None:
-    """Unit that the name of a clock states, empty if it states none; None if it is not a name of a clock."""
+    """Unit that the name of a clock states, empty if it states none, None if it is not a name of a clock."""
     bare = name.strip().casefold()
     if bare in CLOCKS:
         return ""
@@ -171,7 +174,7 @@ def of_arrays(
     arrays: Mapping[str, tuple[tuple[int, ...], np.dtype, Callable[[], np.ndarray]]],
     units: Mapping[str, str] | None = None,
 ) -> tuple[Signal, ...]:
-    """Signals of named arrays; each column of an array of two dimensions is a separate signal, `name[0]`.
+    """Signals of named arrays. Each column of an array of two dimensions is a separate signal, `name[0]`.
 
     Arrays of one group that are equally long share its time stamps: the array there whose name is a clock's. A group
     without one, or a recording in which every array is equally long, is a table.
@@ -258,8 +261,10 @@ class Source:
     """A recording or a table: its signals, and notes on its reading.
 
     Attributes:
-        name: for messages; kind: of file, `a Parquet file` say.
-        signals: in the order of the recording; digest: SHA-256 of the file, empty of data in memory.
+        name: for messages.
+        kind: of file, `a Parquet file` say.
+        signals: in the order of the recording.
+        digest: SHA-256 of the file, empty of data in memory.
         notes: sentences on its reading.
     """
 

@@ -22,7 +22,7 @@ _FIELD = re.compile(r"([^;\[\] ]+)(?:\[(\d+)\])? [^;]+")
 
 
 def of_ulog(path: Path, name: str) -> tuple[Signal, ...]:
-    """Signals of a ULog file, `topic.field`, of a second instance `topic[1].field`; time counts from the boot.
+    """Signals of a ULog file, `topic.field`, of a second instance `topic[1].field`. Time counts from the boot.
 
     Raises:
         BadData: a damaged file.
@@ -57,7 +57,7 @@ def _check_messages(path: Path, name: str) -> dict[str, list[tuple[str, int]]]:
     """Returns the type and number of the fields of each topic.
 
     Raises:
-        BadData: the file ends within a message; the library does not report that.
+        BadData: the file ends within a message. The library does not report that.
     """
     formats: dict[str, list[tuple[str, int]]] = {}
     size, at = path.stat().st_size, HEADER

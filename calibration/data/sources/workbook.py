@@ -23,7 +23,7 @@ CELL = 100
 def of_workbook(path: Path, name: str) -> tuple[Signal, ...]:
     """Columns of a workbook: by their names if one sheet has data, else `sheet/name`.
 
-    The first row with a cell is the header; a row of units may follow.
+    The first row with a cell is the header. A row of units may follow.
 
     Columns of numbers with a cell of words raise `BadData` when they are loaded.
     """
@@ -60,7 +60,7 @@ def of_workbook(path: Path, name: str) -> tuple[Signal, ...]:
 
 
 def _cell_count(content: bytes) -> int:
-    """Number of cells of the rectangle that a sheet's XML declares; calamine allocates it whole."""
+    """Number of cells of the rectangle that a sheet's XML declares. Calamine allocates it whole."""
     places = [(_letters(a), int(b)) for a, b in re.findall(rb'\br="([A-Z]{1,3})(\d{1,7})"', content)]  # of .xlsx
     wide, tall = (max(numbers, default=0) for numbers in zip(*places, strict=True)) if places else (0, 0)
     if b"number-columns-repeated" in content or b"number-rows-repeated" in content:  # of .ods

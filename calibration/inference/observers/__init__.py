@@ -49,7 +49,7 @@ def pose_problem(
 
     Args:
         sd: of the readings [SI], shape (rows, channels).
-        model: name of the fidelity that simulates them; None takes the first that the kind of data allows.
+        model: name of the fidelity that simulates them. None takes the first that the kind of data allows.
 
     Raises:
         BadConfiguration: no such fidelity, or one that cannot simulate data of this kind.

@@ -44,7 +44,7 @@ class SearchPolicy:
 
 
 class CurveScores(Protocol):
-    """Scores of curves in the residuals: normal deviates, and decrease of χ² by each [σ²]; shape (families,)."""
+    """Scores of curves in the residuals: normal deviates, and decrease of χ² by each [σ²], shape (families,)."""
 
     @property
     def curve(self) -> Array: ...
@@ -54,7 +54,7 @@ class CurveScores(Protocol):
 
 
 class Statistics(Protocol):
-    """Strongest statistics of a fit; `white` measures the memory of its residuals."""
+    """Strongest statistics of a fit. `white` measures the memory of its residuals."""
 
     @property
     def white(self) -> Any: ...
@@ -88,19 +88,20 @@ class Observer(eqx.Module):
     """Readings of runs of one kind, and the facts about that kind that inference needs.
 
     Attributes:
-        conditions: of each run, shape (runs,); conditions that change within a history, at each of its instants.
-        word: name of a row; fewest: rows needed to separate a missing effect from noise.
-        axis: column of a table that orders the rows of a run; empty if a run is one row.
+        conditions: of each run, shape (runs,). Conditions that change within a history, at each of its instants.
+        word: name of a row.
+        fewest: rows needed to separate a missing effect from noise.
+        axis: column of a table that orders the rows of a run, empty if a run is one row.
         sizes_padded: numbers of rows to which tables are padded, so that those of similar size share compiled
-            programs; beyond the last one, to a multiple of it; empty for no padding.
+            programs. Beyond the last one, to a multiple of it, empty for no padding.
         blocks: kinds of blocks to hold out, the most informative first.
         policy: options of batched fits.
         rows_tell: True if a single row shows a defect.
         evidence: kinds of evidence for a missing effect.
         library: effects that such data show in addition to the library's.
         menu: True if the menu of experiments has runs of this kind.
-        searches: of a calibration; None takes the fidelity's; profiled: True if its parameters are profiled
-            when the fidelity's are.
+        searches: of a calibration. None takes the fidelity's.
+        profiled: True if its parameters are profiled when the fidelity's are.
     """
 
     conditions: eqx.AbstractVar[Conditions]
@@ -133,7 +134,7 @@ class Observer(eqx.Module):
     @classmethod
     @abc.abstractmethod
     def of(cls, runs: Runs, robot: Robot, fidelity: str | None = None) -> Observer:
-        """Observer of a table; see `observers.pose_problem`."""
+        """Observer of a table. See `observers.pose_problem`."""
 
     @classmethod
     @abc.abstractmethod
@@ -143,7 +144,7 @@ class Observer(eqx.Module):
     @classmethod
     @abc.abstractmethod
     def check(cls, runs: Runs, noise: Noise) -> list[Remark | str]:
-        """Refuse runs that contradict each other; return notes on the others.
+        """Refuse runs that contradict each other. Return notes on the others.
 
         Raises:
             BadData: readings that cannot all be true.
@@ -152,7 +153,7 @@ class Observer(eqx.Module):
     @classmethod
     @abc.abstractmethod
     def check_start(cls, runs: Runs, noise: Noise, robot: Robot) -> list[Remark | str]:
-        """Refuse runs with a start that the model cannot follow; return notes on their length.
+        """Refuse runs with a start that the model cannot follow. Return notes on their length.
 
         Raises:
             BadData: a run that does not begin as the model does.
@@ -160,7 +161,7 @@ class Observer(eqx.Module):
 
     @classmethod
     def with_initial_states(cls, robot: Robot, runs: Runs, noise: Noise) -> Robot:
-        """`robot` with the initial states of runs that do not begin at rest; unchanged for settled runs."""
+        """`robot` with the initial states of runs that do not begin at rest. Unchanged for settled runs."""
         return robot
 
     @classmethod
@@ -203,7 +204,7 @@ class Observer(eqx.Module):
         """Observation of a robot in each row."""
 
     def solve(self, robot: Robot) -> tuple[Array, Array] | None:
-        """Unknowns of each row, shape (rows, unknowns), and True if found; None if rows are no roots of equations."""
+        """Unknowns of each row, shape (rows, unknowns), and True if found, None if rows are no roots of equations."""
         return None
 
     @property
@@ -212,7 +213,7 @@ class Observer(eqx.Module):
         return False
 
     def read(self, robot: Robot) -> Observation:
-        """Observation of a robot in each row; only for observers with `apart`."""
+        """Observation of a robot in each row. Only for observers with `apart`."""
         raise NotImplementedError
 
     def shown(self, robot: Robot, unknowns: Array, found: Array) -> tuple[Observation, Signals, Array]:
@@ -221,7 +222,7 @@ class Observer(eqx.Module):
         raise NotImplementedError
 
     def operating(self, robot: Robot) -> Signals | None:
-        """Signals of a robot at each row's operating point; None for rows without one."""
+        """Signals of a robot at each row's operating point, None for rows without one."""
         return None
 
     @property
@@ -240,7 +241,7 @@ class Observer(eqx.Module):
 
     @property
     def driven(self) -> Conditions:
-        """Conditions under which the robot was driven, as if forwards; shape (cases,)."""
+        """Conditions under which the robot was driven, as if forwards, shape (cases,)."""
         return self.conditions
 
     def cautions(self, robot: Robot) -> list[str]:
@@ -255,7 +256,8 @@ class Observer(eqx.Module):
         """Expected χ² of noise alone: one for each reading of settled runs, because their rows are independent.
 
         Args:
-            off: returns the whitened residuals of a fit, shape (rows, channels); counts: True for included readings.
+            off: returns the whitened residuals of a fit, shape (rows, channels).
+            counts: True for included readings.
         """
         return float(counts.sum())
 
@@ -273,7 +275,8 @@ class Observer(eqx.Module):
         """Initial values of the bootstrap's replicates, leading axis the keys: the keys, or fits of tables drawn.
 
         Args:
-            problem: of the base only, at its fit z; linear: the same fit, linearised.
+            problem: of the base only, at its fit z.
+            linear: the same fit, linearised.
             keys: random keys, as numbers, shape (replicates, words).
             factors: on the sds of each replicate, shape (replicates, channels).
         """
@@ -286,7 +289,9 @@ class Observer(eqx.Module):
         """One replicate of the bootstrap: a table drawn from the fit of the base, fitted again and linearised.
 
         Args:
-            problem: of the base only; data: of the table; linear: the fit, linearised.
+            problem: of the base only.
+            data: of the table.
+            linear: the fit, linearised.
             drawn: one of `draws`.
         """
 
@@ -296,7 +301,8 @@ class Observer(eqx.Module):
         """Initial coordinates of at most `count` searches of a base: the prior mean, and draws of the prior.
 
         Args:
-            problem: without effects in its coordinates; every: the same with all rows of a log that was thinned.
+            problem: without effects in its coordinates.
+            every: the same with all rows of a log that was thinned.
         """
         size = len(problem.coordinates)
         return np.concatenate([np.zeros((1, size)), random.standard_normal((max(count, 1) - 1, size))])
@@ -314,7 +320,7 @@ class Observer(eqx.Module):
 
     def scan(self, problem: Problem, z: Array, data: Data, k: int, values: Array) -> tuple[Array, Array]:
         """Objective, shape (values,), at each of `values` of coordinate k, and all coordinates there, (values,
-        coordinates); the others move from z to the minimum of their linearisation."""
+        coordinates). The others move from z to the minimum of their linearisation."""
         raise NotImplementedError
 
     def places(self, problem: Problem) -> int:
@@ -336,11 +342,12 @@ class Observer(eqx.Module):
         """Optima of any number of fits, each with its own weights, and their observations.
 
         Args:
-            starts: shape (members, coordinates); weights: of each member's readings, (members, rows, channels).
-            active: set of effects of each member, see `ActiveSet`; None keeps the problem's.
+            starts: shape (members, coordinates).
+            weights: of each member's readings, (members, rows, channels).
+            active: set of effects of each member, see `ActiveSet`. None keeps the problem's.
             rivals: True if all search the same optimum, so that some may be stopped early.
-            most: largest number of steps of each; None: the policy's.
-            scanned: problem of the base only, whose coordinates are scanned and come first; None: the problem itself.
+            most: largest number of steps of each. None: the policy's.
+            scanned: problem of the base only, whose coordinates are scanned and come first. None: the problem itself.
         """
 
     def observed(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> Observation:
@@ -355,7 +362,7 @@ class Observer(eqx.Module):
         return observe_robot(problem, problem.robot(jnp.asarray(z)))
 
     def at(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> tuple[Numbers, Numbers, Observation]:
-        """Residuals, their Jacobian and the observation at z; arguments as in `observed`."""
+        """Residuals, their Jacobian and the observation at z. Arguments as in `observed`."""
         return linearise(_with_effects(problem, active), jnp.asarray(z), problem.data)
 
     @abc.abstractmethod
@@ -363,7 +370,8 @@ class Observer(eqx.Module):
         """Bases of curves for the search for a discrepancy.
 
         Args:
-            columns: of the padded table, with fitted readings; robot: fitted.
+            columns: of the padded table, with fitted readings.
+            robot: fitted.
         """
 
     @abc.abstractmethod
@@ -371,7 +379,8 @@ class Observer(eqx.Module):
         """Further findings for data of this kind.
 
         Args:
-            bases: of curves; included: True for included rows of the table.
+            bases: of curves.
+            included: True for included rows of the table.
             before, after: diagnoses of base and proposed robot.
         """
 

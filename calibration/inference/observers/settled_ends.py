@@ -131,7 +131,10 @@ def starts_from_settled_ends(
     points = np.concatenate(
         [ends, np.where(friction, _spread_over_surfaces(problem, draws), ends[0]), 0 * ends[:1], draws]
     )
-    blunt = _with_blunt_instruments(problem)
+    data = problem.data
+    count = np.maximum(np.sum(np.asarray(data.weight) > 0, 0), 1)
+    rms = np.sqrt(np.sum(np.asarray(data.weight > 0) * np.asarray(data.measured) ** 2, 0) / count)
+    blunt = dataclasses.replace(problem, data=dataclasses.replace(data, sd=jnp.hypot(data.sd, BLUNT * rms)))
     optima = search(blunt, _recombined(blunt, points)[:SEARCHES], STEPS_BLUNT)
     ended = np.asarray(optima.z)[np.argsort(np.asarray(optima.cost))]
     best = _recombined(blunt, ended)[:1]
@@ -141,7 +144,7 @@ def starts_from_settled_ends(
 def _with_peaked_friction(problem: Problem, z: np.ndarray) -> np.ndarray:
     """Copies of z with a friction that falls from a peak, with the same creep and sliding friction.
 
-    Their μ_s, V_s and V_d have the nominal ratios to μ_d and to each other, in one configuration or in all;
+    Their μ_s, V_s and V_d have the nominal ratios to μ_d and to each other, in one configuration or in all,
     shape (points, parameters).
     """
     c, out, every = problem.coordinates, [], z.copy()
@@ -162,11 +165,11 @@ def _with_peaked_friction(problem: Problem, z: np.ndarray) -> np.ndarray:
 
 def _distinct_points(points: np.ndarray) -> np.ndarray:
     """Points without those too close to an earlier one."""
-    kept: list[np.ndarray] = []
+    distinct: list[np.ndarray] = []
     for z in points:
-        if all(np.max(np.abs(z - k)) > APART for k in kept):
-            kept.append(z)
-    return np.stack(kept)
+        if all(np.max(np.abs(z - k)) > APART for k in distinct):
+            distinct.append(z)
+    return np.stack(distinct)
 
 
 def _recombined(problem: Problem, points: np.ndarray) -> np.ndarray:
@@ -207,14 +210,6 @@ def _coordinate(problem: Problem, k: int, value: float) -> float:
     return float(((np.log(value) if scale else value) - location) / spread)
 
 
-def _with_blunt_instruments(problem: Problem) -> Problem:
-    """Problem with the enlarged sds of blunt instruments."""
-    data = problem.data
-    count = np.maximum(np.sum(np.asarray(data.weight) > 0, 0), 1)
-    rms = np.sqrt(np.sum(np.asarray(data.weight > 0) * np.asarray(data.measured) ** 2, 0) / count)
-    return dataclasses.replace(problem, data=dataclasses.replace(data, sd=jnp.hypot(data.sd, BLUNT * rms)))
-
-
 def _fit_settled_ends(problem: Problem) -> Float[np.ndarray, "starts parameters"]:
     """Fits to the settled ends: with each adhesion of the grid, and with a free adhesion."""
     names = problem.coordinates.names
@@ -222,19 +217,19 @@ def _fit_settled_ends(problem: Problem) -> Float[np.ndarray, "starts parameters"
     ends = settled_ends(problem)
     mean = np.where(_slides_at_end(problem, ends)[:, None], np.nan, ends.mean)
     observe = SettledRuns(ends.conditions, "steady")
-    here = Problem(problem.base, problem.coordinates, observe, data_from_readings(mean, ends.sd, len(names)))
+    ends_problem = Problem(problem.base, problem.coordinates, observe, data_from_readings(mean, ends.sd, len(names)))
     pinned = np.stack([_with_adhesion(problem, np.zeros(len(names)), a) for a in ADHESIONS])
     held = np.zeros(pinned.shape, bool)
     held[:, statics] = True
-    fitted = jax.device_get(_fit_pinned(here, jnp.asarray(pinned), jnp.asarray(held)))
-    free = jax.device_get(_fit_pinned(here, jnp.asarray(fitted.z), jnp.zeros(held.shape, bool)))
+    fitted = jax.device_get(_fit_pinned(ends_problem, jnp.asarray(pinned), jnp.asarray(held)))
+    free = jax.device_get(_fit_pinned(ends_problem, jnp.asarray(fitted.z), jnp.zeros(held.shape, bool)))
     best = free.z[int(np.argmin(np.where(np.isfinite(free.cost), free.cost, np.inf)))]
-    wanted = [z for z in (best, *fitted.z) if np.all(np.isfinite(z))]
-    return np.stack([_with_sliding(problem, z, share) for z in wanted for share in FINER])
+    finite_points = [z for z in (best, *fitted.z) if np.all(np.isfinite(z))]
+    return np.stack([_with_sliding(problem, z, share) for z in finite_points for share in FINER])
 
 
 def _slides_at_end(problem: Problem, ends: Ends) -> np.ndarray:
-    """True if a run's movers spin at its end, also while it still gains speed, forwards or back; shape (runs,)."""
+    """True if a run's movers spin at its end, also while it still gains speed, forwards or back, shape (runs,)."""
     if not {"motor_speed", "speed"} <= set(problem.base.rig.channels):
         return np.zeros(len(ends.mean), bool)
     turning, travelling = (
@@ -267,8 +262,8 @@ def _with_sliding(problem: Problem, z: np.ndarray, share: float) -> np.ndarray:
             value[k] *= share
     for k, name in enumerate(c.names):
         for follower, leader in TIED:
-            if name.endswith(follower) and (own := name.removesuffix(follower) + leader) in c.names:
-                j = c.names.index(own)
+            if name.endswith(follower) and (base_name := name.removesuffix(follower) + leader) in c.names:
+                j = c.names.index(base_name)
                 value[k] = nominal[k] * value[j] / nominal[j]
     inside = np.where(c.scale, np.log(np.maximum(value, 1e-12)), value)
     changed = value != c.value(np.asarray(z))
@@ -284,7 +279,7 @@ def _fit_pinned(problem: Problem, starts: Array, held: Array) -> Optimum:
 
 
 def _misfit_of_runs(problem: Problem, points: np.ndarray) -> np.ndarray:
-    """Sum of squares of each run's residuals at each point [σ²], infinite if a run fails; shape (points, runs)."""
+    """Sum of squares of each run's residuals at each point [σ²], infinite if a run fails, shape (points, runs)."""
     observe: Histories = problem.observe  # type: ignore[assignment]
     filled = np.resize(points, (-(-len(points) // TOGETHER) * TOGETHER, points.shape[1]))
     parts = filled.reshape(-1, TOGETHER, points.shape[1])

@@ -74,7 +74,7 @@ def export_statement(found: Export) -> str:
 
 
 def share_kept(fate: Fate) -> str:
-    """Share of an effect that is kept, in percent; empty where none was computed."""
+    """Share of an effect that is kept, in percent, empty where none was computed."""
     return f"{100 * fate.kept:.0f} %" if np.isfinite(fate.kept) else ""
 
 

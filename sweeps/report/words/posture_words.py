@@ -29,7 +29,10 @@ class Drawn:
     """A robot from the side on the ground: lower, and from its centre of mass on higher by a step.
 
     Attributes:
-        side: in a frame along the ground; base: height of its middle of the wheelbase [m]; step: [m]; slope: [rad].
+        side: in a frame along the ground.
+        base: height of its middle of the wheelbase [m].
+        step: [m].
+        slope: [rad].
     """
 
     side: Outline
@@ -43,8 +46,9 @@ class StepMap:
     """Highest steps and margins of tipping over angles of the levers.
 
     Attributes:
-        angles_deg: of front and rear; step_mm, margin_mm (at rest on the run's slope): shape (front, rear).
-        best: the highest, drawn; front_deg, rear_deg: there.
+        angles_deg: of front and rear. step_mm, margin_mm (at rest on the run's slope): shape (front, rear).
+        best: the highest, drawn.
+        front_deg, rear_deg: there.
         own_deg: the run's own angles, front and rear.
     """
 
@@ -62,7 +66,9 @@ class Postures:
     """Of the runs of a table.
 
     Attributes:
-        table: by column; rest, step: the first run's, drawn, at rest and on its highest step; over: of the first run.
+        table: by column.
+        rest, step: the first run's, drawn, at rest and on its highest step.
+        over: of the first run.
     """
 
     table: Columns
@@ -72,7 +78,7 @@ class Postures:
 
 
 def posture_of_runs(robot: Robot, runs: Runs, conditions: Conditions) -> Postures | None:
-    """Postures of the runs of a table; None if it states no levers."""
+    """Postures of the runs of a table, None if it states no levers."""
     if not conditions.states_levers:
         return None
     rests, limits, lies, steps = jax.device_get(static_limits.postures_of_runs(robot, conditions))
@@ -98,17 +104,17 @@ def posture_of_runs(robot: Robot, runs: Runs, conditions: Conditions) -> Posture
     }
     first, side, step = jax.tree.map(lambda x: x[0], (conditions, lies, steps))
     level = Drawn(side, float(rests.height[0]), 0.0, float(first.slope))
-    return Postures(table, level, _on_step(step), step_map(robot, first))
-
-
-def step_map(robot: Robot, conditions: Conditions) -> StepMap:
-    """Highest steps and margins of tipping of one run over the angles of its levers."""
-    found, margin = jax.device_get(static_limits.steps_over_lever_angles(robot, conditions, ANGLES, ANGLES))
+    found, margin = jax.device_get(static_limits.steps_over_lever_angles(robot, first, ANGLES, ANGLES))
     front, rear = np.unravel_index(np.argmax(found.height), found.height.shape)
     best = _on_step(jax.tree.map(lambda x: x[front, rear], found))
-    own = tuple(float(np.degrees(x)) for x in lever_angles(robot.running_gear, conditions))
-    return StepMap(
-        ANGLES, found.height / MM, margin / MM, best, float(ANGLES[front]), float(ANGLES[rear]), (own[0], own[1])
+    own = tuple(float(np.degrees(x)) for x in lever_angles(robot.running_gear, first))
+    return Postures(
+        table,
+        level,
+        _on_step(step),
+        StepMap(
+            ANGLES, found.height / MM, margin / MM, best, float(ANGLES[front]), float(ANGLES[rear]), (own[0], own[1])
+        ),
     )
 
 

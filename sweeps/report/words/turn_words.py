@@ -28,7 +28,7 @@ def unlike_sides_note(name: str, effects: Sequence[str], turns: str) -> str:
 
 
 def by_itself(robot: Robot, found: Result, value: float) -> str:
-    """Turn of a robot with both sides driven the same, by configuration, in words; empty if it travels straight.
+    """Turn of a robot with both sides driven the same, by configuration, in words, empty if it travels straight.
 
     Args:
         value: imposed voltage or motor speed [V, rpm].
@@ -52,8 +52,9 @@ def turn_not_found_reason(speed: float, rate: float, speeds: np.ndarray, rates: 
     """Reason for a missing turn: the limit at full voltage, or no steady turn under friction.
 
     Args:
-        speed: demanded [m/s]; rate: demanded yaw rate [rad/s].
-        speeds, rates: of settled turns at full voltage, from straight travel to the spot; NaN: no steady turn.
+        speed: demanded [m/s].
+        rate: demanded yaw rate [rad/s].
+        speeds, rates: of settled turns at full voltage, from straight travel to the spot. NaN: no steady turn.
     """
     known = np.isfinite(speeds) & np.isfinite(rates)
     if not known.any():
@@ -80,7 +81,7 @@ def turn_answer(row: Json, ended: Mapping[str, float] | None) -> str:
 
     Args:
         row: of the table of runs.
-        ended: of a run over time `time_s`, `displacement_m` and `turned_deg` at its end; None: a settled turn.
+        ended: of a run over time `time_s`, `displacement_m` and `turned_deg` at its end. None: a settled turn.
     """
     status = str(row["status"])
     if not is_going(row):

@@ -12,7 +12,7 @@ from calibration.data import contents, robot_file
 from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.data.runs import Runs
 from calibration.inference.feedforward import UNITS, DriveLog, Tolerances, fit_feedforward
-from mmrjax.model.channels import find_channel
+from mmrjax.model.channels import EVERY
 from sweeps import config as configuration
 from sweeps.inputs import load_robot, read_runs
 from sweeps.report import feedforward_report
@@ -20,8 +20,9 @@ from sweeps.store import finish_run_folder, open_folder, print_report
 
 #: Names of signals with the battery's voltage.
 BATTERY = re.compile(r"batt\w*volt", re.IGNORECASE)
-#: Pairs of channels with a velocity and its position, the first that has readings is fitted.
-PAIRS = (("output_speed", "output_angle"), ("speed", "position"), ("motor_speed", ""))
+#: Columns of a velocity and its position, the first pair that has readings is fitted.
+PAIRS = (("output_speed_rpm", "output_angle_deg"), ("speed_mm_s", "position_mm"))
+ROTOR = "motor_speed_rpm", ""
 
 
 def execute(config: configuration.Calibrate, beside: configuration.FittedRuns) -> int:
@@ -60,14 +61,15 @@ def drive_log(runs: Runs, unit: str | None = None, as_logged: bool = False) -> D
         BadConfiguration: a unit of length for an angle, or the reverse.
     """
 
-    def reading(name: str) -> np.ndarray | None:
-        channel = find_channel(name) if name else None
-        if channel is None or not runs.has(channel.column):
+    factors = {channel.column: channel.factor for channel in EVERY}
+
+    def reading(column: str) -> np.ndarray | None:
+        if not runs.has(column):
             return None
-        values = runs[channel.column] * channel.factor
+        values = runs[column] * factors[column]
         return values if np.isfinite(values).any() else None
 
-    for pair in PAIRS:
+    for pair in (*PAIRS, ROTOR):
         velocity, position = map(reading, pair)
         if velocity is not None or position is not None:
             break
@@ -76,11 +78,11 @@ def drive_log(runs: Runs, unit: str | None = None, as_logged: bool = False) -> D
             f"{runs.source}: has neither velocity nor position; expected output_speed_rpm, output_angle_deg, "
             "speed_mm_s, position_mm or motor_speed_rpm, or --columns sysid"
         )
-    unit = unit or ("m" if pair[0] == "speed" else "rotation")
-    if (unit == "m") != (pair[0] == "speed") and not as_logged:
+    unit = unit or ("m" if pair[0] == "speed_mm_s" else "rotation")
+    if (unit == "m") != (pair[0] == "speed_mm_s") and not as_logged:
         raise BadConfiguration(f"--unit: got {unit}, but {pair[0]} is read; expected a unit of its position")
     size = 2 * np.pi if as_logged else UNITS[unit] or 1.0
-    if not runs.has("time_s"):
+    if not runs.sampled:
         raise BadData(f"{runs.source}: has no time; expected a column time_s")
     order = np.concatenate([runs.in_order(name) for name in dict.fromkeys(runs.run_names.tolist())])
     duty = runs["duty"] if runs.has("duty") else 1.0
@@ -95,6 +97,6 @@ def drive_log(runs: Runs, unit: str | None = None, as_logged: bool = False) -> D
         voltage[order],
         ordered(position, size),
         ordered(velocity, size),
-        ordered(reading("motor_current"), 1.0),
+        ordered(reading("motor_current_A"), 1.0),
         unit=unit,
     )

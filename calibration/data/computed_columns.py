@@ -1,0 +1,103 @@
+"""Torques that were computed from a current and not measured, which are left out of a table."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+
+from calibration.data.columns import LOAD
+from calibration.data.contradictions import CURRENTS
+from calibration.data.input_errors import BadData
+from calibration.data.instruments import FEWEST, step_of
+from calibration.data.table import Runs
+from mmrjax.model.robot import Robot
+
+#: Fewest rows and distinct readings for a line through all of them to be significant.
+ROWS, LEVELS = 8, 4
+#: Rounding error in a file as a share of a channel's range; fewest steps of a display within the range for a line
+#: through all readings to be more than the display's rounding.
+ROUNDED, STEPS = 2e-6, 40.0
+#: Steps of the search for a load, and largest error of its current as a share of the largest reading.
+SEARCH, ERROR = 8, 1e-3
+#: A torque that a user may name as a reading.
+TORQUE = "output_torque_Nm"
+
+
+def without_computed_torques(runs: Runs, robot: Robot) -> Runs:
+    """The table without a torque that is a multiple of a current in all rows, to the digits of the file.
+
+    A motor's friction leaves an offset between current and torque, so a torque that was set or read is no multiple.
+    Without a set load torque, the load of each row is the one that the file's robot balances at the current that was
+    read. That current then is no reading any more.
+
+    Raises:
+        BadData: a computed load of a log, of a table of an imposed current, or without another channel.
+    """
+    columns, notes = dict(runs.columns), list(runs.notes)
+    shown = {c.column: c.name for c in runs.channels if runs.has(c.column)}
+    for torque, current in ((t, c) for t in (LOAD, TORQUE) for c in CURRENTS if runs.has(t) and runs.has(c)):
+        if torque not in columns or (torque == TORQUE and len(shown) < 2):
+            continue
+        line = None if len(np.unique(runs[current])) < FEWEST else line_through(runs[current], runs[torque])
+        if line is None or line[0] != 0.0:
+            continue
+        computed = f"{runs.source}, {torque}: in every row {line[1]:.4g} times {current}, to the last digit; it was "
+        computed += "computed and never measured, so it tells nothing of torque constant, friction or efficiency"
+        if torque == TORQUE:
+            columns.pop(torque)
+            notes.append(f"{computed}; it is left out")
+        elif runs.sampled or set(shown) <= {current, TORQUE} or current not in shown:
+            raise BadData(
+                f"{computed}; remove the column and keep rows without a load, or give a torque that was set"
+            )
+        else:
+            columns[torque] = _load_at(runs, robot, shown[current], runs[current])
+            columns.pop(current)
+            notes.append(
+                f"{computed}; it is left out. The load of each row follows from {current} and the robot's file, "
+                "so that this current is no reading either: these rows tell of voltages and speeds"
+            )
+    return dataclasses.replace(runs, columns=columns, notes=tuple(notes))
+
+
+def _load_at(runs: Runs, robot: Robot, channel: str, current: np.ndarray) -> np.ndarray:
+    """Load torque of each row at which the robot of the file draws the current that was read [N·m].
+
+    Raises:
+        BadData: the robot draws this current at no load in a row.
+    """
+    from mmrjax.fidelities.simulation import simulate
+
+    conditions, load = runs.conditions(robot), np.zeros(len(runs))
+    many = float(robot.sides) if channel == "total_current" else 1.0
+    rise = float(robot.gearbox.ratio * robot.gearbox.efficiency_load * robot.motor.torque_constant) / many
+    for _ in range(SEARCH):
+        drawn = np.asarray(
+            simulate(robot, dataclasses.replace(conditions, load_torque=jnp.asarray(load))).reading[channel]
+        )
+        wrong = np.where(np.isfinite(current), current - drawn, 0.0)
+        load = load + rise * np.nan_to_num(wrong)
+    far = np.flatnonzero(~(np.abs(wrong) <= ERROR * np.nanmax(np.abs(current))))
+    if far.size:
+        raise BadData(
+            f"{runs.source} row {far[0] + 1}, {LOAD}: it was computed from {channel}, and the file's robot draws "
+            f"{current[far[0]]:.4g} A at no load torque; check the file's numbers, or remove the row"
+        )
+    return load
+
+
+def line_through(x: np.ndarray, y: np.ndarray) -> tuple[float, float] | None:
+    """Intercept and slope of a line through all points, within their digits, None without such a line."""
+    both = np.isfinite(x) & np.isfinite(y)
+    x, y = x[both], y[both]
+    if len(x) < ROWS or min(len(np.unique(x)), len(np.unique(y))) < LEVELS:
+        return None
+    slope, intercept = np.polyfit(x - x.mean(), y, 1)
+    intercept -= slope * x.mean()
+    rounding = step_of(y) + abs(slope) * step_of(x)
+    allowed = 0.75 * rounding + ROUNDED * (np.ptp(y) + np.max(np.abs(y)))
+    if np.ptp(y) < STEPS * rounding or np.max(np.abs(y - intercept - slope * x)) > allowed:
+        return None
+    return (0.0 if abs(intercept) <= 2 * allowed else float(intercept)), float(slope)
