@@ -43,7 +43,7 @@ _Config = Annotated[
     Path | None, typer.Option("--config", help="TOML file with the keys of a config.resolved.toml; options win.")
 ]
 _Trust = Annotated[
-    bool, typer.Option("--trust", help="Let --config name what is executed: effects, and a scheduler.")
+    bool, typer.Option("--trust", help="Allow --config to name code that is run: effects and a scheduler.")
 ]
 _Effects = Annotated[
     list[str] | None, typer.Option("--effects", help="A Python file with effects of your own, repeatable.")
@@ -409,7 +409,7 @@ def new(
         Path | None, typer.Option("--from", help="A URDF or a model of MuJoCo with the driven joint.")
     ] = None,
     joint: Annotated[
-        str | None, typer.Option(help="Name of that joint; it turns.  \\[default: the only driven one]")
+        str | None, typer.Option(help="Name of the revolute joint.  \\[default: the only driven one]")
     ] = None,
     from_sheet: Annotated[
         bool,

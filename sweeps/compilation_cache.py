@@ -28,7 +28,7 @@ LIMIT = 4 * 2**30
 
 
 def cache_location(path: Path | None = None) -> Path | None:
-    """Folder of the cache, which need not exist yet, None where it is switched off or no place for it is known.
+    """Folder of the cache, which may not exist yet, None if it is switched off or has no known place.
 
     Args:
         path: folder to hold caches. None takes it from the environment.

@@ -197,7 +197,7 @@ class RateColumn(ProgressColumn):
 def progress_bar(
     total: int, quiet: bool, doing: str = "simulating", done: int = 0, rate: bool = False
 ) -> Iterator[Callable[[float], None]]:
-    """A bar on stderr. Gives a function that is called with how much more is done.
+    """A progress bar on stderr. Yields a function to call with the number of newly finished items.
 
     Args:
         done: of the total already.

@@ -125,7 +125,7 @@ def _type(fact: Json) -> Any:
 
 
 def take_options(kind: type[BaseModel], values: Json) -> Json:
-    """Takes what was given for the fields of a configuration out of the values of a command, and reads their texts.
+    """Removes the options of a configuration from a command's values and parses them.
 
     Raises:
         BadConfiguration: an axis or a change that cannot be read.

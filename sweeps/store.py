@@ -241,7 +241,7 @@ class Folder:
         writing.write_table(self.results() / name, columns, self.tables)
 
     def finish(self, manifest: Json, runs: Runs | None = None) -> Path:
-        """Write the manifest and move the folder into place, returns its path.
+        """Write the manifest and move the folder into place. Returns its path.
 
         Hashes of the folder's `robot.toml` and of the file that `runs` came from, if any, are added, and the names of
         all that the folder holds: `--force` deletes nothing else.

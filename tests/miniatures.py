@@ -20,7 +20,7 @@ efficiency_load = "{5} ± 5 %"
 """
 _SHAFT = '[bench]\nload = "shaft"\ninertia = 1e-6\nloss_coulomb = 0.0\n'
 _WHEELS = '[car]\nload = "vehicle"\nmovers = "wheels"\nmass = "{} ± 10 %"\nradius = "{} ± 3 %"\n[car.track]\nloss_coulomb = 0.0\n'
-_WHEELS += '[car.ground]\nrolling_resistance = "0.02 ± 100 %"\n[car.ground.friction]\nstatic = "0.8 ± 0"\n'
+_WHEELS += '[car.ground]\nrolling_resistance = "0.02 ± 100 %"\n[car.ground.friction]\nstatic = "0.8 ± 30 %"\n'
 
 
 def _speed(time: np.ndarray, drive: np.ndarray, gain: float, constant: float, dry: float) -> np.ndarray:

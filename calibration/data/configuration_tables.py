@@ -96,7 +96,7 @@ def loads_from_tables(base: Robot | None, content: Json, sds: dict[str, float], 
         else:
             by_name[name], lacking = _chassis(base, name, table, here), []
         if lacking and base is not None:
-            raise BadConfiguration(f"{here}: load starts from nothing; {_listed(lacking)} missing")
+            raise BadConfiguration(f"{here}: load has no base to start from; {_listed(lacking)} missing")
         missing += [f"{name}.{key}" for key in lacking]
     shafts = [name for name, load in by_name.items() if isinstance(load, Shaft)]
     vehicles = [name for name in names if name not in shafts]

@@ -265,7 +265,7 @@ def _requirements(name: str, value: Any, envelope: Envelope, where: str) -> list
             raise BadConfiguration(f"{where}, {_unknown(key, known)}")
     for key in table:
         if key in AXES and key not in quantity.axes:
-            raise BadConfiguration(f"{where}, {key}: {quantity.label} does not depend on it; leave it out")
+            raise BadConfiguration(f"{where}, {key}: {quantity.label} does not depend on it; remove it")
     if not limits:
         raise BadConfiguration(f"{where}: states neither least nor most; expected one of them [{quantity.unit}]")
     if not isinstance(source, str):

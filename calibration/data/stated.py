@@ -39,7 +39,9 @@ def stated_number(text: str, where: str) -> tuple[float, float]:
         raise BadConfiguration(f"{where}: got {text!r}; the standard deviation must be 0 (exact) or more; {FORM}")
     if sd.strip().endswith("%"):
         if mean == 0 and size > 0:
-            raise BadConfiguration(f"{where}: got {text!r}; a share of 0 is 0: state the standard deviation; {FORM}")
+            raise BadConfiguration(
+                f"{where}: got {text!r}; 0 has no percentage: state the standard deviation; {FORM}"
+            )
         size *= abs(mean) / 100
     return mean, float(f"{size:.12g}")  # a percentage leaves digits of rounding
 

@@ -167,7 +167,7 @@ def mechanism_evidence(found: loop_notes.Mechanism) -> str:
     errors = f", {found.gain / found.se:.1f} standard errors" if 0 < found.se < math.inf else ""
     return (
         f"explains {100 * found.share:.0f} % of the excess misfit, gains {found.gain:.2g} nat a reading that it "
-        f"changes on runs that the fit has not seen{errors}, and is found again in {100 * found.again:.0f} % of the "
+        f"changes on held-out runs{errors}, and is found again in {100 * found.again:.0f} % of the "
         "data with a block left out"
     )
 
@@ -175,7 +175,7 @@ def mechanism_evidence(found: loop_notes.Mechanism) -> str:
 #: Evidence against a mechanism.
 NO_MECHANISM = {
     "share": "it explains only {share:.0f} % of the excess misfit",
-    "gain": "on runs that its fit has not seen it gains {0.gain:.2g} ± {0.se:.2g} nat a reading",
+    "gain": "on held-out runs it gains {0.gain:.2g} ± {0.se:.2g} nat a reading",
     "again": "it is found again in only {again:.0f} % of the data with a block left out",
     "many": "{many} variables may drive it",
 }
@@ -773,7 +773,7 @@ def unwritten_reason(curve: bool, gain: float, se: float) -> str:
     what = "the curve" if curve else "what was found"
     how = "no better than" if curve and gain > 0 else "worse than"
     return (
-        f"{what} predicts runs that it has not seen {how} the refit ({gain:+.2f} ± {se:.2f} nat a "
+        f"{what} predicts held-out runs {how} the refit ({gain:+.2f} ± {se:.2f} nat a "
         "reading): robot.toml is the refit"
     )
 

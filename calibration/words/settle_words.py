@@ -20,7 +20,7 @@ WHY = {
     "rest": ("does not move", "nothing: friction holds it there; time histories use it"),
     "stuck": ("shows one number for long: saturated or frozen", "mend the instrument or its range"),
     "glitches": ("has many readings far from the others", "mend the instrument, or log its mean if it shows pulses"),
-    "unread": ("no channel has enough readings", "log more of them, or remove the rows without"),
+    "unread": ("no channel has enough readings", "log more of them, or remove the rows that lack them"),
     "undriven": ("the driver brakes or coasts", "nothing: time histories use it"),
 }
 

@@ -105,7 +105,7 @@ def ends_early(runs: Names, lasts: float, share: float) -> str:
     at = "" if math.isnan(share) else f", at {share:.0%} of the speed of steady travel"
     return (
         f"{_runs(runs, 'ends', 'end')} after {lasts:.2g} s at the latest{at}: before the robot is under "
-        "way, so what resists its travel is known by its priors; record until the speed is steady"
+        "way, so only priors determine its resistance to travel; record until the speed is steady"
     )
 
 
@@ -140,7 +140,7 @@ SAID: dict[str, str | Callable[..., str]] = {
         f"{name}: nothing in these data measures it; its value is its prior's. {would_measure(name)} would"
     ),
     "constant": lambda column, value, alike: (
-        f"{column} is {bound_text(value)} in every row: {ALIKE[alike]}, and only their priors tell them apart"
+        f"{column} is {bound_text(value)} in every row: {ALIKE[alike]}, so only their priors distinguish them"
     ),
     "repeats": differing_repeats,
     "larger_noise": "{channel}: {pairs} pairs of rows at the same conditions scatter "

@@ -83,7 +83,7 @@ def _over_time(
     for option in (name for name, stated in options.items() if stated):
         raise BadConfiguration(
             f"{option}: {Path(runs.source).name} holds time histories, which are followed sample by sample, with the "
-            "masses and times that they state; leave it out"
+            "masses and times that they state; remove it"
         )
     model = None if config.model == fidelities.NAMES[0] else config.model
     ready = preparation.prepare(runs, file.robot)

@@ -60,7 +60,7 @@ def explain_name(name: str | None, files: Names = ()) -> int:
             raise BadConfiguration(f"explain: got {name}; is one of these meant? {', '.join(below)}")
         close = similar_words(name, [n for those in names.values() for n in those], 3)
         hint = f"did you mean {', '.join(close)}? " if close else ""
-        raise BadConfiguration(f"explain: got {name}; {hint}mmrjax explain lists the names that there are")
+        raise BadConfiguration(f"explain: got {name}; {hint}mmrjax explain lists all names")
     return 0
 
 

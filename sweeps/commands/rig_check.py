@@ -29,7 +29,7 @@ from mmrjax.model.motor import UNLIMITED
 from mmrjax.model.quantities import HEAT
 from mmrjax.model.robot import Robot
 from mmrjax.model.shaft import Shaft
-from sweeps.commands.rig_template import EXAMPLE
+from sweeps.commands.rig_template import EXAMPLE, is_example
 from sweeps.config import RobotPart
 from sweeps.console import print_json
 from sweeps.inputs import load_robot, read_runs
@@ -301,7 +301,7 @@ def examine_rig_file(file: Path, data: str | None, effects: Names = (), columns:
     """Remarks on a rig's file, and on a table whose columns a preset may name."""
     rig = load_robot(RobotPart(robot=str(file), effects=effects))
     lines, robot = rig.text.splitlines(), rig.robot
-    examples = tuple(k for k, line in enumerate(lines, 1) if EXAMPLE in line and not line.startswith("#"))
+    examples = tuple(k for k, line in enumerate(lines, 1) if is_example(line) and not line.startswith("#"))
     check = RigCheck(
         rig.name, robot, examples, tuple(rig_facts.number_origins(rig)), tuple(rig_facts.derived_facts(robot))
     )

@@ -50,7 +50,7 @@ class _Urdf:
     def __init__(self, root: Element, file: str) -> None:
         self.root, self.file = root, file
         if any("xacro}" in element.tag for element in root.iter()):
-            raise BadConfiguration(f"{file}: has elements of xacro; run xacro {file} > robot.urdf, and state that")
+            raise BadConfiguration(f"{file}: has elements of xacro; run xacro {file} > robot.urdf, and use that file")
         self.links, self.joints = self._named("link"), self._named("joint")
         for name, element in self.joints.items():
             for end in ("parent", "child"):

@@ -93,6 +93,17 @@ def _put(lines: list[str], table: str, key: str, line: str) -> None:
     lines.insert(end, line)
 
 
+def is_example(line: str) -> bool:
+    """True if a line of a rig's file is marked as an example and has a template's number."""
+    marked = (x for kind in KINDS for x in rig_template(kind).splitlines() if EXAMPLE in x)
+    return EXAMPLE in line and any(_stated_number(x) == _stated_number(line) for x in marked)
+
+
+def _stated_number(line: str) -> tuple[str, float] | None:
+    match = re.match(r'(\w+) = "?([-+.\deE]+)', line)
+    return None if match is None else (match[1], float(match[2]))
+
+
 def example_numbers(text: str) -> Names:
     """Returns names and units of the numbers that are still those of an example, as `motor.resistance [ohm]`."""
     examples, table = [], ""

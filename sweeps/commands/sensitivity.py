@@ -135,7 +135,7 @@ def _operating_points(
                 f"--vary {name}: the robot's file imposes the {words_of(layout.imposed)}; vary that"
             )
     if config.battery and "voltage" in ranges:
-        raise BadConfiguration("--vary voltage: acts without --battery only, whose voltage is that of its charge")
+        raise BadConfiguration("--vary voltage: acts only without --battery, whose charge sets the voltage")
     for name, (low, high) in ranges.items():
         if name in AXES:
             if getattr(config, AXES[name]) is not None:
@@ -145,7 +145,7 @@ def _operating_points(
     try:
         stated = GridPart(configurations=config.configurations, surface=config.surface, **axes)
     except ValueError:
-        raise BadConfiguration(f"--vary: got {', '.join(config.vary)}; a range leaves what a run may have") from None
+        raise BadConfiguration(f"--vary: got {', '.join(config.vary)}; a range exceeds the limits of a run") from None
     notes: list[str] = []
     stated = grid_room.resolve_grid(stated, robot, config.battery, notes)
     for note in notes:

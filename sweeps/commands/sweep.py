@@ -245,7 +245,7 @@ def simulate_chunks(store: SweepStore, job: scale.Job, options: StoreOptions, po
         written = len(store.done())
         raise DiskFull(
             f"{store.partial}: {error.strerror} after {written} of {len(job.blocks)} chunks; free some space, and "
-            "the same command goes on from there"
+            "the same command resumes from there"
         ) from error
 
 

@@ -134,8 +134,8 @@ def check_acting(robot: Robot, ground: Iterable[str] = (), shaft: Iterable[str] 
         BadConfiguration: the first of them.
     """
     for option in shaft if robot.has_ground else ground:
-        why = "the robot's load is a shaft, and slope, payload, mass and surface do not act on it; leave it out"
-        raise BadConfiguration(f"{option}: {f'{NO_BRAKE}; leave it out' if robot.has_ground else why}")
+        why = "the robot's load is a shaft, and slope, payload, mass and surface do not act on it; remove it"
+        raise BadConfiguration(f"{option}: {f'{NO_BRAKE}; remove it' if robot.has_ground else why}")
 
 
 def check_battery(robot: Robot) -> None:
@@ -146,7 +146,7 @@ def check_battery(robot: Robot) -> None:
     """
     if robot.rig.imposed != "voltage":
         what = SAID[robot.rig.imposed].words
-        raise BadConfiguration(f"--battery: the {what} is imposed on this robot, whatever feeds them; leave it out")
+        raise BadConfiguration(f"--battery: the {what} is imposed on this robot, with any supply; remove it")
     if not capabilities.has_battery(robot):
         raise BadConfiguration("--battery: the robot's file states no battery; add [battery], or state --voltage")
 

@@ -29,9 +29,9 @@ from sweeps.report.document import Block, Document, Note, Section, Table
 VERDICTS: dict[str, tuple[str, str]] = {
     "over": ("gets over", "the rear axle is past the obstacle and a wheel's radius beyond"),
     "tips": ("tips over", "the robot pitched by more than 100 deg"),
-    "stalls": ("stalls", "it comes no further and its tracks stand: the motors cannot turn them"),
-    "slides": ("slides", "it comes no further and its tracks run on: the ground does not hold them"),
-    "hangs": ("hangs", "it comes no further with its body on an edge, or has fallen into a gap"),
+    "stalls": ("stalls", "it stops and its tracks stand still: the motors cannot turn them"),
+    "slides": ("slides", "it stops and its tracks slip: the ground has too little grip"),
+    "hangs": ("hangs", "it stops with its body on an edge, or has fallen into a gap"),
     "unfinished": ("is under way", "the time was over while it still went on; take a longer --duration"),
     "failed": ("failed", "numbers of the run went wrong, or its levers would begin below the ground"),
 }

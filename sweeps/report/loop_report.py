@@ -160,7 +160,7 @@ def _advice(found: DiscoveryResult) -> Table:
         level, texts = found.headline.level, {"none", "undescribed", "named", "open"}
         next_step = catalogue.text(f"loop.next-{level if level in texts else 'other'}")
     else:
-        tells = f" Tells {', '.join(after.separates)}; expected separation {after.expected_sigma:.1f} σ."
+        tells = f" It distinguishes {', '.join(after.separates)}; expected separation {after.expected_sigma:.1f} σ."
         undecided = " Some pairs stay undecided." if found.headline.level == "class" and not after.settles else ""
         next_step = f"**{after.name}**: {after.description}.{tells * bool(after.separates)}{undecided}"
     far = [describe(note) for note in with_codes(found.remarks, "far_from_prior", "repeats", "copied")]

@@ -173,7 +173,7 @@ class ResonanceResult:
             parts.append(self._table8())
         if self.passing.name == "teeth":
             parts.append(
-                f"This configuration has no grousers on the ground; what passes are the belt's teeth, every "
+                f"This configuration has no grousers on the ground. The belt's teeth cause its ripple, one every "
                 f"{self.passing.travel / MM:.2f} mm of travel."
             )
         return parts
