@@ -638,7 +638,27 @@ class Reproduce(RobotPart, ModelPart):
     model: str = option_field(fidelities.NAMES[0], "steady, or track for Figs. 23-27 too")
 
 
-class Calibrate(RobotPart, DataPart, InferencePart, OutputPart):
+class FeedforwardPart(Part):
+    """Constants kS, kV, kA in the place of a robot's parameters."""
+
+    feedforward: Literal["simple", "elevator", "arm"] | None = option_field(
+        None, "Fit kS, kV, kA (kG) of this mechanism instead, and feedback gains (docs/howto/wpilib.md)", usual="no"
+    )
+    unit: Literal["rotation", "rad", "degree", "m"] | None = option_field(
+        None, "Unit of position that kV and kA are for, with --feedforward", usual="rotation; m of a travel"
+    )
+    position_error: Annotated[float, positive(1e6)] = option_field(
+        1.0, "Tolerance of the position's regulator [unit]"
+    )
+    velocity_error: Annotated[float, positive(1e6)] = option_field(1.5, "Tolerance of velocity [unit/s]")
+    effort_V: Annotated[float, positive(1e4)] = option_field(7.0, "Voltage that the gains may use (V)")
+    period_s: Annotated[float, positive(10)] = option_field(0.02, "Period of the controller (s)")
+    measurement_delay_s: Annotated[float, between(0, 10)] | None = option_field(
+        None, "Delay of its measurement (s)", usual="what the log shows"
+    )
+
+
+class Calibrate(RobotPart, DataPart, InferencePart, FeedforwardPart, OutputPart):
     """Options of a calibration. For None the fidelity or the data decide."""
 
     model: Annotated[str, AfterValidator(_fidelity)] | None = option_field(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from calibration.inference import priors
 from calibration.inference.calibration import calibrate as run
 from sweeps import config as configuration
+from sweeps.commands import feedforward_fit
 from sweeps.console import print_message, step_reporter
 from sweeps.inputs import load_robot, read_runs
 from sweeps.pages import words
@@ -17,6 +18,8 @@ def execute(config: configuration.Calibrate, beside: configuration.FittedRuns) -
 
     0 done. 3 done, but the search or a fit without a block did not converge, or the solver failed at a row.
     """
+    if config.feedforward is not None:
+        return feedforward_fit.execute(config, beside)
     robot = load_robot(config).robot
     runs = read_runs(beside.data, robot, columns=config.columns, measured=True, series=True)
     stated = priors.parse_priors(config.prior)

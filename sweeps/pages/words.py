@@ -72,6 +72,8 @@ FILES = {
     "LAW.md": "the law for people who have never seen this program",
     "robot.toml": "the robot; every command takes it with --robot",
     "runs.csv": "every run, one row each",
+    "windows.csv": "windows of a log: voltage, velocity, acceleration",
+    "feedforward.json": "constants, gains and remarks",
     "rows.csv": "every row: measured, simulated, residuals",
     "comparison.csv": "every row: measured, simulated, errors",
     "history.csv": "every instant",
