@@ -18,7 +18,7 @@ STEP, FINE = 0.02, 5
 
 
 def simulated(seed, fault="", tests=TESTS, kG=0.0, arm=False):
-    """A log of a drive by explicit steps of 1 ms; returns it with kS, kV, kA."""
+    """A log of a drive by explicit steps of 1 ms. Returns it with kS, kV, kA."""
     rng = np.random.default_rng(seed)
     kS, kV, kA = rng.uniform(0.1, 0.4), rng.uniform(0.1, 0.2), rng.uniform(0.04, 0.08)
     rows, battery, currents = [], [], []

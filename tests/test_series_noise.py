@@ -163,7 +163,7 @@ def test_replicates_are_drawn_with_sds_that_an_estimate_might_have_been_of():
 
 
 def test_readings_of_motors_at_rest_do_not_tell_the_noise_of_those_that_turn():
-    """A driver's dead band: half of the speeds are exactly 0; a pure share gave the slowest rows a far too small sd."""
+    """A driver's dead band: half of the speeds are exactly 0. A pure share gave the slowest rows a far too small sd."""
     runs = table(0.05, slopes=np.linspace(0, 20, 121), payloads=(0.0,), volts=(15.0,))
     turning = np.maximum(600 - 57 * runs["slope_deg"], 0.0)
     speed = turning + np.where(turning > 0, 3.0, 0.0) * np.random.default_rng(4).standard_normal(121)

@@ -40,11 +40,16 @@ WRONG_UNITS = (60.0, 1 / 60, 2 * np.pi, 1 / (2 * np.pi), 360.0, 1 / 360, 60 / (2
 
 @dataclasses.dataclass(frozen=True)
 class DriveLog:
-    """Readings of a drive; those of `velocity`, `position` and `current` may be missing (None).
+    """Readings of a drive. Those of `velocity`, `position` and `current` may be missing (None).
 
     Attributes:
-        run: name of the run of each row; time: [s]; voltage: [V]; position, velocity: in `unit`, per second.
-        current: of the motor [A]; battery: its voltage at any times [V]; unit: one of `UNITS`.
+        run: name of the run of each row.
+        time: [s].
+        voltage: [V].
+        position, velocity: in `unit`, per second.
+        current: of the motor [A].
+        battery: its voltage at any times [V].
+        unit: one of `UNITS`.
     """
 
     run: np.ndarray
@@ -59,10 +64,14 @@ class DriveLog:
 
 @dataclasses.dataclass(frozen=True)
 class Tolerances:
-    """Weights of the regulator (Bryson's rule) and its clock; defaults are those of WPILib's SysId.
+    """Weights of the regulator (Bryson's rule) and its clock. Defaults are those of WPILib's SysId.
 
     Attributes:
-        position: [unit]; velocity: [unit/s]; effort: [V]; period: of the loop [s]; delay: of the measurement [s].
+        position: [unit].
+        velocity: [unit/s].
+        effort: [V].
+        period: of the loop [s].
+        delay: of the measurement [s].
     """
 
     position: float = 1.0
@@ -77,8 +86,10 @@ class Feedforward:
     """Constants of a drive with their standard deviations, and gains.
 
     Attributes:
-        constants, sds: by name, kS, kV, kA, and kG where it applies; missing: tests that the log lacks.
-        delay: of the motion behind the voltage, and of a speed's filter [s]; gains: by name.
+        constants, sds: by name, kS, kV, kA, and kG where it applies.
+        missing: tests that the log lacks.
+        delay: of the motion behind the voltage, and of a speed's filter [s].
+        gains: by name.
         windows: mean voltage, speed, acceleration, and True for one with little acceleration.
     """
 
@@ -95,7 +106,7 @@ class Feedforward:
     remarks: tuple[Remark, ...]
 
     def to_json(self) -> Json:
-        """The content of `feedforward.json`; intervals are of 95 %."""
+        """The content of `feedforward.json`. Intervals are of 95 %."""
         units = units_of(self.unit)
         return {
             "schema": "mmrjax.feedforward/1",
@@ -129,7 +140,7 @@ def fit_feedforward(log: DriveLog, mechanism: str = "simple", tolerances: Tolera
     """Constants of a drive, gains and what stands in their way.
 
     Raises:
-        BadData: too little motion; the message names the missing tests.
+        BadData: too little motion. The message names the missing tests.
     """
     missing = missing_tests(log)
     log, lag, remarks = _speeds(log)
@@ -210,7 +221,7 @@ def _regulator(a: np.ndarray, b: np.ndarray, tolerated: list[float], t: Toleranc
 
 
 def missing_tests(log: DriveLog) -> Names:
-    """Tests of SysId that a log lacks; none of a log whose voltage is neither ramp nor step."""
+    """Tests of SysId that a log lacks. None of a log whose voltage is neither ramp nor step."""
     present = set()
     for name in dict.fromkeys(log.run.tolist()):
         named = next((t for t, old in TESTS.items() if t in name or old in name), None)

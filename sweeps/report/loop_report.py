@@ -84,7 +84,7 @@ def _findings(found: DiscoveryResult, changes: Mapping[str, Change]) -> Iterable
 
 
 def _noise_alone(found: DiscoveryResult) -> str:
-    """Opening of a claim that does not hold at every noise tried; "" for one that does."""
+    """Opening of a claim that does not hold at every noise tried, "" for one that does."""
     return "" if found.headline.level == found.verdict else "At 1 times the noise alone: "
 
 
