@@ -309,7 +309,7 @@ class Picture(OneRun):
     end: float | None = option_field(None, "Last instant of a film (s)", usual="begin + 0.1")
     slow: Annotated[float, Field(ge=0.01)] | None = option_field(None, "Slow-motion factor of a film", usual="20")
     climb: Path | None = option_field(
-        None, "A folder of mmrjax climb to draw in its place, by default whole and at half speed"
+        None, "Folder of mmrjax climb to draw instead, by default whole and at half speed"
     )
     force: bool = option_field(False, "Replace an existing file")
 
@@ -619,7 +619,7 @@ class Climb(RobotPart, SupplyPart, OutputPart):
                 "idle", "no obstacle is stated; state `step_mm`, `stairs`, `gap_mm` or `terrain`, or `find`"
             )
         if self.find == "stairs" and self.stairs is None:
-            raise PydanticCustomError("idle", "`find` stairs needs `stairs`, whose tread and count stay")
+            raise PydanticCustomError("idle", "`find` stairs needs `stairs`, which sets tread and count")
         if self.find is not None and given and not given[0].startswith(self.find):
             raise PydanticCustomError("idle", f"`find` {self.find} acts without `{given[0]}`")
         if self.nose_mm and (self.gap_mm is not None or self.terrain is not None or self.find == "gap"):
@@ -696,7 +696,7 @@ class Settle(RobotPart, DataPart, OutputPart):
         None, "Shortest stretch that is taken for settled", usual="0.3, and at least 20 samples"
     )
     drift: Annotated[float, Field(gt=0, le=0.5)] = option_field(
-        0.02, "Largest change of a channel's mean within a stretch, as a share of it"
+        0.02, "Largest change of a channel's mean within a stretch, as a share of the mean"
     )
 
 
@@ -765,7 +765,7 @@ class RequirementsPart(Part):
 class Check(RequirementsPart, RobotPart, OutputPart):
     """A robot held against requirements."""
 
-    changes: bool = option_field(True, "Look for what would meet what is missed")
+    changes: bool = option_field(True, "Search for changes that meet the missed requirements")
 
 
 class Size(RequirementsPart, RobotPart, OutputPart):

@@ -52,11 +52,11 @@ def taken_apart(table: Json, where: str, prefix: str = "") -> dict[str, float]:
     Raises:
         BadConfiguration: as `stated_number`.
     """
-    found: dict[str, float] = {}
+    sds: dict[str, float] = {}
     for key, value in table.items():
         name = f"{prefix}{key}"
         if isinstance(value, dict):
-            found |= taken_apart(value, where, f"{name}.")
+            sds |= taken_apart(value, where, f"{name}.")
         elif is_stated(value):
-            table[key], found[name] = stated_number(value, f"{where}, {name}")
-    return found
+            table[key], sds[name] = stated_number(value, f"{where}, {name}")
+    return sds

@@ -159,7 +159,7 @@ def _sections(robot: Robot, found: Missions, first: Json, answer: str) -> Iterab
 
 
 def _names(runs: Columns) -> list[str]:
-    """Headings of runs. What the profile states in the place of a run's condition is left out."""
+    """Headings of runs, without the conditions that the profile states."""
     parts = (label.split(", ") for label in run_headings(runs))
     return [", ".join([head, *(p for p in rest if not p.startswith("nan"))]) for head, *rest in parts]
 
